@@ -35,7 +35,7 @@ METRES_PER_FOOT: Final = 0.3048
 DODGE_FT: Final = 0.35
 """Between series at one distance, so that no interval hides another."""
 
-PAPER_DELAY: Final = Quantity("paper_delay_s", "mean RTT", Kind.MEDIAN)
+PAPER_DELAY: Final = Quantity("paper_delay_s", "mean RTT", Kind.MEDIAN, "s")
 BY: Final = ("topology", "scenario", "protocol", "distance_m")
 STYLES: Final[dict[tuple[str, str], Style]] = {
     ("master", "los"): Style("blue", "o"),

@@ -1,5 +1,6 @@
 """Fixtures that several folders share, and what holds for all tests: no time limit on an example, long ones first."""
 
+import gc
 import signal
 from collections.abc import Iterator
 from typing import Final
@@ -73,6 +74,16 @@ def _no_reader_waits() -> Iterator[None]:
     contents._WORKER.end()
     recorded._GPX_READER.end()
     tlog._READER.end()
+
+
+# What collecting makes lives to the end of the run: nobody is to look through it, then or later.
+gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Look for garbage among what tests make alone."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,14 +1,22 @@
 """The imports point one way, and one dependency has one importing module (design, section 2; style, rule 11)."""
 
 import ast
+import pkgutil
+import re
+import sys
+import tomllib
 from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
+from importlib.metadata import packages_distributions
+from inspect import isfunction
 from pathlib import Path
+from typing import Final
 
 import pytest
 
 from fieldkit.steps import kinds
+from fieldkit.steps.base import Step
 from tests.helpers.paths import ROOT
 
 # A room may import itself, `core`, and what is named here: nobody imports to the left of it.
@@ -48,7 +56,8 @@ MAY_IMPORT = {
 }
 # Measuring and computing must not even know how a file of a lab is read.
 LEAVES = {
-    room: {"core.model", "core.units", "core.errors", "core.columns", "core.lazy"} for room in ("analysis", "measure")
+    room: {"core.model", "core.units", "core.errors", "core.columns", "core.lazy", "core.text"}
+    for room in ("analysis", "measure")
 }
 
 PARENTS = {"fieldkit.core"}
@@ -56,6 +65,9 @@ PARENTS = {"fieldkit.core"}
 
 MOST_MODULES = 28
 """In one room: with more, nobody finds a module by reading the names."""
+WALK = ROOT / "docs" / "walk.md"
+"""The first page for who is new."""
+
 TESTS_APART = {"data", "e2e", "fuzz", "helpers"}
 """Folders of tests that are about no room: real outputs, whole runs, hostile inputs, and what tests share."""
 
@@ -74,14 +86,14 @@ ONE_IMPORTER = {
     "gpxpy": "fieldkit/measure/positions/gpx_reader.py",
     "jmespath": "fieldkit/measure/evidence/printed.py",
     "re2": "fieldkit/measure/evidence/printed.py",
-    # The protocol, and the formats of keys.
-    "paramiko": "fieldkit/remote/keys.py fieldkit/remote/link.py",
+    "paramiko": "fieldkit/remote/ssh_library.py",
     "ruamel": "fieldkit/config/documents.py",
     "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # What the drone says, and, in a process of its own, what a log of it holds.
     "pymavlink": "fieldkit/measure/evidence/tlog_reader.py sim_backends/emulated/autopilot/mavlink.py",
+    "lz4": "fieldkit/bags/salvage.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",
     # On a robot, and what relays an emulated one's sensors to its master.
@@ -89,6 +101,12 @@ ONE_IMPORTER = {
     "rclpy": "fieldkit/agent/ros2.py",
     "cryptography": "sim_backends/emulated/provisioning.py",
 }
+
+
+BROUGHT: Final = {"pytest", "rclpy", "rosgraph", "roslib", "rospy"}
+"""What is there wherever it is imported: pytest runs the plugin, ROS is the robot's."""
+PARTS: Final = {"pydantic_core": "pydantic", "pandas": "pandas"}
+"""A part of another package, which names its version; what pyarrow makes of columns for who asks for it."""
 
 
 def modules(package: str) -> list[Path]:
@@ -163,6 +181,20 @@ def test_one_dependency_has_one_importing_module(package: str, importer: str) ->
     assert importers == set(importer.split())
 
 
+def test_what_is_imported_is_required_and_what_is_required_is_imported() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    required = {
+        re.split(r"[<>=]", line)[0] for line in (*project["dependencies"], *extras["pandas"], *extras["ros2"])
+    }
+    paths = modules("fieldkit") + modules("sim_backends")
+    tops = {name.split(".")[0] for path in paths for name in imported(path)}
+    outside = (tops | PARTS.keys()) - sys.stdlib_module_names - BROUGHT - {"fieldkit", "sim_backends"}
+    owners = packages_distributions()
+    owned = {owner.lower() for top in outside for owner in ([PARTS[top]] if top in PARTS else owners[top])}
+    assert owned == {name.lower() for name in required}
+
+
 def test_no_sentence_in_the_library_says_emulated() -> None:
     """Steps, trial and remote run unchanged on every backend, so none of them may ask which one it is."""
     for folder in ("steps", "trial", "remote", "measure", "analysis"):
@@ -221,6 +253,36 @@ def test_tests_mirror_the_tree() -> None:
 
 def test_no_test_stands_in_the_root() -> None:
     assert {path.name for path in (ROOT / "tests").glob("*.py")} == {"conftest.py", "test_architecture.py"}
+
+
+def in_quotes(text: str) -> list[str]:
+    """Return what stands in backticks in a text of Markdown."""
+    return re.findall(r"`([^`\n]+)`", text)
+
+
+def test_the_walk_leads_by_stations_that_are_there() -> None:
+    stations = WALK.read_text(encoding="utf-8").split("What is asked of a kind of step")[0]
+    dotted = [name for name in in_quotes(stations) if re.fullmatch(r"[a-z_]+(\.\w+)+", name)]
+    for name in (name for name in dotted if not name.endswith((".csv", ".yaml"))):
+        pkgutil.resolve_name(f"fieldkit.{name}")
+
+
+@pytest.mark.parametrize("page", [WALK, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.name)
+def test_pages_for_contributors_name_files_that_are_there(page: Path) -> None:
+    paths = [
+        name for name in in_quotes(page.read_text(encoding="utf-8")) if re.fullmatch(r"\w+/[\w./]*\w(/|\.\w+)?", name)
+    ]
+    assert len(paths) > 10
+    for path in paths:
+        assert any((ROOT / start / path).exists() for start in ("", "fieldkit")), path
+
+
+def test_the_walk_names_each_question_that_a_step_is_asked() -> None:
+    asked = {name for name, what in vars(Step).items() if isfunction(what)} - {"own_name"}
+    rows = WALK.read_text(encoding="utf-8").split("| asked by | question |")[1]
+    assert {name for name in in_quotes(rows) if name.isidentifier()} == {
+        name for name in asked if not name.startswith("_")
+    }
 
 
 def test_a_class_has_its_name_alone() -> None:

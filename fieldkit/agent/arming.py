@@ -112,7 +112,8 @@ class ArmingCheck:
         """Return the parameters that it has not told."""
         dialect = self._drone.dialect
         either = [names.split("|") for names in dialect.bounds_from] if dialect else []
-        return [name for names in either if not any(one in self._drone.parameters for one in names) for name in names]
+        told = self._drone.parameters.keys()
+        return [name for names in either if told.isdisjoint(names) for name in names]
 
     @property
     def done(self) -> bool:
@@ -168,7 +169,7 @@ class ArmingCheck:
     def _own_checks(self) -> Iterator[ArmingFault]:
         drone = self._drone
         assert drone.dialect is not None
-        why = [text[len(one) :] for text in drone.texts for one in _PREFIXES if text.startswith(one)]
+        why = [text[len(prefix) :] for text in drone.texts for prefix in _PREFIXES if text.startswith(prefix)]
         ill = drone.status.ill if drone.status else 0
         if not why and not ill & _PREARM:
             return

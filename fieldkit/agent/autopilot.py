@@ -1,4 +1,4 @@
-"""What a program on a drone's own computer knows of its autopilot, and what it tells it, by MAVLink.
+"""State of a drone's autopilot, and commands to it, over MAVLink, for programs on the drone's own computer.
 
 Messages, commands and their numbers are those of https://mavlink.io/en/messages/common.html.
 """
@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from typing import Callable, Sequence
 
 from fieldkit.agent.arducopter import ArduCopter
-from fieldkit.agent.dialect import REQUEST, SET_INTERVAL, FlightDialect
+from fieldkit.agent.dialect import REQUEST, FlightDialect
 from fieldkit.agent.mavlink_frames import (
     ATTITUDE,
     COMMAND_ACK,
-    COMMAND_LONG,
     EKF_STATUS_REPORT,
     ESTIMATOR_STATUS,
     HEARTBEAT,
@@ -26,6 +25,7 @@ from fieldkit.agent.mavlink_frames import (
     NO_AUTOPILOT,
     PARAM_REQUEST_READ,
     PARAM_VALUE,
+    SET_MESSAGE_INTERVAL,
     SET_POINT,
     STATUSTEXT,
     SYS_STATUS,
@@ -35,8 +35,6 @@ from fieldkit.agent.mavlink_frames import (
 )
 from fieldkit.agent.mavlink_links import FlightLink
 from fieldkit.agent.px4 import Px4
-
-ACCEPTED = 0
 
 FRESH_S = 2.0
 """What was heard longer ago says nothing of now."""
@@ -53,6 +51,7 @@ _PLACE_ALONE = 0b110111111000
 _OWN = 245, 191
 """System and component of who speaks: an on-board computer (MAV_COMP_ID_ONBOARD_COMPUTER) of a ground station."""
 _ONBOARD = 18
+"""MAV_TYPE_ONBOARD_CONTROLLER."""
 _WIDEST = 255
 _WARNING = 4
 """MAV_SEVERITY_WARNING; what is worse has a lower number."""
@@ -79,8 +78,7 @@ class AutopilotState:
     """An autopilot as it says that it is.
 
     Args:
-        link: The way to it.
-        system: Its system id; 0 for the first that is heard.
+        link: The way to it; the first autopilot that is heard there is the one.
 
     Attributes:
         armed: Whether its motors may turn.
@@ -97,9 +95,8 @@ class AutopilotState:
         answers: The result of the last answer to each command.
     """
 
-    def __init__(self, link: FlightLink, system: int) -> None:
+    def __init__(self, link: FlightLink) -> None:
         self._link = link
-        self._system = system
         self._who: tuple[int, int] | None = None
         self._writer = FrameWriter(*_OWN)
         self._heard_s = self._placed_s = self._turned_s = -math.inf
@@ -129,7 +126,12 @@ class AutopilotState:
     @property
     def alive(self) -> bool:
         """Whether its heart beats."""
-        return time.monotonic() - self._heard_s < 2 * FRESH_S
+        return self.silent_s < 2 * FRESH_S
+
+    @property
+    def silent_s(self) -> float:
+        """For how long its heart was not heard; without end before it first was."""
+        return time.monotonic() - self._heard_s
 
     @property
     def guided(self) -> bool:
@@ -165,12 +167,11 @@ class AutopilotState:
 
     def _take_heartbeat(self, who: tuple[int, int], payload: bytes) -> None:
         mode, vehicle, autopilot, base = struct.unpack_from("<IBBB", payload)
-        known = who == self._who if self._who else self._system in (0, who[0])
-        if autopilot == NO_AUTOPILOT or not known:
+        if autopilot == NO_AUTOPILOT or self._who not in (None, who):
             return
         self._who, self._heard_s, self._mode = who, time.monotonic(), mode
         self.armed, self.family = bool(base & _ARMED), (autopilot, vehicle)
-        self.dialect = next((one for one in _DIALECTS if one.speaks(autopilot, vehicle)), None)
+        self.dialect = next((dialect for dialect in _DIALECTS if dialect.speaks(autopilot, vehicle)), None)
 
     def _take_place(self, payload: bytes) -> None:
         _, *values = _FLOATS.unpack_from(payload)
@@ -215,11 +216,11 @@ class AutopilotState:
 
     def beat(self) -> None:
         """Tell it that somebody is there."""
-        self._send(HEARTBEAT, struct.pack("<IBBBBB", 0, _ONBOARD, NO_AUTOPILOT, 0, 4, 3))
+        self._link.send(self._writer.heartbeat(_ONBOARD))
 
     def ask_for(self, kind: int, rate_hz: float) -> None:
         """Ask it to send a message so often; 0 for as often as usual."""
-        self.command(SET_INTERVAL, kind, 1e6 / rate_hz if rate_hz else 0)
+        self.command(SET_MESSAGE_INTERVAL, kind, 1e6 / rate_hz if rate_hz else 0)
 
     def ask_once(self, kind: int) -> None:
         """Ask it to send a message now."""
@@ -234,8 +235,7 @@ class AutopilotState:
     def command(self, command: float, *parameters: float) -> None:
         """Send a command; `answers` will have what it said to it."""
         if self._who is not None:
-            seven = (*parameters, *(0.0,) * (7 - len(parameters)))
-            self._send(COMMAND_LONG, struct.pack("<7fHBBB", *seven, int(command), *self._who, 0))
+            self._link.send(self._writer.command(self._who, int(command), *parameters))
 
     def lead(self, place_m: tuple[float, float, float]) -> None:
         """Send a set-point: to be there, north, east, down of where it was switched on."""
@@ -253,13 +253,15 @@ class AutopilotTalk:
 
     Args:
         link: The way to it.
+        look: Called at the end of each turn, with what it says.
 
     Attributes:
         drone: What it says.
     """
 
-    def __init__(self, link: FlightLink) -> None:
-        self.drone = AutopilotState(link, 0)
+    def __init__(self, link: FlightLink, look: Callable[[AutopilotState], None] = lambda _: None) -> None:
+        self._look = look
+        self.drone = AutopilotState(link)
         self._waiting = selectors.DefaultSelector()
         self._waiting.register(link.fileno(), selectors.EVENT_READ)
         self._beat_s = 0.0
@@ -273,3 +275,4 @@ class AutopilotTalk:
         while (left_s := end_s - time.monotonic()) > 0:
             if self._waiting.select(left_s):
                 self.drone.receive()
+        self._look(self.drone)

@@ -1,4 +1,4 @@
-"""What a program that flies a drone must know of one family of autopilots; a module each says it of PX4, ArduCopter.
+"""Contract of a dialect: all that a program must know of a family of autopilots to fly its drones.
 
 Commands and their numbers are those of https://mavlink.io/en/messages/common.html.
 """
@@ -10,8 +10,8 @@ from typing import Mapping, Protocol, Sequence, Tuple
 
 RETURN, LAND, TAKE_OFF, SET_MODE, CHANGE_SPEED = 20, 21, 22, 176, 178
 """MAV_CMD: NAV_RETURN_TO_LAUNCH, NAV_LAND, NAV_TAKEOFF, DO_SET_MODE, DO_CHANGE_SPEED."""
-ARM, PREARM_CHECKS, SET_INTERVAL, REQUEST = 400, 401, 511, 512
-"""MAV_CMD: COMPONENT_ARM_DISARM, RUN_PREARM_CHECKS, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE."""
+ARM, PREARM_CHECKS, REQUEST = 400, 401, 512
+"""MAV_CMD: COMPONENT_ARM_DISARM, RUN_PREARM_CHECKS, REQUEST_MESSAGE."""
 
 CUSTOM_MODE = 1
 """MAV_MODE_FLAG_CUSTOM_MODE_ENABLED: the mode is in a number that each family has for itself."""

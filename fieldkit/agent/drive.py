@@ -15,9 +15,10 @@ import time
 from pathlib import Path
 from typing import IO, Any, Callable, Mapping
 
+from fieldkit.agent.drive_plan import ORDERS, DriveTask
 from fieldkit.agent.middleware import Middleware, MiddlewareError, Publisher, Topic
 from fieldkit.agent.orders import Orders
-from fieldkit.agent.steering import ORDERS, STAND, Driver, DriveTask, DriveVelocity, OdometryPose
+from fieldkit.agent.steering import STAND, Driver, DriveVelocity, OdometryPose
 
 RATE_HZ = 20.0
 _ENDS_S = 0.5
@@ -49,6 +50,7 @@ def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: thre
 
     Raises:
         MiddlewareError: Nobody hears the velocity topic, or no odometry comes.
+        OSError: The log cannot be written; the robot stands.
     """
     cdr = bool(told["cdr"])
     publisher = middleware.publisher(Topic.from_json(told["command"]))

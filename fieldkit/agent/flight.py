@@ -9,50 +9,44 @@ drone does not depend on this program either (COM_OF_LOSS_T, COM_OBL_RC_ACT); Ar
 from __future__ import annotations
 
 import math
-import sys
 import threading
 import time
 from functools import partial
 from typing import Callable, Iterator, Sequence
 
 from fieldkit.agent.arming import ArmingCheck
-from fieldkit.agent.autopilot import ACCEPTED, AutopilotTalk
+from fieldkit.agent.autopilot import AutopilotState, AutopilotTalk
 from fieldkit.agent.dialect import ARM, Command, FlightDialect
+from fieldkit.agent.flight_log import FlightLog
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan, Place, along
-from fieldkit.agent.mavlink_frames import ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
+from fieldkit.agent.landing import (
+    AGAIN_S,
+    ANSWERS_S,
+    CALLED_OFF,
+    LAPSED,
+    REFUSED,
+    TAKEN,
+    FlightError,
+    bring_down,
+    say,
+    unhurried,
+)
+from fieldkit.agent.mavlink_frames import ACCEPTED, ATTITUDE, HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.mavlink_links import opened
 from fieldkit.agent.orders import Orders
-from fieldkit.agent.px4 import Px4
 
 RATE_HZ = 10.0
 """How often it leads, looks for orders, and asks to be told where the drone is, and in which mode."""
 
-LAPSED, REFUSED, TAKEN, CALLED_OFF = 4, 5, 6, 7
-"""Exit codes: the laptop was gone, the autopilot did not do it, somebody else flies it, it was told to end."""
-
 _HEARD = (HEARTBEAT, LOCAL_POSITION_NED, ATTITUDE)
-_AGAIN_S = 0.4
-"""After so long without an answer a command is sent again."""
-_ANSWERS_S = 5.0
 _NEAR_M = 0.3
 _SLOW_M_S = 0.2
 _RISEN = 0.9
 """Share of a take-off by command behind which set-points lead."""
 _SETTLES_S = 1.0
 """So long set-points come before the mode that follows them (PX4 user guide, offboard mode)."""
-
-
-class FlightError(Exception):
-    """It does not go on; the text is for people.
-
-    Args:
-        code: Exit code.
-        why: Why.
-    """
-
-    def __init__(self, code: int, why: str) -> None:
-        super().__init__(why)
-        self.code = code
+_SILENT_S = 10.0
+"""So long it leads one that it does not hear."""
 
 
 class OffboardPilot:
@@ -66,10 +60,11 @@ class OffboardPilot:
     def __init__(self, plan: FlightPlan, over: threading.Event) -> None:
         self._plan = plan
         self._over = over
-        self._talk = AutopilotTalk(opened(plan.connection))
+        self._log = FlightLog(plan.log)
+        self._talk = AutopilotTalk(opened(plan.connection), self._note)
         self._drone = self._talk.drone
         self._orders = Orders(plan.orders, (STAY, CLIMB, GO, HOME, LEAVE), plan.lease_s)
-        self._followed = False
+        self._followed = self._rose = False
 
     def fly(self) -> None:
         """Fly, as the orders come.
@@ -83,24 +78,35 @@ class OffboardPilot:
             # What it does not lead is somebody else's, unless it was to watch that.
             leads = self._followed and self._drone.armed
             if error.code != TAKEN and (leads or not self._plan.height_m):
-                _say(f"{self._plan.abort}: {error}")
-                self._down(self._plan.abort)
-                _say("landed")
+                self._give_up(error)
+            raise
+        except Exception as error:
+            if self._followed:
+                self._give_up(error)  # whatever fails here, nobody else brings it down
             raise
         finally:
             for kind in _HEARD:
                 self._drone.ask_for(kind, 0)
 
+    def _give_up(self, error: Exception) -> None:
+        """Bring it down where the flight does not go on; errors as `bring_down`."""
+        say(f"{self._plan.abort}: {error}")
+        self._log.phase = "coming down"
+        with unhurried(self._plan.unhurried):
+            bring_down(self._talk, self._plan.abort)
+        say("landed")
+
     def _flown(self) -> None:
         plan, drone = self._plan, self._drone
-        _say(f"waiting for the heartbeat of an autopilot at {plan.connection}")
+        say(f"waiting for the heartbeat of an autopilot at {plan.connection}")
         self._until(lambda: drone.alive)
-        _say("ready")
+        say("ready")
         if not plan.height_m:
             self._until(lambda: self._orders.order == LEAVE)
             return
         dialect, begin_m, yaw_rad = self._stands()
-        _say("standing")
+        self._log.begin(begin_m, yaw_rad)
+        self._enter("standing")
         self._until(lambda: self._orders.order in (CLIMB, HOME))
         corners_m = plan.corners_m(begin_m, yaw_rad)
         if self._orders.order == CLIMB:
@@ -108,9 +114,9 @@ class OffboardPilot:
             self._go(corners_m)
             if plan.end == "return":
                 self._back(begin_m)
-        _say("coming down")
-        self._down("land")
-        _say("landed")
+        self._enter("coming down")
+        bring_down(self._talk, "land")
+        say("landed")
 
     def _stands(self) -> tuple[FlightDialect, Place, float]:
         """Return how it is flown, where it stands, once it says so, and where its nose points."""
@@ -119,7 +125,7 @@ class OffboardPilot:
             raise FlightError(REFUSED, _sentences(ArmingCheck(drone, self._plan.needs)))
         asked_s = 0.0
         if drone.armed:
-            _say("waiting until its motors stand: somebody flies it, or it is coming down")
+            say("waiting until its motors stand: somebody flies it, or it is coming down")
         for _ in self._turns():
             if time.monotonic() > asked_s:
                 asked_s = time.monotonic() + 1.0
@@ -140,7 +146,8 @@ class OffboardPilot:
         self._followed = True
         self._may_rise(waits)
         self._ask(lambda: drone.command(ARM, 1), lambda: drone.armed, "to arm", waits)
-        _say("climbing")
+        self._rose = True
+        self._enter("climbing")
         if commands:
             self._lift(commands)
         way_m, began_s = [drone.place_m or begin_m, top_m], time.monotonic()
@@ -148,7 +155,7 @@ class OffboardPilot:
             lambda: _near(drone.place_m, top_m) or self._orders.order == HOME,
             lead=lambda: along(way_m, (time.monotonic() - began_s) * self._plan.climb_m_s),
         )
-        _say("up")
+        self._enter("up")
         self._until(lambda: self._orders.order in (GO, HOME), lead=lambda: top_m)
 
     def _may_rise(self, waits: Callable[[], Place] | None) -> None:
@@ -189,13 +196,13 @@ class OffboardPilot:
         """Fly the way, and wait at its end."""
         began_s, said = time.monotonic(), False
         if self._orders.order == GO:
-            _say("flying")
+            self._enter("flying")
         for _ in self._turns(lambda: along(corners_m, (time.monotonic() - began_s) * self._plan.speed_m_s)):
             if self._orders.order == HOME:
                 return
             if not said and _near(self._drone.place_m, corners_m[-1]):
                 said = True
-                _say("there")
+                self._enter("there")
 
     def _back(self, begin_m: Place) -> None:
         """Fly to above where it rose."""
@@ -204,36 +211,11 @@ class OffboardPilot:
             raise FlightError(REFUSED, "the autopilot does not say any more where it is")
         above_m, began_s = (begin_m[0], begin_m[1], here_m[2]), time.monotonic()
         way_m = [here_m, above_m]
-        _say("coming back")
+        self._enter("coming back")
         self._until(
             lambda: _near(self._drone.place_m, above_m) and self._drone.speed_m_s < _SLOW_M_S,
             lead=lambda: along(way_m, (time.monotonic() - began_s) * self._plan.speed_m_s),
         )
-
-    def _down(self, how: str) -> None:
-        """Bring it down, and wait until its motors stand; one that does not return lands.
-
-        Raises:
-            FlightError: The autopilot is silent: nobody knows what became of it.
-        """
-        drone, asked_s, began_s = self._drone, 0.0, time.monotonic()
-        command = (drone.dialect or Px4()).bring_down(how)  # others know the commands that PX4 does
-        number = int(command[0])
-        drone.answers.pop(number, None)
-        while drone.armed:
-            if not drone.alive:
-                raise FlightError(REFUSED, "the autopilot is silent; it was told to land")
-            does = drone.answers.get(number) == ACCEPTED and not drone.guided
-            if not does and how == "return" and time.monotonic() > began_s + _ANSWERS_S:
-                _say(f"land: it does not return: {drone.said or 'it does not say why'}")
-                self._down("land")
-                return
-            if not does and time.monotonic() > asked_s:
-                asked_s = time.monotonic() + _AGAIN_S
-                drone.command(*command)
-                if number in drone.answers:
-                    drone.command(ARM, 0)  # it stands on the ground, and so does not land; in the air it refuses this
-            self._talk.turn(1 / RATE_HZ)
 
     def _ask(
         self,
@@ -251,11 +233,11 @@ class OffboardPilot:
         for _ in self._turns(waits):
             if done():
                 return
-            if time.monotonic() > began_s + _ANSWERS_S:
+            if time.monotonic() > began_s + ANSWERS_S:
                 why = self._drone.said or "it does not say why"
                 raise FlightError(REFUSED, f"the autopilot refuses {what}: {why}")
             if time.monotonic() > asked_s:
-                asked_s = time.monotonic() + _AGAIN_S
+                asked_s = time.monotonic() + AGAIN_S
                 ask()
 
     def _until(self, holds: Callable[[], bool], lead: Callable[[], Place] | None = None) -> None:
@@ -275,12 +257,35 @@ class OffboardPilot:
             self._orders.look()
             if self._orders.lapsed:
                 raise FlightError(LAPSED, "nobody has renewed the order in time: the laptop is gone")
-            if self._followed and self._drone.alive and not self._drone.guided:
-                raise FlightError(TAKEN, f"somebody else flies it: {self._drone.said or 'it is in another mode'}")
+            self._demand_led()
             if lead is not None:
                 self._drone.lead(lead())
             self._talk.turn(1 / RATE_HZ)
             yield
+
+    def _demand_led(self) -> None:
+        """Go on only while the autopilot is there, and goes where this program leads it.
+
+        Raises:
+            FlightError: It does not.
+        """
+        drone = self._drone
+        if not self._followed:
+            return
+        if drone.silent_s > _SILENT_S:
+            raise FlightError(REFUSED, f"the autopilot has been silent for {_SILENT_S:g} s")
+        if not drone.guided:
+            raise FlightError(TAKEN, f"somebody else flies it: {drone.said or 'it is in another mode'}")
+        if self._rose and not drone.armed:
+            raise FlightError(TAKEN, f"its motors stand: {drone.said or 'it does not say why'}")
+
+    def _note(self, drone: AutopilotState) -> None:
+        self._log.note(drone.place_m, drone.speed_m_s)
+
+    def _enter(self, phase: str) -> None:
+        """Say what the flight is about from now on."""
+        self._log.phase = phase
+        say(phase)
 
 
 def fly(plan: FlightPlan, over: threading.Event) -> int:
@@ -292,20 +297,15 @@ def fly(plan: FlightPlan, over: threading.Event) -> int:
     try:
         OffboardPilot(plan, over).fly()
     except FlightError as error:
-        _say(f"error: {error}")
+        say(f"error: {error}")
         return error.code
     return 0
 
 
 def _sentences(check: ArmingCheck) -> str:
     """Return what speaks against a flight, and what to do about it; empty where nothing does."""
-    return "; ".join(f"{one.what} ({one.remedy})" for one in check.faults() if one.grave)
+    return "; ".join(f"{fault.what} ({fault.remedy})" for fault in check.faults() if fault.grave)
 
 
 def _near(place_m: Place | None, goal_m: Place) -> bool:
     return place_m is not None and math.dist(place_m, goal_m) < _NEAR_M
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(f"{time.time():.3f} {text}\n")
-    sys.stderr.flush()

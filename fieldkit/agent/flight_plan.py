@@ -1,4 +1,4 @@
-"""What the laptop tells a program that flies a drone: its plan, and the words of orders."""
+"""Plans of flights, as the laptop sends them to the program that flies a drone, and the words of its orders."""
 
 from __future__ import annotations
 
@@ -48,6 +48,8 @@ class FlightPlan:
         climb_m_s: How fast it rises.
         ceiling_m: How high it may fly.
         least_charge: What its battery must have before it rises, of 1.
+        log: The file in which it writes down where it is; empty for none.
+        unhurried: File that is there while it brings down a drone that is no longer to fly: nobody kills it then.
     """
 
     connection: str
@@ -61,6 +63,8 @@ class FlightPlan:
     climb_m_s: float = 1.0
     ceiling_m: float = 0.0
     least_charge: float = 0.0
+    log: str = ""
+    unhurried: str = ""
 
     @property
     def needs(self) -> FlightNeeds:

@@ -1,4 +1,4 @@
-"""What a participant tells of its nodes over DDS: the topic `ros_discovery_info`, which `ros2 node list` reads.
+"""Nodes of a participant of DDS: the topic `ros_discovery_info`, which `ros2 node list` reads.
 
 DDS knows participants and endpoints, ROS 2 nodes with endpoints. Each participant says which of its endpoints belong
 to which node, in a message of rmw_dds_common that every rmw over DDS reads (design.ros2.org, "Node to Participant

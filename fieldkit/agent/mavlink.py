@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, Mapping
 
 from fieldkit.agent.mavlink_frames import (
+    ACCEPTED,
     COMMAND_ACK,
     HEARTBEAT,
     NO_AUTOPILOT,
@@ -32,7 +33,6 @@ from fieldkit.agent.mavlink_links import FlightLink, opened
 MOST_BYTES = 256 << 20
 """A log is no longer, whoever floods the recorder."""
 
-_ACCEPTED = 0
 _STAMP = struct.Struct(">Q")
 _BEATS_S = 1.0
 _ASKS_S = 0.4
@@ -115,7 +115,7 @@ class FlightRecorder:
                 kind = next(iter(self._open))
                 del self._open[kind]
                 self._asks_s = 0.0
-                if result != _ACCEPTED:
+                if result != ACCEPTED:
                     self._refused[kind] = result
 
     def speak(self) -> None:
@@ -127,13 +127,13 @@ class FlightRecorder:
         if self._autopilot and self._open and now_s >= self._asks_s:
             self._asks_s = now_s + _ASKS_S
             kind, interval_us = next(iter(self._open.items()))
-            self._link.send(self._writer.interval(*self._autopilot, kind, interval_us))
+            self._link.send(self._writer.command(self._autopilot, SET_MESSAGE_INTERVAL, kind, interval_us))
 
     def end(self) -> Mapping[str, Any]:
         """Have the messages come as usual again, close the log, and return what it holds."""
         if self._autopilot:
             for kind in self._asked:
-                self._link.send(self._writer.interval(*self._autopilot, kind, 0))
+                self._link.send(self._writer.command(self._autopilot, SET_MESSAGE_INTERVAL, kind, 0))
         os.fsync(self._log.fileno())
         self._log.close()
         return {

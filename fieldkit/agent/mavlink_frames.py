@@ -12,17 +12,24 @@ EKF_STATUS_REPORT, ESTIMATOR_STATUS = 193, 230
 """Ids of messages (https://mavlink.io/en/messages/common.html; EKF_STATUS_REPORT is of ardupilotmega); a set-point is
 SET_POSITION_TARGET_LOCAL_NED."""
 SET_MESSAGE_INTERVAL = 511
-"""MAV_CMD_SET_MESSAGE_INTERVAL."""
+"""MAV_CMD_SET_MESSAGE_INTERVAL: the message, and the time between two in microseconds; 0 for as often as usual."""
+ACCEPTED = 0
+"""MAV_RESULT_ACCEPTED: what a COMMAND_ACK says of a command that is done."""
 NO_AUTOPILOT = 8
 """MAV_AUTOPILOT_INVALID: what beats is a ground station, a camera, a logger."""
 
 OWN_SYSTEM, OWN_COMPONENT = 254, 155
 """Who the recorder is: MAV_COMP_ID_LOG of a system that no vehicle is."""
+TYPE_LOG = 38
+"""MAV_TYPE_LOG."""
 
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _SIGNED = 1
 _SIGNATURE_BYTES = 13
-_TYPE_LOG = 38
+_ACTIVE = 4
+"""MAV_STATE_ACTIVE."""
+_VERSION = 3
+"""Of MAVLink, as every heartbeat has it."""
 EXTRA = {
     HEARTBEAT: 50,
     ATTITUDE: 39,
@@ -110,16 +117,14 @@ class FrameWriter:
         body = bytes(head) + kind.to_bytes(3, "little") + payload
         return bytes((_MAGIC_2,)) + body + checksum(body + bytes((EXTRA[kind],))).to_bytes(2, "little")
 
-    def heartbeat(self) -> bytes:
+    def heartbeat(self, vehicle: int = TYPE_LOG) -> bytes:
         """Return a heartbeat: of a logger, whose silence later lets no autopilot think that its pilot is gone."""
-        return self.frame(HEARTBEAT, struct.pack("<IBBBBB", 0, _TYPE_LOG, NO_AUTOPILOT, 0, 4, 3))
+        return self.frame(HEARTBEAT, struct.pack("<IBBBBB", 0, vehicle, NO_AUTOPILOT, 0, _ACTIVE, _VERSION))
 
-    def interval(self, system: int, component: int, kind: int, interval_us: int) -> bytes:
-        """Return the command that sets how often a message comes; 0 for as often as usual."""
-        parameters = (kind, interval_us, 0, 0, 0, 0, 0)
-        return self.frame(
-            COMMAND_LONG, struct.pack("<7fHBBB", *parameters, SET_MESSAGE_INTERVAL, system, component, 0)
-        )
+    def command(self, target: tuple[int, int], command: int, *parameters: float) -> bytes:
+        """Return a command to a system and its component; the parameters behind those that are given are 0."""
+        seven = (*parameters, *(0.0,) * (7 - len(parameters)))
+        return self.frame(COMMAND_LONG, struct.pack("<7fHBBB", *seven, command, *target, 0))
 
 
 @dataclass(frozen=True)

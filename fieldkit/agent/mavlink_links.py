@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import socket
 import termios
+import time
 import tty
 from contextlib import suppress
 from typing import Iterator, Protocol
@@ -17,6 +18,8 @@ from fieldkit.agent.mavlink_frames import frames
 
 MOST_BYTES = 65_536
 _CONNECTS_S = 5.0
+_GONE_S = 3.0
+"""Who was not heard for so long gives its place to who speaks next: it has begun anew, at another port."""
 
 
 class FlightLink(Protocol):
@@ -70,6 +73,8 @@ class UdpFlightLink:
     def __init__(self, address: tuple[str, int], *, listens: bool) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._peer = None if listens else address
+        self._listens = listens
+        self._heard_s = float("-inf")
         if listens:
             self._socket.bind(address)
         self._socket.setblocking(False)
@@ -83,8 +88,9 @@ class UdpFlightLink:
         datagram = b""
         with suppress(BlockingIOError, ConnectionRefusedError):  # nobody listens there, yet
             datagram, sender = self._socket.recvfrom(MOST_BYTES)
-            if self._peer is None:
-                self._peer = sender
+            now_s = time.monotonic()
+            if self._listens and (sender == self._peer or now_s > self._heard_s + _GONE_S):
+                self._peer, self._heard_s = sender, now_s
         yield from frames(bytearray(datagram))
 
     def send(self, frame: bytes) -> None:

@@ -9,27 +9,29 @@ straight path), and its speed before an end is the one from which half of its ac
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, Mapping, NamedTuple, Sequence
+from typing import NamedTuple
 
-OUT = "out"
-BACK = "back"
-END = "end"
-ORDERS = (OUT, BACK, END)
-"""What the laptop can want: that the robot goes its way, comes back, or stands for good."""
+from fieldkit.agent.drive_plan import (
+    ARRIVED_M,
+    BACK,
+    END,
+    FACES_RAD,
+    OUT,
+    TURNS_UP_S,
+    DriveTask,
+    turning_rad_s,
+    wrapped,
+)
 
-_ARRIVED_M = 0.02
-_FACES_RAD = 0.05
 _TURNS_RAD = 0.6
-"""More off its heading than this a robot stands and turns; less than `_FACES_RAD` it drives again."""
+"""More off its heading than this a robot stands and turns; less than `FACES_RAD` it drives again."""
 _LOOKAHEAD_M = 0.5
-_TURN_PER_S = 2.0
 _CREEP_M_S = 0.03
 """As slow as a robot's motors still turn."""
-_TURNS_UP_S = 0.5
-"""How long its turning takes to come up to its limit."""
 _JUMP_M = 0.5
 """No odometry of a robot that drives is off by so much at once."""
+_STUCK_M, _STUCK_S = 0.5, 2.0
+"""A robot that was told to drive so far, and for so long at its speed, has come a quarter of that at least."""
 
 
 class OdometryPose(NamedTuple):
@@ -48,36 +50,6 @@ class DriveVelocity(NamedTuple):
 
 
 STAND = DriveVelocity()
-
-
-@dataclass(frozen=True)
-class DriveTask:
-    """What a robot is to drive, and what must hold meanwhile.
-
-    Attributes:
-        legs: Of each how far ahead, and to the left, as the robot faces where it begins; in metres.
-        speed_m_s: How fast it drives.
-        turn_rad_s: Most that it turns.
-        acceleration_m_s2: Most that its speed grows per second.
-        fence_m: Farther than this from where it began it stops.
-        lease_s: It stops where the laptop has not renewed its lease for so long.
-        odometry_s: It stops where its odometry was silent for so long.
-        limit_s: It stops where one way takes longer.
-    """
-
-    legs: Sequence[tuple[float, float]]
-    speed_m_s: float
-    turn_rad_s: float
-    acceleration_m_s2: float
-    fence_m: float
-    lease_s: float
-    odometry_s: float
-    limit_s: float
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> DriveTask:
-        """Return a task from what JSON made of it."""
-        return cls(**{**data, "legs": [(float(ahead), float(left)) for ahead, left in data["legs"]]})
 
 
 class Driver:
@@ -113,6 +85,9 @@ class Driver:
         self._ways = [*zip(self._corners, self._corners[1:])]
         self._last: DriveVelocity = STAND
         self._turning = True
+        # How far it was told to drive, and how far it came, since it was last seen to drive, and where that was.
+        self._told_m = self._came_m = 0.0
+        self._from = (0.0, 0.0)
 
     @property
     def here(self) -> OdometryPose | None:
@@ -162,14 +137,14 @@ class Driver:
     def tick(self, now_s: float) -> DriveVelocity:
         """Return how fast to drive and to turn from now on."""
         for_s, self._now_s = max(now_s - self._now_s, 0.0), now_s
-        self._watch(now_s)
+        self._watch(now_s, for_s)
         here = self.here
         wanted = STAND if self.stopped or here is None or not self._order else self._wanted(here)
         stands = wanted == STAND  # at once: nothing that stops a robot waits for a ramp
         self._last = STAND if stands else self._ramped(wanted, for_s)
         return self._last
 
-    def _watch(self, now_s: float) -> None:
+    def _watch(self, now_s: float, for_s: float) -> None:
         """Stop it where something does not hold that must."""
         task, here = self._task, self.here
         if self.over:
@@ -182,6 +157,22 @@ class Driver:
             self._stop(f"beyond the fence, {task.fence_m:g} m from where it began")
         elif self._order and self.phase in (OUT, BACK) and now_s - self._began_s > task.limit_s:
             self._stop(f"not there after {task.limit_s:g} s")
+        elif here is not None and not self._drives(here, for_s):
+            self._stop(f"told to drive {self._told_m:.1f} m, it came {self._came_m:.1f} m, as its odometry says")
+
+    def _drives(self, here: OdometryPose, for_s: float) -> bool:
+        """Return whether it comes on as it is told.
+
+        Odometry that says the same for ever is not silent, and within the fence.
+        """
+        self._told_m += self._last.forward_m_s * for_s
+        self._came_m = max(self._came_m, math.dist(self._from, (here.x_m, here.y_m)))
+        if self._told_m < _STUCK_M + _STUCK_S * self._task.speed_m_s:
+            return True
+        if self._came_m < self._told_m / 4:
+            return False
+        self._told_m, self._came_m, self._from = 0.0, 0.0, (here.x_m, here.y_m)
+        return True
 
     def _stop(self, why: str) -> None:
         self.stopped = self.stopped or why
@@ -194,7 +185,7 @@ class Driver:
             self.phase = "home"
             return
         path = [(here.x_m, here.y_m), *reversed(passed)]
-        self._ways = [(begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > _ARRIVED_M]
+        self._ways = [(begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > ARRIVED_M]
         self.phase, self._began_s, self._turning = BACK, now_s, True
 
     def _wanted(self, here: OdometryPose) -> DriveVelocity:
@@ -207,20 +198,20 @@ class Driver:
             along = (end[0] - begin[0]) / long_m, (end[1] - begin[1]) / long_m
             off = here.x_m - begin[0], here.y_m - begin[1]
             left_m = long_m - (off[0] * along[0] + off[1] * along[1])
-            if left_m > _ARRIVED_M:
+            if left_m > ARRIVED_M:
                 across_m = along[0] * off[1] - along[1] * off[0]
                 heading_rad = math.atan2(along[1], along[0]) - math.atan2(across_m, _LOOKAHEAD_M)
-                return self._along(left_m, _wrapped(heading_rad - here.yaw_rad))
+                return self._along(left_m, wrapped(heading_rad - here.yaw_rad))
             del self._ways[0]
             self._turning = True
-        if self.phase == BACK and abs(_wrapped(here.yaw_rad)) > _FACES_RAD:
-            return DriveVelocity(0.0, self._turn_rad_s(_wrapped(-here.yaw_rad)))
+        if self.phase == BACK and abs(wrapped(here.yaw_rad)) > FACES_RAD:
+            return DriveVelocity(0.0, self._turn_rad_s(wrapped(-here.yaw_rad)))
         self.phase = "there" if self.phase == OUT else "home"
         return STAND
 
     def _along(self, left_m: float, off_rad: float) -> DriveVelocity:
         """Return the velocity with so much of a leg left, and so much off the heading."""
-        self._turning = abs(off_rad) > (_FACES_RAD if self._turning else _TURNS_RAD)
+        self._turning = abs(off_rad) > (FACES_RAD if self._turning else _TURNS_RAD)
         turn_rad_s = self._turn_rad_s(off_rad)
         if self._turning:
             return DriveVelocity(0.0, turn_rad_s)
@@ -228,13 +219,12 @@ class Driver:
         return DriveVelocity(max(speed_m_s * math.cos(off_rad), _CREEP_M_S), turn_rad_s)
 
     def _turn_rad_s(self, off_rad: float) -> float:
-        braked_rad_s = math.sqrt(self._task.turn_rad_s / _TURNS_UP_S * abs(off_rad))
-        return math.copysign(min(_TURN_PER_S * abs(off_rad), braked_rad_s), off_rad)
+        return math.copysign(turning_rad_s(abs(off_rad), self._task.turn_rad_s), off_rad)
 
     def _ramped(self, wanted: DriveVelocity, for_s: float) -> DriveVelocity:
         """Return a velocity within the limits that the robot can have after so many seconds."""
         task = self._task
-        most, turn_most = task.acceleration_m_s2 * for_s, task.turn_rad_s / _TURNS_UP_S * for_s
+        most, turn_most = task.acceleration_m_s2 * for_s, task.turn_rad_s / TURNS_UP_S * for_s
         forward = _near(self._last.forward_m_s, wanted.forward_m_s, most)
         turn = _near(self._last.turn_rad_s, wanted.turn_rad_s, turn_most)
         return DriveVelocity(_within(forward, task.speed_m_s), _within(turn, task.turn_rad_s))
@@ -248,12 +238,8 @@ def _within(value: float, limit: float) -> float:
     return max(-limit, min(value, limit))
 
 
-def _wrapped(angle_rad: float) -> float:
-    return math.remainder(angle_rad, 2 * math.pi)
-
-
 def _seen_from(start: OdometryPose, pose: OdometryPose) -> OdometryPose:
     """Return a pose as seen from another, ahead of which is x."""
     cos, sin = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
     x_m, y_m = pose.x_m - start.x_m, pose.y_m - start.y_m
-    return OdometryPose(cos * x_m + sin * y_m, cos * y_m - sin * x_m, _wrapped(pose.yaw_rad - start.yaw_rad))
+    return OdometryPose(cos * x_m + sin * y_m, cos * y_m - sin * x_m, wrapped(pose.yaw_rad - start.yaw_rad))

@@ -51,7 +51,7 @@ def configuration(network: Network, mode: str) -> dict[str, Any]:
     if mode == "client":
         del found["listen/endpoints"]
     if mode != "router":
-        found["connect/endpoints"] = [f"{network.transport}/{one}:{port}" for one in to]
+        found["connect/endpoints"] = [f"{network.transport}/{address}:{port}" for address in to]
         # The other end may not be up yet.
         found["connect/timeout_ms"] = -1
         found["connect/exit_on_failure"] = False

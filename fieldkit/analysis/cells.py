@@ -123,8 +123,10 @@ def aggregate(
 
 def _correct(estimates: Sequence[dict[str, Estimate]]) -> None:
     """Correct every p-value of an order for the number of all."""
-    tested = [(cell, one) for cell in estimates for one in cell.values() if one.p_order is not None]
-    corrected = order.corrected(np.array([one.p_order for _, one in tested], dtype=np.float64)).tolist()
+    tested = [
+        (cell, difference) for cell in estimates for difference in cell.values() if difference.p_order is not None
+    ]
+    corrected = order.corrected(np.array([difference.p_order for _, difference in tested], dtype=np.float64)).tolist()
     for (cell, one), p_order in zip(tested, corrected, strict=True):
         cell[one.quantity.name] = replace(one, p_order=p_order)
 

@@ -1,4 +1,4 @@
-"""Whether two runs may be compared at all: what makes their numbers differ, other than what is being compared."""
+"""Comparability of two runs: what makes their numbers differ, other than what is being compared."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Final

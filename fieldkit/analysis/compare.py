@@ -87,9 +87,9 @@ class Pair:
     @property
     def words(self) -> tuple[tuple[Tally, Tally], ...]:
         """Of each column of words that either of them has, what A and B have; no counts where one has none."""
-        a, b = (one.tallies if one else {} for one in (self.a, self.b))
+        a, b = (cell.tallies if cell else {} for cell in (self.a, self.b))
         none = {name: replace(one, counts={}) for name, one in (*a.items(), *b.items())}
-        return tuple((a.get(name, one), b.get(name, one)) for name, one in none.items())
+        return tuple((a.get(name, difference), b.get(name, difference)) for name, difference in none.items())
 
 
 @dataclass(frozen=True)
@@ -109,31 +109,33 @@ class Comparison:
     @property
     def differences(self) -> tuple[Difference, ...]:
         """Differences of all conditions."""
-        return tuple(one for pair in self.pairs for one in pair.differences)
+        return tuple(difference for pair in self.pairs for difference in pair.differences)
 
     @property
     def made(self) -> int:
         """How many differences have an interval: the number that `p_holm` corrects for."""
-        return sum(one.interval is not None for one in self.differences)
+        return sum(difference.interval is not None for difference in self.differences)
 
     @property
     def refusals(self) -> tuple[Concern, ...]:
         """Why the runs are not comparable; empty if they are."""
-        return tuple(one for one in self.concerns if one.refuses)
+        return tuple(concern for concern in self.concerns if concern.refuses)
 
     @property
     def varied(self) -> tuple[Concern, ...]:
         """What is compared, because A has one value of it and B another, and conditions are not told by it."""
         return tuple(
-            one
-            for one in self.concerns
-            if not one.refuses and one.what in comparable.VARIED and comparable.UNKNOWN not in {one.a, one.b}
+            concern
+            for concern in self.concerns
+            if not concern.refuses
+            and concern.what in comparable.VARIED
+            and comparable.UNKNOWN not in {concern.a, concern.b}
         )
 
     @property
     def missed(self) -> bool:
         """Whether any quantity with a threshold, of any condition, is not shown to be within it."""
-        return any(one.within is False for one in self.differences)
+        return any(difference.within is False for difference in self.differences)
 
 
 def compare(
@@ -165,14 +167,16 @@ def compare(
 
 def _quantities(a: Repeats, b: Repeats) -> tuple[Quantity, ...]:
     """Return what either run has, in the order in which tables show it."""
-    has_either = {one.name for rows in (a, b) for one in rows.quantities}
+    has_either = {quantity.name for rows in (a, b) for quantity in rows.quantities}
     columns = {column.name: column for column in (*b.columns, *a.columns)}
     ordered = dict.fromkeys(column.name for column in (*a.columns, *b.columns))
-    return tuple(one for one in quantities(columns[name] for name in ordered) if one.name in has_either)
+    return tuple(
+        quantity for quantity in quantities(columns[name] for name in ordered) if quantity.name in has_either
+    )
 
 
 def _cells(rows: Repeats, by: Sequence[str]) -> dict[Key, Cell]:
-    return {tuple(one.key[name] for name in by): one for one in aggregate(rows, by)}
+    return {tuple(cell.key[name] for name in by): cell for cell in aggregate(rows, by)}
 
 
 def _valid(rows: Repeats, by: Sequence[str]) -> dict[Key, Repeats]:
@@ -189,7 +193,7 @@ def _differences(
 ) -> tuple[Difference, ...]:
     found = []
     for quantity in compared:
-        a, b = (None if one is None else one.estimates.get(quantity.name) for one in cells)
+        a, b = (None if cell is None else cell.estimates.get(quantity.name) for cell in cells)
         if a is None and b is None:
             continue
         one = Difference(quantity, a, b, threshold=thresholds.get(quantity.name))
@@ -213,13 +217,16 @@ def _interval(a: Estimate, b: Estimate) -> Interval | None:
 
 def _corrected(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
     """Correct for the number of differences that all conditions have together."""
-    intervals = [one.interval for pair in pairs for one in pair.differences if one.interval is not None]
-    p_holm = iter(statistics.holm([statistics.p_value(one) for one in intervals]))
+    intervals = [
+        difference.interval for pair in pairs for difference in pair.differences if difference.interval is not None
+    ]
+    p_holm = iter(statistics.holm([statistics.p_value(interval) for interval in intervals]))
     return tuple(
         replace(
             pair,
             differences=tuple(
-                one if one.interval is None else replace(one, p_holm=next(p_holm)) for one in pair.differences
+                difference if difference.interval is None else replace(difference, p_holm=next(p_holm))
+                for difference in pair.differences
             ),
         )
         for pair in pairs

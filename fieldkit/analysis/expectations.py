@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable
 from typing import Final
 
-from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
+from fieldkit.analysis.quantities import Quantity, parse_amount
 from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol
@@ -44,7 +44,7 @@ def parse(text: str, known: Iterable[Quantity]) -> Expectation:
     Raises:
         ConfigurationError: It says nothing, or of a figure that there is not.
     """
-    by_name = {one.name: one for one in known}
+    by_name = {quantity.name: quantity for quantity in known}
     found = _TEXT.fullmatch(text.strip())
     if found is None:
         raise ConfigurationError(
@@ -58,7 +58,6 @@ def parse(text: str, known: Iterable[Quantity]) -> Expectation:
     amount = found["amount"].strip()
     sign = -1.0 if amount.startswith("-") else 1.0
     unit = by_name[name].unit
-    example = symbols(unit)[0] if symbols(unit) else ""
-    bound = sign * parse_amount(amount.removeprefix("-"), unit, f"bound for {name}, as 2{example}")
+    bound = sign * parse_amount(amount.removeprefix("-"), unit, f"bound for {name}")
     protocol = Protocol(found["protocol"]) if found["protocol"] else None
     return Expectation(text.strip(), name, found["sign"] == "<", bound, protocol)

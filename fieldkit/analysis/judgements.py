@@ -41,7 +41,7 @@ class Judgement:
 
 def judge(expectations: Sequence[Expectation], cells: Sequence[Cell]) -> tuple[Judgement, ...]:
     """Return what cells say of expectations, expectation by expectation; one that no cell is of can not be told."""
-    return tuple(one for expectation in expectations for one in _judged(expectation, cells))
+    return tuple(judgement for expectation in expectations for judgement in _judged(expectation, cells))
 
 
 def judge_own(cells: Iterable[tuple[Cell, Iterable[Expectation]]]) -> tuple[Judgement, ...]:
@@ -56,7 +56,7 @@ def judge_own(cells: Iterable[tuple[Cell, Iterable[Expectation]]]) -> tuple[Judg
     for cell, expected in cells:
         for one in dict.fromkeys(expected):
             concerned.setdefault(one, []).append(cell)
-    return tuple(said for one, of in concerned.items() for said in _judged(one, of))
+    return tuple(said for expectation, of in concerned.items() for said in _judged(expectation, of))
 
 
 def _judged(expectation: Expectation, cells: Sequence[Cell]) -> Iterator[Judgement]:

@@ -1,4 +1,4 @@
-"""Whether repeats hang together: two rank tests of values in the order of time, for a trend and for runs of alike.
+"""Independence of repeats: two rank tests of values in the order of time, for a trend and for runs of alike.
 
 An interval over repeats takes each as an independent draw. Where the place, the weather or a battery changes slowly,
 each repeat says again what the one before said, and the interval is too narrow however right its formula is. Both

@@ -3,7 +3,7 @@
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -57,12 +57,14 @@ def columns(
         found, rows = dict(zip(present, table.columns, strict=True)), len(table)
     numbers: dict[str, Numbers] = {}
     texts: dict[str, Texts] = {}
-    for name, one in declared.items():
+    for name, declaration in declared.items():
         column = found.get(name)
-        if one.type is str:
+        if declaration.type is str:
             texts[name] = np.full(rows, "", np.object_) if column is None else _texts(column)
         else:
-            numbers[name] = np.asarray(np.full(rows, np.nan, _width(one))) if column is None else _numbers(column)
+            numbers[name] = (
+                np.asarray(np.full(rows, np.nan, _width(declaration))) if column is None else _numbers(column)
+            )
     return numbers, texts, rows
 
 
@@ -81,13 +83,13 @@ def contradiction(numbers: Mapping[str, ArrayLike], quantities: Iterable[Quantit
         numbers: Columns, or the numbers of one row; NaN where missing. Where one of three is, nothing is compared.
         quantities: What to look at.
     """
-    for one in quantities:
-        if one.kind is Kind.COUNTED and numbers.keys() >= set(one.columns):
-            share, arrived, sent = (np.asarray(numbers[name], dtype=np.float64) for name in one.columns)
+    for quantity in quantities:
+        if quantity.kind is Kind.COUNTED and numbers.keys() >= set(quantity.columns):
+            share, arrived, sent = (np.asarray(numbers[name], dtype=np.float64) for name in quantity.columns)
             known = np.isfinite(share) & np.isfinite(arrived) & np.isfinite(sent)
             counted = 1 - arrived / np.where(sent > 0, sent, np.nan)
             if (known & ~np.isclose(share, counted, rtol=_AGREED, atol=_AGREED)).any():
-                return one
+                return quantity
     return None
 
 
@@ -130,16 +132,28 @@ def _width(column: Column) -> type[np.float64] | type[np.longdouble]:
 def _texts(column: pa.ChunkedArray) -> Texts:
     encoded = column.unify_dictionaries().combine_chunks()
     known = np.array([*encoded.dictionary.to_pylist(), ""], dtype=np.object_)
-    return np.asarray(known[encoded.indices.to_numpy()], dtype=np.object_)
+    return np.asarray(known[_plain(encoded.indices, np.int32)], dtype=np.object_)
 
 
 def _numbers(column: pa.ChunkedArray) -> Numbers:
+    numbers: Numbers
     if column.type == pa.int64():
-        values = column.fill_null(0).to_numpy().astype(np.longdouble)
-        values[column.is_null().to_numpy()] = np.nan
-        return np.asarray(values)
-    typed = column.cast(pa.uint8()) if column.type == pa.bool_() else column
-    return np.asarray(typed.cast(pa.float64()).to_numpy(), dtype=np.float64)
+        numbers = _plain(column.combine_chunks(), np.int64).astype(np.longdouble)
+    else:
+        typed = column.cast(pa.uint8()) if column.type == pa.bool_() else column
+        numbers = _plain(typed.cast(pa.float64()).combine_chunks(), np.float64).copy()
+    if column.null_count:
+        numbers[_plain(column.is_null().cast(pa.uint8()).combine_chunks(), np.uint8) != 0] = np.nan
+    return numbers
+
+
+def _plain(array: pa.Array, kind: type[np.generic]) -> NDArray[Any]:
+    """Return the values of an array where Arrow keeps them, whatever stands in place of those that are missing.
+
+    `to_numpy` would import pandas where that is installed, which takes longer than all else that reads a table.
+    """
+    _, values = array.buffers()
+    return np.frombuffer(values, kind, len(array), array.offset * np.dtype(kind).itemsize)
 
 
 def _explain_row(

@@ -23,12 +23,12 @@ def more_wanted_of(cells: Sequence[Cell], half_widths: Mapping[str, float]) -> t
             without an interval.
     """
     found: tuple[dict[str, int], ...] = tuple({} for _ in cells)
-    quantities = {one.quantity for cell in cells for one in cell.estimates.values()}
+    quantities = {estimate.quantity for cell in cells for estimate in cell.estimates.values()}
     for quantity in (one for one in quantities if one.unit in half_widths):
         having = [index for index, cell in enumerate(cells) if quantity.name in cell.estimates]
         estimates = [cells[index].estimates[quantity.name] for index in having]
-        ends = np.array([(one.value, one.low, one.high) for one in estimates], dtype=np.float64)
-        n = [one.n for one in estimates]
+        ends = np.array([(estimate.value, estimate.low, estimate.high) for estimate in estimates], dtype=np.float64)
+        n = [estimate.n for estimate in estimates]
         more = more_wanted(Intervals(*ends.T), n, half_widths[quantity.unit], quantity.kind, quantity.unit)
         for index, count in zip(having, more.tolist(), strict=True):
             if not math.isnan(count):

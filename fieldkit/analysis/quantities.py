@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from types import MappingProxyType
 from typing import Final, Self
 
-from fieldkit.core.columns import FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name
+from fieldkit.core.columns import BACKGROUND, FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.lazy import dataclass
 from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
@@ -22,9 +22,9 @@ class Quantity:
         name: The column.
         label: In words, for tables and axes.
         kind: How repeats are put together.
+        unit: The column's, `share` for what is true or false.
         arrived: Column that counts what arrived; None unless counted.
         sent: Column that counts of how many; None unless counted.
-        unit: The column's, `share` for what is true or false.
         possible: Smallest and largest value of a repeat.
         rank: Place among others, from the first.
     """
@@ -32,9 +32,9 @@ class Quantity:
     name: str
     label: str
     kind: Kind
+    unit: str
     arrived: str | None = None
     sent: str | None = None
-    unit: str = "share"
     possible: Bounds = (-sys.float_info.max, sys.float_info.max)
     rank: int = FIRST_OF_OTHERS
 
@@ -45,7 +45,7 @@ class Quantity:
         if one is None or one.kind is Kind.WORDS:
             return None
         unit = "share" if one.kind is Kind.FLAG else column.unit
-        return cls(column.name, one.label, one.kind, one.arrived, one.sent, unit, column.possible, one.rank)
+        return cls(column.name, one.label, one.kind, unit, one.arrived, one.sent, column.possible, one.rank)
 
     @property
     def step(self) -> str:
@@ -60,7 +60,7 @@ class Quantity:
     @property
     def is_own(self) -> bool:
         """Whether every trial has it, or a step of a kind that every trial has, under a name."""
-        return self.rank < FIRST_OF_OTHERS
+        return not FIRST_OF_OTHERS <= self.rank < BACKGROUND
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -74,12 +74,14 @@ def quantities(columns: Iterable[Column]) -> tuple[Quantity, ...]:
     Args:
         columns: The table's, in order.
     """
-    return in_order(quantity for one in columns if (quantity := Quantity.of(one)) is not None)
+    return in_order(quantity for column in columns if (quantity := Quantity.of(column)) is not None)
 
 
 def alike(found: Iterable[Quantity], name: str) -> list[Quantity]:
     """Return the quantities that are called `name` but for the names of their steps, that of no named step first."""
-    return sorted((one for one in found if plain_name(one.name) == name), key=lambda one: one.step != "")
+    return sorted(
+        (quantity for quantity in found if plain_name(quantity.name) == name), key=lambda one: one.step != ""
+    )
 
 
 def in_order(found: Iterable[Quantity]) -> tuple[Quantity, ...]:

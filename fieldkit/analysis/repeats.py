@@ -60,12 +60,12 @@ class Repeats:
     def quantities(self) -> tuple[Quantity, ...]:
         """What figures can be made of, in the order in which tables show them."""
         found = quantities(self.columns)
-        return tuple(one for one in found if self.numbers.keys() >= set(one.columns))
+        return tuple(quantity for quantity in found if self.numbers.keys() >= set(quantity.columns))
 
     @cached_property
     def worded(self) -> tuple[Column, ...]:
         """The columns whose words are counted, in order."""
-        return tuple(one for one in worded(self.columns) if one.name in self.texts)
+        return tuple(column for column in worded(self.columns) if column.name in self.texts)
 
     def __len__(self) -> int:
         return len(next(iter(self.texts.values())))
@@ -360,8 +360,8 @@ def _parse(names: Sequence[str], body: bytes, declared: Mapping[str, Column]) ->
 
 def _concatenated(parts: Sequence[Repeats]) -> Repeats:
     return Repeats(
-        {name: np.concatenate([one.numbers[name] for one in parts]) for name in parts[0].numbers},
-        {name: np.concatenate([one.texts[name] for one in parts]) for name in parts[0].texts},
+        {name: np.concatenate([part.numbers[name] for part in parts]) for name in parts[0].numbers},
+        {name: np.concatenate([part.texts[name] for part in parts]) for name in parts[0].texts},
         parts[0].columns,
     )
 

@@ -100,7 +100,7 @@ def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRo
     """Yield every condition with a row per quantity, or with one without any where neither run measured."""
     for pair in comparison.pairs:
         missing_in = pair.missing_in or None
-        found = [_difference_row(one, missing_in, comparison.made) for one in pair.differences]
+        found = [_difference_row(difference, missing_in, comparison.made) for difference in pair.differences]
         found += [row for a, b in pair.words for row in _word_rows(a, b, missing_in)]
         yield from ((pair, row) for row in found or [DifferenceRow(missing_in=missing_in)])
 
@@ -121,7 +121,7 @@ def comparison_json(comparison: Comparison) -> str:
             "schema_version": SCHEMA_VERSION,
             "by": list(comparison.by),
             "conclusions": list(wording.conclusions(comparison)),
-            "concerns": [asdict(one) for one in comparison.concerns],
+            "concerns": [asdict(concern) for concern in comparison.concerns],
             "missed": comparison.missed,
             "differences": [
                 {**pair.key, **{name: _rounded(value) for name, value in asdict(row).items()}}
@@ -180,13 +180,18 @@ def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Q
     The columns of words that cells have follow.
     """
     apart, common = wording.told_by(by, cells)
-    scales = {one: wording.scale(one, cells) for one in wording.shown(cells, quantities)}
+    scales = {quantity: wording.scale(quantity, cells) for quantity in wording.shown(cells, quantities)}
     words = wording.worded(cells)
-    head = [*apart, "repeats", *(scale.head(wording.label(one)) for one, scale in scales.items()), *words.values()]
+    head = [
+        *apart,
+        "repeats",
+        *(scale.head(wording.label(quantity)) for quantity, scale in scales.items()),
+        *words.values(),
+    ]
     marks = ["---"] * (len(apart) + 1) + ["---:"] * len(scales) + ["---"] * len(words)
     lines = [markdown_line(head), markdown_line(marks)]
     for cell in cells:
-        found = [(scale, cell.estimates.get(one.name)) for one, scale in scales.items()]
+        found = [(scale, cell.estimates.get(quantity.name)) for quantity, scale in scales.items()]
         figures = (f"{s.number(e.value)} {wording.interval(s, e)}".rstrip() if e else "" for s, e in found)
         said = (wording.tally(cell, name) for name in words)
         conditions = (wording.key(cell, name) for name in apart)
@@ -227,11 +232,11 @@ def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quan
     columns = [
         column
         for column in (
-            _Column(one, quantity, other) for one in scenarios for quantity in shown for other in protocols
+            _Column(scenario, quantity, other) for scenario in scenarios for quantity in shown for other in protocols
         )
         if any(column.has(cell) for cell in cells)
     ]
-    scales = {one: wording.scale(one, cells) for one in shown}
+    scales = {quantity: wording.scale(quantity, cells) for quantity in shown}
     rows: dict[tuple[str, ...], list[Cell]] = {}
     for cell in cells:
         rows.setdefault(tuple(wording.key(cell, name) for name in down), []).append(cell)
@@ -272,11 +277,11 @@ def _latex_head(
     down: Sequence[str], columns: Sequence[_Column], scales: dict[Quantity, wording.Scale]
 ) -> Iterator[str]:
     """Yield the lines of the head: what stands over several columns is ruled off below."""
-    named = [scales[one.quantity].head(wording.label(one.quantity)) for one in columns]
+    named = [scales[column.quantity].head(wording.label(column.quantity)) for column in columns]
     levels: list[list[tuple[str, ...]]] = [
-        [(one.scenario,) for one in columns],
-        [(one.scenario, name) for one, name in zip(columns, named, strict=True)],
-        [(one.scenario, name, one.protocol) for one, name in zip(columns, named, strict=True)],
+        [(column.scenario,) for column in columns],
+        [(column.scenario, name) for column, name in zip(columns, named, strict=True)],
+        [(column.scenario, name, column.protocol) for column, name in zip(columns, named, strict=True)],
     ]
     levels = [level for level in levels if any(path[-1] for path in level)]
     for level in levels:
@@ -298,7 +303,9 @@ def _latex_figures(
     for column in columns:
         scale = scales[column.quantity]
         found = (cell.estimates[column.quantity.name] for cell in row if column.has(cell))
-        yield " ".join(f"{scale.number(one.value)} {wording.interval(scale, one)}".rstrip() for one in found)
+        yield " ".join(
+            f"{scale.number(estimate.value)} {wording.interval(scale, estimate)}".rstrip() for estimate in found
+        )
 
 
 def _latex_line(parts: Sequence[str]) -> str:

@@ -92,8 +92,8 @@ def hangs_together(found: Estimate) -> bool:
 
 def cautions(cells: Sequence[Cell]) -> Iterator[str]:
     """Yield what the marks of intervals mean, each with what to do."""
-    every = [(cell, one) for cell in cells for one in cell.estimates.values()]
-    if few := sorted({one.n for _, one in every if is_few(one)}):
+    every = [(cell, estimate) for cell in cells for estimate in cell.estimates.values()]
+    if few := sorted({estimate.n for _, estimate in every if is_few(estimate)}):
         held = ", ".join(f"{100 * assured(n):.0f} % of {n}" for n in reversed(few))
         yield (
             f"* a median of fewer than {FEWEST_FOR_ORDER} repeats: its interval holds it in 95 % if they spread as "
@@ -101,9 +101,9 @@ def cautions(cells: Sequence[Cell]) -> Iterator[str]:
         )
     apart = [name for name in (cells[0].key if cells else ()) if len({cell.key[name] for cell in cells}) > 1]
     if together := [
-        " ".join([one.quantity.label, *(key(cell, name) for name in apart)])
-        for cell, one in every
-        if hangs_together(one)
+        " ".join([estimate.quantity.label, *(key(cell, name) for name in apart)])
+        for cell, estimate in every
+        if hangs_together(estimate)
     ]:
         more = f" and {len(together) - _NAMED} more" if len(together) > _NAMED else ""
         yield (
@@ -115,7 +115,9 @@ def cautions(cells: Sequence[Cell]) -> Iterator[str]:
 
 def scale(quantity: Quantity, cells: Sequence[Cell]) -> Scale:
     """Return in what to write a quantity of these cells."""
-    return scale_of(quantity, [one.estimates[quantity.name].value for one in cells if quantity.name in one.estimates])
+    return scale_of(
+        quantity, [cell.estimates[quantity.name].value for cell in cells if quantity.name in cell.estimates]
+    )
 
 
 def scale_of(quantity: Quantity, values: Sequence[float]) -> Scale:
@@ -144,12 +146,12 @@ def label(quantity: Quantity) -> str:
 
 def shown(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> list[Quantity]:
     """Return the quantities that any of the cells has."""
-    return [one for one in quantities if any(one.name in cell.estimates for cell in cells)]
+    return [quantity for quantity in quantities if any(quantity.name in cell.estimates for cell in cells)]
 
 
 def measured(cells: Sequence[Cell]) -> tuple[Quantity, ...]:
     """Return the quantities that any of the cells has, in order."""
-    return in_order(one.quantity for cell in cells for one in cell.estimates.values())
+    return in_order(estimate.quantity for cell in cells for estimate in cell.estimates.values())
 
 
 def key(cell: Cell, name: str) -> str:
@@ -164,7 +166,7 @@ def told_by(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[s
     distance, a procedure that is called as its scenario.
     """
     again = {"distance_m"} if "distance" in by else set()
-    if {"procedure", "scenario"} <= set(by) and all(one.key["procedure"] == one.key["scenario"] for one in cells):
+    if {"procedure", "scenario"} <= set(by) and all(cell.key["procedure"] == cell.key["scenario"] for cell in cells):
         again.add("procedure")
     values = {name: {cell.key[name] for cell in cells} for name in by if name not in again}
     return [name for name in values if len(values[name]) > 1], [name for name in values if len(values[name]) == 1]
@@ -177,20 +179,20 @@ def counts(cell: Cell) -> str:
 
 def worded(cells: Sequence[Cell]) -> dict[str, str]:
     """Return the labels of the columns of words that any of the cells has, by name and in order."""
-    return {name: one.label for cell in cells for name, one in cell.tallies.items()}
+    return {name: tally.label for cell in cells for name, tally in cell.tallies.items()}
 
 
-def tally(cell: Cell, name: str) -> str:
+def tally(cell: Cell, name: str, between: str = ", ") -> str:
     """Return how many valid repeats of a cell have each word of a column: `wet 12, dry 7, 1 without`."""
     found = cell.tallies.get(name)
     if found is None:
         return ""
     without = cell.n_valid - found.n
-    return tallied(found) + (f", {without} without" if without else "")
+    return between.join((*_counted(found), *([f"{without} without"] if without else [])))
 
 
 def tallied(found: Tally) -> str:
-    """Return the same without those that have none."""
+    """Return how many repeats have each word: `wet 12, dry 7`."""
     return ", ".join(_counted(found))
 
 
@@ -207,7 +209,7 @@ def _counted(found: Tally) -> Iterator[str]:
 
 def ended(numbers: Mapping[str, int]) -> str:
     """Return how many attempts ended in each way, the same way."""
-    return ", ".join(f"{numbers[one]} {one}" for one in ENDED if numbers.get(one)) or "none"
+    return ", ".join(f"{numbers[status]} {status}" for status in ENDED if numbers.get(status)) or "none"
 
 
 def verdict(one: Difference, comparisons: int) -> str:
@@ -241,7 +243,7 @@ def holds(one: Difference) -> bool:
 def conclusions(comparison: Comparison) -> Iterator[str]:
     """Yield what the whole comes to, and what of it could not be compared."""
     made, every = comparison.made, comparison.differences
-    seen, held = sum(one.seen for one in every), sum(holds(one) for one in every)
+    seen, held = sum(estimate.seen for estimate in every), sum(holds(estimate) for estimate in every)
     yield (
         f"{format_count(made, 'comparison')}: {format_count(seen, 'difference')} seen, {held} after correction "
         f"for their number; were there none, about {(1 - CONFIDENCE) * made:.1f} would be seen"
@@ -249,8 +251,13 @@ def conclusions(comparison: Comparison) -> Iterator[str]:
     for pair in comparison.pairs:
         if pair.missing_in:
             yield f"not compared, because {pair.missing_in} has no such condition: {pair.name}"
-    limited = [(pair.name, one) for pair in comparison.pairs for one in pair.differences if one.within is not None]
-    missed = [(name, one) for name, one in limited if not one.within]
+    limited = [
+        (pair.name, difference)
+        for pair in comparison.pairs
+        for difference in pair.differences
+        if difference.within is not None
+    ]
+    missed = [(name, difference) for name, difference in limited if not difference.within]
     if limited:
         yield f"shown to be within its threshold: {len(limited) - len(missed)} of {len(limited)}"
     for name, one in missed:

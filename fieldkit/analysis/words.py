@@ -45,7 +45,7 @@ class Tally:
 
 def worded(columns: Iterable[Column]) -> tuple[Column, ...]:
     """Return the columns whose words are counted, in their order."""
-    return tuple(one for one in columns if one.figure is not None and one.figure.kind is Kind.WORDS)
+    return tuple(column for column in columns if column.figure is not None and column.figure.kind is Kind.WORDS)
 
 
 def tallies(column: Column, given: Iterable[tuple[int, str]]) -> Iterator[tuple[int, Tally]]:

@@ -57,7 +57,7 @@ class Trials:
         chosen, words = self._found.chosen(_names(quantities or ()), asked="quantities")
         keys = self._found.condition(",".join(_names(by)), asked="by")
         self._tell_mixtures(keys)
-        declared = {one.name: one for one in (*self._attempts.columns, _SOURCE)}
+        declared = {column.name: column for column in (*self._attempts.columns, _SOURCE)}
         cells = aggregate(self._attempts, keys, quantities=chosen, words=words)
         return table.of_cells([declared[name] for name in keys], cells)
 
@@ -107,7 +107,9 @@ class Trials:
             raise EvidenceError(
                 "; ".join((f"the evidence of {repeat} is not at hand", *evidence.unread)), where=source, remedy=remedy
             )
-        transfers = {one.name: one for one in plan.transfers(Protocol(self._attempts.texts["protocol"][row]))}
+        transfers = {
+            transfer.name: transfer for transfer in plan.transfers(Protocol(self._attempts.texts["protocol"][row]))
+        }
         if step is not None and step not in transfers:
             named = ", ".join(map(repr, transfers)) or "none"
             raise ConfigurationError(

@@ -1,4 +1,4 @@
-"""Whether a robot can be driven by its topic: nobody else obeys it, and nobody else says where the robot is."""
+"""Conditions for driving a robot by its topic: nobody else obeys it, and nobody else says where the robot is."""
 
 from collections.abc import Iterable
 

@@ -5,6 +5,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
+from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Bool, Document, Field, Strict
 from fieldkit.config.site import Site
@@ -45,16 +46,16 @@ class Robot(Strict):
     address: str
     profile: RobotProfile
     control: Control = Control.SEPARATE
-    ros_master: str = Field(default="", exclude_if=lambda address: not address)
-    drives: Bool = Field(default=False, exclude_if=lambda drives: not drives)
-    flies: Bool = Field(default=False, exclude_if=lambda flies: not flies)
+    ros_master: str = Field(default="", exclude_if=schema.is_empty)
+    drives: Bool = Field(default=False, exclude_if=schema.is_empty)
+    flies: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @property
     def ros_graph(self) -> str:
         """What robots have in common that hear each other's topics, in words; empty for one whose are its own."""
         ros = self.profile.ros
         if ros is not None and ros.variant == "ros2":
-            return f"ROS domain {ros.environment.get('ROS_DOMAIN_ID', '0')}"
+            return f"ROS domain {ros.domain}{' over Zenoh' if ros.middleware == 'zenoh' else ''}"
         return f"the ROS master at {self.ros_master}" if self.ros_master else ""
 
     @property

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fieldkit.bags.formats import BagFiles, BagFormat, find
+from fieldkit.bags.formats import LAST_RESORT, BagFiles, BagFormat, find
 from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
 from fieldkit.measure.evidence.bag import given_bytes
 from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError, Json
@@ -86,7 +86,8 @@ def inspect(path: Path, *, read_all: bool = False) -> BagContents:
         read_all: Read and decode every message, which takes time, to find what an index does not tell.
 
     Raises:
-        EvidenceError: There is no bag, or looking at it takes more memory or time than one of its size may.
+        ConfigurationError: There is no bag, or it cannot be opened.
+        EvidenceError: Nothing was written in it, or looking at it takes more memory or time than one of its size may.
     """
     bag = find(path)
     found = _asked(bag, {"do": "inspect", "all": read_all})
@@ -106,7 +107,7 @@ def repair(path: Path, to: Path) -> Written:
     """Write what can be read of a damaged bag into a new one of the same format, with an index; the old one stays.
 
     Raises:
-        ConfigurationError: `to` is there already, or its name is not one for the format.
+        ConfigurationError: As `inspect`; or `to` is there already, or its name is not one for the format.
         EvidenceError: As `inspect`; or no message can be read.
     """
     bag = find(path)
@@ -119,7 +120,8 @@ def repair(path: Path, to: Path) -> Written:
     def ask(place: Path) -> Written:
         found = _asked(bag, {"do": "repair", "to": str(place)})
         if not found["messages"]:
-            raise EvidenceError(f"no message can be saved: {found['why']}", where=str(path))
+            why = f"no message can be saved: {found['why']}"
+            raise EvidenceError(why, where=str(path), remedy=LAST_RESORT.get(bag.format, ""))
         return Written(found["messages"], (found["why"],) if found["why"] else ())
 
     return _written(to, ask)
@@ -135,7 +137,7 @@ def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distri
         distribution: Whose message types it has; those of Noetic or Jazzy if empty.
 
     Raises:
-        ConfigurationError: `to` is there already, or the distribution is not one for its format.
+        ConfigurationError: As `inspect`; or `to` is there already, or the distribution is not one for its format.
         EvidenceError: As `inspect`; or the bag is damaged, or cannot be converted.
     """
     bag, is_ros1 = find(path), to.suffix == ".bag"
@@ -167,7 +169,11 @@ def _written(to: Path, write: Callable[[Path], Written]) -> Written:
             found = write(place.absolute())
             place.rename(to)
     except OSError as error:
-        raise ConfigurationError(f"cannot write there: {error.strerror or error}", where=str(to)) from error
+        raise ConfigurationError(
+            f"cannot write there: {error.strerror or error}",
+            where=str(to),
+            remedy="name a place in a folder that is there, and that you may write to",
+        ) from error
     return found
 
 

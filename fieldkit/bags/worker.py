@@ -64,7 +64,10 @@ def inspect(bag: BagFiles, *, read_all: bool) -> Json:
         except Exception as error:  # noqa: BLE001 (as `answer`; what is wrong is what is asked for)
             problems.append(_told(error))
     if problems:
-        found |= {"saved": _savable(bag)}
+        saved = _savable(bag)
+        found |= {"saved": saved}
+        if not bag.closed and saved["why"]:  # nothing else has looked into the files
+            problems.append(saved["why"])
     return found | {"problems": problems[:_MOST_PROBLEMS]}
 
 

@@ -70,7 +70,9 @@ class CampaignFile(Strict):
         expect: What is demanded of the figures of each trial that has them, beside what its procedure demands.
     """
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$")]
+    name: Annotated[
+        str, schema.shaped(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$", "a name: letters, digits, - and _, 61 in all")
+    ]
     procedures: Annotated[tuple[str, ...], *_ONCE]
     distances: Annotated[tuple[Span, ...], Field(min_length=1), _distinct(lambda one: one.metres)]
     topologies: Annotated[tuple[Topology, ...], *_ONCE]
@@ -80,7 +82,7 @@ class CampaignFile(Strict):
     seed: Annotated[Int, Field(ge=0, lt=10**15)]
     walk: Length | None = None
     left_out: tuple[LeftOut, ...] = Field(default=(), alias="except")
-    expect: tuple[str, ...] = Field(default=(), exclude_if=lambda expect: not expect)
+    expect: tuple[str, ...] = Field(default=(), exclude_if=schema.is_empty)
 
 
 def load_campaign(path: Path) -> tuple[CampaignFile, Document]:
@@ -136,7 +138,7 @@ def trials_of(
 
 
 def _covered(trial: PlannedTrial, left_out: Iterable[LeftOut]) -> bool:
-    return any(one.covers(trial) for one in left_out)
+    return any(rule.covers(trial) for rule in left_out)
 
 
 class CampaignPlan(Strict):
@@ -165,7 +167,7 @@ class CampaignPlan(Strict):
 
     def procedure(self, trial: PlannedTrial) -> Procedure:
         """Return the procedure of a trial."""
-        return next(one for one in self.procedures if one.name == trial.procedure)
+        return next(procedure for procedure in self.procedures if procedure.name == trial.procedure)
 
 
 def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:

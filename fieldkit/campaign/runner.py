@@ -13,7 +13,7 @@ from fieldkit.campaign.order import PlannedTrial, walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent, Sink
+from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent, Note, Sink
 from fieldkit.core.model import Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.core.units import format_bytes
@@ -70,7 +70,7 @@ class CampaignRun:
         self._plans = {trial: self._trial_plan(trial, backend.cast(trial.topology)) for trial in self._trials}
 
     def announce(self) -> None:
-        """Tell what there is to be done."""
+        """Tell what there is to be done, and what of it is less than the procedures ask for."""
         left = self._left()
         needed_bytes, free_bytes = self._room(left)
         self._sink(
@@ -85,6 +85,11 @@ class CampaignRun:
                 left_s=self._left_s(left),
             )
         )
+        shortened = (
+            line for trial in left for line in self._plan.procedure(trial).shortened(self._plans[trial].cast)
+        )
+        for line in dict.fromkeys(shortened):
+            self._sink(Note(line))
 
     def run(self, operator: Operator, stop: Stop) -> CampaignOutcome:
         """Run what is left; trials that are skipped are offered once more after the others.
@@ -158,7 +163,7 @@ class CampaignRun:
             else:
                 outcome = go_on(folder, testbed, self._sink, stop, told=False)
             trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
-            unmet = sum(not one.holds for one in outcome.judgements)
+            unmet = sum(not judgement.holds for judgement in outcome.judgements)
             self._journal.add(trial, TrialProgress.ENDED, trial=trial_name, valid=valid, failed=failed, unmet=unmet)
         left = self._left()
         self._sink(CampaignWent(str(trial), total - len(left), total, self._left_s(left)))

@@ -23,6 +23,9 @@ INTERRUPTED: Final = 130
 _COLLECT_AFTER: Final = 50_000
 """How many new objects the collector of cycles lets pass: imports make fewer, of which it would free none."""
 
+_ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "1")
+"""numpy's OpenBLAS starts a thread per core, which spins for 30 ms, for products of larger matrices than any here."""
+
 _EPILOG: Final = """\
 begin with emulated robots:  fieldkit trial los 30ft --repeats 1 --record 1s
 begin with real ones:        fieldkit init
@@ -52,6 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     _fill_streams()
     gc.set_threshold(_COLLECT_AFTER)
+    os.environ.setdefault(*_ONE_THREAD)
     if "_ARGCOMPLETE" in os.environ:  # a shell asks how its line may go on
         from fieldkit.cli.commands import completion  # noqa: PLC0415 (only then)
 

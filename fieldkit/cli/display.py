@@ -82,20 +82,29 @@ def prose(text: str) -> None:
     print(textwrap.fill(text, _console().width) if sys.stdout.isatty() else text)
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "", right: Sequence[int] = ()) -> None:
-    """Print a table; columns whose index is in `right` are aligned to the right.
+def table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    title: str = "",
+    right: Sequence[int] = (),
+    fold: Sequence[int] | None = None,
+) -> None:
+    """Print a table; columns whose index is in `right` are aligned to the right. A cell may have several lines.
 
-    Only words in the last column are folded: a name or a figure broken in two is read as another, so in a narrow
-    terminal the table is too wide rather than wrong.
+    Words are folded in the columns `fold` alone, in this order, by default in the last one unless that is aligned to
+    the right: a name or a figure broken in two is read as another, so in a narrow terminal the table is too wide
+    rather than wrong.
     """
     # Not by `rich.table`, which measures and cuts every cell several times: 100 ms for the list of all columns.
     console = _console()
     cells = [[harmless(cell) for cell in row] for row in (head, *rows)]
     widths = _widths(cells)
-    if len(head) - 1 not in right:
-        words = (word for row in cells for word in row[-1].split())
-        room = console.width - sum(widths[:-1]) - 2 * len(widths) - 1
-        widths[-1] = min(widths[-1], max([room, *map(cell_len, words)]))
+    last = len(head) - 1
+    for index in fold if fold is not None else () if last in right else (last,):
+        words = (word for row in cells for word in row[index].split())
+        room = console.width - sum(widths) + widths[index] - 2 * len(widths) - 1
+        widths[index] = min(widths[index], max([room, *map(cell_len, words)]))
     rule = " " + "─" * (_table_width(widths) - 1)
     first, *others = ("\n".join(_table_lines(row, widths, right, console)) for row in cells)
     if title:
@@ -105,7 +114,9 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = ""
 
 
 def _widths(cells: Sequence[Sequence[str]]) -> list[int]:
-    return [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
+    return [
+        max(cell_len(line) for cell in column for line in cell.split("\n")) for column in zip(*cells, strict=True)
+    ]
 
 
 def _table_width(widths: Sequence[int]) -> int:
@@ -136,10 +147,10 @@ _MARKS: Final = {Verdict.OK: ("ok", "green"), Verdict.WARN: ("warn", "yellow"), 
 def show_findings(findings: Sequence[Finding]) -> None:
     """Print findings robot by robot, each that is not ok with what to type, and a count at the end."""
     console = _console()
-    width = max(len(one.check) for one in findings)
-    for robot in dict.fromkeys(one.robot for one in findings):
+    width = max(len(finding.check) for finding in findings)
+    for robot in dict.fromkeys(finding.robot for finding in findings):
         console.print(Text(robot, style="bold"))
-        for one in (one for one in findings if one.robot == robot):
+        for one in (finding for finding in findings if finding.robot == robot):
             word, style = _MARKS[one.status]
             grid = Table.grid(padding=(0, 2, 0, 0))
             grid.add_column(width=6, justify="right")
@@ -151,7 +162,7 @@ def show_findings(findings: Sequence[Finding]) -> None:
             print("\n".join(line.rstrip() for line in shown.get().splitlines()))
             if one.remedy:  # never broken, so that it can be copied
                 console.print(_harmless(Text.assemble("        ", (completed(one.remedy), "cyan"))))
-    counts = {verdict: sum(one.status is verdict for one in findings) for verdict in Verdict}
+    counts = {verdict: sum(finding.status is verdict for finding in findings) for verdict in Verdict}
     names = {Verdict.OK: "ok", Verdict.WARN: "warned of", Verdict.FAIL: "failed"}
     worst = max(findings, key=lambda one: list(Verdict).index(one.status)).status
     said = ", ".join(f"{counts[verdict]} {name}" for verdict, name in names.items() if counts[verdict])
@@ -287,7 +298,8 @@ def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEn
 def _repeat(event: RepeatEnded, width: int | None) -> Words:
     """Return a repeat as one line; in a terminal, why it is not valid is folded below it where it is longer."""
     head, status = f"{event.done:3d}/{event.total}  {event.repeat:7} ", f"{event.status:6} "
-    said = "; ".join(filter(None, (event.reason, event.summary)))
+    measured = f"measured: {event.summary}" if event.reason and event.summary else event.summary
+    said = "; ".join(filter(None, (event.reason, measured)))
     left = f"  ({format_duration(event.left_s)} left)" if event.left_s > 0 else ""
     if width is not None:  # the live line says what is left
         left, room = "", width - len(head) - len(status)
@@ -299,7 +311,8 @@ def _repeat(event: RepeatEnded, width: int | None) -> Words:
         if len(said) > room:
             indent = f"\n{' ' * _INDENT}"
             said = indent + indent.join(textwrap.wrap(said, max(width - _INDENT, _INDENT)))
-    return ((head, ""), (status, _STYLE[event.status]), (said, ""), (left, "dim"))
+    remedy = f"\n{' ' * _INDENT}remedy: {event.remedy}" if event.remedy else ""
+    return ((head, ""), (status, _STYLE[event.status]), (said, ""), (left, "dim"), (remedy, ""))
 
 
 def _harmless(text: Text) -> Text:

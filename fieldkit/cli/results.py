@@ -17,6 +17,8 @@ from fieldkit.trial import store
 from fieldkit.trial.running.runner import Outcome
 
 Row = tuple[str, ...]
+_Table = tuple[Row, list[Row]]
+"""Its head and its rows."""
 
 
 def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) -> int:
@@ -67,29 +69,39 @@ def keep_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
 def summary_table(cells: Sequence[Cell]) -> None:
     """Print per condition a table: measures down, protocols across, each value with its 95 % interval.
 
-    Where the terminal is too narrow for that, each protocol has a table of its own.
+    Where the terminal is too narrow for that, each protocol has a table of its own; and where that is too wide,
+    intervals stand below their values, and words are folded.
     """
     groups: dict[tuple[str | float | None, ...], list[Cell]] = {}
     for one in cells:
         condition = tuple(one.key[name] for name in ("procedure", "distance", "topology", "backend"))
         groups.setdefault(condition, []).append(one)
     for condition, group in groups.items():
-        whole = _summary(group)
-        for head, rows in [whole] if fits(*whole) else [_summary([one]) for one in group]:
-            table(head, rows, title=", ".join(str(part) for part in condition), right=range(1, len(head)))
+        title = ", ".join(str(part) for part in condition)
+        layouts: Sequence[tuple[list[_Table], Sequence[int]]] = (
+            ([_summary(group)], ()),
+            ([_summary([one]) for one in group], ()),
+            ([_summary([one], between="\n") for one in group], (0,)),
+        )
+        tables, fold = next((one for one in layouts if all(fits(*made) for made in one[0])), layouts[-1])
+        for head, rows in tables:
+            table(head, rows, title=title, right=range(1, len(head)), fold=fold)
     for caution in wording.cautions(cells):
         prose(caution)
 
 
-def _summary(group: Sequence[Cell]) -> tuple[Row, list[Row]]:
-    """Return the head and the rows of a table of one condition."""
+def _summary(group: Sequence[Cell], between: str = " ") -> _Table:
+    """Return the head and the rows of a table of one condition, with this between the parts of a cell."""
     rows = [
         ("repeats", *map(wording.counts, group)),
         *(
-            (wording.label(one), *(_value(cell, one, wording.scale(one, group)) for cell in group))
+            (wording.label(one), *(_value(cell, one, wording.scale(one, group), between) for cell in group))
             for one in wording.measured(group)
         ),
-        *((label, *(wording.tally(cell, name) for cell in group)) for name, label in wording.worded(group).items()),
+        *(
+            (label, *(wording.tally(cell, name, f",{between}") for cell in group))
+            for name, label in wording.worded(group).items()
+        ),
     ]
     return ("[95 % interval]", *(str(one.key["protocol"]).upper() for one in group)), rows
 
@@ -98,11 +110,11 @@ def expectation_table(judgements: Sequence[Judgement]) -> None:
     """Print what the figures say of expectations, a line each; nothing where nothing was expected."""
     if judgements:
         rows = [wording.judged(one) for one in judgements]
-        table(("expected", "of", "measured", "[95 % interval]", ""), rows)
+        table(("expected", "of", "measured", "[95 % interval]", ""), rows, fold=(0, 4))
 
 
-def _value(one: Cell, quantity: Quantity, scale: Scale) -> str:
+def _value(one: Cell, quantity: Quantity, scale: Scale, between: str) -> str:
     found = one.estimates.get(quantity.name)
     if found is None:
         return ""
-    return f"{scale.amount(found.value)} {wording.interval(scale, found)}".rstrip()
+    return f"{scale.amount(found.value)}{between}{wording.interval(scale, found)}".rstrip()

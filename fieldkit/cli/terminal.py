@@ -12,10 +12,11 @@ from fieldkit.core import prompts
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Answered, Asked, Entered, Request, Sink
 from fieldkit.core.prompts import Answer, Question
+from fieldkit.core.units import format_duration
 from fieldkit.trial.running.stop import Stop
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_FINISHING: Final = "finishing the repeat that runs; Ctrl-C again stops it now"
+_FINISHING: Final = "finishing the repeat that runs{left}; Ctrl-C again stops it now"
 _STOPPING: Final = "stopping: ending what runs on the robots"
 _CLEAR_LINE: Final = "\r\x1b[K"
 
@@ -102,10 +103,11 @@ def interruptible() -> Iterator[Stop]:
             return
         if number == signal.SIGINT and stop.patient and not stop.asked:
             stop.asked = True
-            _say(_FINISHING)
+            left = f", about {format_duration(stop.left_s)} more" if stop.left_s else ""
+            _say(_with(_FINISHING.format(left=left), stop.cut_short))
             return
         stopping = True
-        _say(_STOPPING)
+        _say(_with(_STOPPING, stop.cut_short))
         stop.due = True
         if not stop.saving:
             raise KeyboardInterrupt
@@ -116,6 +118,10 @@ def interruptible() -> Iterator[Stop]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _with(text: str, cut_short: str) -> str:
+    return f"{text}: {cut_short}" if cut_short else text
 
 
 def _say(text: str) -> None:

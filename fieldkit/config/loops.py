@@ -123,9 +123,11 @@ class _Writer:
                 raise self._problem(f"{name} is a variable of a for: around this one", here, "give it another name")
             if not isinstance(listed, list) or not listed:
                 raise self._problem(f"the values of {name} are no list", here, f"{name}: [1, 2]")
-            found[name] = [self._copy(one, (*here, index), (*here, index), outer) for index, one in enumerate(listed)]
-            for index, one in enumerate(found[name]):
-                if not isinstance(one, Scalar):
+            found[name] = [
+                self._copy(item, (*here, index), (*here, index), outer) for index, item in enumerate(listed)
+            ]
+            for index, value in enumerate(found[name]):
+                if not isinstance(value, Scalar):
                     raise self._problem(f"a value of {name} is no text or number", (*here, index), f"{name}: [1, 2]")
         return found
 

@@ -15,16 +15,12 @@ from fieldkit.config.schema import (
     Int,
     Number,
     Strict,
+    shaped,
 )
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
-
-def _is_none(value: object) -> bool:
-    return value is None
-
-
-TopicName = Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")]
+TopicName = Annotated[str, shaped(r"^(/[A-Za-z][A-Za-z0-9_]*)+$", "the name of a topic, as /scan or /camera/image")]
 
 
 class PublishedTopic(Strict):
@@ -44,15 +40,17 @@ class PublishedTopic(Strict):
     """
 
     name: TopicName
-    type: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$")]
+    type: Annotated[
+        str, shaped(r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$", "a type of messages, as sensor_msgs/LaserScan")
+    ]
     rate: Hertz
     frame: str = ""
-    child_frame: str = Field(default="", exclude_if=lambda text: not text)
+    child_frame: str = Field(default="", exclude_if=schema.is_empty)
     points: Annotated[Int, Field(gt=0, le=10_000_000)] | None = None
-    width: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
-    height: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=_is_none)
-    size: Annotated[Bytes, Field(gt=0, le=50_000_000)] | None = Field(default=None, exclude_if=_is_none)
-    definition: str = Field(default="", exclude_if=lambda text: not text)
+    width: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=schema.is_empty)
+    height: Annotated[Int, Field(gt=0, le=100_000)] | None = Field(default=None, exclude_if=schema.is_empty)
+    size: Annotated[Bytes, Field(gt=0, le=50_000_000)] | None = Field(default=None, exclude_if=schema.is_empty)
+    definition: str = Field(default="", exclude_if=schema.is_empty)
 
     @property
     def payload_bytes(self) -> int:
@@ -88,7 +86,7 @@ class RecordCommand(Strict):
         record: Argument list; `{duration_s}`, `{name}` and `{topics}` are filled in.
         ends: `itself` after its duration, or on `sigint` (ros2 bag record has no duration).
         writes: The file that holds the messages, `{name}` filled in; for ROS 2 in a folder.
-        rmw: The middleware of ROS 2 by which an emulated robot speaks: `cyclonedds` (DDS) or `zenoh`.
+        rmw: The middleware of ROS 2 where the environment names none: `cyclonedds` (DDS) or `zenoh`.
     """
 
     distribution: str
@@ -101,7 +99,13 @@ class RecordCommand(Strict):
     )
 
 
-_CROSSING: Final = r"^(/[A-Za-z]\w*)+:[a-z]\w*/(msg/)?[A-Z]\w*(:[a-z0-9_=,]+)?$"
+_Crossing = Annotated[
+    str,
+    shaped(
+        r"^(/[A-Za-z]\w*)+:[a-z]\w*/(msg/)?[A-Z]\w*(:[a-z0-9_=,]+)?$",
+        "NAME:TYPE or NAME:TYPE:QOS, as /scan:sensor_msgs/LaserScan",
+    ),
+]
 
 
 class RobotBridge(Strict):
@@ -117,8 +121,8 @@ class RobotBridge(Strict):
     """
 
     to: Annotated[str, Field(pattern="^(dds|zenoh)$")]
-    topics: tuple[Annotated[str, Field(pattern=_CROSSING)], ...] = ()
-    back: tuple[Annotated[str, Field(pattern=_CROSSING)], ...] = ()
+    topics: tuple[_Crossing, ...] = ()
+    back: tuple[_Crossing, ...] = ()
     domain: Annotated[Int, Field(ge=0, le=101)] = 0
     router: Annotated[str, Field(pattern=r"^[\w.-]+(:\d{1,5})?$")] | None = None
     program: str = "fieldkit"
@@ -147,6 +151,10 @@ class RobotBridge(Strict):
         return (self.program, "bridge", *options, *back, *self.topics)
 
 
+MOST_DOMAIN: Final = 232
+"""Above it there are no ports for RTPS (docs.ros.org, "The ROS_DOMAIN_ID")."""
+
+
 class Ros(Strict):
     """The ROS side of a robot.
 
@@ -158,11 +166,11 @@ class Ros(Strict):
         bridge: What is carried to DDS or Zenoh; None for nothing.
     """
 
-    variant: Annotated[str, Field(pattern="^ros[12]$")]
-    variants: dict[Annotated[str, Field(pattern="^ros[12]$")], RecordCommand]
+    variant: Annotated[str, Field(pattern="^(ros1|ros2)$")]
+    variants: dict[Annotated[str, Field(pattern="^(ros1|ros2)$")], RecordCommand]
     environment: dict[str, str] = Field(default_factory=dict)
     topics: tuple[PublishedTopic, ...]
-    bridge: RobotBridge | None = Field(default=None, exclude_if=_is_none)
+    bridge: RobotBridge | None = Field(default=None, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _variant_exists(self) -> "Ros":
@@ -171,6 +179,25 @@ class Ros(Strict):
         if self.bridge is not None and self.variant != "ros1":
             raise schema.complaint("a robot with ROS 2 needs no bridge; leave it out", "bridge")
         return self
+
+    @schema.model_validator(mode="after")
+    def _is_in_a_domain(self) -> "Ros":
+        text = self.environment.get("ROS_DOMAIN_ID") or "0"
+        if not (text.isascii() and text.isdecimal() and int(text) <= MOST_DOMAIN):
+            why = f"{text!r} is no domain of ROS 2; take a whole number from 0 to {MOST_DOMAIN}"
+            raise schema.complaint(why, "environment", "ROS_DOMAIN_ID")
+        return self
+
+    @property
+    def domain(self) -> int:
+        """The domain of ROS 2 that its programs are in, as its environment says it; 0 is ROS 2's own."""
+        return int(self.environment.get("ROS_DOMAIN_ID") or 0)
+
+    @property
+    def middleware(self) -> str:
+        """What carries its ROS 2: `zenoh`, or `dds` by whichever RMW, as all of those speak RTPS."""
+        named = self.environment.get("RMW_IMPLEMENTATION") or self.command.rmw
+        return "zenoh" if named.removeprefix("rmw_").startswith("zenoh") else "dds"
 
     @property
     def command(self) -> RecordCommand:
@@ -207,7 +234,7 @@ class Radio(Strict):
         sensitivity_dbm: Weakest signal it still receives, in dBm.
     """
 
-    interface: Annotated[str, Field(pattern=r"^[a-z][a-z0-9._-]{0,14}$")]
+    interface: Annotated[str, shaped(r"^[a-z][a-z0-9._-]{0,14}$", "the name of a network interface, as wlan0")]
     standard: str
     access_point: schema.Bool = False
     tx_power_dbm: Number | Int
@@ -232,7 +259,9 @@ class Mavlink(Strict):
     """
 
     port: Annotated[Int, Field(gt=0, lt=65536)]
-    connection: Annotated[str, Field(pattern=_CONNECTION)] | None = None
+    connection: (
+        Annotated[str, shaped(_CONNECTION, "a connection, as udpout:127.0.0.1:14550 or /dev/ttyAMA0:921600")] | None
+    ) = None
     autopilot: Annotated[str, Field(pattern="^(px4|ardupilot)$", exclude_if=lambda name: name == "px4")] = "px4"
     least_charge: Annotated[Fraction, Field(exclude_if=lambda share: share == LEAST_CHARGE)] = LEAST_CHARGE
 
@@ -271,8 +300,8 @@ class Limits(Strict):
     """
 
     max_speed_m_s: Number | Int
-    max_height_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=_is_none)
-    fence_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=_is_none)
+    max_height_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=schema.is_empty)
+    fence_m: Annotated[Number | Int, Field(gt=0)] | None = Field(default=None, exclude_if=schema.is_empty)
     battery_min: Number | Int | None = None
 
 
@@ -280,7 +309,7 @@ class RobotProfile(catalog.Named):
     """What a robot model is: one YAML file in `robots/`.
 
     Attributes:
-        kind: `ugv` or `uav`.
+        kind: `ugv`, `uav` or `usv`: on the ground, in the air, on water.
         computer: The on-board computer.
         radio: Its radio.
         tools: Its programs.
@@ -297,7 +326,7 @@ class RobotProfile(catalog.Named):
     ros: Ros | None = None
     limits: Limits
     mavlink: Mavlink | None = None
-    drive: Drive | None = Field(default=None, exclude_if=_is_none)
+    drive: Drive | None = Field(default=None, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _has_a_fence(self) -> "RobotProfile":

@@ -6,7 +6,6 @@ The only module that imports pydantic. Profiles, procedures, site files and back
 
 import json
 import os
-import re
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -32,6 +31,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, core_schema
 
+from fieldkit.config import problems
 from fieldkit.config.documents import Document, Location, parse, read, to_text
 from fieldkit.core import units
 from fieldkit.core.errors import ConfigurationError, nearest
@@ -61,11 +61,13 @@ __all__ = [
     "by_kind",
     "complaint",
     "dump",
+    "is_empty",
     "load",
     "model_serializer",
     "model_validator",
     "parse",
     "read",
+    "shaped",
     "validate",
 ]
 
@@ -83,6 +85,17 @@ def complaint(text: str, *at: str | int) -> Exception:
         at: Keys and indices that lead from the validated value to the part that is wrong, for the line.
     """
     return PydanticCustomError("complaint", "{text}", {"text": text, "at": at})
+
+
+def shaped(pattern: str, words: str) -> Any:  # noqa: ANN401 (as pydantic's own `Field`)
+    """Return the `Field` of a text that has to match a pattern.
+
+    Args:
+        pattern: A regular expression for the whole text.
+        words: What such a text is, for who wrote another: `a name in small letters`.
+    """
+    problems.SHAPES[pattern] = words
+    return Field(pattern=pattern)
 
 
 def _written(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator:
@@ -166,6 +179,11 @@ class Strict(BaseModel):
         return data
 
 
+def is_empty(value: object) -> bool:
+    """Return whether a value says nothing and need not be written: for `exclude_if` of a default that is so."""
+    return not value
+
+
 Model = TypeVar("Model", bound=Strict)
 Item = TypeVar("Item")
 
@@ -190,8 +208,9 @@ def by_kind(
             return _made(data)
         known = kinds()
         if unknown := next((str(key) for key in data if key not in known), None):
+            around = next((str(key) for key in data if key in known and unknown in known[key].model_fields), None)
             valid = f"valid keys: {', '.join(known)}; a {what} of another kind comes with a package to be installed"
-            hint = nearest(unknown, known, valid)
+            hint = f"it is a key of {around}: write it inside" if around else nearest(unknown, known, valid)
             raise PydanticCustomError("unknown_key", "unknown key {key}; {hint}", {"key": unknown, "hint": hint})
         if len(data) != 1:
             raise complaint(f"a {what} has one kind, one of: {', '.join(known)}")
@@ -243,66 +262,7 @@ def validate(document: Document, model: type[Model]) -> Model:
     try:
         return model.model_validate(document.data)
     except ValidationError as error:
-        raise _explain(error, document) from error
-
-
-def _explain(error: ValidationError, document: Document) -> ConfigurationError:
-    def rank(problem: Any) -> tuple[bool, int]:  # noqa: ANN401 (pydantic's own ErrorDetails)
-        # A list whose only item is wrong counts as empty too, which would hide what is wrong.
-        return problem["type"] == "too_short", int(document.where(_location(problem)).rsplit(":", 1)[1])
-
-    problems = sorted(error.errors(), key=rank)
-    first = problems[0]
-    location = _location(first)
-    place: Location = first["loc"]
-    missing = first["type"] == "missing" and isinstance(place[-1], str)
-    if missing:
-        message = f"required key {place[-1]!r} is missing"
-    elif place and place[-1] == "[key]":
-        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {first['msg']}"
-    else:
-        message = _worded(first["type"], first["msg"], first["input"], first.get("ctx", {}))
-    path = ".".join(str(part) for part in (*document.place, *document.known(place)))
-    remedy = f"add {first['loc'][-1]}: to it" if missing else "mend this line"
-    more = f" ({len(problems) - 1} more after this one)" if len(problems) > 1 else ""
-    return ConfigurationError(
-        f"{f'in {path}: ' if path else ''}{message}{more}",
-        where=document.where(location),
-        remedy=f"{remedy}; docs/reference.md lists the keys of every file",
-    )
-
-
-def _worded(kind: str, message: str, found: object, context: Mapping[str, Any]) -> str:
-    """Return one of pydantic's messages as somebody can use it who knows YAML, but no classes."""
-    match kind:
-        case "model_type" | "dict_type":
-            message = f"keys with values are needed here{', and nothing stands here' * (found is None)}"
-        case "tuple_type":
-            message = "a list is needed here"
-        case "value_error":
-            message = str(context["error"])
-        case "missing":
-            message = "this list needs more values"
-        case "union_tag_not_found":
-            message = f"required key {context['discriminator']} is missing"
-        case "union_tag_invalid":
-            known = re.findall(r"'([^']+)'", context["expected_tags"])
-            hint = nearest(context["tag"], known, f"kinds: {', '.join(known)}")
-            message = f"there is no kind {context['tag']!r}; {hint}"
-        case "string_type" if isinstance(found, bool | int | float):
-            message = f"{message}; put it in quotes"
-        case "bool_type" if isinstance(found, str):
-            message = f"{message}; write true or false"
-        case "int_type" if isinstance(found, str):
-            message = f"{message}, in digits alone and without quotes"
-    return message
-
-
-def _location(problem: Any) -> Location:  # noqa: ANN401 (pydantic's own ErrorDetails)
-    location: Location = problem["loc"]
-    context = problem.get("ctx", {})
-    key = context.get("key")
-    return (*location, *context.get("at", ()), *(() if key is None else (key,)))
+        raise problems.explain(error.errors(), document) from error
 
 
 def dump(model: Strict) -> str:

@@ -30,6 +30,12 @@ def _ipv4(text: str) -> str:
     return text
 
 
+RobotName = Annotated[
+    str,
+    schema.shaped(r"^[a-z][a-z0-9-]{0,30}$", "a name: small letters, digits and -, a small letter first, 31 in all"),
+]
+
+
 class SiteRobot(Strict):
     """One robot that a lab has.
 
@@ -77,7 +83,7 @@ class Site(Strict):
     backend: str = "field"
     control: Control = Control.SEPARATE
     patience: Duration = 60.0
-    robots: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")], SiteRobot]
+    robots: dict[RobotName, SiteRobot]
     roles: dict[Topology, dict[Role, str]]
     ros_master: Role | None = None
     emulated: dict[str, object] | None = None

@@ -75,6 +75,8 @@ class Kind(StrEnum):
 
 FIRST_OF_OTHERS: Final = 100
 """Rank of the first figure that is not fieldkit's own."""
+BACKGROUND: Final = 1000
+"""Rank from which on figures are fieldkit's own again: what every trial has beside what it is about comes last."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Figure:
         arrived: Column that counts what arrived; None unless counted.
         sent: Column that counts of how many; None unless counted.
         rank: Place among the figures of a table, from the first; equal ranks keep the order of columns. fieldkit's
-            own are below `FIRST_OF_OTHERS`.
+            own are below `FIRST_OF_OTHERS`, or from `BACKGROUND` on.
     """
 
     label: str
@@ -189,12 +191,12 @@ def columns(
         declared: Of each its name, unit and meaning; its figure where it has one; its bounds where the unit does not
             tell them.
     """
-    return tuple(_declared(rank, *one) for one in declared)
+    return tuple(_declared(rank, *parts) for parts in declared)
 
 
 def _declared(rank: int, name: str, unit: str, meaning: str, *more: Figure | Bounds) -> Column:
-    figure = next((one for one in more if isinstance(one, Figure)), None)
-    bounds = next((one for one in more if not isinstance(one, Figure)), None)
+    figure = next((part for part in more if isinstance(part, Figure)), None)
+    bounds = next((part for part in more if not isinstance(part, Figure)), None)
     return Column(name, unit, meaning, rank, bounds, figure)
 
 

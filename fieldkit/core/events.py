@@ -167,6 +167,7 @@ class RepeatEnded:
         done: Repeats finished for good so far.
         total: Repeats planned.
         left_s: Estimated time left.
+        remedy: What to do about a step that failed, where the step says it.
     """
 
     repeat: str
@@ -177,6 +178,7 @@ class RepeatEnded:
     done: int
     total: int
     left_s: float
+    remedy: str = ""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar
 
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.text import JSON_ERRORS
 
 Entry = TypeVar("Entry")
 Parse = Callable[[Any], Entry]
@@ -18,9 +19,6 @@ Parse = Callable[[Any], Entry]
 
 _LIMIT_BYTES: Final = 1 << 28
 """A line of a journal has some 120 bytes, so this holds far more than any trial."""
-
-_NO_ENTRY: Final = (ValueError, KeyError, TypeError, RecursionError)
-"""What `Parse` raises, and a value nested too deep for Python's reader of JSON."""
 
 
 @contextmanager
@@ -85,7 +83,7 @@ def mend(path: Path, parse: Parse[object]) -> None:
         return
     try:
         parse(json.loads(torn.decode()))
-    except _NO_ENTRY:
+    except JSON_ERRORS:
         os.truncate(path, len(content) - len(torn))
     else:
         with path.open("ab") as file:
@@ -112,7 +110,7 @@ def read(path: Path, parse: Parse[Entry], *, remedy: str) -> list[Entry]:
     for number, line in enumerate(lines, start=1):
         try:
             entries.append(parse(json.loads(line)))
-        except _NO_ENTRY as error:
+        except JSON_ERRORS as error:
             if number == len(lines) and not content.endswith(b"\n"):
                 break
             raise EvidenceError(

@@ -55,7 +55,7 @@ class Question:
         if not said or said == UNKNOWN:
             return said or None
         if self.choices:
-            by_number = {str(number): one for number, one in enumerate(self.choices, start=1)}
+            by_number = {str(number): choice for number, choice in enumerate(self.choices, start=1)}
             return said if said in self.choices else by_number.get(said)
         try:
             value = float(said.removesuffix(self.unit))
@@ -68,7 +68,7 @@ class Question:
     def how(self) -> str:
         """What can be answered, in words."""
         if self.choices:
-            words = ", ".join(f"{number} {one}" for number, one in enumerate(self.choices, start=1))
+            words = ", ".join(f"{number} {choice}" for number, choice in enumerate(self.choices, start=1))
         else:
             low, high = self.bounds
             least = f" from {low:g}" if math.isfinite(low) else ""

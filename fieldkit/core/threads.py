@@ -29,8 +29,8 @@ class Halt:
     def call(self) -> None:
         """End all waits, those of what runs inside too; there may be none."""
         self._event.set()
-        for one in self._inner:
-            one.call()
+        for halt in self._inner:
+            halt.call()
 
     def inside(self) -> "Halt":
         """Return one of what runs inside, which is called with this one, and may be called by itself."""

@@ -1,4 +1,4 @@
-"""What became of the packets in the captures of an attempt: which were lost, which are further copies."""
+"""Fates of the packets in the captures of an attempt: which were lost, which are further copies."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
@@ -25,12 +25,12 @@ def told(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapp
         captures: By file.
         transfers: What tells the packets of each.
     """
-    found = {file: _unknown(one.packets) for file, one in captures.items()}
+    found = {file: _unknown(capture.packets) for file, capture in captures.items()}
     ways: dict[tuple[str, str, str, str], list[Transfer]] = {}
-    for one in transfers:
-        here, there = one.captures
+    for transfer in transfers:
+        here, there = transfer.captures
         if here is not None and there is not None and {here, there} <= captures.keys():
-            ways.setdefault((here, there, one.sender_address, one.receiver_address), []).append(one)
+            ways.setdefault((here, there, transfer.sender_address, transfer.receiver_address), []).append(transfer)
     for (here, there, sender, receiver), alike in ways.items():
         matched = _matched(captures[here], captures[there], alike)
         if matched is None:
@@ -54,10 +54,10 @@ def _matched(here: Capture, there: Capture, alike: Sequence[Transfer]) -> Match 
     sent, received = here.packets, there.packets
     if here.damage or there.damage:
         return None
-    is_tcp = any(one.protocol is Protocol.TCP for one in alike)
+    is_tcp = any(transfer.protocol is Protocol.TCP for transfer in alike)
     if is_tcp and (_is_offloaded(sent) or _is_offloaded(received)):
         return None
-    if any(strangers.reason(sent, received, one) for one in alike):
+    if any(strangers.reason(sent, received, transfer) for transfer in alike):
         return None
     try:
         return match(sent, received)

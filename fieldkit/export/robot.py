@@ -49,12 +49,12 @@ class AttemptRecord:
 def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptRecord:
     """Return what is left of an attempt."""
     captures = {name: evidence.known(pcap.read, name) for name in plan.captures()}
-    pings = {one.file: evidence.known(ping.read, one.file) for one in plan.pingings()}
+    pings = {pinging.file: evidence.known(ping.read, pinging.file) for pinging in plan.pingings()}
     bags = {role: evidence.known(bag.read, name) for role, name in plan.bags().items()}
     return AttemptRecord(
         plan=plan,
         attempt=attempt,
-        captures={name: one for name, one in captures.items() if one},
+        captures={name: capture for name, capture in captures.items() if capture},
         pings={name: one for name, one in pings.items() if one},
         bags={role: one for role, one in bags.items() if one},
         links={role: evidence.links(role) for role in plan.cast},

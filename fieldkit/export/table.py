@@ -50,10 +50,10 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
 def of_repeats(repeats: Repeats) -> Table:
     """Return all columns but the source, those of every trial first; unit and meaning are each one's metadata."""
     arrays = [
-        _texts(repeats.texts[one.name])
-        if one.name in repeats.texts
-        else _numbers(repeats.numbers[one.name], _TYPES[one.type])
-        for one in repeats.columns
+        _texts(repeats.texts[column.name])
+        if column.name in repeats.texts
+        else _numbers(repeats.numbers[column.name], _TYPES[column.type])
+        for column in repeats.columns
     ]
     return Table.from_arrays(arrays, schema=_schema(repeats.columns))
 
@@ -65,7 +65,9 @@ def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
         by: Columns that tell cells apart.
         cells: What to tell of.
     """
-    rows = [(*(cell.key[one.name] for one in by), *astuple(row)) for cell in cells for row in estimate_rows(cell)]
+    rows = [
+        (*(cell.key[column.name] for column in by), *astuple(row)) for cell in cells for row in estimate_rows(cell)
+    ]
     columns = (*by, *declared(EstimateRow))
     return _of_rows(columns, [[None if value == "" else value for value in row] for row in rows])
 
@@ -102,8 +104,8 @@ def _of_rows(columns: Sequence[Column], rows: Sequence[Sequence[Any]]) -> Table:
 def _schema(columns: Sequence[Column]) -> pa.Schema:
     return pa.schema(
         [
-            pa.field(one.name, _TYPES[one.type], metadata={"unit": one.unit, "meaning": one.meaning})
-            for one in columns
+            pa.field(column.name, _TYPES[column.type], metadata={"unit": column.unit, "meaning": column.meaning})
+            for column in columns
         ],
         metadata={"fieldkit_version": __version__, "schema_version": str(SCHEMA_VERSION)},
     )

@@ -73,7 +73,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     # A plan and what tells where robots really were have different origins, so one file has one of them.
     places = (folder, *(store.attempt_folder(folder, one.folder) for one in attempts))
     tracked = any((place / name).exists() for place in places for name in (track.FILE, accounts.FILE))
-    ended_ns = {(one.repeat, one.attempt): one.utc_ns for one in entries if one.status in ENDED}
+    ended_ns = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status in ENDED}
 
     @lru_cache(maxsize=_AT_ONCE)
     def evidence(attempt: Attempt) -> AttemptEvidence:
@@ -119,9 +119,9 @@ def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, i
         told = where.told_of(evidence(attempt))
         # What held when the attempt began is told then.
         found = [
-            _place(plan, one.role, max(one.utc_ns, attempt.started_utc_ns), one.position_m)
-            for one in evidence(attempt).known(track.read, track.FILE) or ()
-            if one.position_m is not None and one.role in plan.cast.keys() - told.keys()
+            _place(plan, whereabouts.role, max(whereabouts.utc_ns, attempt.started_utc_ns), whereabouts.position_m)
+            for whereabouts in evidence(attempt).known(track.read, track.FILE) or ()
+            if whereabouts.position_m is not None and whereabouts.role in plan.cast.keys() - told.keys()
         ]
         for role in filter(told.__contains__, plan.cast):
             found += _told(plan, role, told[role], attempt.started_utc_ns, ended_ns)

@@ -140,7 +140,11 @@ class EvidenceKeeper:
 
     def _kept(self) -> list[str]:
         """Return the folders of the test that runs, where they are kept."""
-        return [str(one.path) for one in (self._own, self._shared) if one.is_there and self._keep is not Keep.NONE]
+        return [
+            str(folder.path)
+            for folder in (self._own, self._shared)
+            if folder.is_there and self._keep is not Keep.NONE
+        ]
 
 
 def _as_lab_error(item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport) -> None:

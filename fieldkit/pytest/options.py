@@ -1,4 +1,4 @@
-"""What the options say: the lab that tests want."""
+"""Options of pytest: the lab that tests want."""
 
 from dataclasses import dataclass
 from enum import StrEnum

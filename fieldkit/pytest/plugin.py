@@ -1,4 +1,4 @@
-"""What pytest loads wherever fieldkit is installed: options, fixtures, and what becomes of a test's evidence.
+"""The plugin that pytest loads wherever fieldkit is installed: options, fixtures, the end of a test's evidence.
 
 It imports nothing of fieldkit until a test asks for one of its fixtures: other tests pay for this module alone.
 """

@@ -249,7 +249,7 @@ class RobotHandles:
         self._lab = lab
 
     def __repr__(self) -> str:
-        return f"<robots {', '.join(f'{one.role}: {one.name}' for one in self)}>"
+        return f"<robots {', '.join(f'{robot.role}: {robot.name}' for robot in self)}>"
 
     def __getitem__(self, name: str) -> RobotHandle:
         """Return a robot by its role or its name.

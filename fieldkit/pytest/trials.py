@@ -72,7 +72,7 @@ class TrialRunner:
         asked = argparse.Namespace(
             procedure=procedure,
             topology=chosen and one_of(Topology, chosen, "topology"),
-            protocol=[one_of(Protocol, one, "protocol") for one in protocols],
+            protocol=[one_of(Protocol, name, "protocol") for name in protocols],
             repeats=_positive(repeats),
             record=record,
         )
@@ -113,6 +113,6 @@ def _demanded(outcome: Outcome) -> Trials:
 
 def _demand_expected(judgements: Sequence[Judgement]) -> None:
     __tracebackhide__ = True
-    unmet = [" ".join(filter(None, wording.judged(one))) for one in judgements if not one.holds]
+    unmet = [" ".join(filter(None, wording.judged(judgement))) for judgement in judgements if not judgement.holds]
     if unmet:
         raise ExpectationError("; ".join(unmet))

@@ -10,6 +10,9 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.remote.script import HOME, demand
 from fieldkit.remote.shell import Shell
 
+_INSTALL_S: Final = 30.0
+"""Some 140 kB, over a radio that may be slow."""
+
 _ROOT: Final = Path(__file__).parents[1]
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 _LOOK: Final = '[ -O "$1" ] && [ ! -L "$1" ] && said=$(sha256sum <"$1") && [ "${said%% *}" = "$2" ]'
@@ -50,14 +53,14 @@ def _name() -> str:
     return f"agent-{_sha256()[:12]}.pyz"
 
 
-def install(shell: Shell, deadline: Deadline) -> None:
+def install(shell: Shell) -> None:
     """Put the agent on the robot where it is not there yet; the job script has made its folder.
 
     Raises:
         LinkError: The robot did not answer.
         RobotError: Its home cannot be written.
     """
-    path = path_from_home()
+    path, deadline = path_from_home(), Deadline.after(_INSTALL_S)
     looked = shell.run(("sh", "-c", _LOOK, "sh", path, _sha256()), deadline=deadline, check=False)
     if looked.exit_code != 0:
         placed = shell.run(("sh", "-c", _PLACE, "sh", path), stdin=content(), deadline=deadline, check=False)

@@ -33,6 +33,9 @@ def with_environment(
 
 
 def printable(data: bytes, limit: int = 300) -> str:
-    """Return the last `limit` characters of what a robot said as one line, safe in a terminal, a log and a CSV."""
-    words = " ".join(_STYLE.sub("", data.decode("utf-8", "replace")).split())
-    return harmless(words)[-limit:]
+    """Return what a robot said as one line, safe in a terminal, a log and a CSV; of long ones the last words."""
+    words = harmless(" ".join(_STYLE.sub("", data.decode("utf-8", "replace")).split()))
+    if len(words) <= limit:
+        return words
+    end = words[-limit:]
+    return end.partition(" ")[2] or end  # a word that was cut at its front may read as another

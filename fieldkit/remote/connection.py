@@ -230,7 +230,7 @@ class Connection:
             yield until
         finally:
             with self._lock:
-                self._silences = [one for one in self._silences if one is not until]
+                self._silences = [silence for silence in self._silences if silence is not until]
 
     def _endure(self, link: Link | None, seconds: float) -> None:
         if link is not None:
@@ -239,7 +239,7 @@ class Connection:
 
     def _silence_s(self) -> float:
         """Return for how long no link, channel or standing shell may be opened, 0 where they may."""
-        return max((one.remaining_s for one in self._silences), default=0.0)
+        return max((silence.remaining_s for silence in self._silences), default=0.0)
 
     def close(self) -> None:
         """End the link, and all waiting for it in other threads."""

@@ -192,7 +192,7 @@ gone() { # the end of every job of this folder that was let go by `stop`; set la
     done
 }
 
-end() { # all jobs in the folders $@ and say which: signal all, then give them 2 s together
+end() { # all jobs in the folders $@ and say which: signal all, then give them 2 s together; see `jobs.unhurried_file`
     for dir do
         [ -d "$dir/.jobs" ] && { printf '%s\n' "${by-}" >"$dir/.ended"; } 2>/dev/null
         for meta in "$dir"/.jobs/*; do
@@ -205,6 +205,7 @@ end() { # all jobs in the folders $@ and say which: signal all, then give them 2
             alive "$meta" || continue
             [ -n "$patient" ] && await "$meta" 2 && continue
             patient=
+            [ ! -e "$meta/unhurried" ] || continue
             signal KILL && await "$meta" 2 || stuck="$stuck ${dir#"${base%/*}"/}/${meta##*/}"
         done
     done

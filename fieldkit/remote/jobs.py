@@ -27,12 +27,14 @@ __all__ = [
     "begin_wait",
     "bound",
     "command",
+    "exit_file",
     "install",
     "left",
     "run",
     "serve",
     "start",
     "stop",
+    "unhurried_file",
     "work_folder",
 ]
 
@@ -83,6 +85,19 @@ class Job:
 def work_folder(trial: str, attempt: str) -> str:
     """Return the folder on the robot for one attempt at a repeat."""
     return f"{HOME}/{trial}/{attempt}"
+
+
+def exit_file(job: Job) -> str:
+    """Return the file, in the folder of its attempt, that holds the exit code of a job that has ended."""
+    return f".jobs/{job.name}/exit"
+
+
+def unhurried_file(name: str) -> str:
+    """Return the file, in the folder of its attempt, by which a job says that it needs its time to end.
+
+    Who ends all jobs tells it to end as all others, and does not kill it while that is there.
+    """
+    return f".jobs/{name}/unhurried"
 
 
 def bound(protocol: Protocol, port: int) -> str:
@@ -202,7 +217,7 @@ def stop(
         signal: Name without `SIG`.
         grace_s: Time to end by itself, whole seconds.
         settle: File in the job's folder that must have stopped growing first.
-        parting: The job has done its work once its log has this; only `evidence.fetch` then waits for its end,
+        parting: The job has done its work once its log has this; only `fetching.fetch` then waits for its end,
             and fails if its exit code is not 0.
 
     Returns:

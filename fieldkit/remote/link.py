@@ -9,13 +9,12 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import Final
 
-import paramiko
-
 from fieldkit.core.deadline import Deadline, bounded
 from fieldkit.core.errors import HostKeyError, RobotError
 from fieldkit.core.units import format_count
 from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.keys import private_keys
+from fieldkit.remote.ssh_library import paramiko
 
 Connect = Callable[[float], socket.socket]
 """Returns a fresh connected stream socket to the robot's SSH server within so many seconds, or raises OSError."""

@@ -94,9 +94,8 @@ def demand(shell: Shell, done: Completed, *, remedy: str = "") -> None:
     """Raise what a failed call of the script means: as `call`."""
     if done.exit_code == 0:
         return
-    said = (
-        printable(done.stderr or done.stdout) or "no message"
-    )  # a login shell that lets nobody in says so on either
+    # A login shell that lets nobody in says so on either stream.
+    said = printable(done.stderr or done.stdout) or "no message"
     what = complaint(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {said}"
     match done.exit_code:
         case 75 if held := _HELD.match(what):  # codes of the script's own, see common.sh

@@ -64,7 +64,7 @@ class Standing:
         with self._lock:
             if self._link is not link:
                 self._link, self._shells, self._opening = link, [], False
-            self._shells = [one for one in self._shells if one.alive]
+            self._shells = [shell for shell in self._shells if shell.alive]
             if self._opening or len(self._shells) == _SHELLS:
                 return
             self._opening = True

@@ -35,7 +35,7 @@ unwatch() { # $1 role: end it
 }
 
 sample() { # $1 interface, $2 token of the lock, or -: until it is ended, the folder goes, or the lock is another's
-    interface=$1 token=$2 look=0 again=0
+    interface=$1 token=$2 look=0 again=0 wifi=
     ulimit -f "$BLOCKS"
     exec 8<>.jobs/link/end # into which nobody writes
     [ -z "$({ read -r -t 0.01 _ <&8; } 2>&1)" ] && waits=1 || waits=
@@ -50,7 +50,9 @@ sample() { # $1 interface, $2 token of the lock, or -: until it is ended, the fo
                 look=$((at + SEEN))
                 [ "$token" = - ] || ours || return 0
                 section link
-                said=$(iw dev "$interface" link) || return 0
+                # It fails where there is no Wi-Fi, and also while a station is being lost.
+                said=$(iw dev "$interface" link) || [ -n "$wifi" ] || return 0
+                wifi=1
                 echo "$said"
                 section survey
                 iw dev "$interface" survey dump

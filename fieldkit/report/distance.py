@@ -13,9 +13,9 @@ from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities, Identity, panels
 from fieldkit.report.evidence import Evidence
 
-LOSS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "topic_loss")
+LOSS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "topic_loss", "iperf3_loss", "iperf3_captured_loss")
 DELAY: Final = ("rtt_median_s", "one_way_median_s", "delay_s", "transfer_s", "topic_delay_median_s")
-RATE: Final = ("goodput_bit_s", "throughput_bit_s")
+RATE: Final = ("goodput_bit_s", "throughput_bit_s", "iperf3_throughput_bit_s")
 
 _LEAST_TOP_PERCENT: Final = 1.0
 _MOST_ROOM: Final = 2.0
@@ -119,8 +119,8 @@ def _chart(measured: Mapping[Quantity, Sequence[Cell]], identities: Identities, 
 
 
 def _capital(label: str) -> str:
-    """Return a label as it begins a line."""
-    return label[:1].upper() + label[1:]
+    """Return a label as it begins a line; a program is called as it is."""
+    return label if label.startswith("iperf3") else label[:1].upper() + label[1:]
 
 
 def _titled(title: str, quantity: Quantity | None, cells: Sequence[Cell], evidence: Evidence) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.judgements import Judgement, Ruling, judge_own
+from fieldkit.analysis.wording import judged
 from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
 
@@ -41,9 +42,8 @@ def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence
 
 def _verdict(said: Judgement, told: Collection[str]) -> JudgementRow:
     place = wording.condition(said.cell, told=told) if said.cell else ""
-    if said.found is None:
-        return JudgementRow(place, "nothing", "", said.ruling)
-    return JudgementRow(place, wording.value(said.found), wording.interval(said.found), said.ruling)
+    _, _, value, interval, _ = judged(said)
+    return JudgementRow(place, wording.unbroken(value), wording.unbroken(interval), said.ruling)
 
 
 def _of(cell: Cell, evidence: Evidence) -> Iterator[Expectation]:

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.comparable import mixtures
 from fieldkit.analysis.quantities import Quantity, alike
 from fieldkit.analysis.repeats import Repeats
@@ -22,9 +22,6 @@ from fieldkit.report.evidence import Evidence
 _HEADLINES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
 _HEADLINES_OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
 """Of trials that stream topics, beside which pings and transfers are there for clocks and load."""
-
-_MOST_OF_STEPS: Final = 2
-"""Headlines of one quantity and protocol."""
 
 
 @dataclass(frozen=True)
@@ -84,40 +81,51 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
 
 
 def headlines(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Headline]:
-    """Yield the least and the largest figure of each protocol, with intervals and conditions."""
+    """Yield the least and the largest figure of each protocol, with intervals and conditions.
+
+    Steps that are told apart by name alone share a headline: the step is part of the condition there.
+    """
     told = wording.differing(cells)
     for protocol, names in _HEADLINES.items():
         mine = [one for one in cells if one.key["protocol"] == protocol]
         has_topics = bool(alike(measured(mine), _HEADLINES_OF_TOPICS[0]))
-        for quantity in _of_headlines(measured(mine), _HEADLINES_OF_TOPICS if has_topics else names):
-            name, label = quantity.name, quantity.label
-            found = [one for one in mine if name in one.estimates]
-            found.sort(key=lambda one: one.estimates[name].value)
-            says_so = has_topics or quantity.plain_label.startswith(protocol.upper())
+        for same in _of_headlines(measured(mine), _HEADLINES_OF_TOPICS if has_topics else names):
+            first = same[0]
+            label = first.label if len(same) == 1 else first.plain_label
+            found = [(cell, cell.estimates[one.name]) for one in same for cell in mine if one.name in cell.estimates]
+            found.sort(key=lambda one: one[1].value)
+            says_so = has_topics or first.plain_label.startswith(protocol.upper())
             subject = label if says_so else f"{label} with {protocol.upper()}"
-            sizes = evidence.payloads(found, quantity.step) if plain_name(name) == "rtt_median_s" else ()
-            yield Headline(", ".join((subject, *sizes)), _ends(found, name, told))
+            is_rtt = plain_name(first.name) == "rtt_median_s"
+            sizes = (size for one in same for size in evidence.payloads(mine, one.step) if is_rtt)
+            yield Headline(", ".join((subject, *dict.fromkeys(sizes))), _ends(found, told, by_step=len(same) > 1))
 
 
-def _of_headlines(found: Sequence[Quantity], names: Sequence[str]) -> list[Quantity]:
-    """Return the quantities called `names`, of named steps where others have none; else the first that there are."""
-    chosen = [one for name in names for one in _first_alike(found, name)]
-    return chosen or list(found[: len(names)])
+def _of_headlines(found: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
+    """Return the quantities called `names`, else the first that there are, each with its like of other steps."""
+    chosen = [one for name in names if (one := _alike(found, name))]
+    others = dict.fromkeys(plain_name(one.name) for one in found)
+    return chosen or [_alike(found, name) for name in list(others)[: len(names)]]
 
 
-def _first_alike(found: Sequence[Quantity], name: str) -> list[Quantity]:
+def _alike(found: Sequence[Quantity], name: str) -> list[Quantity]:
+    """Return the quantity of a name; of named steps where no other measures it."""
     same = alike(found, name)
-    return same[:1] if same and not same[0].step else same[:_MOST_OF_STEPS]
+    return same[:1] if same and not same[0].step else same
 
 
-def _ends(cells: Sequence[Cell], name: str, told: Collection[str]) -> list[Extreme]:
-    """Return the least and the largest figure of cells that are sorted by it, or the one that all have."""
+def _ends(found: Sequence[tuple[Cell, Estimate]], told: Collection[str], *, by_step: bool) -> list[Extreme]:
+    """Return the least and the largest of figures that are sorted, or the one that all have."""
     least, most = (
-        Extreme(which, wording.value(end), wording.interval(end), wording.place(cell, told=told))
-        for which, cell in (("least", cells[0]), ("most", cells[-1]))
-        for end in (cell.estimates[name],)
+        Extreme(
+            which,
+            wording.value(end),
+            wording.interval(end),
+            ", ".join(filter(None, (end.quantity.step if by_step else "", wording.place(cell, told=told)))),
+        )
+        for which, (cell, end) in (("least", found[0]), ("most", found[-1]))
     )
-    if len(cells) == 1:
+    if len(found) == 1:
         return [replace(least, which="")]
     if least.value == most.value:
         return [replace(least, which="in all conditions", interval="", place="")]
@@ -136,7 +144,7 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
         places = [wording.condition(cell, told=told) for cell in none]
         yield Caution(f"Nothing valid in {format_count(len(none), 'condition')}.", places)
     for caution in cautions(cells):
-        yield Caution(f"{caution}.")
+        yield Caution(f"{caution}.".replace(" %", "\N{NO-BREAK SPACE}%"))
     if single := sum(cell.n_valid == 1 for cell in cells):
         yield Caution(f"{single} of {len(cells)} conditions have a single valid repeat, and no intervals.")
     valid = repeats.where(repeats.texts["status"] == Status.VALID)

@@ -11,12 +11,12 @@ from fieldkit.core.units import format_distance
 
 def value(found: Estimate) -> str:
     """Return the figure to quote, unbroken: `3.21 %`."""
-    return _unbroken(_scale(found).amount(found.value))
+    return unbroken(_scale(found).amount(found.value))
 
 
 def interval(found: Estimate) -> str:
     """Return its interval, unbroken: `[1.10, 6.70]`; empty where there is none."""
-    return _unbroken(interval_of(_scale(found), found))
+    return unbroken(interval_of(_scale(found), found))
 
 
 def estimate(found: Estimate) -> str:
@@ -24,7 +24,8 @@ def estimate(found: Estimate) -> str:
     return f"{value(found)} {interval(found)}".strip()
 
 
-def _unbroken(said: str) -> str:
+def unbroken(said: str) -> str:
+    """Return words between which no line is broken."""
     return said.replace(" ", "\N{NO-BREAK SPACE}")
 
 
@@ -49,7 +50,7 @@ def distance(cell: Cell) -> str:
     if cell.key["distance_m"] is None:
         return label or "distance unknown"
     said = format_distance(Distance(metres(cell), label)) if label else f"{metres(cell):.2f} m"
-    return _unbroken(said)
+    return unbroken(said)
 
 
 def scenario(cell: Cell) -> str:

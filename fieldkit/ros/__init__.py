@@ -1,1 +1,1 @@
-"""What robots speak, on the laptop's side: message types, names on the wire, qualities of service."""
+"""ROS on the laptop's side: message types, names on the wire, qualities of service, bridges."""

@@ -150,7 +150,7 @@ def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTy
     if near.over == far.over:
         # Nobody could tell what came by the bridge: both ends are the same node or share a network.
         raise ConfigurationError(f"a bridge from {near.over} to {far.over} is none", remedy="name two middlewares")
-    ways = [(one.topic, one.back) for one in crossings]
+    ways = [(crossing.topic, crossing.back) for crossing in crossings]
     for one in crossings:
         if ways.count((one.topic, one.back)) > 1:
             raise ConfigurationError(f"{one.topic} is named twice for the same way", remedy="name it once")

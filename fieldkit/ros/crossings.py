@@ -152,8 +152,8 @@ class CrossingTally:
     def _delay_s(self, share: float) -> float | None:
         """Return the least delay that this share of messages do not exceed."""
         missing = math.ceil(share * self._messages)
-        for one in sorted(self._classes):
-            missing -= self._classes[one]
+        for number in sorted(self._classes):
+            missing -= self._classes[number]
             if missing <= 0:
-                return math.exp(one * _BUCKET) / 1e9
+                return math.exp(number * _BUCKET) / 1e9
         return None

@@ -4,12 +4,10 @@ DDS: "Topic and Service name mapping to DDS" and the mapping of interfaces to ID
 Zenoh: docs/design.md of github.com/ros2/rmw_zenoh, sections Publishers and Graph Cache, from its version 0.3 on.
 """
 
-import re
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, Self
+from typing import Final
 
-from fieldkit.core.errors import EvidenceError
 from fieldkit.ros import qos
 from fieldkit.ros.qos import QosProfile
 
@@ -20,9 +18,6 @@ NO_HASH: Final = "TypeHashNotSupported"
 """Stands for the hash of a type where ROS 2 has none: in rmw_zenoh of Humble."""
 
 _TOPIC_PREFIX: Final = "rt"
-_DDS_TYPE: Final = re.compile(r"(?P<package>\w+)::(?P<kind>msg|srv|action)::dds_::(?P<name>\w+)_", re.ASCII)
-_OF_NODE: Final = 9
-_OF_ENDPOINT: Final = 13
 
 
 def dds_type(name: str) -> str:
@@ -31,21 +26,9 @@ def dds_type(name: str) -> str:
     return f"{package}::{kind}::dds_::{short}_"
 
 
-def ros_type(name: str) -> str | None:
-    """Return the ROS name of a DDS type, `sensor_msgs/msg/LaserScan`; None where it is no type of ROS."""
-    found = _DDS_TYPE.fullmatch(name)
-    return found and "/".join(found.group("package", "kind", "name"))
-
-
 def dds_topic(topic: str) -> str:
     """Return the DDS name of a topic: `rt/scan` of `/scan`."""
     return f"{_TOPIC_PREFIX}/{topic.lstrip('/')}"
-
-
-def ros_topic(name: str) -> str | None:
-    """Return the ROS name of a DDS topic, `/scan`; None where it is no topic of ROS."""
-    prefix, slash, rest = name.partition("/")
-    return f"/{rest}" if prefix == _TOPIC_PREFIX and slash else None
 
 
 def user_data(rihs01: str) -> str:
@@ -64,17 +47,15 @@ class Entity(StrEnum):
     NODE = "NN"
     PUBLISHER = "MP"
     SUBSCRIPTION = "MS"
-    SERVICE = "SS"
-    CLIENT = "SC"
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """A publisher, a subscription, or one end of a service.
+    """A publisher or a subscription.
 
     Attributes:
         topic: `/scan`.
-        type_name: `sensor_msgs/msg/LaserScan`, or the DDS name of what is no type of ROS.
+        type_name: `sensor_msgs/msg/LaserScan`.
         rihs01: Its hash.
         qos: Its quality of service.
     """
@@ -125,38 +106,11 @@ class Token:
         node = (_mangled(self.enclave), _mangled(self.namespace), _mangled(self.node))
         if self.endpoint is None:
             return "/".join((*head, *node))
-        one = self.endpoint
-        known = "/" in one.type_name
-        kind = dds_type(one.type_name) if known else one.type_name
-        return "/".join((*head, *node, _mangled(one.topic), kind, one.rihs01, qos.to_zenoh(one.qos)))
-
-    @classmethod
-    def parse(cls, key: str) -> Self:
-        """Return what a key expression tells.
-
-        What newer versions append is passed over.
-
-        Raises:
-            EvidenceError: It is no liveliness token.
-        """
-        parts = key.split("/")
-        whole = parts[0] == ADMIN_SPACE and len(parts) >= _OF_NODE and "" not in parts[:_OF_NODE]
-        try:
-            entity = Entity(parts[5] if whole else "")
-            enclave, namespace, node = map(_demangled, parts[6:_OF_NODE])
-            endpoint = None
-            if entity is not Entity.NODE:
-                topic, kind, rihs01, quality = parts[_OF_NODE:_OF_ENDPOINT]
-                endpoint = Endpoint(_demangled(topic), ros_type(kind) or kind, rihs01, qos.from_zenoh(quality))
-            numbers = int(parts[1]), parts[2], int(parts[3]), int(parts[4])
-            return cls(*numbers, entity, node, namespace, enclave, endpoint)
-        except ValueError:
-            raise EvidenceError(f"{key[:200]!r} is no liveliness token of rmw_zenoh") from None
+        end = self.endpoint
+        return "/".join(
+            (*head, *node, _mangled(end.topic), dds_type(end.type_name), end.rihs01, qos.to_zenoh(end.qos))
+        )
 
 
 def _mangled(name: str) -> str:
     return name.replace("/", "%") or "%"
-
-
-def _demangled(name: str) -> str:
-    return name.replace("%", "/")

@@ -90,12 +90,24 @@ _ZENOH: Final = QosProfile(depth=42, liveliness=Liveliness.AUTOMATIC)
 
 _SECOND_NS: Final = 10**9
 _INFINITE_NS: Final = 2**63 - 1  # RMW_DURATION_INFINITE
-_PARTS: Final = 6
 
 Kind = TypeVar("Kind", bound=Policy)
 
 
-def adapted(profile: QosProfile) -> QosProfile:
+def to_zenoh(profile: QosProfile) -> str:
+    """Return a profile as the last part of a liveliness token: `2::,5:,:,:,,` of sensor data."""
+    own = _adapted(profile)
+    kinds = (own.reliability, own.durability, own.history, own.liveliness)
+    usual = (_ZENOH.reliability, _ZENOH.durability, _ZENOH.history, _ZENOH.liveliness)
+    reliability, durability, history, liveliness = (
+        "" if kind is other else str(kind.value) for kind, other in zip(kinds, usual, strict=True)
+    )
+    depth = "" if own.depth == _ZENOH.depth else str(own.depth)
+    deadline, lifespan, lease = (_duration(time_ns) for time_ns in (own.deadline_ns, own.lifespan_ns, own.lease_ns))
+    return f"{reliability}:{durability}:{history},{depth}:{deadline}:{lifespan}:{liveliness},{lease}"
+
+
+def _adapted(profile: QosProfile) -> QosProfile:
     """Return what rmw_zenoh makes of a profile: what is left to the middleware has its values."""
     return replace(
         profile,
@@ -111,19 +123,6 @@ def _chosen(policy: Kind, otherwise: Kind) -> Kind:
     return policy if policy.value else otherwise
 
 
-def to_zenoh(profile: QosProfile) -> str:
-    """Return a profile as the last part of a liveliness token: `2::,5:,:,:,,` of sensor data."""
-    own = adapted(profile)
-    kinds = (own.reliability, own.durability, own.history, own.liveliness)
-    usual = (_ZENOH.reliability, _ZENOH.durability, _ZENOH.history, _ZENOH.liveliness)
-    reliability, durability, history, liveliness = (
-        "" if kind is other else str(kind.value) for kind, other in zip(kinds, usual, strict=True)
-    )
-    depth = "" if own.depth == _ZENOH.depth else str(own.depth)
-    deadline, lifespan, lease = (_duration(one) for one in (own.deadline_ns, own.lifespan_ns, own.lease_ns))
-    return f"{reliability}:{durability}:{history},{depth}:{deadline}:{lifespan}:{liveliness},{lease}"
-
-
 def _duration(time_ns: int | None) -> str:
     if time_ns is None:
         return ","
@@ -132,37 +131,3 @@ def _duration(time_ns: int | None) -> str:
         "" if own == usual else str(own)
         for own, usual in zip(divmod(time_ns, _SECOND_NS), divmod(_INFINITE_NS, _SECOND_NS), strict=True)
     )
-
-
-def from_zenoh(text: str) -> QosProfile:
-    """Return the profile that the last part of a liveliness token tells.
-
-    Raises:
-        ValueError: It is none.
-    """
-    parts = text.split(":")
-    if len(parts) < _PARTS:
-        raise ValueError(f"{text!r} is no quality of service of rmw_zenoh")
-    history, depth = parts[2].split(",")
-    liveliness, *lease = parts[5].split(",")
-    return QosProfile(
-        reliability=_kind(Reliability, parts[0], _ZENOH.reliability),
-        history=_kind(History, history, _ZENOH.history),
-        depth=int(depth) if depth else _ZENOH.depth,
-        durability=_kind(Durability, parts[1], _ZENOH.durability),
-        deadline_ns=_time_ns(parts[3].split(",")),
-        lifespan_ns=_time_ns(parts[4].split(",")),
-        liveliness=_kind(Liveliness, liveliness, _ZENOH.liveliness),
-        lease_ns=_time_ns(lease),
-    )
-
-
-def _kind(kind: type[Kind], text: str, usual: Kind) -> Kind:
-    return kind(int(text)) if text else usual
-
-
-def _time_ns(parts: list[str]) -> int | None:
-    usual_s, usual_ns = divmod(_INFINITE_NS, _SECOND_NS)
-    seconds, nanoseconds = parts
-    time_ns = (int(seconds) if seconds else usual_s) * _SECOND_NS + (int(nanoseconds) if nanoseconds else usual_ns)
-    return None if time_ns >= _INFINITE_NS else time_ns

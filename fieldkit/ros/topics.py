@@ -48,7 +48,9 @@ def describe(
             "deadline_ns": qos.deadline_ns,
             "lifespan_ns": qos.lifespan_ns,
         },
-        "members": {name: [(one.name, one.type, one.count) for one in of] for name, of in members.items()},
+        "members": {
+            name: [(member.name, member.type, member.count) for member in of] for name, of in members.items()
+        },
         "dds_topic": names.dds_topic(topic),
         "dds_types": {name: names.dds_type(name) for name in members},
         "user_data": names.user_data(rihs01),

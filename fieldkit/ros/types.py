@@ -87,11 +87,6 @@ class MessageType:
     md5: str
     rihs01: str
 
-    @property
-    def ros1_name(self) -> str:
-        """The name in ROS 1, `sensor_msgs/LaserScan`."""
-        return self.name.replace("/msg/", "/")
-
 
 class MessageTypes:
     """The message types that a lab knows.
@@ -144,27 +139,26 @@ class MessageTypes:
         found: dict[str, tuple[MessageField, ...]] = {}
         waiting = [full_name(name)]
         while waiting:
-            one = waiting.pop(0)
-            if one in found:
+            kind = waiting.pop(0)
+            if kind in found:
                 continue
-            if one not in self.ros2.fielddefs:
-                raise self._unknown(one)
-            found[one] = tuple(_field(*member) for member in self.ros2.fielddefs[one][1])
-            waiting += [member.type for member in found[one] if "/" in member.type]
+            if kind not in self.ros2.fielddefs:
+                raise self._unknown(kind)
+            found[kind] = tuple(_field(*member) for member in self.ros2.fielddefs[kind][1])
+            waiting += [member.type for member in found[kind] if "/" in member.type]
         return found
 
-    def translatable(self, name: str) -> bool:
+    def translatable(self, type_name: str) -> bool:
         """Return whether a message of this type in one ROS is one of the other, but for `seq` of headers."""
-        known = self.ros1.fielddefs
         return all(
-            one == _HEADER or (one in known and [_char_as_uint8(kind) for _, kind in known[one][1]] == kinds)
-            for one in self.fields(name)
-            for kinds in ([kind for _, kind in self.ros2.fielddefs[one][1]],)
+            name == _HEADER
+            or (name in self.ros1.fielddefs and _char_as_uint8(_kinds(self.ros1, name)) == _kinds(self.ros2, name))
+            for name in self.fields(type_name)
         )
 
     def _unknown(self, name: str) -> ConfigurationError:
         known = self.ros1.fielddefs.keys() | self.ros2.fielddefs.keys()
-        last = {one.rpartition("/")[2]: one for one in known}
+        last = {full.rpartition("/")[2]: full for full in known}
         remedy = nearest(name, last.values(), "give its definition")
         return ConfigurationError(f"there is no message type {name}", remedy=remedy)
 
@@ -185,7 +179,7 @@ def _add(store: Typestore, definitions: Mapping[str, str]) -> None:
     for name, text in definitions.items():
         try:
             found = get_types_from_msg(text, name)
-            store.register({one: found[one] for one in found if one not in store.fielddefs})
+            store.register({kind: found[kind] for kind in found if kind not in store.fielddefs})
         except (TypesysError, AssertionError, ValueError, KeyError) as error:
             raise ConfigurationError(
                 f"the definition of {name} is none: {error}", remedy="write it as in a .msg file of ROS"
@@ -198,10 +192,15 @@ def _add(store: Typestore, definitions: Mapping[str, str]) -> None:
                 )
 
 
+def _kinds(store: Typestore, name: str) -> list[Any]:
+    """Return the descriptions of a type's members, without their names."""
+    return [description for _, description in store.fielddefs[name][1]]
+
+
 def _char_as_uint8(node: Any) -> Any:  # noqa: ANN401 (of rosbags, whose own type is recursive)
     """Return a description of members, tuples in lists, with one type of the language for another."""
     if isinstance(node, list):
-        return [_char_as_uint8(one) for one in node]
+        return [_char_as_uint8(part) for part in node]
     if not isinstance(node, tuple):
         return node
     return ("uint8", 0) if node == ("char", 0) else tuple(map(_char_as_uint8, node))

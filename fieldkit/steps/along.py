@@ -20,7 +20,7 @@ class AlongStep(Step):
 
     lasts_by: ClassVar[str] = "duration"
 
-    along: Bool = Field(default=False, exclude_if=lambda along: not along)
+    along: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _lasts_one_time(self) -> Self:

@@ -6,7 +6,7 @@ from contextlib import suppress
 from functools import cache, partial
 from inspect import isabstract
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.config import schema
@@ -23,7 +23,13 @@ from fieldkit.remote import jobs
 from fieldkit.steps import kinds
 from fieldkit.steps.scene import Announce, Flow, ListeningPort, Need, Pinging, Planned, RecordedFile, Refusal, Scene
 
-NAME: Final = r"^[a-z][a-z0-9_]{0,30}$"
+StepName = Annotated[
+    str,
+    schema.shaped(r"^[a-z][a-z0-9_]{0,30}$", "a name: small letters, digits and _, a small letter first, 31 in all"),
+]
+FileName = Annotated[
+    str, schema.shaped(r"^[a-z][a-z0-9_.-]{0,40}$", "the name of a file: small letters, digits, _ . and -, 41 in all")
+]
 """What a step, and a bag, may be called."""
 
 
@@ -76,7 +82,7 @@ class Step(Strict, ABC):
 
     columns: ClassVar[tuple[Column, ...]] = ()
 
-    name: Annotated[str, Field(pattern=NAME)] = Field(default="", exclude_if=lambda name: not name)
+    name: StepName = Field(default="", exclude_if=schema.is_empty)
 
     @property
     def prefix(self) -> str:
@@ -115,6 +121,10 @@ class Step(Strict, ABC):
 
     def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
         """Yield what the testbed does beside the commands, in words: `--dry-run` prints it."""
+        return iter(())
+
+    def cut_short(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most leave robots where they are)
+        """Yield in words what robots do that move where somebody stops the attempt at once."""
         return iter(())
 
     @abstractmethod
@@ -310,8 +320,8 @@ class Nest(Step, ABC):
 
     def own(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.own`."""
-        others = {(one.role, one.job.name) for one in self.inside(scene)}
-        return (one for one in self.commands(scene) if (one.role, one.job.name) not in others)
+        others = {(planned.role, planned.job.name) for planned in self.inside(scene)}
+        return (planned for planned in self.commands(scene) if (planned.role, planned.job.name) not in others)
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`."""
@@ -323,14 +333,19 @@ class Nest(Step, ABC):
         for entry in self.during:
             yield from entry.step.beside(scene)
 
+    def cut_short(self, scene: Scene) -> Iterator[str]:
+        """See `Step.cut_short`."""
+        for entry in self.during:
+            yield from entry.step.cut_short(scene)
+
     def with_record(self, duration_s: float) -> Self:
         """See `Step.with_record`."""
-        during = tuple(StepEntry(one.kind, one.step.with_record(duration_s)) for one in self.during)
+        during = tuple(StepEntry(entry.kind, entry.step.with_record(duration_s)) for entry in self.during)
         return self.model_copy(update={"during": during})
 
     def fitted(self, cast: Cast, way_s: float | None = None) -> Self:
         """See `Step.fitted`."""
-        during = tuple(StepEntry(one.kind, one.step.fitted(cast, way_s)) for one in self.during)
+        during = tuple(StepEntry(entry.kind, entry.step.fitted(cast, way_s)) for entry in self.during)
         return self.model_copy(update={"during": during})
 
     def shortened(self, cast: Cast) -> Iterator[str]:
@@ -351,9 +366,9 @@ class Nest(Step, ABC):
         Raises:
             LinkError: A robot did not answer.
         """
-        for one in self.inside(scene):
+        for planned in self.inside(scene):
             with suppress(RobotError):  # it was never started
-                jobs.stop(testbed.shells[one.role], one.job)
+                jobs.stop(testbed.shells[planned.role], planned.job)
 
     def roles_inside(self) -> frozenset[Role]:
         """Return the roles that the steps inside need."""

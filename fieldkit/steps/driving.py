@@ -6,12 +6,16 @@ from contextlib import contextmanager, suppress
 from types import MappingProxyType
 from typing import Any, Final
 
+from fieldkit.agent import drive_plan
+from fieldkit.agent.drive_plan import DriveTask
 from fieldkit.backends.driven import disturbed
 from fieldkit.backends.protocols import Robot, Testbed
+from fieldkit.config.profiles import Drive
 from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, RobotError
 from fieldkit.core.model import Move
+from fieldkit.core.text import JSON_ERRORS, brief
 from fieldkit.measure.evidence import drive_log
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
@@ -35,10 +39,15 @@ _RENEWALS: Final = 5
 _GRACE_S: Final = 3.0
 _SILENT_S: Final = 10.0
 
-HOME: Final = "home"
+_ZENOH_PORT: Final = 7447
+"""Zenoh's own, at which rmw_zenoh's router listens."""
 
 _NAMED: Final = MappingProxyType(
-    {Over.ROS1: ("md5", "definition"), Over.DDS: ("members", "dds_topic", "dds_types", "user_data"), Over.ZENOH: ()}
+    {
+        Over.ROS1: ("md5", "definition"),
+        Over.DDS: ("members", "dds_topic", "dds_types", "user_data"),
+        Over.ZENOH: ("key", "tokens"),
+    }
 )
 """What each middleware wants to know of a topic: command lines are for people, too."""
 
@@ -51,12 +60,17 @@ def over(robot: Robot) -> Over:
     ros = robot.profile.ros
     if ros is None or ros.variant == "ros1":
         return Over.ROS1
-    return Over.ZENOH if ros.command.rmw == "zenoh" else Over.DDS
+    return Over(ros.middleware)
 
 
 def limit_s(move: Move) -> float:
     """Return how long one way of a move may take, in seconds, before the robot stops."""
     return 2 * geometry.length_m(move) / move.speed_m_s + _TURN_S * (len(move.legs) + 1) + _SLACK_S
+
+
+def way_s(robot: Robot, move: Move) -> float:
+    """Return how long a robot takes for one way of a move, with its turns, to the millisecond."""
+    return round(drive_plan.way_s(DriveTask.from_json(_task(robot, move))), 3)
 
 
 def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
@@ -103,12 +117,6 @@ def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
     if why := disturbed(robot, scene.cast.values()):
         remedy = "give each its own topics, or ROS domain or master; or let somebody move it: without --allow-motion"
         yield Refusal(move.role, why, remedy)
-    if over(robot) is Over.ZENOH:
-        yield Refusal(
-            move.role,
-            "its ROS 2 speaks over Zenoh, and robots are driven over ROS 1 and DDS",
-            "rmw: cyclonedds in its profile, if it has that too; or let somebody move it: without --allow-motion",
-        )
 
 
 def files(name: str) -> tuple[str, ...]:
@@ -116,46 +124,76 @@ def files(name: str) -> tuple[str, ...]:
     return tuple(name.format(one) for one in (drive_log.FILE, orders_file("drive"), _STATUS, _TEXT))
 
 
+def _drive(robot: Robot) -> Drive:
+    """Return how a robot is driven.
+
+    Raises:
+        RobotError: Its profile does not say.
+    """
+    if robot.profile.drive is None:
+        raise RobotError(
+            "it cannot be driven", where=robot.name, remedy="add drive: and limits.fence_m to its profile"
+        )
+    return robot.profile.drive
+
+
+def _task(robot: Robot, move: Move) -> dict[str, Any]:
+    """Return what a robot is to drive, as `fieldkit.agent.steering.DriveTask` has it."""
+    drive = _drive(robot)
+    return {
+        "legs": [(leg.away_m, leg.left_m) for leg in move.legs],
+        "speed_m_s": move.speed_m_s,
+        "turn_rad_s": drive.turn_rad_s,
+        "acceleration_m_s2": drive.acceleration_m_s2,
+        "fence_m": robot.profile.limits.fence_m,  # of which a profile that drives has one
+        "lease_s": drive.lease,
+        "odometry_s": ODOMETRY_S,
+        "limit_s": limit_s(move),
+    }
+
+
 def _told(robot: Robot, move: Move, name: str) -> str:
     """Return what the driver is told, as JSON."""
     from fieldkit.ros import topics, types  # noqa: PLC0415 (50 ms, and only a robot that drives needs it)
     from fieldkit.ros.qos import PROFILES  # noqa: PLC0415
 
-    drive = robot.profile.drive
-    if drive is None or robot.profile.limits.fence_m is None:
-        raise RobotError(
-            "it cannot be driven", where=robot.name, remedy="add drive: and limits.fence_m to its profile"
-        )
-    way = over(robot)
-    domain = int((robot.profile.ros.environment if robot.profile.ros else {}).get("ROS_DOMAIN_ID", "0"))
-    shipped, node = types.shipped(), f"fieldkit_drive_{robot.name}".replace("-", "_")
+    drive = _drive(robot)
+    way, ros = over(robot), robot.profile.ros
+    known = types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.shipped()
+    network = _network(robot, way) | {"gid_bytes": known.distribution.gid_bytes}
 
-    def topic(called: str, kind: str, profile: str) -> dict[str, Any]:
-        described = topics.describe(shipped, called, kind, PROFILES[profile], domain=domain, node=node)
+    def topic(called: str, kind: str, profile: str, number: int) -> dict[str, Any]:
+        described = topics.describe(
+            known, called, kind, PROFILES[profile], domain=network["domain"], node=network["node"], number=number
+        )
         return {key: described[key] for key in ("name", "type", "quality", *_NAMED[way])}
 
-    task = {
-        "legs": [(leg.away_m, leg.left_m) for leg in move.legs],
-        "speed_m_s": move.speed_m_s,
-        "turn_rad_s": drive.turn_rad_s,
-        "acceleration_m_s2": drive.acceleration_m_s2,
-        "fence_m": robot.profile.limits.fence_m,
-        "lease_s": drive.lease,
-        "odometry_s": ODOMETRY_S,
-        "limit_s": limit_s(move),
-    }
     told = {
         "over": way.value,
-        # Nodes on the robot itself hear of this one also where nobody hears multicast.
-        "network": {"address": robot.address, "peers": [robot.address], "domain": domain, "node": node},
+        "network": network,
         "cdr": way is not Over.ROS1,
-        "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default"),
-        "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data"),
-        "task": task,
+        "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default", 1),
+        "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
+        "task": _task(robot, move),
         "orders": orders_file(name.format("drive")),
         "status": name.format(_STATUS),
     }
     return streams.compact(told)
+
+
+def _network(robot: Robot, way: Over) -> dict[str, Any]:
+    """Return how the driver finds the nodes of its own robot, also where nobody hears multicast."""
+    found = {
+        "address": robot.address,
+        "domain": robot.profile.ros.domain if robot.profile.ros else 0,
+        "node": f"fieldkit_drive_{robot.name}".replace("-", "_"),
+    }
+    if way is not Over.ZENOH:
+        return found | {"peers": [robot.address]}
+    # rmw_zenoh's router on the robot tells it of all sessions there; a session may be where a router would be.
+    near = [f"tcp/{address}:{_ZENOH_PORT}" for address in ("127.0.0.1", robot.address)]
+    own = {"connect/endpoints": streams.compact(near), "listen/endpoints": f'["tcp/{robot.address}:0"]'}
+    return found | {"settings": own}
 
 
 class DriveLease(HeldLease):
@@ -169,17 +207,14 @@ class DriveLease(HeldLease):
     """
 
     def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
-        from fieldkit.agent import steering  # noqa: PLC0415 (only a robot that drives needs it)
-
-        self._back = steering.BACK
         super().__init__(
-            shell, job, says=name.format(_STATUS), order=steering.OUT, lease_s=lease_s, renewals=_RENEWALS
+            shell, job, says=name.format(_STATUS), order=drive_plan.OUT, lease_s=lease_s, renewals=_RENEWALS
         )
 
     def turn_back(self) -> None:
         """Want the robot at its place again; where it does not hear of it now, it does with a renewal, or stops."""
         with suppress(LinkError, RobotError):
-            self.order(self._back)
+            self.order(drive_plan.BACK)
 
     @property
     def status(self) -> dict[str, Any]:
@@ -193,13 +228,16 @@ class DriveLease(HeldLease):
         A driver writes its status ten times a second: one that does not has ended, or is out of reach.
         """
         status, silent_s = self.status, self.unchanged_s
-        if ended := status.get("ended"):
-            return str(ended)
-        return (
-            f"nothing was heard of its driver for {silent_s:.0f} s"
-            if silent_s > (_SILENT_S if status else _START_S)
-            else ""
-        )
+        if isinstance(ended := status.get("ended"), str) and ended:
+            return brief(ended)
+        if silent_s > (_SILENT_S if status else _START_S):
+            return f"nothing was heard of its driver for {silent_s:.0f} s"
+        return super().over
+
+    @property
+    def over(self) -> str:
+        """See `HeldLease.over`."""
+        return "" if self.why in {"", drive_log.HOME} else f"it stopped on its way: {self.why}"
 
     def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
         """Wait until something holds, or the deadline has passed."""
@@ -214,14 +252,14 @@ def _read(said: bytes) -> dict[str, Any]:
     """Return what a driver wrote of itself; nothing where it is not whole."""
     try:
         found = json.loads(said)
-    except ValueError:
+    except JSON_ERRORS:
         return {}
     return found if isinstance(found, dict) else {}
 
 
 @contextmanager
-def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str) -> Iterator[None]:
-    """Let a robot drive while the body runs, and come back to its place afterwards.
+def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str) -> Iterator[DriveLease]:
+    """Let a robot drive while the body runs, which is given its lease, and come back to its place afterwards.
 
     Whatever ends the body but an interruption, the robot drives back; one that cannot is brought by the operator.
     One that is interrupted stands where it is.
@@ -236,21 +274,18 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
     with DriveLease(shell, plan.job, name, lease_s) as held:
         try:
             held.wait(lambda: held.status or held.why, Deadline.after(_START_S))
-            yield
+            held.demand()
+            yield held
         except Exception:
             _bring_back(testbed, shell, plan.job, held, move)
             raise
         except BaseException:
             _end(shell, plan.job)
             raise
-        early = held.why
-        late = _bring_back(testbed, shell, plan.job, held, move)
-    if early or late != HOME:
-        raise RobotError(
-            f"it stopped on its way: {early or late or 'it is not back in time'}",
-            where=robot.name,
-            remedy=f"see {plan.job.log} of this repeat",
-        )
+        early = held.over
+        came = _bring_back(testbed, shell, plan.job, held, move)
+        if early or came != drive_log.HOME:
+            raise held.failure(early or held.over or "it stopped on its way: it is not back in time")
 
 
 def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move: Move) -> str:
@@ -259,7 +294,7 @@ def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move
     held.wait(lambda: held.why, Deadline.after(_START_S + limit_s(move)))
     why = held.why
     _end(shell, job)
-    testbed.bring_back(move.role, by_itself=why == HOME)
+    testbed.bring_back(move.role, by_itself=why == drive_log.HOME)
     return why
 
 

@@ -6,22 +6,28 @@ then is for its program to know (`fieldkit.agent.orders`).
 
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from itertools import count
-from types import TracebackType
 from typing import Final, Self
 
+from fieldkit.backends.protocols import Testbed
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import FieldkitError
+from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
+from fieldkit.steps.base import Nest
+from fieldkit.steps.scene import Announce, Scene
 
-_INSTALLS_S: Final = 30.0
 _LOOKS_S: Final = 0.25
 
-# Writes $2 into the file $1, whole or not at all, and prints what the program has said in $3.
-_ORDER: Final = 'printf "%s\\n" "$2" >"$1.$$" && mv -f "$1.$$" "$1" && { cat "$3" 2>/dev/null || :; }'
+# Writes $3 into the file $2, whole or not at all, and prints what the program has said in $4; on standard error its
+# exit code, which is in $1 once it has ended.
+_ORDER: Final = (
+    'printf "%s\\n" "$3" >"$2.$$" && mv -f "$2.$$" "$2" && { cat "$4" 2>/dev/null; [ ! -s "$1" ] || cat "$1" >&2; }'
+)
 
 
 def orders_file(name: str) -> str:
@@ -31,7 +37,7 @@ def orders_file(name: str) -> str:
 
 def start(shell: Shell, job: Job) -> None:
     """Bring the agent to a robot and start a program of it; errors as `jobs.start`."""
-    agent.install(shell, Deadline.after(_INSTALLS_S))
+    agent.install(shell)
     jobs.start(shell, job)
 
 
@@ -49,6 +55,7 @@ class HeldLease:
 
     Attributes:
         said: What the program had said when it was looked at last.
+        code: Its exit code then, as text; empty while it runs.
     """
 
     def __init__(
@@ -63,14 +70,18 @@ class HeldLease:
         unheard_s: float | None = None,
     ) -> None:
         self.said = b""
+        self.code = ""
         self._shell = shell
-        self._files = tuple(f"{job.folder}/{name}" for name in (orders_file(job.name), says))
+        self._job = job
+        names = jobs.exit_file(job), orders_file(job.name), says
+        self._exit, self._orders, self._says = (f"{job.folder}/{name}" for name in names)
         self._order = order
         self._lease_s = lease_s
         self._holds_s = lease_s if unheard_s is None else unheard_s
         self._pause_s = None if unheard_s is not None else lease_s / renewals
         self._numbers = count(1)
         self._said_s = time.monotonic()
+        self._end: Callable[[], None] | None = None
         self._turn = threading.Lock()
         self._left = threading.Event()
         self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
@@ -80,9 +91,7 @@ class HeldLease:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._left.set()
         self._thread.join()
 
@@ -106,6 +115,46 @@ class HeldLease:
         time.sleep(_LOOKS_S)
 
     @property
+    def over(self) -> str:
+        """Why the program is at its end before it was to be, as it or its exit code says; empty where it is not."""
+        return f"its program has ended with exit code {self.code}" if self.code else ""
+
+    def failure(self, why: str) -> RobotError:
+        """Return the error of a program that did not do what it was to."""
+        return RobotError(why, where=self._shell.robot, remedy=f"see {self._job.log} of this attempt")
+
+    def demand(self) -> None:
+        """Go on only if the program does.
+
+        Raises:
+            RobotError: It is at its end; says why.
+        """
+        if self.over:
+            raise self.failure(self.over)
+
+    @contextmanager
+    def outlasting(self, end: Callable[[], None]) -> Iterator[None]:
+        """Run the body for as long as the program goes on; where nothing may be sent meanwhile, until its own end.
+
+        Args:
+            end: Ends what the body waits for. With each renewal it is called anew: the body may have begun to wait
+                for something else.
+
+        Raises:
+            RobotError: The program ended before the body did. What the body raises then is the work of that.
+        """
+        self._end = end
+        try:
+            yield
+        except FieldkitError as error:
+            if error.ends_trial or not self.over:
+                raise
+            raise self.failure(self.over) from error
+        finally:
+            self._end = None
+        self.demand()
+
+    @property
     def unchanged_s(self) -> float:
         """For how long nobody has seen the program say anything new."""
         return time.monotonic() - self._said_s
@@ -113,8 +162,10 @@ class HeldLease:
     def _send(self, within_s: float) -> bytes:
         with self._turn:
             line = f"{next(self._numbers)} {self._order} {self._holds_s:g}"
-        orders, says = self._files
-        done = self._shell.run(("sh", "-c", _ORDER, "sh", orders, line, says), deadline=Deadline.after(within_s))
+        words = ("sh", "-c", _ORDER, "sh", self._exit, self._orders, line, self._says)
+        done = self._shell.run(words, deadline=Deadline.after(within_s))
+        *_, code = (b"", *done.stderr.splitlines())  # a login shell may say something, too
+        self.code = code.decode() if code.isdigit() else ""
         if done.stdout != self.said:
             self.said, self._said_s = done.stdout, time.monotonic()
         return done.stdout
@@ -123,3 +174,21 @@ class HeldLease:
         while self._pause_s is not None and not self._left.wait(self._pause_s):
             with suppress(FieldkitError):  # the link may come back before the order has lapsed
                 self._send(min(self._lease_s, jobs.REPLY_S))
+            end = self._end
+            if end is not None and self.over:
+                end()
+
+
+def run_inside(nest: Nest, held: HeldLease, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+    """Run the steps inside one for as long as the program goes on that it has on a robot; errors as `outlasting`."""
+    inner = replace(scene, halt=scene.halt.inside())
+
+    def end() -> None:
+        inner.halt.call()
+        with suppress(FieldkitError):  # it is called anew
+            nest.end_inside(inner, testbed)
+
+    with held.outlasting(end):
+        for entry in nest.during:
+            if not inner.halt.called:
+                entry.step.run(inner, testbed, announce)

@@ -4,18 +4,18 @@ The program is the agent's (`fieldkit.agent.flight`). Who kills this process, or
 the lease, brings the drone down.
 """
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
-from functools import partial
+from dataclasses import asdict, replace
 from typing import Final
 
 from fieldkit.agent.flight_plan import LEAVE, STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import ConfigurationError, RobotError
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Control, OnAbort, Role
-from fieldkit.core.text import harmless
+from fieldkit.core.text import brief
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
@@ -30,7 +30,8 @@ READY: Final = " ready"
 _GUARD_S: Final = 86_400.0
 _RENEWALS: Final = 3
 """So many in a lease: one may be late."""
-_LAST: Final = 200
+_ENDS: Final = re.compile(r"(?:[0-9.]+ )?(?:error|land|return): (?P<why>.+)")
+"""What the program says when it brings its drone down too early, or lets go of it."""
 
 
 def connection(robot: Robot) -> str:
@@ -56,8 +57,8 @@ def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: floa
         plan: What it does; its orders are in the folder of the attempt.
         limit_s: For how long at most.
     """
-    robot = scene.robot(role)
-    argv = streams.agent_command(robot, "fly", streams.compact(asdict(plan)))
+    robot, whole = scene.robot(role), replace(plan, unhurried=jobs.unhurried_file(name))
+    argv = streams.agent_command(robot, "fly", streams.compact(asdict(whole)))
     log = f"{name}.log"
     job = Job(folder=scene.folder, name=name, argv=argv, limit_s=limit_s, log=log, ready=f"log:{READY}")
     return Planned(role, job, program=robot.profile.tools.python, ends=BY_ITSELF)
@@ -86,7 +87,21 @@ class Leash(HeldLease):
         super().__init__(
             shell, job, says=job.log, order=STAY, lease_s=lease_s, renewals=_RENEWALS, unheard_s=unheard_s
         )
-        self._failure = partial(RobotError, where=shell.robot, remedy=f"see {job.log} of this attempt")
+
+    @property
+    def over(self) -> str:
+        """See `HeldLease.over`."""
+        return f"its flight ended early: {self._why}" if self._why else super().over
+
+    @property
+    def _lines(self) -> Sequence[str]:
+        return self.said.decode("utf-8", "replace").splitlines()
+
+    @property
+    def _why(self) -> str:
+        """Why the program does not go on, in its own words."""
+        found = next(filter(None, map(_ENDS.match, self._lines)), None)
+        return brief(found["why"]) if found else ""
 
     def let_go(self) -> None:
         """End the program, and leave the drone as it is; errors as `order`."""
@@ -101,14 +116,14 @@ class Leash(HeldLease):
         """
         deadline = Deadline.after(within_s)
         while True:
-            said = self.look().decode("utf-8", "replace").splitlines()
-            if any(line.endswith(f" {mark}") for line in said):
+            self.look()
+            if any(line.endswith(f" {mark}") for line in self._lines):
                 return
-            last = harmless(said[-1].partition(" ")[2])[:_LAST] if said else "nothing"
-            if last.startswith("error: "):
-                raise self._failure(last.removeprefix("error: "))
+            if why := self._why or self.over:
+                raise self.failure(why)
             if deadline.expired:
-                raise self._failure(f"it is not {mark} after {within_s:.0f} s; it said last: {last}")
+                last = brief(self._lines[-1].partition(" ")[2]) if self._lines else "nothing"
+                raise self.failure(f"it is not {mark} after {within_s:.0f} s; it said last: {last}")
             self.pause()
 
 
@@ -136,13 +151,10 @@ def leashed(
     unheard_s = lease_s + 2 * body_s if scene.robot(one.role).control is Control.RADIO else None
     with Leash(shell, one, lease_s, unheard_s) as leash:
         yield leash
-    code = jobs.begin_wait(shell, one.job, ends_s).end(ends_s + jobs.REPLY_S)
-    if code != 0:
-        raise RobotError(
-            f"{one.job.name} ended with exit code {code}",
-            where=shell.robot,
-            remedy=f"see {one.job.log} of this attempt",
-        )
+        code = jobs.begin_wait(shell, one.job, ends_s).end(ends_s + jobs.REPLY_S)
+        if code != 0:
+            leash.look()
+            raise leash.failure(leash.over or f"{one.job.name} ended with exit code {code}")
 
 
 def abort_of(scene: Scene, role: Role) -> OnAbort:

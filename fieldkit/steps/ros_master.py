@@ -1,4 +1,4 @@
-"""What preflight asks of the ROS master that robots share: whether it answers, from where a recorder asks it."""
+"""Preflight of the ROS master that robots share: whether it answers, from where a recorder asks it."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -30,7 +30,7 @@ def needs(scene: Scene, role: Role, *, explains: str) -> Iterator[Need]:
     """
     robot = scene.robot(role)
     if robot.ros_master:
-        master = next(one for one in scene.cast.values() if one.address == robot.ros_master)
+        master = next(other for other in scene.cast.values() if other.address == robot.ros_master)
         asked = (robot.ros_master, str(ROS_MASTER_PORT), _POST)
         argv = ("timeout", str(_ANSWERS_S), "bash", "-c", _ASK, "bash", *asked)
         yield Need(role, "ROS master", argv, lambda answer: judged(master, answer), explains=explains)

@@ -8,8 +8,10 @@ from types import MappingProxyType
 from typing import ClassVar, Final
 
 from fieldkit.backends.protocols import Cast, Robot
+from fieldkit.core import geometry
+from fieldkit.core.errors import RobotError
 from fieldkit.core.lazy import dataclass
-from fieldkit.core.model import OnAbort, Placement, Protocol, Role, Verdict
+from fieldkit.core.model import OnAbort, Placement, Protocol, Role, Vector, Verdict
 from fieldkit.core.threads import Halt
 from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote.jobs import Job
@@ -89,6 +91,20 @@ class Scene:
     def tools(self, role: Role) -> Variants:
         """Return the tools of the robot in `role`: those found, or those that its profile lets expect."""
         return self.variants.get(role) or variants.expected(self.cast[role].profile)
+
+    @property
+    def places_m(self) -> Mapping[Role, Vector]:
+        """Where robots were placed, as `geometry.positions_m` has it; empty where nobody placed them."""
+        return {} if self.placement is None else geometry.positions_m(self.placement)
+
+    def failure(self, planned: "Planned", what: str) -> RobotError:
+        """Return what to raise where a job did not do what it was to; its log says more.
+
+        Args:
+            planned: The job.
+            what: In one sentence without a full stop.
+        """
+        return RobotError(what, where=self.robot(planned.role).name, remedy=f"see {planned.job.log} of this repeat")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
+from fieldkit.config.profiles import TopicName
 from fieldkit.config.schema import AfterValidator, Bytes, Duration, Field, Hertz, Int, Strict
 from fieldkit.core.model import Role
 from fieldkit.remote import agent
@@ -100,7 +101,7 @@ class StreamOptions(Strict):
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
     over: Over = Over.DDS
-    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] = "/fieldkit/stream"
+    topic: TopicName = "/fieldkit/stream"
     rate: Annotated[Hertz, Field(gt=0, le=100_000)] = 10.0
     bytes: Annotated[Bytes, Field(ge=LEAST_BYTES, le=MOST_BYTES)] = 1000.0
     qos: StreamQos = StreamQos.defaults()

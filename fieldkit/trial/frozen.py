@@ -1,4 +1,4 @@
-"""What `trial.yaml` says of a trial's table: columns that are not in every one, and what is expected of figures."""
+"""The part of `trial.yaml` about tables: columns that are not in every one, and what is expected of figures."""
 
 import sys
 from collections import Counter
@@ -50,7 +50,7 @@ class FrozenColumn(Strict):
 
 
 def _demand_different(columns: tuple[FrozenColumn, ...]) -> tuple[FrozenColumn, ...]:
-    for name, times in Counter(one.name for one in columns).items():
+    for name, times in Counter(column.name for column in columns).items():
         if times > 1:
             raise schema.complaint(f"the column {name} is there twice")
     return columns
@@ -75,7 +75,7 @@ def read(path: Path) -> tuple[Column, ...]:
     if not isinstance(document.data, dict) or "columns" not in document.data:
         return ()
     found = schema.validate(replace(document, data={"columns": document.data["columns"]}), _Beyond)
-    return tuple(one.column for one in found.columns or ())
+    return tuple(frozen.column for frozen in found.columns or ())
 
 
 class _Expecting(Strict):
@@ -101,11 +101,11 @@ def freeze(columns: Iterable[Column]) -> tuple[FrozenColumn, ...]:
     """Return columns as a plan holds them."""
     return tuple(
         FrozenColumn(
-            name=one.name,
-            unit=one.unit,
-            meaning=one.meaning,
-            bounds=one.bounds and (max(one.bounds[0], -_MOST), min(one.bounds[1], _MOST)),
-            figure=None if one.figure is None else FrozenFigure(**vars(one.figure)),
+            name=column.name,
+            unit=column.unit,
+            meaning=column.meaning,
+            bounds=column.bounds and (max(column.bounds[0], -_MOST), min(column.bounds[1], _MOST)),
+            figure=None if column.figure is None else FrozenFigure(**vars(column.figure)),
         )
-        for one in columns
+        for column in columns
     )

@@ -39,8 +39,8 @@ def restarted(procedure: Procedure) -> frozenset[Role]:
 def without_effects(reasons: Sequence[str]) -> list[str]:
     """Return why an attempt is void; of a robot that rebooted, what went wrong with it for that is left out."""
     reasons = list(dict.fromkeys(reasons))  # a link that is away fails the step and the fetching alike
-    robots = [one.removesuffix(REBOOTED) for one in reasons if one.endswith(f": {REBOOTED}")]
-    return [one for one in reasons if one.endswith(REBOOTED) or not one.startswith(tuple(robots))]
+    robots = [reason.removesuffix(REBOOTED) for reason in reasons if reason.endswith(f": {REBOOTED}")]
+    return [reason for reason in reasons if reason.endswith(REBOOTED) or not reason.startswith(tuple(robots))]
 
 
 def rebooted(before: str | None, after: str | None) -> bool:

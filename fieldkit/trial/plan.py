@@ -72,7 +72,7 @@ class Plan(Strict):
         """The columns of the trial's trial.csv, in order."""
         if self.columns is None:
             return trial_columns(of_steps(placed.step for placed in self.procedure.walk()))
-        return trial_columns(one.column for one in self.columns)
+        return trial_columns(frozen.column for frozen in self.columns)
 
     def order(self) -> Iterator[RepeatId]:
         """Yield the planned repeats; protocols alternate, so that a slow change of the air meets each alike."""
@@ -104,7 +104,7 @@ class Plan(Strict):
     def refusals(self, variants: Mapping[Role, Variants]) -> tuple[Refusal, ...]:
         """Return what of the procedure cannot work with the tools that the robots have, each once."""
         scenes, steps = self.scenes(variants), self.procedure.steps
-        found = (one for scene in scenes for entry in steps for one in entry.step.refusals(scene))
+        found = (refusal for scene in scenes for entry in steps for refusal in entry.step.refusals(scene))
         return tuple(dict.fromkeys((*found, *self._out_of_reach())))
 
     def _out_of_reach(self) -> Iterator[Refusal]:
@@ -118,18 +118,24 @@ class Plan(Strict):
         """Return what the testbed does beside the commands of one repeat, in words."""
         on_abort = self.procedure.on_abort.items()
         drones = (f"where it is cut short: {self.cast[role].name} is told to {how}" for role, how in on_abort)
-        return (*drones, *(one for entry in self.procedure.steps for one in entry.step.beside(scene)))
+        return (*drones, *(line for entry in self.procedure.steps for line in entry.step.beside(scene)))
+
+    def cut_short(self, scene: Scene) -> str:
+        """Return in words what robots do that move where somebody stops a repeat at once; empty where none moves."""
+        watched = (role for role in self.procedure.on_abort if role not in self.procedure.moved())
+        told = (f"{self.cast[role].name} is told to {self.procedure.on_abort[role]}" for role in watched)
+        return "; ".join((*told, *(one for entry in self.procedure.steps for one in entry.step.cut_short(scene))))
 
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
         """Return what tells the packets of each transfer, in the order in which they begin."""
         scene = self.procedure.scene(protocol, self.cast, "")
-        found = (placed.step.transfer(scene, placed.within) for placed in self.procedure.walk())
-        return tuple(one for one in found if one is not None)
+        transfers = (placed.step.transfer(scene, placed.within) for placed in self.procedure.walk())
+        return tuple(transfer for transfer in transfers if transfer is not None)
 
     def pingings(self) -> tuple[Pinging, ...]:
         """Return all round-trip times of a repeat, in the order in which they begin."""
-        found = (placed.step.pinging() for placed in self.procedure.walk())
-        return tuple(one for one in found if one is not None)
+        pingings = (placed.step.pinging() for placed in self.procedure.walk())
+        return tuple(pinging for pinging in pingings if pinging is not None)
 
     def captures(self) -> Mapping[str, Role]:
         """Return whose robot makes each capture, by its file."""

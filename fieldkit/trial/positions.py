@@ -75,7 +75,7 @@ def give(
             files.write(folder / accounts.FILE, text.encode())
         else:
             (folder / accounts.FILE).unlink(missing_ok=True)
-        _remove_others(folder, {one.file for one in kept.values()})
+        _remove_others(folder, {account.file for account in kept.values()})
         if (folder / store.MANIFEST_FILE).exists():
             manifest.Manifest(folder).renew_positions()
     return rebuild(folder)

@@ -71,10 +71,10 @@ class Procedure(catalog.Named):
     protocols: Annotated[tuple[Protocol, ...], Field(min_length=1)]
     repeats: Repeats
     attempts: Annotated[Int, Field(gt=0, le=1000)] = 3
-    needs_ros_master: Bool = Field(default=False, exclude_if=lambda needs: not needs)
-    places: dict[Role, Place] = Field(default_factory=dict, exclude_if=lambda places: not places)
-    on_abort: dict[Role, OnAbort] = Field(default_factory=dict, exclude_if=lambda drones: not drones)
-    expect: tuple[str, ...] = Field(default=(), exclude_if=lambda expect: not expect)
+    needs_ros_master: Bool = Field(default=False, exclude_if=schema.is_empty)
+    places: dict[Role, Place] = Field(default_factory=dict, exclude_if=schema.is_empty)
+    on_abort: dict[Role, OnAbort] = Field(default_factory=dict, exclude_if=schema.is_empty)
+    expect: tuple[str, ...] = Field(default=(), exclude_if=schema.is_empty)
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @classmethod
@@ -237,7 +237,7 @@ class PlacedStep:
         A port of a robot takes one listener at a time. In one capture packets are told by both robots and the port.
         """
         at_once = self.is_beside(other) or any(nest is other.step for nest in self.within)
-        captured = any(nest.captures() and any(nest is one for one in other.within) for nest in self.within)
+        captured = any(nest.captures() and any(nest is around for around in other.within) for nest in self.within)
         for mine, theirs in product(self.step.listens(), other.step.listens()):
             alone = not (mine.shared and theirs.shared)
             if at_once and alone and (mine.role, mine.port) == (theirs.role, theirs.port):
@@ -297,10 +297,10 @@ def expecting(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
     Raises:
         ConfigurationError: It is none, or of a figure that none of them measures.
     """
-    wanted = expectations.parse(text, (figure for one in procedures for figure in one.figures)).quantity
+    wanted = expectations.parse(text, (figure for procedure in procedures for figure in procedure.figures)).quantity
     return [
-        one.model_copy(update={"expect": (*one.expect, text)})
-        if wanted in {figure.name for figure in one.figures}
-        else one
-        for one in procedures
+        procedure.model_copy(update={"expect": (*procedure.expect, text)})
+        if wanted in {figure.name for figure in procedure.figures}
+        else procedure
+        for procedure in procedures
     ]

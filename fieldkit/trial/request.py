@@ -86,7 +86,10 @@ def make_plan(
             **plugins.versions(),
             "fieldkit": __version__,
             "python": platform.python_version(),
-            **{one: plugins.version(one) for one in ("google-re2", "jmespath", "numpy", "paramiko", "rosbags")},
+            **{
+                package: plugins.version(package)
+                for package in ("google-re2", "jmespath", "numpy", "paramiko", "rosbags")
+            },
         },
         code_sha256=code_hash(),
         profiles_sha256=data_hash(_what_robots_are(cast)),

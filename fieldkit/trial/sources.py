@@ -42,12 +42,12 @@ class Sources:
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
         """What figures can be made of, by name and in order."""
-        return {one.name: one for one in quantities(self.columns)}
+        return {quantity.name: quantity for quantity in quantities(self.columns)}
 
     @cached_property
     def words(self) -> Mapping[str, Column]:
         """Columns whose words are counted, by name and in order."""
-        return {one.name: one for one in worded(self.columns)}
+        return {column.name: column for column in worded(self.columns)}
 
     def condition(self, text: str, *, asked: str = "--by") -> tuple[str, ...]:
         """Return the columns that tell one condition from another, each once.

@@ -1,4 +1,4 @@
-"""What the columns of tables are, where trials of procedures that differ stand beside each other."""
+"""Columns of tables in which trials of procedures that differ stand beside each other."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -26,10 +26,10 @@ def declared_in(tables: Sequence[Path]) -> tuple[Column, ...]:
     Raises:
         ConfigurationError: A table or a plan cannot be read, or plans contradict each other.
     """
-    everywhere = {one.name for one in trial_columns()} | {"", SOURCE}
+    everywhere = {column.name for column in trial_columns()} | {"", SOURCE}
     others = {table: names for table in tables if (names := _others(table, everywhere))}
     said = united((table.parent / PLAN_FILE, _frozen(table)) for table in others)
-    known = {one.name: one for one in installed()}
+    known = {column.name: column for column in installed()}
     found = dict.fromkeys(name for names in others.values() for name in names)
     return trial_columns(said.get(name) or _by_name(name, known) for name in found)
 
@@ -38,7 +38,10 @@ def planned(tables: Iterable[Path]) -> tuple[Column, ...]:
     """Return every column that the plans beside tables have; errors as `declared_in`, or a plan cannot be read."""
     plans = [table.parent / PLAN_FILE for table in tables if (table.parent / PLAN_FILE).is_file()]
     everywhere = set(trial_columns())
-    found = ((plan, [one for one in store.read_plan(plan.parent).table if one not in everywhere]) for plan in plans)
+    found = (
+        (plan, [column for column in store.read_plan(plan.parent).table if column not in everywhere])
+        for plan in plans
+    )
     return trial_columns(united(found).values())
 
 

@@ -184,9 +184,9 @@ class EmulatedBackend:
         return members
 
     def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
-        for key, robot in robots.items():
+        for robot in robots.values():
             _check_ros(robot, self._options)
-            for sensor in sensors_of(robots, key):
+            for sensor in sensors_of(robot):
                 messages.check(sensor)
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
@@ -196,7 +196,7 @@ class EmulatedBackend:
         variants = self._options.robots
         tools = (variants[name] for name in names if name in variants)
         mesh = set() if self._options.mesh is None else {self._options.mesh.daemon}
-        requirements.check({program for one in tools for program in one.programs()} | mesh)
+        requirements.check({program for options in tools for program in options.programs()} | mesh)
         return requirements.ros_in_use(self._options.ros)
 
 
@@ -240,14 +240,15 @@ def _check_bridges(robots: "Mapping[RobotKey, Robot | LabRobot]", ros: RosChoice
 
 def _check_ros2(name: str, ros: Ros, options: Ros2Options) -> None:
     """See that a robot can speak ROS 2 as its profile and the lab say."""
-    if options.discovery == "router" and ros.command.rmw != "zenoh":
+    if options.discovery == "router" and ros.middleware != "zenoh":
         raise ConfigurationError(
             "emulated.ros2 has a router, and the profile speaks over DDS, which has none",
             where=name,
             remedy="write rmw: zenoh in a copy of the profile, or discovery: peers in the site file",
         )
-    domain = ros.environment.get("ROS_DOMAIN_ID", "0")
-    if not domain.isdecimal() or int(domain) > MOST_DOMAIN:
+    if ros.domain > MOST_DOMAIN:
         raise ConfigurationError(
-            f"ROS_DOMAIN_ID {domain!r} of the profile is no domain of ROS 2", where=name, remedy=f"0 to {MOST_DOMAIN}"
+            f"the ports of ROS_DOMAIN_ID {ros.domain} of the profile are those that Linux gives to anybody",
+            where=name,
+            remedy=f"0 to {MOST_DOMAIN}",
         )

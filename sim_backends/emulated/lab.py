@@ -94,10 +94,10 @@ class EmulatedLab:
         """Take in where robots have gone by their own power; return when to do it again."""
         with self._turn:
             states = {
-                name: one.state
+                name: said.state
                 if self.members[name].profile.mavlink is not None
-                else placement.on_ground(one.state, self._world)
-                for name, one in self_steered(self._up.robots, self._ways_ns).items()
+                else placement.on_ground(said.state, self._world)
+                for name, said in self_steered(self._up.robots, self._ways_ns).items()
             }
             if states != self._states:
                 self._states = states

@@ -83,9 +83,9 @@ def self_steered(
     now_ns = time.monotonic_ns()
     said = {key: robot.steered() for key, robot in robots.items()}
     return {
-        key: one.at(now_ns) if one.moves else one
-        for key, one in said.items()
-        if one is not None and one.way_ns == ways_ns.get(key)
+        key: steered.at(now_ns) if steered.moves else steered
+        for key, steered in said.items()
+        if steered is not None and steered.way_ns == ways_ns.get(key)
     }
 
 
@@ -189,11 +189,11 @@ class Mobility:
         """Tell of robots that moved themselves since they were looked at last; return when to look again."""
         with self._turn:
             said = self._steered()
-            if said == self._seen and not any(one.moves for one in said.values()):
+            if said == self._seen and not any(steered.moves for steered in said.values()):
                 return WATCH_S
             self._seen = said
             self._tell()
-            fastest_m_s = max((math.hypot(*one.velocity_m_s) for one in said.values()), default=0.0)
+            fastest_m_s = max((math.hypot(*steered.velocity_m_s) for steered in said.values()), default=0.0)
             return min(max(STEP_M / fastest_m_s, _SHORTEST_S), WATCH_S) if fastest_m_s else WATCH_S
 
     def _steered(self) -> dict[Role, Steered]:
@@ -203,8 +203,16 @@ class Mobility:
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
         """Return where each robot was from a moment on; what was before it is forgotten."""
         with self._turn:
-            last = {one.role: number for number, one in enumerate(self._track) if one.utc_ns <= since_utc_ns}
-            self._track = [one for number, one in enumerate(self._track) if number >= last.get(one.role, 0)]
+            last = {
+                whereabouts.role: number
+                for number, whereabouts in enumerate(self._track)
+                if whereabouts.utc_ns <= since_utc_ns
+            }
+            self._track = [
+                whereabouts
+                for number, whereabouts in enumerate(self._track)
+                if number >= last.get(whereabouts.role, 0)
+            ]
             return tuple(self._track)
 
     def _tell_robot(self, move: Move, began_ns: int) -> None:
@@ -227,7 +235,9 @@ class Mobility:
             states = {name: State(place_m) for name, place_m in positions_m.items()}
             for began_ns, motion in self._motions:
                 states |= motion.at(now_ns - began_ns)
-            states |= {self._cast[role].name: self._on_its_own(role, one) for role, one in self._steered().items()}
+            states |= {
+                self._cast[role].name: self._on_its_own(role, steered) for role, steered in self._steered().items()
+            }
             relay = places.relay(self._cast, placement)
             if self._laptop is not None:
                 states[self._laptop.name] = State(places.laptop_m(self._cast, placement, self._world))
@@ -245,7 +255,7 @@ class Mobility:
     def _note(self, states: Mapping[str, State]) -> None:
         """Write down who is elsewhere than before, or moves otherwise."""
         utc_ns = time.time_ns()
-        last = {one.role: one for one in self._track}
+        last = {whereabouts.role: whereabouts for whereabouts in self._track}
         for role, robot in self._cast.items():
             state = states.get(robot.name)
             now = (None, STILL) if state is None else (state.position_m, state.velocity_m_s)

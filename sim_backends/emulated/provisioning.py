@@ -72,9 +72,9 @@ def definition(kind: str, text: str = "") -> Definition:
     return templates.definition_of(kind, text)
 
 
-def sensors_of(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[Sensor, ...]:
+def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
     """Return what a robot publishes. Errors as `template_of`."""
-    return tuple(_sensor(topic) for topic in _topics(robots[key]))
+    return tuple(_sensor(topic) for topic in _topics(robot))
 
 
 def _topics(robot: "Robot | LabRobot") -> tuple[PublishedTopic, ...]:
@@ -103,7 +103,7 @@ def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
     """
     taken: set[str] = set()
     for other in robots:
-        own = [sensor.topic for sensor in sensors_of(robots, other)]
+        own = [topic.name for topic in _topics(robots[other])]
         if other == key:
             return tuple(topic for topic in own if topic not in taken)
         if ros_master_of(robots[other]) == ros_master_of(robots[key]) != LOOPBACK:
@@ -112,11 +112,16 @@ def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
 
 
 def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
-    """Return whether robots of a profile are driven by a topic, of real ROS 1 or of ROS 2 over DDS."""
+    """Return whether robots of a profile are driven by a topic: of real ROS 1, or of ROS 2 where its ends meet.
+
+    By a router of Zenoh on another robot they do not, for the driver looks on its own alone.
+    """
     ros = profile.ros
     if profile.drive is None or ros is None:
         return False
-    return uses_debian_ros(options.ros) if ros.variant == "ros1" else over_ros2(profile, options) == "dds"
+    if ros.variant == "ros1":
+        return uses_debian_ros(options.ros)
+    return over_ros2(profile, options) != "" and options.ros2.router is None
 
 
 def over_ros2(profile: RobotProfile, options: EmulatedOptions) -> str:
@@ -125,9 +130,10 @@ def over_ros2(profile: RobotProfile, options: EmulatedOptions) -> str:
     They do not either where their middleware is not installed here.
     """
     ros = profile.ros
-    if ros is None or ros.variant != "ros2" or options.ros is RosChoice.BUILTIN or find_spec(ros.command.rmw) is None:
+    if ros is None or ros.variant != "ros2" or options.ros is RosChoice.BUILTIN:
         return ""
-    return {"cyclonedds": "dds"}.get(ros.command.rmw, ros.command.rmw)
+    package = {"dds": "cyclonedds"}.get(ros.middleware, ros.middleware)
+    return ros.middleware if find_spec(package) else ""
 
 
 def _base(profile: RobotProfile) -> Base | None:
@@ -148,7 +154,7 @@ def _ros2_spec(
     own, over = robot.profile.ros, over_ros2(robot.profile, options)
     if own is None or not over:
         return None
-    others = {one.name: one.address for one in robots.values()}
+    others = {other.name: other.address for other in robots.values()}
     how = options.ros2
     if how.router is not None and how.router not in others:
         raise ConfigurationError(
@@ -163,7 +169,7 @@ def _ros2_spec(
         discovery=how.discovery,
         peers=peers if how.discovery == "peers" else (),
         router=others[how.router] if how.router else "",
-        domain=int(own.environment.get("ROS_DOMAIN_ID", "0")),
+        domain=own.domain,
     )
 
 
@@ -192,12 +198,12 @@ def robot_spec(
     ros2 = own is not None and own.variant == "ros2"
     speaks_ros2 = _ros2_spec(robots, robot, options)
     hears_ros1 = ros is RosChoice.DEBIAN and own is not None and not ros2
-    sensors = sensors_of(robots, key)
+    mavlink, limits = robot.profile.mavlink, robot.profile.limits
     return RobotSpec(
         name=robot.name,
         interface=robot.profile.radio.interface,
         address=f"{robot.address}/{NETWORK.prefixlen}",
-        hosts={one.name: one.address for one in robots.values()},
+        hosts={other.name: other.address for other in robots.values()},
         host_key=host_key.private,
         authorized_key=login.public,
         # Debian has no ROS 2, and a robot without ROS runs no master.
@@ -206,16 +212,16 @@ def robot_spec(
         distribution=own.command.distribution if own else "",
         setup=own.command.setup if own else (),
         ros_master=ros_master_of(robot),
-        sensors=sensors,
+        sensors=sensors_of(robot),
         registered=_registered(robots, key),
         definitions={topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)},
-        mavlink_port=robot.profile.mavlink.port if robot.profile.mavlink else None,
-        max_speed_m_s=robot.profile.limits.max_speed_m_s,
-        max_height_m=robot.profile.limits.max_height_m,
-        fence_m=robot.profile.limits.fence_m,
+        mavlink_port=mavlink.port if mavlink else None,
+        max_speed_m_s=limits.max_speed_m_s,
+        max_height_m=limits.max_height_m,
+        fence_m=limits.fence_m,
         profile=robot.profile.name,
-        world=world.model_dump_json() if world is not None and robot.profile.mavlink else "",
-        autopilot=robot.profile.mavlink.autopilot if robot.profile.mavlink else "px4",
+        world=world.model_dump_json() if world is not None and mavlink else "",
+        autopilot=mavlink.autopilot if mavlink else "px4",
         base=_base(robot.profile) if hears_ros1 or speaks_ros2 is not None else None,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
         ros2=speaks_ros2,

@@ -73,8 +73,8 @@ def running_robots(
         started = pool.map(EmulatedRobot.start, sorted(up.values(), key=lambda one: not one.spec.runs_master))
         for key, one in up.items():
             medium.attach(one.name, one.address, robots[key].profile.radio, one.radio_fd)
-        if any(one.spec.waits_for_another for one in up.values()):
-            medium.place(placement.together_m(one.name for one in up.values()))
+        if any(robot.spec.waits_for_another for robot in up.values()):
+            medium.place(placement.together_m(robot.name for robot in up.values()))
         list(started)
         yield RunningRobots(up, medium, {key: pair.public for key, pair in host_keys.items()}, login.private)
         for one in up.values():

@@ -189,8 +189,8 @@ class Bodies:
 
     def _report(self, touching: Mapping[str, Collection[str]], step: int) -> None:
         for name, names in touching.items():
-            new = [one for one in names if one not in self._touching.get(name, ())]
-            self.collisions += [Collision(step * self.step_ns, name, one) for one in new]
+            new = [other for other in names if other not in self._touching.get(name, ())]
+            self.collisions += [Collision(step * self.step_ns, name, other) for other in new]
         self._touching = touching
 
     def _take_up(self, tracks: Mapping[str, Track]) -> None:
@@ -234,7 +234,7 @@ class Bodies:
 
 
 def _metres(place_m: Vector) -> str:
-    return ", ".join(f"{one:g}" for one in place_m)
+    return ", ".join(f"{metres:g}" for metres in place_m)
 
 
 class BodyLimits(Mapping[str, float]):

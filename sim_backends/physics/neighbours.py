@@ -1,4 +1,4 @@
-"""Who may meet what before a list of neighbours ends, and how long everybody is free for certain."""
+"""Lists of neighbours: who may meet what before a list ends, and how long everybody is free for certain."""
 
 import math
 from collections.abc import Mapping

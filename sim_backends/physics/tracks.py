@@ -1,4 +1,4 @@
-"""What bodies do from a step on, and their states at a step, worked out when they are asked for."""
+"""Tracks of bodies from a step on, and their states at a step, worked out when they are asked for."""
 
 from collections.abc import Iterator, KeysView, Mapping
 from typing import Final, NamedTuple

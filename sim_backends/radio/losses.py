@@ -1,4 +1,4 @@
-"""Why packets never arrive, told as it happens."""
+"""Reasons for which packets never arrive, told as it happens."""
 
 from collections.abc import Callable
 from typing import Any, Final

@@ -1,4 +1,4 @@
-"""What stations' drivers count on the air: the time that their channel was busy, frames, retries, failures, rates."""
+"""Counters of stations' drivers: the time that their channel was busy, frames, retries, failures, rates."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -148,4 +148,7 @@ class WifiInWorld(Wifi[Payload]):
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
         """See `RadioModel.jam`."""
         heard_mw = self._world_channel.heard_mw
-        self.hear(now_ns, {one.name: Emission(now_ns, heard_mw(one.place_m, one.power_dbm)) for one in emitters})
+        self.hear(
+            now_ns,
+            {emitter.name: Emission(now_ns, heard_mw(emitter.place_m, emitter.power_dbm)) for emitter in emitters},
+        )

@@ -94,7 +94,7 @@ class RadioOptions(Strict):
     @property
     def fixed(self) -> bool:
         """Whether every link is fixed."""
-        return any(one is not None for one in (self.loss, self.delay, self.rate, self.jitter))
+        return any(option is not None for option in (self.loss, self.delay, self.rate, self.jitter))
 
     def link(self) -> LinkParameters:
         """Return what every fixed link does."""

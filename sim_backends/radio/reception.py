@@ -135,7 +135,7 @@ class Reception(Generic[Payload]):
     def jammed(self, index: int) -> bool:
         """Return whether a station finds so much noise of jammers that it does not send."""
         emissions = self._emissions.values()
-        return bool(emissions) and sum(one.powers_mw[index] for one in emissions) >= _ENERGY_DETECTION_MW
+        return bool(emissions) and sum(emission.powers_mw[index] for emission in emissions) >= _ENERGY_DETECTION_MW
 
     def decodes(self, index: int, transmission: Transmission, purpose: str) -> bool:
         """Return whether a station decodes a frame whose end has come; to be asked once, before `end`.

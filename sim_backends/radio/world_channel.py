@@ -22,6 +22,7 @@ from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control import FixedRate, RateControl
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
+from sim_backends.world.motion import STILL
 from sim_backends.world.shapes import Floats
 from sim_backends.world.world import World
 
@@ -33,7 +34,6 @@ _SLOWEST_M_S: Final = 1e-6
 
 # So many links cost little more than one, about 0.3 ms among trees; whoever sends next may ask for them.
 _TOGETHER: Final = 100
-_STILL: Final = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class WorldChannel(RadioChannel):
         self._antennas = tuple(antennas.values())
         self._sent_dbm = np.array([antenna.tx_power_dbm for antenna in self._antennas])
         self._options = options
-        self._fixed_mode = fixed_mode(options.mode, {name: one.standard for name, one in antennas.items()})
+        self._fixed_mode = fixed_mode(options.mode, {name: antenna.standard for name, antenna in antennas.items()})
         self._world = world
         self._shadowing = (
             Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
@@ -156,7 +156,7 @@ class WorldChannel(RadioChannel):
             stir_m_s=options.stir_m_s,
         )
         self._places: list[Vector | None] = [None] * count
-        self._velocities: list[Vector] = [_STILL] * count
+        self._velocities: list[Vector] = [STILL] * count
         self._in_motion = False
         self._cut = np.zeros((count, count), dtype=bool)
         self._present = np.zeros(count, dtype=bool)
@@ -178,7 +178,7 @@ class WorldChannel(RadioChannel):
         moved = np.array(list(map(ne, places, self._places)), dtype=bool)
         velocities = self._velocities
         if moving or self._in_motion:
-            velocities = [moving.get(name, _STILL) for name in self.names]
+            velocities = [moving.get(name, STILL) for name in self.names]
             moved |= list(map(ne, velocities, self._velocities))
         if not moved.any() and not self._in_motion:
             return
@@ -188,7 +188,7 @@ class WorldChannel(RadioChannel):
             self._kept_ns = self._gain_kept_ns()
         self._places, self._velocities = places, velocities
         self._present = np.array([place is not None for place in places])
-        self._places_m = np.array([place or _STILL for place in places], dtype=np.float64).reshape(-1, 3)
+        self._places_m = np.array([place or STILL for place in places], dtype=np.float64).reshape(-1, 3)
         # Where nobody moves it does not matter since when, and must not, not even by a rounding.
         self._told_ns = now_ns if self._in_motion else 0
         self._moves += 1
@@ -334,7 +334,7 @@ class WorldChannel(RadioChannel):
     def delay_ns(self, transmitter: int, receiver: int) -> int:
         """See `RadioChannel.delay_ns`."""
         one, other = self._places[transmitter], self._places[receiver]
-        return round(math.dist(one or _STILL, other or _STILL) / SPEED_OF_LIGHT_M_S * 1e9)
+        return round(math.dist(one or STILL, other or STILL) / SPEED_OF_LIGHT_M_S * 1e9)
 
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
         """See `RadioChannel.rate_control`."""

@@ -156,9 +156,9 @@ def _box_arrays(boxes: Iterable[Box]) -> tuple[Floats, Floats, Floats]:
 
 def _cylinder_arrays(cylinders: Iterable[Cylinder]) -> tuple[Floats, Floats, Floats]:
     """Return centres, shape (m, 1, 3), and radii and heights, shape (m, 1)."""
-    radius = np.array([one.radius_m for one in cylinders])[:, None]
-    height = np.array([one.height_m for one in cylinders])[:, None]
-    return _vectors(one.centre_m for one in cylinders), radius, height
+    radius = np.array([cylinder.radius_m for cylinder in cylinders])[:, None]
+    height = np.array([cylinder.height_m for cylinder in cylinders])[:, None]
+    return _vectors(cylinder.centre_m for cylinder in cylinders), radius, height
 
 
 def _vectors(points: Iterable[Vector]) -> Floats:

@@ -123,11 +123,11 @@ class World(Named):
 def _of_materials(names: tuple[str, ...], frequency_hz: float) -> tuple[Floats, Floats, Floats]:
     """Return what each material takes per metre and by two faces, in dB, if it is solid, and 1 for foliage."""
     materials = [MATERIALS[name] for name in names]
-    solids = [one if isinstance(one, Solid) else None for one in materials]
+    solids = [material if isinstance(material, Solid) else None for material in materials]
     return (
-        np.array([one.loss_db_per_m(frequency_hz) if one else 0.0 for one in solids]),
-        np.array([2 * one.face_loss_db(frequency_hz) if one else 0.0 for one in solids]),
-        np.array([float(one is None) for one in solids]),
+        np.array([solid.loss_db_per_m(frequency_hz) if solid else 0.0 for solid in solids]),
+        np.array([2 * solid.face_loss_db(frequency_hz) if solid else 0.0 for solid in solids]),
+        np.array([float(solid is None) for solid in solids]),
     )
 
 

@@ -46,7 +46,7 @@ def talk(*messages: d.MAVLink_message, system: int = 7) -> tuple[AutopilotState,
     link, writer = MemoryLink(), d.MAVLink(None, srcSystem=system, srcComponent=1)
     beat = d.MAVLink_heartbeat_message(2, PX4, ARMED, 6 << 16, 4, 3)
     link.coming = [message.pack(writer) for message in (beat, *messages)]
-    state = AutopilotState(link, 0)
+    state = AutopilotState(link)
     state.receive()
     return state, link
 

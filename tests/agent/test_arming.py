@@ -53,7 +53,7 @@ WELL_SAID: Mapping[str, Any] = {
 def faults(needs: FlightNeeds = NEEDS, first: Any = None, **said: Any) -> list[str]:  # noqa: ANN401
     """Return what speaks against a flight where an autopilot says all is well, but for what is `said` otherwise."""
     link, writer = MemoryLink(), d.MAVLink(None, srcSystem=7, srcComponent=1)
-    drone = AutopilotState(link, 0)
+    drone = AutopilotState(link)
     link.coming = [(first or beat(d.MAV_AUTOPILOT_ARDUPILOTMEGA)).pack(writer)]
     drone.receive()
     check = ArmingCheck(drone, needs)

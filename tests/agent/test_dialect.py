@@ -27,7 +27,7 @@ def test_every_message_ends_as_its_definition_says() -> None:
         (dialect.CHANGE_SPEED, "DO_CHANGE_SPEED"),
         (dialect.ARM, "COMPONENT_ARM_DISARM"),
         (dialect.PREARM_CHECKS, "RUN_PREARM_CHECKS"),
-        (dialect.SET_INTERVAL, "SET_MESSAGE_INTERVAL"),
+        (mavlink_frames.SET_MESSAGE_INTERVAL, "SET_MESSAGE_INTERVAL"),
         (dialect.REQUEST, "REQUEST_MESSAGE"),
     ],
 )

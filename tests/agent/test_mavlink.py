@@ -1,6 +1,7 @@
 """The recorder of MAVLink: frames against pymavlink, and the program against a drone at each kind of connection."""
 
 import json
+import select
 import signal
 import socket
 import subprocess
@@ -21,7 +22,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v10 import common as v1
 from pymavlink.dialects.v20 import common as d
 
-from fieldkit.agent import mavlink_frames
+from fieldkit.agent import mavlink_frames, mavlink_links
 from fieldkit.measure.evidence import tlog
 from fieldkit.remote import agent
 from tests.helpers import drones
@@ -78,7 +79,7 @@ def test_its_own_frames_are_what_pymavlink_reads() -> None:
     writer, reader = mavlink_frames.FrameWriter(), d.MAVLink(None)
     reader.robust_parsing = False
     beat, command, other = reader.parse_buffer(
-        writer.heartbeat() + writer.interval(7, 1, 32, 100_000) + writer.interval(7, 1, 0, 0)
+        writer.heartbeat() + writer.command((7, 1), 511, 32, 100_000) + writer.command((7, 1), 511, 0, 0)
     )
     assert (beat.type, beat.autopilot, beat.get_srcComponent()) == (
         d.MAV_TYPE_LOG,
@@ -229,6 +230,25 @@ def test_a_log_holds_what_pymavlinks_own_reader_finds_in_it(way: Way, program: P
     assert read.kinds == {kind: found.count(kind) for kind in set(found) - {"BAD_DATA"}}
     assert read.values["mavlink_loss"] == 0
     assert found.count("LOCAL_POSITION_NED") > 3 * found.count("ATTITUDE")
+
+
+def test_who_begins_anew_at_another_port_is_spoken_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.9.9.8", 0))
+        port = free.getsockname()[1]
+    link = mavlink_links.opened(f"udpin:127.9.9.8:{port}")
+    with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
+        first.settimeout(60)
+        second.settimeout(60)
+        for speaks, heard_by in ((first, first), (second, first), (second, second)):
+            if heard_by is second:
+                monkeypatch.setattr(mavlink_links, "_GONE_S", 0.0)
+            speaks.sendto(Sender().frame(drones.beat()), ("127.9.9.8", port))
+            select.select([link], [], [], 60)
+            list(link.receive())
+            link.send(b"to whom it may concern")
+            assert heard_by.recv(100) == b"to whom it may concern"
+    link.close()
 
 
 def test_an_autopilot_that_refuses_a_rate_is_told(program: Path, tmp_path: Path) -> None:

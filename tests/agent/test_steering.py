@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldkit.agent import steering
-from fieldkit.agent.steering import BACK, END, OUT, STAND, Driver, DriveTask, DriveVelocity, OdometryPose
+from fieldkit.agent.drive_plan import BACK, END, OUT, DriveTask, way_s
+from fieldkit.agent.steering import STAND, Driver, DriveVelocity, OdometryPose
 
 TICK_S = 0.05
 TASK = DriveTask(
@@ -202,4 +202,33 @@ def test_it_waits_for_its_laptop_and_turns_back_where_it_is() -> None:
 @pytest.mark.parametrize("data", [{"legs": [["x", 0]]}, {"legs": []}, {}])
 def test_a_task_that_lacks_something_is_none(data: dict[str, object]) -> None:
     with pytest.raises((TypeError, ValueError, KeyError)):
-        steering.DriveTask.from_json(data)
+        DriveTask.from_json(data)
+
+
+@settings(max_examples=30)
+@given(LEGS, st.floats(0.1, 1.5), st.floats(0.3, 3.0), st.floats(0.2, 2.0))
+def test_its_way_takes_as_long_as_is_said(
+    legs: list[tuple[float, float]], speed_m_s: float, turn_rad_s: float, acceleration_m_s2: float
+) -> None:
+    task = replace(TASK, legs=legs, speed_m_s=speed_m_s, turn_rad_s=turn_rad_s, fence_m=20.0, limit_s=1e3)
+    task = replace(task, acceleration_m_s2=acceleration_m_s2)
+    driver = Driver(task, 0.0)
+    took_s = len(list(run(driver, Robot(OdometryPose(1.0, 2.0, 0.5)), ticks=20_000))) * TICK_S
+    assert driver.phase == "there"
+    assert way_s(task) == pytest.approx(took_s, rel=0.1, abs=0.5 + 0.5 * len(legs))
+
+
+@pytest.mark.parametrize("told", [(1.0, 0.0), (0.0, 1.0)])
+def test_odometry_that_says_the_same_for_ever_stops_it(told: tuple[float, float]) -> None:
+    driver, pose = Driver(replace(TASK, legs=[told]), 0.0), OdometryPose(0.0, 0.0, math.atan2(*reversed(told)))
+    driver.odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
+    way_m = 0.0
+    for number in range(1, 1200):
+        at_s = number * TICK_S
+        driver.odometry(at_s, pose)
+        driver.renewed(at_s, OUT)
+        way_m += driver.tick(at_s).forward_m_s * TICK_S
+        if driver.stopped:
+            break
+    assert driver.stopped.startswith("told to drive 1.3 m, it came 0.0 m")
+    assert way_m < 1.5, "of 5 m to its fence"

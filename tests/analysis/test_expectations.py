@@ -13,9 +13,9 @@ from fieldkit.analysis.quantities import Quantity
 from fieldkit.core.columns import Kind
 from fieldkit.core.errors import ConfigurationError
 
-LOSS = Quantity("up.file_loss", "up: file bytes lost", Kind.MEAN)
-RTT = Quantity("rtt_median_s", "RTT", Kind.MEDIAN, unit="s")
-SIGNAL = Quantity("signal_dbm", "signal", Kind.MEDIAN, unit="dBm")
+LOSS = Quantity("up.file_loss", "up: file bytes lost", Kind.MEAN, "share")
+RTT = Quantity("rtt_median_s", "RTT", Kind.MEDIAN, "s")
+SIGNAL = Quantity("signal_dbm", "signal", Kind.MEDIAN, "dBm")
 KNOWN = (LOSS, RTT, SIGNAL)
 
 

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import os
 import random
 import shutil
 import sqlite3
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
@@ -24,6 +26,7 @@ from fieldkit.bags.worker import types_of
 from fieldkit.cli import main
 from fieldkit.cli.arguments import bag
 from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.evidence.bag import METADATA
 from tests.helpers.paths import DATA
 
 KILLED = DATA / "rosbag/1.15.15/killed"
@@ -68,11 +71,11 @@ def written(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
     return path
 
 
-def in_chunks(path: Path, messages: Sequence[Message]) -> Path:
+def in_chunks(path: Path, messages: Sequence[Message], compression: CompressionType = CompressionType.ZSTD) -> Path:
     """Return a file of MCAP whose chunks have 20 messages or so, as rosbags writes one for all."""
     path.mkdir()
     with (path / "all.mcap").open("wb") as opened:
-        writer = McapWriter(opened, chunk_size=20_000)
+        writer = McapWriter(opened, chunk_size=20_000, compression=compression)
         writer.start(profile="ros2")
         definition, _ = TYPES.generate_msgdef("std_msgs/msg/String", ros_version=2)
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", definition.encode())
@@ -231,11 +234,23 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (("info", "nowhere.bag"), 4, "No such file"),
-        (("info", "text.bag"), 4, "this is no bag of ROS 1, SQLite or MCAP"),
-        (("info", "packed.bag.gz"), 4, "remedy: gunzip -k packed.bag.gz, then try again"),
+        (("info", "nowhere.bag"), 2, "nowhere.bag: the bag cannot be read: No such file or directory"),
+        (("info", "circle.bag"), 2, "circle.bag: the bag cannot be read: Too many levels of symbolic links"),
+        (("info", "x" * 300), 2, "File name too long"),
+        (("info", "none"), 2, "no bag is in this folder"),
+        (("info", "pipe.bag"), 2, "this is neither a file nor a folder"),
+        (("info", "text.bag"), 2, "this is no bag of ROS 1, SQLite or MCAP"),
+        (("info", "packed.bag.gz"), 2, "remedy: gunzip -k packed.bag.gz, then try again"),
+        (("info", "all.db3"), 2, "remedy: mv all.db3 all.db3.bag"),
         (("info", "empty.bag"), 4, "the file is empty"),
-        (("info", "."), 4, "this folder holds several bags"),
+        (("info", "zeros.mcap"), 4, "the file begins with zeros"),
+        (("info", "."), 2, "this folder holds several bags"),
+        (("check", "nowhere.bag"), 2, "No such file"),
+        (("check", "nowhere.bag", "killed.bag", "all.bag"), 4, "225 messages can be saved"),
+        (("repair", "nowhere.bag", "new.bag"), 2, "No such file"),
+        (("repair", "zeros.mcap", "new"), 4, "the file begins with zeros"),
+        (("convert", "nowhere.bag", "new"), 2, "No such file"),
+        (("convert", "none", "new"), 2, "no bag is in this folder"),
         (("repair", "all.bag", "all.bag"), 2, "something is there already"),
         (("repair", "all.bag", "new"), 2, "a saved bag keeps its format, ros1: the new one is NAME.bag"),
         (("convert", "all.bag", "no/new"), 2, "cannot write there"),
@@ -251,11 +266,62 @@ def test_what_cannot_be_is_told(
     Path("text.bag").write_text("a text")
     Path("packed.bag.gz").write_bytes(gzip.compress(b"a bag"))
     Path("empty.bag").touch()
+    Path("none").mkdir()
+    Path("circle.bag").symlink_to("circle.bag")
+    os.mkfifo("pipe.bag")
+    shutil.copyfile("all.bag", "all.db3")
+    Path("zeros.mcap").write_bytes(bytes(1000))
     shutil.copyfile(KILLED / "bz2.bag.active", "killed.bag")
     names = {path.name for path in here.iterdir()}
     assert main(["bag", *words]) == code
     assert said in capsys.readouterr().err
     assert {path.name for path in here.iterdir()} == names, "nothing is left"
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.NONE])
+def test_a_file_of_mcap_is_a_bag_by_itself(
+    tmp_path: Path, compression: CompressionType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its index is inside: nothing beside it is needed to know that it is whole, and what it holds."""
+    messages = expected(300)
+    alone = data_file(in_chunks(tmp_path / "all", messages, compression))
+    assert not (alone.parent / METADATA).exists()
+    for path in (alone, alone.parent):
+        assert main(["bag", "check", str(path)]) == 0
+        assert "whole, 300 messages" in capsys.readouterr().out
+    assert main(["bag", "convert", str(alone.parent), str(tmp_path / "new.bag")]) == 0
+    assert read(tmp_path / "new.bag") == messages
+    capsys.readouterr()
+    with alone.open("r+b") as opened:
+        opened.truncate(alone.stat().st_size // 2)
+    assert main(["bag", "check", str(alone)]) == EvidenceError.exit_code
+    said = capsys.readouterr().err
+    assert "there is no metadata.yaml" in said
+    assert "bytes before a record does" in said
+    assert "messages can be saved: fieldkit bag repair" in said
+
+
+def test_of_a_database_that_is_cut_off_it_is_told_what_may_help(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = data_file(written(tmp_path, BagFormat.SQLITE, expected(300)))
+    cut = tmp_path / "cut.db3"
+    cut.write_bytes(whole.read_bytes()[:30_000])
+    assert main(["bag", "check", str(cut)]) == EvidenceError.exit_code
+    said = capsys.readouterr().err
+    assert "there is no metadata.yaml" in said
+    assert f"{cut}: database disk image is malformed" in said
+    assert "no message can be saved; SQLite may read more of it: sqlite3 OLD.db3 .recover | sqlite3 NEW.db3" in said
+    assert main(["bag", "repair", str(cut), str(tmp_path / "new")]) == EvidenceError.exit_code
+    assert "remedy: SQLite may read more of it" in capsys.readouterr().err
+
+
+def test_a_file_of_holes_is_told_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = data_file(in_chunks(tmp_path / "all", expected(300)))
+    with whole.open("r+b") as opened:
+        opened.truncate(1 << 42)
+    assert main(["bag", "check", str(whole)]) == EvidenceError.exit_code
+    assert "can be saved" in capsys.readouterr().err
 
 
 def test_the_command_line_knows_what_the_library_can() -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.campaign.plan import load_campaign, load_procedures, trials_of
+from fieldkit.cli import main
 from fieldkit.core.errors import ConfigurationError
 
 LAWN = """\
@@ -70,3 +71,28 @@ def test_a_wrong_file_is_told_with_its_line(tmp_path: Path, old: str, new: str, 
     assert caught.value.where == f"{tmp_path / 'lawn.yaml'}:{line}"
     assert said in f"{caught.value.what} {caught.value.remedy}"
     assert caught.value.remedy
+
+
+ROVERS = """\
+backend: field
+robots:
+  turtlebot-1: {profile: turtlebot3_burger, host: 10.0.0.2, user: ubuntu, host_key: KEY}
+  turtlebot-2: {profile: turtlebot3_burger, host: 10.0.0.3, user: ubuntu, host_key: KEY}
+roles:
+  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
+"""
+KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
+SHORTER = "turtlebot-2 moves 29.5 m away, at 0.22 m/s; 60 m away, at 2 m/s is beyond its limits"
+
+
+def test_what_robots_do_less_than_asked_is_said_once_before_the_first_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("fieldkit.yaml").write_text(ROVERS.replace("KEY", KEY), encoding="utf-8")
+    text = LAWN.replace("[los, nlos]", "[driveaway]").replace("[master, masterless]", "[masterless]")
+    Path("lawn.yaml").write_text(text, encoding="utf-8")
+    assert main(["campaign", "lawn.yaml", "--dry-run", "--allow-motion"]) == 0
+    shown = capsys.readouterr().out
+    assert "driveaway 20ft masterless" in shown
+    assert shown.count(SHORTER) == 1

@@ -52,6 +52,23 @@ def test_a_summary_wider_than_the_terminal_has_a_table_per_protocol(
     assert [line.split()[-1] for line in narrow.splitlines() if line.startswith(" [95")] == ["TCP", "UDP"]
 
 
+@pytest.mark.parametrize("columns", [60, 80, 100])
+def test_a_summary_of_a_trial_fits_a_narrow_terminal(
+    tmp_path: Path, columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No figure is broken: in the narrowest, an interval stands below its value."""
+    trial = shutil.copytree(TRIALS / "20261122T013134.573068Z_los_30ft_master", tmp_path / "los")
+    main(["rebuild", str(trial)])
+    wide = capsys.readouterr().out
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    main(["rebuild", str(trial)])
+    narrow = re.sub("\x1b[^m]*m", "", capsys.readouterr().out)
+    assert max(map(len, narrow.splitlines())) <= columns
+    figure = re.compile(r"\d\.\d+ [%a-zA-Z/]+|\[\d+\.\d[^]]*\]\*?")
+    assert sorted(figure.findall(wide)) == sorted(figure.findall(narrow))
+
+
 def test_words_at_the_end_of_a_line_are_folded_between_words(capsys: pytest.CaptureFixture[str]) -> None:
     verdict = "no difference seen; " * 20
     table(("quantity", "A", "verdict"), [("RTT, median", "1.05 ms", verdict)], right=(1,))
@@ -69,7 +86,13 @@ def test_a_title_longer_than_its_table_stays_one_line(capsys: pytest.CaptureFixt
 
 def test_why_a_repeat_is_not_valid_comes_before_what_it_measured() -> None:
     ended = RepeatEnded("udp-07", 1, Status.VOID, "no message", "RTT 1.3 ms", done=0, total=2, left_s=0.0)
-    assert "".join(text for text, _ in words_of(ended)) == "  0/2  udp-07  void   no message; RTT 1.3 ms"
+    assert "".join(text for text, _ in words_of(ended)) == "  0/2  udp-07  void   no message; measured: RTT 1.3 ms"
+
+
+def test_what_to_do_about_a_step_that_failed_stands_below_its_repeat() -> None:
+    ended = RepeatEnded("udp-07", 1, Status.VOID, "too late", "", done=0, total=2, left_s=0, remedy="a larger idle")
+    _, below = "".join(text for text, _ in words_of(ended)).splitlines()
+    assert below.split() == ["remedy:", "a", "larger", "idle"]
 
 
 def test_a_campaign_that_is_done_tells_of_no_time_and_no_disk() -> None:

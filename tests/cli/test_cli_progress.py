@@ -95,7 +95,7 @@ def test_why_a_repeat_is_void_is_folded_below_it_and_never_cut() -> None:
     first, *below = "".join(text for text, _ in words_of(void, 60)).splitlines()
     assert first == "  6/40  udp-07  void   "
     assert all(text.startswith(" " * 8) and len(text) <= 60 for text in below)
-    assert " ".join(text.strip() for text in below) == f"{reason}; RTT 1.3 ms"
+    assert " ".join(text.strip() for text in below) == f"{reason}; measured: RTT 1.3 ms"
 
 
 def test_a_computation_tells_how_much_of_it_is_done_and_how_long_the_rest_takes() -> None:

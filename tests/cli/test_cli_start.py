@@ -20,8 +20,8 @@ from tests.helpers.paths import DATA, ROOT
 from tests.helpers.runs import fieldkit
 
 LIBRARIES = {
-    *("cryptography", "jinja2", "keyring", "matplotlib", "mcap", "numpy", "paramiko", "pyarrow", "pydantic", "rich"),
-    *("rosbags", "ruamel", "scipy", "sim_backends", "yaml"),
+    *("cryptography", "jinja2", "keyring", "matplotlib", "mcap", "numpy", "pandas", "paramiko", "pyarrow"),
+    *("pydantic", "rich", "rosbags", "ruamel", "scipy", "sim_backends", "yaml"),
 }
 ROOMS = {"analysis", "campaign", "export", "lab", "measure", "remote", "report", "steps", "trial"}
 LIMIT_S = 60.0
@@ -72,7 +72,10 @@ def test_a_mistyped_word_imports_what_shows_errors_alone(tmp_path: Path) -> None
     ("words", "unneeded"),
     [
         ("columns", {"paramiko", "matplotlib", "rosbags", "ruamel", "sim_backends"}),
-        (f"aggregate {DATA / 'fieldkit' / '1' / 'trial.csv'}", {"paramiko", "matplotlib", "rosbags", "ruamel"}),
+        (
+            f"aggregate {DATA / 'fieldkit' / '1' / 'trial.csv'}",
+            {"paramiko", "matplotlib", "pandas", "rosbags", "ruamel"},
+        ),
         ("trial los 30ft --dry-run", {"paramiko", "matplotlib", "pyarrow", "ruamel"}),
         ("robots", {"paramiko", "matplotlib", "numpy", "pyarrow", "rosbags", "ruamel", "sim_backends"}),
         ("completion bash", LIBRARIES),
@@ -80,6 +83,21 @@ def test_a_mistyped_word_imports_what_shows_errors_alone(tmp_path: Path) -> None
 )
 def test_a_command_imports_no_library_that_it_does_not_need(tmp_path: Path, words: str, unneeded: set[str]) -> None:
     assert not imported(tmp_path, words) & unneeded
+
+
+def test_a_command_that_calculates_has_one_thread(tmp_path: Path) -> None:
+    """Of numpy's OpenBLAS there would be one more per core, which spins while it has nothing to do."""
+    script = "import os; from fieldkit.cli import main; main(['columns']); print(*os.listdir('/proc/self/task'))"
+    done = subprocess.run(
+        (sys.executable, "-c", script),
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"},
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=LIMIT_S,
+        check=True,
+    )
+    assert len(done.stdout.splitlines()[-1].split()) == 1
 
 
 def test_the_help_names_the_columns_by_which_repeats_are_told_apart() -> None:

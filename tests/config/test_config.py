@@ -54,7 +54,7 @@ def test_every_shipped_procedure_loads(name: str) -> None:
         ("points: 360", "points: many", "valid integer"),
         ("points: 360", "points: 0", "greater than 0"),
         ("{duration_s}", "{duraton_s}", "unknown placeholder"),
-        ("  variant: ros1", "  variant: ros3", "should match pattern"),
+        ("  variant: ros1", "  variant: ros3", "'ros3' is none of these: ros1, ros2"),
         ("kind: ugv", "kind: ugv\nkind: uav", "duplicate key 'kind'"),
         ("kind: ugv", "kind: *ugv", "aliases"),
         ("kind: ugv", "kind: [ugv", "not valid YAML"),
@@ -71,6 +71,24 @@ def test_a_wrong_profile_names_file_line_and_what_is_meant(tmp_path: Path, old: 
     assert caught.value.remedy
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "others"),
+    [
+        ("rate: 5Hz", "rate: 5", 0),  # a list of one topic less is no second mistake
+        ("max_speed_m_s: 0.22", "max_speed_m_s: fast", 0),  # neither a whole number nor another
+        ("summary: ROBOTIS", "# summary: ROBOTIS", 0),
+        ("name: turtlebot3_burger\nsummary: ROBOTIS", "# summary: ROBOTIS", 1),
+    ],
+)
+def test_each_mistake_counts_once(tmp_path: Path, old: str, new: str, others: int) -> None:
+    assert old in PROFILE
+    path = tmp_path / "robot.yaml"
+    path.write_text(PROFILE.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ConfigurationError) as caught:
+        schema.load(path, RobotProfile)
+    assert ("(1 more after this one)" in caught.value.what) == bool(others), caught.value.what
+
+
 def test_the_line_is_the_right_one(tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
     path.write_text(PROFILE.replace("points: 360", "pionts: 360"), encoding="utf-8")
@@ -83,6 +101,7 @@ def test_the_line_is_the_right_one(tmp_path: Path) -> None:
     ("old", "new", "said"),
     [
         ("- record:", "- recrod:", "unknown key recrod; did you mean 'record'?"),
+        ("  - record:", "  - name: up\n    record:", "unknown key name; it is a key of record: write it inside"),
         ("        - transfer: {from: sender", "        - transfer: {form: sender", "did you mean 'from'?"),
         ("- transfer: {from: sender, to: receiver", "- transfer: {from: sender, to: sender", "cannot send to itself"),
         ("- ping: {from: sender, to: receiver", "- ping: {from: sender, to: sender", "cannot ping itself"),
@@ -90,9 +109,14 @@ def test_the_line_is_the_right_one(tmp_path: Path) -> None:
         ("duration: 15s", "duration: 15", "has no unit"),
         ("duration: 15s", "duration: 0s", "greater than 0"),
         ("topics: [/scan]", "topics: []", "at least 1 item"),
-        ("topics: [/scan]", "topics: ['/scan; reboot']", "should match pattern"),
-        ("into: recv.bag", "into: ../recv.bag", "should match pattern"),
-        ("into: recv.bag", "file: a/b/c.bag", "should match pattern"),
+        ("topics: [/scan]", "topics: ['/scan; reboot']", "'/scan; reboot' is not the name of a topic"),
+        (
+            "topics: [/scan]",
+            "topics: [scan]",
+            "in steps.0.record.topics.0: 'scan' is not the name of a topic",
+        ),
+        ("into: recv.bag", "into: ../recv.bag", "'../recv.bag' is not the name of a file: small letters"),
+        ("into: recv.bag", "file: a/b/c.bag", "is not the name of a recording"),
         ("port: 1234\n", "port: 0\n", "greater than 0"),
         ("topology: master", "topology: mesh", "'master' or 'masterless'"),
         ("repeats: 20", "repeats: 20.5", "valid integer"),
@@ -138,7 +162,7 @@ def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
         ("receiver: b", "receiver: c", "names 'c'; the robots are: a, b"),
         ("receiver: b", "receiver: a", "one robot plays two roles"),
         ("receiver: b", "reciever: b", "roles.masterless.reciever: did you mean 'receiver'?"),
-        ("  a: {profile", "  A b: {profile", "should match pattern"),
+        ("  a: {profile", "  A b: {profile", "'A b' cannot be a key here: 'A b' is not a name: small letters"),
         ("{profile: turtlebot3_burger}", "{profile: turtlebot3_burger, hots: x}", "did you mean 'host'?"),
     ],
 )

@@ -4,11 +4,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldkit.campaign.plan import CampaignFile
-from fieldkit.config import schema
+from fieldkit.config import documents, schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
@@ -195,11 +196,11 @@ def validated(text: str, model: type[schema.Strict]) -> None:
         assert schema.validate(schema.parse(schema.dump(made), source="y.yaml"), model) == made
 
 
-@given(st.sampled_from(FILES), st.data())
-def test_no_damage_to_a_file_gives_anything_but_our_own_error(
-    file: tuple[str, type[schema.Strict]], data: st.DataObject
-) -> None:
-    lines, draw = file[0].splitlines(), data.draw
+@st.composite
+def damaged(draw: st.DrawFn) -> tuple[str, type[schema.Strict]]:
+    """A file that ships, with up to three changes, and its model."""
+    text, model = draw(st.sampled_from(FILES))
+    lines = text.splitlines()
     changes: tuple[Callable[[str], str], ...] = (
         lambda line: line.partition(":")[0] + ": " + draw(st.sampled_from(NASTY)),
         lambda line: line[: draw(st.integers(0, len(line)))],
@@ -210,14 +211,48 @@ def test_no_damage_to_a_file_gives_anything_but_our_own_error(
     for _ in range(draw(st.integers(1, 3))):
         at = draw(st.integers(0, len(lines) - 1))
         lines[at] = draw(st.sampled_from(changes))(lines[at])
-    validated("\n".join(lines), file[1])
+    return "\n".join(lines), model
 
 
-@given(
-    st.text(st.characters(), max_size=40) | st.text(st.sampled_from("a01 \n\t:-?[]{},#&*!|>'\"%@`\\.~<"), max_size=40)
-)
+TEXTS = st.text(st.characters(), max_size=40) | st.text(st.sampled_from(MARKS), max_size=40)
+
+
+@given(damaged())
+def test_no_damage_to_a_file_gives_anything_but_our_own_error(file: tuple[str, type[schema.Strict]]) -> None:
+    validated(*file)
+
+
+@given(TEXTS)
 @example("%YAML 1." + "9" * 5000 + "\n--- a")
 @example("a: \ud800")
 def test_no_text_gives_anything_but_our_own_error(text: str) -> None:
     validated(text, Site)
     validated(f"robots: {text}", Site)
+
+
+def read(text: str) -> tuple[object, ...]:
+    try:
+        document = documents.parse(text, source="x")
+    except ConfigurationError as error:
+        return error.what, error.where, error.remedy
+    return repr(document.data), document.lines
+
+
+def read_by_pyyaml_alone(text: str) -> tuple[object, ...]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(yaml, "__with_libyaml__", False)
+        return read(text)
+
+
+@given(TEXTS.map("a: {}".format) | TEXTS | damaged().map(lambda file: file[0]))
+@example("a: 1\t# one")
+@example("a: [1?2]")
+@example("a: |# one")
+@example("a: 1\nb: \ufeff")
+def test_libyaml_reads_what_pyyaml_reads(text: str) -> None:
+    assert read(text) == read_by_pyyaml_alone(text)
+
+
+@pytest.mark.parametrize("text", [text for text, _ in FILES])
+def test_what_ships_is_read_alike_with_and_without_libyaml(text: str) -> None:
+    assert read(text) == read_by_pyyaml_alone(text)

@@ -20,7 +20,7 @@ from fieldkit.core.model import Fault, FaultKind, Protocol, Role, Status
 from fieldkit.remote import jobs
 from fieldkit.trial import journal
 from sim_backends.emulated.backend import DEFAULT_SITE
-from tests.helpers.labs import built_in_ros, own_procedure
+from tests.helpers.labs import own_procedure
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import LIMIT_S, Run, fieldkit, only_trial, rows, start
 
@@ -282,8 +282,7 @@ def chaos(folder: Path, *, seed: int, repeats: int, faults: int, debian: bool = 
 
     The robots have Debian's ROS, or the built-in one.
     """
-    site = DEFAULT_SITE if debian else built_in_ros(folder, "robots.yaml")
-    with robots_outside(folder, site=site) as outside:
+    with robots_outside(folder, site=DEFAULT_SITE if debian else None) as outside:
         return Chaos(outside, seed=seed, repeats=repeats, faults=faults).run()
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from fieldkit.core.model import Topology
 from tests.helpers.host import descendants, wait_for_end
+from tests.helpers.labs import built_in_ros
 from tests.helpers.outside import robots_outside
 from tests.helpers.runs import Run, fieldkit, finish, rows, start, wait_for_line
 
@@ -29,6 +30,7 @@ seed: 7
 
 
 def begin(lab: Path, distances: str) -> Path:
+    built_in_ros(lab)
     (lab / "lawn.yaml").write_text(CAMPAIGN.format(distances=distances), encoding="utf-8")
     return lab / "trials" / "campaign_lawn"
 

@@ -13,6 +13,7 @@ from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import Holder
+from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.labs import own
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import LIMIT_S, Run, fieldkit
@@ -32,7 +33,8 @@ def failed(run: Run) -> set[tuple[str, str]]:
 
 @pytest.fixture(scope="module")
 def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
-    with robots_outside(tmp_path_factory.mktemp("lab")) as robots:
+    """Debian's ROS, as its programs are what is checked."""
+    with robots_outside(tmp_path_factory.mktemp("lab"), site=DEFAULT_SITE) as robots:
         yield robots
 
 

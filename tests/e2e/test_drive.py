@@ -1,4 +1,4 @@
-"""Robots that drive by themselves, from the outside: by ROS 1 and by DDS, and a laptop with the field backend."""
+"""Robots that drive by themselves, from the outside: by ROS 1, DDS and Zenoh, and a laptop with the field backend."""
 
 import json
 import math
@@ -11,7 +11,7 @@ import pytest
 
 from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.model import Role, Vector, Whereabouts
+from fieldkit.core.model import Role, Topology, Vector, Whereabouts
 from fieldkit.lab.protocol import Destination
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.ssh import SshShell
@@ -30,8 +30,9 @@ backend: emulated
 robots:
   rover-1: {profile: rover}
   rover-2: {profile: rover_two}
+  rover-3: {profile: rover_three}
 roles:
-  masterless: {sender: rover-2, receiver: rover-1}
+  master: {sender: rover-2, receiver: rover-1, relay: rover-3}
 emulated: {ros: auto}
 """
 LAB = """\
@@ -47,7 +48,7 @@ DRIVE = """\
 name: drive
 summary: The receiver drives away
 scenario: los
-topology: masterless
+topology: master
 protocols: [udp]
 repeats: 1
 attempts: 1
@@ -63,16 +64,21 @@ BOTH = (
     DRIVE[: DRIVE.index("  - move:")]
     + """\
   - move:
-      name: outer
-      robot: sender
-      path: [{away: 0.3m, left: 0.3m}]
+      name: zenoh
+      robot: relay
+      path: [{left: 0.3m}]
       during:
         - move:
-            robot: receiver
-            path: [{away: 0.4m}]
-            speed: 0.6m/s
+            name: outer
+            robot: sender
+            path: [{away: 0.3m, left: 0.3m}]
             during:
-              - ping: {from: sender, to: receiver, count: 13, interval: 200ms, payload_bytes: 500}
+              - move:
+                  robot: receiver
+                  path: [{away: 0.4m}]
+                  speed: 0.6m/s
+                  during:
+                    - ping: {from: sender, to: receiver, count: 13, interval: 200ms, payload_bytes: 500}
 """
 )
 RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
@@ -95,8 +101,11 @@ def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Outside
     (tmp_path / "robots" / "rover.yaml").write_text(profile, encoding="utf-8")
     ros2 = profile.replace("name: rover", "name: rover_two").replace("variant: ros1", "variant: ros2")
     (tmp_path / "robots" / "rover_two.yaml").write_text(ros2, encoding="utf-8")
+    zenoh = ros2.replace("name: rover_two", "name: rover_three").replace("distribution: foxy", "distribution: jazzy")
+    zenoh = zenoh.replace("\nlimits:", "\n  environment: {RMW_IMPLEMENTATION: rmw_zenoh_cpp}\nlimits:")
+    (tmp_path / "robots" / "rover_three.yaml").write_text(zenoh, encoding="utf-8")
     (tmp_path / "lab.yaml").write_text(SITE, encoding="utf-8")
-    with robots_outside(tmp_path, site=tmp_path / "lab.yaml") as robots:
+    with robots_outside(tmp_path, site=tmp_path / "lab.yaml", topology=Topology.MASTER) as robots:
         yield robots
 
 
@@ -117,14 +126,18 @@ def place_at(track: list[Whereabouts], utc_ns: int) -> Vector:
 
 def test_they_drive_there_and_back_and_the_world_agrees_with_their_odometry(outside: Outside) -> None:
     (outside.folder / "procedures" / "drive.yaml").write_text(BOTH, encoding="utf-8")
-    starts_m = {role: track_of(outside, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER)}
+    starts_m = {role: track_of(outside, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
     run = fieldkit(outside.folder, *RUN)
     assert run.code == 0, run.err
     trial = only_trial(outside.folder)
     (repeat,) = (trial / "repeats").iterdir()
     (row,) = rows(trial)
-    # By ROS 1, and as it looks from the sender; by ROS 2 over DDS, and facing the other way.
-    for role, name, sign, way_m in ((Role.RECEIVER, "", 1, (0.4, 0.0)), (Role.SENDER, "outer.", -1, (0.3, 0.3))):
+    # By ROS 1, and as it looks from the sender; by ROS 2 over DDS, and facing the other way; over Zenoh.
+    for role, name, sign, way_m in (
+        (Role.RECEIVER, "", 1, (0.4, 0.0)),
+        (Role.SENDER, "outer.", -1, (0.3, 0.3)),
+        (Role.RELAY, "zenoh.", 1, (0.0, 0.3)),
+    ):
         log = [json.loads(line) for line in (repeat / f"{name}drive.jsonl").read_text(encoding="ascii").splitlines()]
         assert (log[-1]["ended"], log[-1]["phase"]) == ("home", "home")
         assert max(one["x_m"] for one in log) == pytest.approx(way_m[0], abs=0.1)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.labs import built_in_ros
 from tests.helpers.runs import LIMIT_S, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
@@ -17,6 +18,7 @@ set -e
 out=$1 python=$2 lab=$3
 mount -t tmpfs -o size=150m tmpfs "$lab"
 cd "$lab"
+cp "$out/fieldkit.yaml" .
 "$python" -m fieldkit trial los 30ft --repeats 2 --record 1s --protocol tcp --json >"$out/first.json" 2>"$out/first" &
 until grep -q '"transfer"' "$out/first.json"; do kill -0 $!; sleep 0.05; done
 head -c 1G /dev/zero >fill 2>/dev/null || true
@@ -41,6 +43,7 @@ def test_a_full_disk_stops_the_trial_and_resume_goes_on_when_there_is_room(tmp_p
     out, lab = tmp_path / "out", tmp_path / "lab"
     out.mkdir()
     lab.mkdir()
+    built_in_ros(out)
     done = subprocess.run(
         ("unshare", "--mount", "sh", "-c", SCRIPT, "sh", str(out), sys.executable, str(lab)),
         capture_output=True,

@@ -15,7 +15,7 @@ from fieldkit.core.model import Protocol, RepeatId, Role, Topology
 from fieldkit.core.prompts import Nobody
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.captures import pcap
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.kinds.transfer import TransferStep
@@ -81,7 +81,7 @@ def test_the_control_connection_is_silent_while_packets_are_measured(
             jobs.stop(up.shells[role], one, settle=f"{one.name.removeprefix('watch-')}.pcap")
         into = tmp_path / role
         into.mkdir()
-        evidence.fetch(up.shells[role], FOLDER, role, "wlan0", into)
+        fetching.fetch(up.shells[role], FOLDER, role, "wlan0", into)
         control, radio = (pcap.read(into / name).packets for name in ("lo.pcap", "wlan0.pcap"))
         spoken_ns = control.time_ns[control.tcp_payload_bytes > 0]
         assert len(spoken_ns) > 10, "the capture of the control connection works"

@@ -8,7 +8,7 @@ import pytest
 from fieldkit.config import locations
 from fieldkit.core.deadline import Deadline
 from tests.helpers.host import Untouched
-from tests.helpers.labs import own_procedure
+from tests.helpers.labs import built_in_ros, own_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
@@ -116,6 +116,7 @@ def test_what_never_heals_has_no_times_and_what_fails_inside_a_fault_is_a_result
 
 
 def test_a_service_that_is_killed_comes_back(tmp_path: Path) -> None:
+    built_in_ros(tmp_path)
     run = run_procedure(tmp_path, HEALS)
     assert run.code == 0, run.err + run.out
     (row,) = rows(only_trial(tmp_path))
@@ -124,6 +125,7 @@ def test_a_service_that_is_killed_comes_back(tmp_path: Path) -> None:
 
 
 def test_what_fails_before_the_fault_makes_the_attempt_fail_and_there_is_no_fault(tmp_path: Path) -> None:
+    built_in_ros(tmp_path)
     profile = locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8")
     (tmp_path / "robots").mkdir()
     broken = re.sub(r"record: \[rosbag.*\]", 'record: ["false", "{topics}"]', profile)
@@ -138,6 +140,7 @@ def test_what_fails_before_the_fault_makes_the_attempt_fail_and_there_is_no_faul
 
 
 def test_a_fault_that_cannot_be_made_makes_the_attempt_fail(tmp_path: Path) -> None:
+    built_in_ros(tmp_path)
     began = Deadline.after(LONG_S)
     recording = "during: [{record: {robot: receiver, topics: [/pidrone/imu], duration: 500s}}]"
     run = run_procedure(tmp_path, HEALS.replace("sensors, after: 0.3s", f"roscore, after: 0.3s, {recording}"))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.labs import built_in_ros
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import only_trial, rows
 
@@ -73,6 +74,7 @@ def test_a_kind_that_is_not_there_is_refused_with_those_that_are(fieldkit: Field
 
 @pytest.mark.emulated
 def test_it_runs_is_judged_measured_and_told(fieldkit: Fieldkit, tmp_path: Path) -> None:
+    built_in_ros(tmp_path)
     done = fieldkit("trial", "busy", "5m", "--json")
     assert done.returncode == 0, done.stderr
     folder = only_trial(tmp_path)

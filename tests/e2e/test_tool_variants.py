@@ -19,6 +19,7 @@ robots:
 roles:
   masterless: {{sender: one, receiver: two}}
 emulated:
+  ros: {ros}
   radio: {{fading: false}}
   robots:
     one: {{{one}}}
@@ -39,11 +40,12 @@ SHORTER: Final = (
 
 @dataclass(frozen=True)
 class Pair:
-    """Two robots: the tools of each as the site file says them, and what the sender's profile says otherwise."""
+    """Two robots: the tools of each as the site file says them, what the sender's profile says otherwise, and ROS."""
 
     sender: str
     receiver: str
     recorder: tuple[str, ...] = ROSBAG
+    ros: str = "builtin"
 
 
 def trial(lab: Path, pair: Pair, *words: str) -> Run:
@@ -52,7 +54,9 @@ def trial(lab: Path, pair: Pair, *words: str) -> Run:
         changes = ("name: turtlebot3_burger", f"name: {name}", "netcat: nc.traditional", "netcat: nc", *recorder)
         own(lab, "robots", "turtlebot3_burger", *changes, called=name)
     own(lab, "procedures", "los", *SHORTER)
-    (lab / "fieldkit.yaml").write_text(SITE.format(one=pair.sender, two=pair.receiver), encoding="utf-8")
+    (lab / "fieldkit.yaml").write_text(
+        SITE.format(one=pair.sender, two=pair.receiver, ros=pair.ros), encoding="utf-8"
+    )
     return fieldkit(lab, "trial", "los", "5m", "--repeats", "1", "--record", "1s", *words)
 
 
@@ -61,7 +65,11 @@ def trial(lab: Path, pair: Pair, *words: str) -> Run:
     [
         Pair("netcat: openbsd, ssh: dropbear", "netcat: openbsd, sftp: false", recorder=SQLITE3),
         Pair("netcat: ncat, ping: busybox", "netcat: ncat, ssh: dropbear, sftp: false", recorder=MCAP),
-        Pair("netcat: traditional, userland: busybox", "netcat: openbsd, userland: busybox, ssh: dropbear"),
+        Pair(
+            "netcat: traditional, userland: busybox",
+            "netcat: openbsd, userland: busybox, ssh: dropbear",
+            ros="debian",
+        ),
         Pair("netcat: ncat", "netcat: openbsd"),
     ],
     ids=lambda pair: f"{pair.sender} to {pair.receiver}",

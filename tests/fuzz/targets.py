@@ -26,6 +26,8 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.evidence import (
     bag,
+    clock,
+    endings,
     host,
     iperf3,
     lateness,
@@ -42,7 +44,7 @@ from fieldkit.measure.positions import recorded
 from fieldkit.measure.positions.accounts import Account
 from fieldkit.measure.transfers import topic_log, topics
 from fieldkit.measure.transfers.topics import TopicTraffic
-from fieldkit.remote import archive, evidence, jobs, script
+from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.steps.base import View
 from fieldkit.steps.scene import Said
@@ -52,6 +54,7 @@ from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.running import locks
 from tests.fuzz.harness import Target
+from tests.fuzz.motion_targets import motion_targets
 from tests.fuzz.mutate import MOST_BYTES
 from tests.fuzz.radio_targets import radio_targets
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
@@ -83,8 +86,8 @@ def _all(*patterns: str, below: Path = DATA) -> tuple[bytes, ...]:
     return tuple(dict.fromkeys(path.read_bytes() for path in found))
 
 
-def _attempts(name: str) -> tuple[bytes, ...]:
-    return _all(f"*/repeats/*/{name}", below=TRIALS)
+def _attempts(*names: str) -> tuple[bytes, ...]:
+    return _all(*(f"*/repeats/*/{name}" for name in names), below=TRIALS)
 
 
 def _written(read: Callable[[Path], object], name: str, data: bytes, place: Path) -> None:
@@ -173,7 +176,7 @@ def _tool_seeds() -> tuple[bytes, ...]:
 
 
 def _tar(data: bytes, place: Path) -> None:
-    evidence.fetch(Sender(place, data), "x", "sender", "lo", place)
+    fetching.fetch(Sender(place, data), "x", "sender", "lo", place)
 
 
 def _tars() -> tuple[bytes, ...]:
@@ -271,6 +274,16 @@ def _measured_text(read: Callable[[Path], object], data: bytes, place: Path) -> 
     _written(read, "evidence.txt", data, place)
 
 
+def _host(path: Path) -> None:
+    host.read(path)
+    host.stations(path)
+    state = host.state(path)
+    for ending in (state.endings or {}).values():
+        endings.problem(ending, frozenset({endings.Cause.ITSELF}))
+    if state.clock is not None:
+        clock.problem(state.clock, state.clock)
+
+
 def _pinged(text: str) -> None:
     found = ping.parse(text)
     ping.measure(found)
@@ -341,7 +354,7 @@ def _all_targets() -> Iterator[Target]:
     pings = _all("ping/*/*.txt", "busybox/*/ping*.txt")
     yield Target("ping", (*pings, *_attempts("ping.txt")), partial(_parsed, _pinged), 3)
     yield Target("tcpdump-log", _all("tcpdump/*/*.log"), partial(_parsed, tcpdump_log.parse))
-    yield Target("host", _attempts("*-before.txt"), partial(_parsed, host.parse))
+    yield Target("host", _attempts("*-before.txt", "*-after.txt"), partial(_measured_text, _host))
     yield Target("lateness", _attempts(lateness.FILE), partial(_measured_text, lateness.read))
     yield Target("medium", _attempts(medium.FILE), partial(_measured_text, medium.read))
     yield Target("track", _attempts(track.FILE), partial(_measured_text, _tracked))
@@ -354,6 +367,7 @@ def _all_targets() -> Iterator[Target]:
     yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_all("iperf3/3.12/*.json")), _printed)
     yield Target("iw", (*_all("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe()), _sections, 2)
     yield from radio_targets()
+    yield from motion_targets()
     yield Target("tools", _tool_seeds(), _tools)
     yield Target("tar", _tars(), _tar, 2)
     yield Target("replies", _REPLIES, _replies)

@@ -19,7 +19,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from tests.helpers.sshd import wait_until
@@ -27,7 +27,7 @@ from tests.helpers.sshd import wait_until
 SOON_S = 60.0
 # Larger than every window: paramiko's has 2 MiB.
 LARGE_BYTES = 5_000_000
-LARGE_FILE_BYTES = evidence.PIECE_BYTES + 100
+LARGE_FILE_BYTES = fetching.PIECE_BYTES + 100
 """Evidence of two pieces."""
 
 GAP_S = 3.0
@@ -189,7 +189,7 @@ class ShellConformance:
         jobs.start(shell, job)
         shell.close()
         assert jobs.begin_wait(shell, job, 20).end(SOON_S) == 0
-        evidence.fetch(shell, folder, "sender", "lo", tmp_path)
+        fetching.fetch(shell, folder, "sender", "lo", tmp_path)
         evidence.discard(shell, "conformance")
         assert (tmp_path / "slow.log").read_text(encoding="ascii") == "done\n"
         assert (tmp_path / "large.bag").stat().st_size == LARGE_FILE_BYTES

@@ -28,7 +28,7 @@ def changed(text: str, *changes: str) -> str:
 def built_in_ros(folder: Path, name: str = SITE_FILE) -> Path:
     """Write a site file with the robots that are there without one, but for Debian's ROS; return its path.
 
-    For tests that ask nothing of ROS: a short trial takes 3.6 s of processor time in place of 5.5 s.
+    For tests that ask nothing of ROS: a short trial takes two thirds of the processor time.
     """
     site = folder / name
     site.write_text(f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin}}\n", encoding="utf-8")

@@ -12,10 +12,11 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Nobody
 from fieldkit.core.units import parse_distance
-from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
+from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.robot import ssh_server
 from sim_backends.emulated.testbed import EmulatedTestbed
 from tests.helpers.forwarder import Forwarder
+from tests.helpers.labs import built_in_ros
 from tests.helpers.sshd import make_key
 
 
@@ -38,19 +39,19 @@ class Outside:
 
 @contextmanager
 def robots_outside(
-    folder: Path, *, topology: Topology = Topology.MASTERLESS, site: Path = DEFAULT_SITE, distance: str = "5m"
+    folder: Path, *, topology: Topology = Topology.MASTERLESS, site: Path | None = None, distance: str = "5m"
 ) -> Iterator[Outside]:
     """Yield the robots of an emulated testbed, placed, with a site file in `folder` that reaches them by SSH.
 
     They end with the calling thread at the latest, so call this in one that lives as long as the test.
 
     Args:
-        folder: Gets the site file and the key.
+        folder: Gets the site files and the key.
         topology: Whose robots to bring up.
-        site: Site file of the emulated testbed.
+        site: Site file of the emulated testbed; without one, robots as `built_in_ros` has them.
         distance: How far apart they stand, in line of sight; `testbed.place` moves them.
     """
-    backend = EmulatedBackend(*load_site(site))
+    backend = EmulatedBackend(*load_site(site or built_in_ros(folder, "robots.yaml")))
     cast = backend.cast(topology)
     with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as testbed:
         assert isinstance(testbed, EmulatedTestbed)

@@ -12,7 +12,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LockLostError, RobotError
 from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Role
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import Holder, taken
@@ -94,7 +94,7 @@ def test_evidence_that_does_not_fit_is_told(shell: SmallShell, tmp_path: Path) -
     into = tmp_path / "local"
     into.mkdir()
     with pytest.raises(RobotError, match=NO_SPACE):
-        evidence.fetch(shell, FOLDER, "sender", "lo", into)
+        fetching.fetch(shell, FOLDER, "sender", "lo", into)
     assert not list(into.iterdir())
 
 

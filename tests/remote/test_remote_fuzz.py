@@ -21,7 +21,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LockLostError, RobotError
 from fieldkit.core.events import Event, Note, RepeatEnded
 from fieldkit.core.model import Status
-from fieldkit.remote import archive, evidence, jobs, script
+from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable, quote
 from fieldkit.remote.drain import drain
 from fieldkit.remote.shell import Completed
@@ -108,7 +108,7 @@ def fetched(content: bytes) -> dict[str, bytes] | None:
         into.mkdir(parents=True)
         said: FieldkitError | None = None
         try:
-            evidence.fetch(Sender(Path(folder), content), "x", "sender", "lo", into)
+            fetching.fetch(Sender(Path(folder), content), "x", "sender", "lo", into)
         except FieldkitError as error:
             said = error
         assert said is None or harmless(said)
@@ -134,7 +134,7 @@ def test_an_archive_arrives_whole_or_not_at_all(files: dict[str, bytes], data: s
     whole = b"".join(entry(name.encode(), content) for name, content in sent) + bytes(1024)
     if files:
         with tempfile.TemporaryDirectory() as folder:
-            evidence.fetch(Sender(Path(folder), whole), "x", "sender", "lo", Path(folder))
+            fetching.fetch(Sender(Path(folder), whole), "x", "sender", "lo", Path(folder))
             assert {name: Path(folder, name).read_bytes() for name in files} == files
     hurt = bytearray(whole)
     place = data.draw(st.integers(0, len(whole) - 1))
@@ -173,7 +173,7 @@ def test_a_second_writer_of_tars_agrees_on_what_a_plain_file_is(kind: int, tmp_p
 )
 def test_what_no_robot_of_ours_sends_is_refused(content: bytes, tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
-        evidence.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
+        fetching.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
 
 
 def test_what_the_other_robot_sent_is_not_overwritten(tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_what_the_other_robot_sent_is_not_overwritten(tmp_path: Path) -> None:
     sums = hashlib.sha256(b"y").hexdigest().encode() + b"  scan.bag\n"
     content = entry(b".sums-1", sums) + entry(b"scan.bag", b"y") + bytes(1024)
     with pytest.raises(EvidenceError, match="which it or the other robot sent before"):
-        evidence.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
+        fetching.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
     assert (tmp_path / "scan.bag").read_bytes() == b"x"
 
 
@@ -189,7 +189,7 @@ def test_a_damaged_header_is_told(tmp_path: Path) -> None:
     content = bytearray(entry(b"scan.bag", b"y") + bytes(1024))
     content[0] ^= 1
     with pytest.raises(EvidenceError, match="arrived damaged: a header fails its checksum"):
-        evidence.fetch(Sender(tmp_path, bytes(content)), "x", "sender", "lo", tmp_path)
+        fetching.fetch(Sender(tmp_path, bytes(content)), "x", "sender", "lo", tmp_path)
 
 
 @given(BYTES)
@@ -318,7 +318,7 @@ def test_sums_of_any_size_take_little_memory(tmp_path: Path) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(EvidenceError):
-            evidence.fetch(Big(tmp_path), "f", "sender", "lo", tmp_path)
+            fetching.fetch(Big(tmp_path), "f", "sender", "lo", tmp_path)
         assert tracemalloc.get_traced_memory()[1] < 10 << 20
     finally:
         tracemalloc.stop()

@@ -22,7 +22,7 @@ from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.evidence import clock, host
 from fieldkit.measure.evidence.endings import Cause
-from fieldkit.remote import evidence, jobs, script
+from fieldkit.remote import evidence, fetching, jobs, script
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed
 from tests.helpers.host import ENDED
@@ -290,9 +290,9 @@ def test_a_job_that_said_its_parting_word_ends_by_itself_until_the_evidence_is_f
         assert jobs.stop(shell, one, grace_s=30, parting="counted") == 0
     if code:
         with pytest.raises(RobotError, match="job job ended with exit code 3"):
-            evidence.fetch(shell, FOLDER, "sender", "lo", into)
+            fetching.fetch(shell, FOLDER, "sender", "lo", into)
     else:
-        evidence.fetch(shell, FOLDER, "sender", "lo", into)
+        fetching.fetch(shell, FOLDER, "sender", "lo", into)
         assert (into / "job.log").read_text(encoding="ascii").endswith("counted\ngone\n")
     assert jobs.left(shell, Deadline.after(30)) == ()
 
@@ -303,7 +303,7 @@ def test_a_job_that_does_not_end_after_its_parting_word_is_killed(shell: LocalSh
     jobs.start(shell, one)
     assert jobs.stop(shell, one, grace_s=30, parting="counted") == 0
     with pytest.raises(RobotError, match=f"job job ended with exit code {jobs.KILLED}"):
-        evidence.fetch(shell, FOLDER, "sender", "lo", tmp_path)
+        fetching.fetch(shell, FOLDER, "sender", "lo", tmp_path)
     assert jobs.left(shell, Deadline.after(30)) == ()
 
 
@@ -488,7 +488,7 @@ def test_a_folder_is_fetched_whole_with_the_hosts_state_before_and_after(shell: 
     jobs.run(shell, replace(job("printf", "abc"), stdout="scan.bag"))
     into = tmp_path / "local"
     into.mkdir()
-    evidence.fetch(shell, FOLDER, "sender", "lo", into)
+    fetching.fetch(shell, FOLDER, "sender", "lo", into)
     assert sorted(path.name for path in into.iterdir()) == [
         "job.log",
         "scan.bag",
@@ -518,7 +518,7 @@ def test_who_ended_each_job_is_kept_with_which_boot_it_was_and_what_the_clock_sa
         assert stop(shell, one) == 0, "as if nobody else had ended it"
     into = tmp_path / "local"
     into.mkdir()
-    evidence.fetch(shell, FOLDER, "sender", "lo", into)
+    fetching.fetch(shell, FOLDER, "sender", "lo", into)
     before, after = (host.state(into / f"sender-{when}.txt") for when in ("before", "after"))
     assert after.endings is not None
     assert before.endings is None
@@ -550,7 +550,7 @@ def test_the_state_of_the_radio_is_kept_before_and_after(shell: LocalShell, tmp_
     iw.write_text(f"#!/bin/sh\ncase $3 in\n{cases}\nesac\n", encoding="utf-8")
     iw.chmod(0o755)
     evidence.begin(shell, f"{FOLDER}-2", "sender", "wlan0")
-    evidence.fetch(shell, f"{FOLDER}-2", "sender", "wlan0", into)
+    fetching.fetch(shell, f"{FOLDER}-2", "sender", "wlan0", into)
     for moment in ("before", "after"):
         state = (into / f"sender-{moment}.txt").read_text(encoding="utf-8")
         assert "==> iw power save <==\nPower save: on\n" in state
@@ -567,7 +567,7 @@ def test_files_in_one_level_of_folders_are_fetched_and_nothing_but_files(shell: 
     for _ in range(2):  # the answer of the first may have been lost
         shutil.rmtree(into)
         into.mkdir()
-        evidence.fetch(shell, FOLDER, "sender", "lo", into)
+        fetching.fetch(shell, FOLDER, "sender", "lo", into)
         assert {str(path.relative_to(into)) for path in into.rglob("*") if path.is_file()} == {
             "job.log",
             "scan/metadata.yaml",
@@ -664,7 +664,7 @@ def test_what_a_robot_sends_cannot_leave_the_folder_or_pass_unchecked(
     home.mkdir()
     into.mkdir()
     with pytest.raises(EvidenceError, match=said):
-        evidence.fetch(Liar(home, members, link=link), FOLDER, "sender", "lo", into)
+        fetching.fetch(Liar(home, members, link=link), FOLDER, "sender", "lo", into)
     assert {path.name for path in tmp_path.iterdir()} == {"home", "into"}
     assert not list(into.glob(".*"))
 
@@ -673,7 +673,7 @@ def test_an_archive_cut_short_is_refused(tmp_path: Path) -> None:
     liar = Liar(tmp_path, {"scan.bag": b"x" * 5000})
     liar.archive.write_bytes(liar.archive.read_bytes()[:2000])
     with pytest.raises(EvidenceError):
-        evidence.fetch(liar, FOLDER, "sender", "lo", tmp_path)
+        fetching.fetch(liar, FOLDER, "sender", "lo", tmp_path)
 
 
 def test_nobody_else_can_write_where_the_script_is(shell: LocalShell) -> None:

@@ -11,8 +11,8 @@ import pytest
 from fieldkit.core import files
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, LinkError, RobotError
-from fieldkit.remote import evidence, jobs
-from fieldkit.remote.evidence import PIECE_BYTES, FetchProgress, NoFolderError
+from fieldkit.remote import evidence, fetching, jobs
+from fieldkit.remote.fetching import PIECE_BYTES, FetchProgress, NoFolderError
 from fieldkit.remote.shell import Completed
 from tests.helpers.userlands import USERLANDS, LocalShell, path_of
 
@@ -63,7 +63,7 @@ def into(tmp_path: Path) -> Path:
 
 
 def fetch(robot: Flaky, into: Path, **more: object) -> None:
-    evidence.fetch(robot, FOLDER, "sender", "lo", into, **more)  # type: ignore[arg-type]
+    fetching.fetch(robot, FOLDER, "sender", "lo", into, **more)  # type: ignore[arg-type]
 
 
 def names(folder: Path) -> set[str]:
@@ -158,8 +158,8 @@ def test_what_an_earlier_fetch_left_wrong_is_noticed_and_fetched_anew(robot: Fla
 def test_more_than_is_expected_stays_on_the_robot_and_is_told(
     robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(evidence, "ALWAYS_BYTES", 1000)
-    monkeypatch.setattr(evidence, "UNEXPECTED_SHARE", 0.0)
+    monkeypatch.setattr(fetching, "ALWAYS_BYTES", 1000)
+    monkeypatch.setattr(fetching, "UNEXPECTED_SHARE", 0.0)
     with pytest.raises(
         EvidenceError, match=r"17 MB wait there \(camera\.bag, scan/scan_0\.db3\), and at most 4\.0 MB are taken"
     ):
@@ -175,7 +175,7 @@ def test_more_than_is_expected_stays_on_the_robot_and_is_told(
 def test_more_than_fits_here_stays_on_the_robot_and_is_told(
     robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(files, "free_bytes", lambda _: evidence.RESERVE_BYTES + 5_000_000)
+    monkeypatch.setattr(files, "free_bytes", lambda _: fetching.RESERVE_BYTES + 5_000_000)
     with pytest.raises(EvidenceError, match=r"17 MB wait there .* and 5\.0 MB are free here"):
         fetch(robot, into)
 
@@ -253,6 +253,6 @@ def test_what_a_robot_lists_cannot_leave_the_folder_or_fill_the_disk(tmp_path: P
     into.mkdir(parents=True)
     told = f"{hashlib.sha256(bytes(100)).hexdigest()}  {'x' if 'x' in large else 'y'}\n"
     with pytest.raises((EvidenceError, RobotError), match=said):
-        evidence.fetch(Liar(home, large, told.encode()), FOLDER, "sender", "lo", into)
+        fetching.fetch(Liar(home, large, told.encode()), FOLDER, "sender", "lo", into)
     assert [path.name for path in (tmp_path / "outer").iterdir()] == ["into"]
     assert names(into) <= {"x", ".sender.x.part"}

@@ -240,6 +240,18 @@ def test_quote_keeps_backslashes_from_shells_that_read_them_between_single_quote
     assert quote(("a\\b", "\\")) == """'a'"\\\\"'b' ''"\\\\"''"""
 
 
+@pytest.mark.parametrize(
+    ("said", "text"),
+    [
+        (b"Subscribing to /scan\nRecording", "to /scan Recording"),
+        (b"x" * 21, "x" * 20),
+        (b"all of it is here", "all of it is here"),
+    ],
+)
+def test_what_a_robot_says_at_length_is_cut_between_words(said: bytes, text: str) -> None:
+    assert printable(said, limit=20) == text
+
+
 @given(st.binary(max_size=200))
 def test_what_a_robot_says_cannot_garble_a_terminal(data: bytes) -> None:
     text = printable(data, limit=50)

@@ -17,7 +17,7 @@ from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import host, link
 from fieldkit.measure.evidence.endings import Cause
-from fieldkit.remote import evidence, jobs, script
+from fieldkit.remote import evidence, fetching, jobs, script
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import USERLANDS, LocalShell, path_of
@@ -41,6 +41,11 @@ def give_iw(tmp_path: Path, link_file: str = "link-station") -> None:
     """Let iw answer with real outputs, and write down what it was asked."""
     answers = {"link": link_file, "station": "station-iwlwifi-6", "survey": "survey-mt7996-6", "info": "info-station"}
     files = {verb: shlex.quote(str(DATA / "iw" / f"{name}.txt")) for verb, name in answers.items()}
+    # The two are of different machines: here the access point is the same.
+    (link := tmp_path / "link.txt").write_text(
+        (DATA / "iw" / f"{link_file}.txt").read_text().replace("f0:99:bf:0e:86:98", "04:f0:21:32:3f:d2")
+    )
+    files["link"] = shlex.quote(str(link))
     cases = "\n".join(f"{verb}) exec cat {file} ;;" for verb, file in files.items())
     iw = tmp_path / "bin" / "iw"
     asked = shlex.quote(str(tmp_path / "asked"))
@@ -66,7 +71,7 @@ def test_a_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_pat
     assert len(jobs.left(shell, Deadline.after(30))) == 1, "a begin whose answer was lost joins it"
     into = tmp_path / "local"
     into.mkdir()
-    evidence.fetch(shell, FOLDER, "sender", "wlan0", into)
+    fetching.fetch(shell, FOLDER, "sender", "wlan0", into)
     assert jobs.left(shell, Deadline.after(30)) == ()
     assert not written.exists()
     assert (into / "sender-link.txt.gz").stat().st_size < 4000, "it is fetched compressed"
@@ -79,7 +84,7 @@ def test_a_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_pat
     assert after.endings is not None
     assert after.endings["link"].cause is Cause.ASKED
     asked = (tmp_path / "asked").read_text().splitlines()
-    assert "dev wlan0 station get f0:99:bf:0e:86:98" in asked, "of its own cell, which some drivers list nowhere"
+    assert "dev wlan0 station get 04:f0:21:32:3f:d2" in asked, "of its own cell, which some drivers list nowhere"
 
 
 def test_an_access_point_is_asked_for_all_its_stations(shell: LocalShell, tmp_path: Path) -> None:
@@ -120,8 +125,26 @@ def test_without_wifi_it_ends_at_once_and_without_iw_it_never_begins(shell: Loca
     wait_until(lambda: exit_code.is_file() and exit_code.read_text() == "0\n", Deadline.after(60))
     into = tmp_path / "local"
     into.mkdir()
-    evidence.fetch(shell, f"{FOLDER}-2", "sender", "wlan0", into)
+    fetching.fetch(shell, f"{FOLDER}-2", "sender", "wlan0", into)
     assert link.measure(Role.SENDER, AttemptEvidence(into).links(Role.SENDER)).values == {}
+
+
+def test_a_look_that_fails_in_between_does_not_end_it(shell: LocalShell, tmp_path: Path) -> None:
+    # A station that is lost between the two questions of `iw link` is one that the kernel does not know.
+    give_iw(tmp_path)
+    iw, lost = tmp_path / "bin" / "iw", tmp_path / "lost"
+    fails = "{ echo 'command failed: No such file or directory (-2)' >&2; exit 254; }"
+    text = iw.read_text(encoding="utf-8")
+    iw.write_text(text.replace("case $3", f"[ ! -e {shlex.quote(str(lost))} ] || {fails}\ncase $3"), encoding="utf-8")
+    written = begin(shell)
+    lost.touch()
+    looks = written.read_text().count(" link <==")
+    # The first of them may have asked before; one that failed was followed by another.
+    wait_until(lambda: written.read_text().count(" link <==") > looks + 1, Deadline.after(60))
+    lost.unlink()
+    seen = written.read_text().count("Connected to ")
+    wait_until(lambda: written.read_text().count("Connected to ") > seen, Deadline.after(60))
+    evidence.end_jobs(shell, FOLDER)
 
 
 def test_a_file_that_nobody_fetches_does_not_fill_the_disk(shell: LocalShell, tmp_path: Path) -> None:

@@ -9,9 +9,13 @@ from playwright.sync_api import Browser
 
 from tests.helpers import lawns, tables
 from tests.helpers.browser import LAPTOP, PHONE, chromium, opened
+from tests.helpers.labs import built_in_ros
 from tests.helpers.runs import fieldkit, only_trial
 
 pytestmark = pytest.mark.emulated
+
+A4 = 720
+"""Its width with margins, in pixels of CSS."""
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +55,18 @@ def test_every_figure_shows_on_phone_and_laptop(
         assert found.page.evaluate("document.documentElement.scrollWidth") == width
 
 
+def test_on_paper_tables_stay_within_the_page_and_charts_keep_their_size(browser: Browser, lawn: Path) -> None:
+    with opened(browser, lawn, width=A4) as found:
+        found.page.emulate_media(media="print")
+        for table in found.page.locator(".scroll > table").all():
+            box = table.bounding_box()
+            assert box is None or box["x"] + box["width"] <= A4, table.inner_text()
+        for panel in found.page.locator(".panels:not(.dense) > svg").all():
+            box = panel.bounding_box()
+            assert box is not None
+            assert box["width"] > A4 / 3
+
+
 def test_dark_and_light_differ_and_text_stands_out(browser: Browser, lawn: Path) -> None:
     for scheme in ("light", "dark"):
         with opened(browser, lawn, scheme=scheme) as found:
@@ -78,6 +94,7 @@ def luminance(colour: list[float]) -> float:
 
 
 def test_an_emulated_trial_is_reported_with_links_to_its_evidence(browser: Browser, tmp_path: Path) -> None:
+    built_in_ros(tmp_path)
     run = fieldkit(tmp_path, "trial", "los", "30ft", "--repeats", "2", "--record", "1s", "--protocol", "udp")
     assert run.code == 0, run.err
     run = fieldkit(tmp_path, "report", "trials", "--rebuild")

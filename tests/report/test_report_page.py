@@ -29,6 +29,15 @@ class Elements(HTMLParser):
         self.ids += [value or "" for name, value in attrs if name == "id"]
 
 
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the text of a report on a made-up lawn."""
+    folder = tmp_path_factory.mktemp("lawn")
+    written = folder / "report.html"
+    assert main(["report", str(tables.write(folder, lawns.lawn(2))), "-o", str(written)]) == 0
+    return written.read_text(encoding="utf-8")
+
+
 def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
     rows = [row for row in lawns.lawn(2) if row.topology == "master" and row.distance == "20ft"]
     path = tables.write(tmp_path, rows)
@@ -61,22 +70,15 @@ def test_texts_of_the_evidence_are_texts_of_the_page(tmp_path: Path, monkeypatch
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
 
 
-def test_ids_are_unique_and_everything_that_is_named_is_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["report", str(tables.write(tmp_path, lawns.lawn(2)))]) == 0
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    found = Elements(text)
+def test_ids_are_unique_and_everything_that_is_named_is_there(page: str) -> None:
+    found = Elements(page)
     assert len(found.ids) == len(set(found.ids))
     named = {value[1:] for name, value in found.attributes if name.endswith("href") and value.startswith("#")}
-    assert named | set(re.findall(r"url\(#([^)]*)\)", text)) <= set(found.ids)
+    assert named | set(re.findall(r"url\(#([^)]*)\)", page)) <= set(found.ids)
 
 
-def test_the_page_asks_nobody_for_anything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["report", str(tables.write(tmp_path, lawns.lawn(2)))]) == 0
-    found = Elements((tmp_path / "report.html").read_text(encoding="utf-8"))
+def test_the_page_asks_nobody_for_anything(page: str) -> None:
+    found = Elements(page)
     outside = [value for name, value in found.attributes if "//" in value and not name.startswith("xmlns")]
     assert outside == []
     assert not {"script", "iframe", "object", "img"} & set(found.tags)

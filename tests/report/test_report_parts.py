@@ -13,14 +13,17 @@ from scipy import stats
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats, read
+from fieldkit.core.columns import named
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.transfers import fates, tcp, topics
+from fieldkit.measure.evidence import iperf3, ping
+from fieldkit.measure.transfers import fates, load, tcp, topics
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.report import bursts, distance, distribution, figures, strips, summary, timeline
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities
+from fieldkit.report.contents import put_together
 from fieldkit.report.evidence import at_hand
 from fieldkit.report.theme import Style
 from fieldkit.trial.columns import trial_columns
@@ -201,7 +204,7 @@ def test_the_page_warns_of_what_matters(tmp_path: Path) -> None:
     assert said[1] == ("1 attempt failed.", ["no answer (1)"])
     assert said[2] == ("Nothing valid in 1 condition.", ["UDP, 20 ft (6.10 m)"])
     assert said[3][0].startswith("* a median of fewer than 6 repeats")
-    assert "in 50 % of 2 repeats" in said[3][0]
+    assert "in 50 % of 2 repeats" in plain(said[3][0])
     assert said[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
     assert said[5][0].startswith("Several versions of fieldkit")
     assert len(said) == 6
@@ -230,6 +233,21 @@ def test_a_headline_names_the_ends_with_their_intervals(tmp_path: Path) -> None:
     ]
 
 
+def test_a_headline_of_several_steps_says_at_which_its_ends_are(tmp_path: Path) -> None:
+    pings = {f"{step}.rtt_median_s": at_s for step, at_s in (("small", 0.002), ("middle", 0.004), ("big", 0.016))}
+    columns = trial_columns(named(step, one) for step in ("small", "middle", "big") for one in ping.COLUMNS)
+    rows = [{**lawns.row(number), **pings, "rtt_median_s": None} for number in (1, 2)]
+    path = tmp_path / "trial.csv"
+    path.write_text(to_csv(rows, columns), encoding="utf-8")
+    found = at_hand(read([path], columns))
+    _, rtt = summary.headlines(aggregate(found.repeats), found)
+    assert rtt.subject == "RTT with UDP"
+    assert ends(rtt) == [
+        "least 2.00 ms [2.00, 2.00]* small, 10 ft (3.05 m)",
+        "most 16.00 ms [16.00, 16.00]* big, 10 ft (3.05 m)",
+    ]
+
+
 def test_a_report_of_topics_begins_with_them_and_draws_them(tmp_path: Path) -> None:
     topic = {"topic_sent": 20, "topic_received": 18, "topic_loss": 0.1, "topic_delay_median_s": 0.03}
     columns = trial_columns(topics.COLUMNS)
@@ -244,6 +262,19 @@ def test_a_report_of_topics_begins_with_them_and_draws_them(tmp_path: Path) -> N
     }
     drawn = distance.charts(cells, Identities(cells), found, (*distance.LOSS, *distance.DELAY))
     assert {"topic-loss", "topic-delay-median"} <= {chart.name for chart in drawn}
+
+
+def test_what_iperf3_measured_is_drawn_against_distance_under_its_own_name(tmp_path: Path) -> None:
+    tested = {"iperf3_throughput_bit_s": 5e6, "iperf3_loss": 0.1, "iperf3_captured_loss": 0.12}
+    counts = {"iperf3_datagrams_sent": 100, "iperf3_datagrams_received": 90}
+    columns = trial_columns((*iperf3.COLUMNS, *load.COLUMNS))
+    path = tmp_path / "trial.csv"
+    rows = [{**lawns.row(number), **tested, **counts} for number in (1, 2)]
+    path.write_text(to_csv(rows, columns), encoding="utf-8")
+    page = put_together(read([path], columns), title="", repeat="", command=["fieldkit"])
+    titles = {section.name: [chart.title for chart in section.charts] for section in page.against_distance}
+    assert {"iperf3 loss against distance", "iperf3 loss, captured against distance"} <= set(titles["loss"])
+    assert "iperf3 throughput against distance" in titles["rate"]
 
 
 def ends(headline: summary.Headline) -> list[str]:

@@ -1,8 +1,6 @@
 """Qualities of service, against the values of rmw/qos_profiles.h and the texts of rmw_zenoh."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from fieldkit.ros import qos
 from fieldkit.ros.qos import PROFILES, Durability, History, Liveliness, QosProfile, Reliability
@@ -41,37 +39,3 @@ def test_profiles_have_the_values_of_rmw(name: str, values: tuple[object, ...]) 
 )
 def test_rmw_zenoh_leaves_out_what_it_takes_anyway(profile: QosProfile, text: str) -> None:
     assert qos.to_zenoh(profile) == text
-    assert qos.from_zenoh(text) == qos.adapted(profile)
-
-
-def test_a_text_in_full_is_read() -> None:
-    found = qos.from_zenoh("1:2:1,10:5,0:60,3000:1,9223372036,854775807")
-    assert found == QosProfile(
-        deadline_ns=5 * SECOND_NS, lifespan_ns=60 * SECOND_NS + 3000, liveliness=Liveliness.AUTOMATIC
-    )
-
-
-@pytest.mark.parametrize("text", ["", "::", "a::,:,:,:,,", "9::,:,:,:,,", "::,:,:,:,", "::,x:,:,:,,", "::1:,:,:,,"])
-def test_what_is_none_is_refused(text: str) -> None:
-    with pytest.raises(ValueError):  # noqa: PT011 (Python's own complaints)
-        qos.from_zenoh(text)
-
-
-durations = st.none() | st.integers(0, 2**62)
-
-
-@given(
-    st.builds(
-        QosProfile,
-        st.sampled_from(Reliability),
-        st.sampled_from(History),
-        st.integers(0, 10_000),
-        st.sampled_from(Durability),
-        durations,
-        durations,
-        st.sampled_from(Liveliness),
-        durations,
-    )
-)
-def test_every_profile_comes_back(profile: QosProfile) -> None:
-    assert qos.from_zenoh(qos.to_zenoh(profile)) == qos.adapted(profile)

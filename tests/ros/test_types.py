@@ -57,7 +57,6 @@ def test_every_hash_is_that_of_a_real_ros_2() -> None:
 
 def test_either_spelling_names_a_type() -> None:
     assert shipped().get("sensor_msgs/LaserScan") == shipped().get("sensor_msgs/msg/LaserScan")
-    assert shipped().get("sensor_msgs/msg/LaserScan").ros1_name == "sensor_msgs/LaserScan"
 
 
 def test_a_definition_of_ones_own_is_a_type_like_others() -> None:

@@ -7,7 +7,7 @@ from typing import cast
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import LinkError
+from fieldkit.core.errors import LinkError, LockLostError, RobotError
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed, Shell
 from fieldkit.steps.lease import HeldLease, orders_file
@@ -90,3 +90,35 @@ def test_who_cannot_be_reached_at_first_is_an_error() -> None:
     link.broken = 1
     with pytest.raises(LinkError), held(link):
         pytest.fail("nobody has a lease")
+
+
+class Ending(Link):
+    """A shell whose program has ended when it is looked at for the third time."""
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
+        done = super().run(argv, deadline=deadline)
+        said = b"bash: warning: no locale\n7\n" if len(self.words) > 2 else b"bash: warning: no locale\n"
+        return Completed(done.argv, 0, done.stdout, said)
+
+
+def test_a_body_ends_with_the_program_and_says_why() -> None:
+    ended = Event()
+
+    def wait() -> None:
+        assert ended.wait(60)
+        raise LinkError("it broke off", where="r", remedy="wait")
+
+    with held(Ending()) as lease:
+        assert lease.over == ""
+        with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.outlasting(ended.set):
+            wait()
+        assert "it broke off" in str(caught.value.__cause__)
+        with pytest.raises(RobotError, match="ended with exit code 7"), lease.outlasting(ended.set):
+            pass
+        with pytest.raises(LockLostError), lease.outlasting(ended.set):
+            raise LockLostError("aborted", where="r", remedy="ask")
+
+
+def test_a_body_that_fails_by_itself_says_why_itself() -> None:
+    with held(Link()) as lease, pytest.raises(LinkError), lease.outlasting(pytest.fail):
+        raise LinkError("it broke off", where="r", remedy="wait")

@@ -8,7 +8,7 @@ import pytest
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import FIXED_ROLES, Placement, Protocol, RepeatId, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.steps import variants
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
@@ -38,5 +38,5 @@ def test_the_kernels_ring_is_drained(tmp_path: Path) -> None:
         for entry in plan.procedure.steps:
             entry.step.run(scene, robots, lambda *_: None)
         for at in where.values():
-            evidence.fetch(*at, tmp_path)
+            fetching.fetch(*at, tmp_path)
     assert problems(plan, Protocol.TCP, tmp_path) == ()

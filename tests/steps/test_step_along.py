@@ -1,5 +1,6 @@
 """Steps that last as long as the way of the move around them: ping, wait, topics, iperf3."""
 
+import math
 from typing import Any
 
 import pytest
@@ -56,6 +57,18 @@ def test_each_lasts_as_long_as_the_way() -> None:
     assert isinstance(iperf3, Iperf3Step)
     assert (iperf3.duration, iperf3.limit) == (11.0, 41.0), "whole seconds"
     assert fitted("ping", f"{ENDS}, count: 7").count == 7
+
+
+def test_a_robot_that_drives_by_itself_needs_time_for_its_turns() -> None:
+    text = TEXT.replace("AWAY", "1m}, {left: 1m").replace("KIND: {WORDS}", "wait: {along: true}")
+    own = schema.validate(schema.parse(text, source="x.yaml"), Procedure)
+    drives = {role: one.model_copy(update={"drives": one.profile.drive is not None}) for role, one in CAST.items()}
+    moved, driven = (list(own.fitted(cast).walk())[-1].step for cast in (CAST, drives))
+    assert isinstance(moved, WaitStep)
+    assert isinstance(driven, WaitStep)
+    assert moved.duration == 10.0
+    # A quarter of a turn at 1 rad/s at most, and it brakes twice.
+    assert driven.duration == pytest.approx(10.0 + math.pi / 2 + 2.0, abs=1.0)
 
 
 def test_what_is_fitted_reads_back() -> None:

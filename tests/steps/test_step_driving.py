@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import pytest
 
-from fieldkit.agent.steering import DriveTask
+from fieldkit.agent.drive_plan import DriveTask
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
@@ -93,25 +93,49 @@ def test_two_robots_that_hear_one_topic_are_not_driven() -> None:
     )
 
 
-def test_a_robot_whose_ros_2_speaks_over_zenoh_is_not_driven() -> None:
-    ros = ros_of(TURTLEBOT)
-    command = ros.variants["ros2"].model_copy(update={"rmw": "zenoh"})
-    ros2 = ros.model_copy(update={"variant": "ros2", "variants": {"ros2": command}})
+def told_with_ros_2(**environment: str) -> Any:  # noqa: ANN401 (of JSON)
+    """Return what the driver of a robot with ROS 2 is told."""
+    ros2 = ros_of(TURTLEBOT).model_copy(update={"variant": "ros2", "environment": environment})
     profile = TURTLEBOT.model_copy(update={"ros": ros2})
     cast_of = {**DRIVES, Role.RECEIVER: DRIVES[Role.RECEIVER].model_copy(update={"profile": profile})}
-    (refusal,) = STEP.refusals(replace(SCENE, cast=cast_of))
-    assert refusal.what == "its ROS 2 speaks over Zenoh, and robots are driven over ROS 1 and DDS"
-
-
-def test_over_dds_the_driver_finds_its_own_robot_without_multicast() -> None:
-    ros2 = ros_of(TURTLEBOT).model_copy(update={"variant": "ros2", "environment": {"ROS_DOMAIN_ID": "7"}})
-    profile = TURTLEBOT.model_copy(update={"ros": ros2})
-    cast_of = {**DRIVES, Role.RECEIVER: DRIVES[Role.RECEIVER].model_copy(update={"profile": profile})}
-    first, *_ = STEP.commands(replace(SCENE, cast=cast_of))
+    scene = replace(SCENE, cast=cast_of)
+    assert not list(STEP.refusals(scene))
+    first, *_ = STEP.commands(scene)
+    (need, *_) = STEP.needs(scene)
     told = json.loads(first.job.argv[-2])
+    assert need.name == f"{told['over']} for Python"
+    return told
+
+
+def test_over_zenoh_the_driver_asks_the_router_of_its_own_robot() -> None:
+    told = told_with_ros_2(RMW_IMPLEMENTATION="rmw_zenoh_cpp", ROS_DOMAIN_ID="7")
+    assert (told["over"], told["cdr"]) == ("zenoh", True)
+    # ROS 2 Foxy, which this profile has, has no hashes of types.
+    assert told["command"]["key"] == "7/cmd_vel/geometry_msgs::msg::dds_::Twist_/TypeHashNotSupported"
+    assert "tcp/127.0.0.1:7447" in told["network"]["settings"]["connect/endpoints"]
+    ends = told["command"]["tokens"]["publisher"], told["odometry"]["tokens"]["subscription"]
+    assert ends[0][0] == ends[1][0], "one node"
+    assert ends[0][1] != ends[1][1]
+
+
+@pytest.mark.parametrize("rmw", ["", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds"])
+def test_over_dds_the_driver_finds_its_own_robot_without_multicast(rmw: str) -> None:
+    told = told_with_ros_2(RMW_IMPLEMENTATION=rmw, ROS_DOMAIN_ID="7")
     assert (told["over"], told["cdr"], told["command"]["dds_topic"]) == ("dds", True, "rt/cmd_vel")
     assert told["network"]["peers"] == [told["network"]["address"]] == [DRIVES[Role.RECEIVER].address]
     assert told["network"]["domain"] == 7
+    assert told["network"]["gid_bytes"] == 24, "of Foxy"
+
+
+@pytest.mark.parametrize("domain", ["seven", "-1", "233", "1.5", "٣"])
+def test_what_is_no_domain_is_told_where_the_profile_says_it(domain: str) -> None:
+    data = TURTLEBOT.model_dump(mode="json", by_alias=True)
+    data["ros"]["environment"] = {"ROS_DOMAIN_ID": domain}
+    text = json.dumps(data, indent=1, ensure_ascii=False)
+    with pytest.raises(ConfigurationError, match="no domain of ROS 2; take a whole number from 0 to 232") as caught:
+        schema.validate(schema.parse(text, source="robots/x.yaml"), RobotProfile)
+    line = next(number for number, line in enumerate(text.split("\n"), 1) if "ROS_DOMAIN_ID" in line)
+    assert caught.value.where == f"robots/x.yaml:{line}"
 
 
 def test_a_drive_whose_log_is_not_whole_does_not_count(tmp_path: Path) -> None:
@@ -171,11 +195,18 @@ def test_a_lease_says_what_is_wanted_until_the_robot_is_home() -> None:
     assert [text.split()[1] for text in link.written[:2]] == ["out", "back"]
 
 
-def test_what_a_driver_says_that_is_no_status_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    with held(Link(status=["[1]"])) as lease:
-        assert (lease.status, lease.why) == ({}, "")
+@pytest.mark.parametrize("said", ["[1]", "[" * 100_000, '{"ended": ["home"]}'])
+def test_what_a_driver_says_that_is_no_status_is_none(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with held(Link(status=[said])) as lease:
+        assert lease.why == ""
         monkeypatch.setattr(DriveLease, "unchanged_s", 41.0)
         assert lease.why == "nothing was heard of its driver for 41 s"
+
+
+def test_why_a_driver_stopped_is_a_line_that_fits_into_a_table() -> None:
+    with held(Link(status=[json.dumps({"ended": "\ud800\x1b[2J" + "long\n" * 1000})])) as lease:
+        assert lease.why.startswith("??[2Jlong long ")
+        assert len(lease.why) == 200
 
 
 def test_a_link_that_is_gone_ends_no_wait() -> None:
@@ -209,7 +240,7 @@ def stopped(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         found.append(job.name)
         return 0
 
-    monkeypatch.setattr(agent, "install", lambda shell, deadline: None)
+    monkeypatch.setattr(agent, "install", lambda shell: None)
     monkeypatch.setattr(jobs, "start", lambda shell, job: None)
     monkeypatch.setattr(jobs, "stop", stop)
     return found
@@ -242,6 +273,17 @@ def test_one_that_stopped_is_brought_and_the_attempt_fails(stopped: list[str]) -
     field = Field(Link(status=['{"ended": "odometry was silent for 0.5 s"}']))
     with pytest.raises(RobotError, match="it stopped on its way: odometry was silent"):
         driven(field, lambda: None)
+    assert field.brought == [False]
+    assert stopped == ["out.drive"]
+
+
+def test_one_that_stops_early_ends_the_steps_inside(stopped: list[str]) -> None:
+    waits = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
+    step = schema.validate(schema.parse(json.dumps(waits), source="x.yaml"), MoveStep)
+    field = Field(Link(status=['{"ended": ""}'] * 4 + ['{"ended": "beyond the fence"}']))
+    with pytest.raises(RobotError, match="it stopped on its way: beyond the fence") as caught:
+        step.run(quick(), field, lambda *_: None)
+    assert "the wait was cut short" in str(caught.value.__cause__)
     assert field.brought == [False]
     assert stopped == ["out.drive"]
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from fieldkit.config import schema
+from fieldkit.core.columns import of_fault
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Protocol, RepeatId, Role
+from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.steps.base import Step, View, capture_around
@@ -152,8 +153,8 @@ def test_gates_put_names_before_columns_and_reasons_and_rows_before_words(tmp_pa
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
-        ("ping: {name: up, ", "ping: {name: 2up, ", "should match pattern"),
-        ("ping: {name: up, ", "ping: {name: up.2, ", "should match pattern"),
+        ("ping: {name: up, ", "ping: {name: 2up, ", "'2up' is not a name: small letters, digits and _"),
+        ("ping: {name: up, ", "ping: {name: up.2, ", "'up.2' is not a name"),
         ("ping: {name: up, ", "ping: {", "a ping comes twice; tell them apart by name:"),
         ("transfer: {name: bare", "transfer: {name: up", "a transfer named up comes twice; give one another name"),
         ("name: imu}", "name: scan}", "a recording on sender comes twice; tell them apart by name:"),
@@ -181,3 +182,12 @@ def test_a_file_that_no_recorder_writes_so_is_refused_with_those_that_there_are(
     (refusal,) = plan_of(STEPS.replace("file: imu", "file: imu/imu_0.db3")).refusals({})
     assert refusal.what == "it is to send imu/imu_0.db3, and its recorder writes scan.bag, imu.bag"
     assert refusal.remedy == "write file: scan.bag"
+
+
+def test_a_line_for_people_begins_with_the_gap_of_the_ping_and_not_with_that_of_the_robot() -> None:
+    ping = "{ping: {from: sender, to: receiver, gap: true}}"
+    plan = plan_of(f"  - fault: {{name: cut, robot: sender, kind: link-down, for: 7s, during: [{ping}]}}\n")
+    outage_s, recovered = (of_fault(FaultKind.LINK_DOWN, what) for what in ("outage_s", "recovered"))
+    gone = {f"cut.{outage_s}": 7.2, f"cut.{recovered}": True}
+    said = rows.in_words(plan, {**gone, "rtt_gap_s": 3.2, "rtt_gap_lost": 29, "rtt_median_s": 0.0032})
+    assert said == "longest gap 3.2 s with 29 lost, RTT 3.2 ms, cut: link-down: gone for 7.2 s"

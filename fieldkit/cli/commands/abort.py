@@ -36,4 +36,4 @@ def run(arguments: argparse.Namespace) -> int:
         print("".join(f"  {job}\n" for job in one.jobs), end="")
         if one.error is not None:
             show_error(str(one.error))
-    return RobotError.exit_code if any(one.error for one in ended.values()) else 0
+    return RobotError.exit_code if any(aborted.error for aborted in ended.values()) else 0

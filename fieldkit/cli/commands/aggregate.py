@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     counted = list(found.words.values()) if words is None else words
     widths = dict(_width(text, quantities) for text in arguments.width)
     _demand_units(widths, quantities)
-    needed = {name for one in quantities for name in one.columns} | {one.name for one in counted}
+    needed = {name for quantity in quantities for name in quantity.columns} | {quantity.name for quantity in counted}
     mixed = {column.name for column in found.columns if plain_name(column.name) in MIXED_BY}
     repeats = found.read({*by, *needed, *mixed, "started_utc_ns"})
     for mixture in mixtures(repeats, by):
@@ -81,16 +81,17 @@ def _by_default(form: str, known: Mapping[str, Quantity]) -> list[Quantity]:
 
 
 def _demand_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) -> None:
-    if widths and not any(one.unit in widths for one in quantities):
+    if widths and not any(quantity.unit in widths for quantity in quantities):
+        names = [quantity.name for quantity in quantities]
         raise ConfigurationError(
-            f"--width: none of these is {_UNITS[next(iter(widths))]}: {', '.join(one.name for one in quantities)}",
+            f"--width: none of these is {_UNITS[next(iter(widths))]}: {', '.join(names)}",
             remedy=_WIDTHS,
         )
 
 
 def _demand_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
     if not wording.shown(cells, quantities):
-        names = " or ".join(one.name for one in quantities)
+        names = " or ".join(quantity.name for quantity in quantities)
         raise EvidenceError(
             f"no valid repeat has {names}: the table would be empty",
             remedy="name others by --quantity; to see what there is: --format table",
@@ -99,7 +100,7 @@ def _demand_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> No
 
 def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
     """Return the unit of the quantities that a wanted half-width is for, and the half-width in it."""
-    units = dict.fromkeys(one.unit for one in quantities)
+    units = dict.fromkeys(quantity.unit for quantity in quantities)
     symbol = text.strip().lstrip("0123456789. ")
     own = [unit for unit in units if unit not in PER_UNIT]
     unit = next((unit for unit in (*PER_UNIT, *own) if symbol in symbols(unit)), None)
@@ -114,7 +115,7 @@ def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
 
 def _show(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity], more: _More) -> None:
     """Print a table of the repeats, and one per quantity."""
-    counts = [{"valid": str(one.n_valid), "void": str(one.n_void), "failed": str(one.n_failed)} for one in cells]
+    counts = [{"valid": str(cell.n_valid), "void": str(cell.n_void), "failed": str(cell.n_failed)} for cell in cells]
     _show_one("repeats", by, cells, counts)
     apart, _ = wording.told_by(by, cells)
     for quantity in wording.shown(cells, quantities):
@@ -140,7 +141,7 @@ def _judged(
     found: Sources, repeats: Repeats, cells: Sequence[Cell], quantities: Sequence[Quantity]
 ) -> Sequence[Judgement]:
     """Return what cells say of what their trials expect of the figures that are shown."""
-    shown = {one.name for one in quantities}
+    shown = {quantity.name for quantity in quantities}
     if not (expected := found.expectations()):
         return ()
     rows = repeats.groups(tuple(cells[0].key))
@@ -156,11 +157,14 @@ def _show_expected(by: Sequence[str], cells: Sequence[Cell], judgements: Sequenc
     """Print whether expectations hold, a line for each condition; nothing where nothing was expected."""
     apart, _ = wording.told_by(by, cells)
     rows = []
-    for one in judgements:
-        expected, _, *said = wording.judged(one)
-        rows.append((expected, *(wording.key(one.cell, name) if one.cell else "" for name in apart), *said))
+    for judgement in judgements:
+        expected, _, *said = wording.judged(judgement)
+        rows.append(
+            (expected, *(wording.key(judgement.cell, name) if judgement.cell else "" for name in apart), *said)
+        )
     if rows:
-        table(("expected", *apart, "measured", "95 % interval", ""), rows)
+        head = ("expected", *apart, "measured", "95 % interval", "")
+        table(head, rows, fold=(0, len(head) - 1))
 
 
 def _show_one(

@@ -8,20 +8,20 @@ from pathlib import Path
 
 from fieldkit.bags import contents
 from fieldkit.bags.contents import BagContents
-from fieldkit.bags.formats import BagFormat
+from fieldkit.bags.formats import LAST_RESORT, BagFormat
 from fieldkit.cli.display import show_error, show_note, table
-from fieldkit.core.errors import EvidenceError, typed
+from fieldkit.core.errors import EvidenceError, FieldkitError, typed
 from fieldkit.core.units import format_bytes, format_count, format_duration
 
 
 def info(arguments: argparse.Namespace) -> int:
-    """Print what a bag holds by its index."""
+    """Print what a bag holds by its index, and what is wrong with that."""
     found = contents.inspect(arguments.bag)
     if arguments.json:
         print(json.dumps(asdict(found) | {"messages": found.messages}))
     else:
         _show(arguments.bag, found)
-    return 0
+    return EvidenceError.exit_code if found.problems else 0
 
 
 def _show(path: Path, found: BagContents) -> None:
@@ -33,7 +33,10 @@ def _show(path: Path, found: BagContents) -> None:
     if found.messages:
         begun = datetime.fromtimestamp(found.started_utc_ns / 1e9, UTC)
         print(f"{begun:%Y-%m-%d %H:%M:%S} UTC, {format_duration(found.duration_s)}")
-    rows = [(one.name, one.type, str(one.messages), _rate(one.messages, found.duration_s)) for one in found.topics]
+    rows = [
+        (topic.name, topic.type, str(topic.messages), _rate(topic.messages, found.duration_s))
+        for topic in found.topics
+    ]
     if rows:
         table(("topic", "type", "messages", "Hz"), rows, right=(2, 3))
     _tell(path, found)
@@ -46,22 +49,30 @@ def _rate(messages: int, duration_s: float) -> str:
 def _tell(path: Path, found: BagContents) -> None:
     for problem in found.problems:
         show_error(f"{path}: {problem}")
-    if found.problems and found.savable:
+    if found.savable:
         repair = typed("fieldkit", "bag", "repair", path, "NEW")
         show_note(f"{format_count(found.savable, 'message')} can be saved: {repair}")
+    elif found.problems:
+        show_note("; ".join(filter(None, ("no message can be saved", LAST_RESORT.get(found.format)))))
 
 
 def check(arguments: argparse.Namespace) -> int:
-    """Read every message of bags, and print what is wrong."""
-    damaged = 0
-    for path in arguments.bags:
+    """Read every message of bags, and print what is wrong; of a bag that cannot be read as well, and go on."""
+    return max(map(_checked, arguments.bags))
+
+
+def _checked(path: Path) -> int:
+    """Print what is wrong with a bag, and return the exit code."""
+    try:
         found = contents.inspect(path, read_all=True)
-        if found.problems:
-            damaged += 1
-            _tell(path, found)
-        else:
-            print(f"{path}: whole, {format_count(found.messages, 'message')}")
-    return EvidenceError.exit_code if damaged else 0
+    except FieldkitError as error:
+        show_error(str(error))
+        return error.exit_code
+    if found.problems:
+        _tell(path, found)
+        return EvidenceError.exit_code
+    print(f"{path}: whole, {format_count(found.messages, 'message')}")
+    return 0
 
 
 def repair(arguments: argparse.Namespace) -> int:

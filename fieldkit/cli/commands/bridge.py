@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
@@ -17,7 +18,7 @@ from urllib.parse import urlsplit
 from fieldkit.agent.middleware import Network
 from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import BRIDGE_IS_UP
+from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
 from fieldkit.core.units import format_bytes
 from fieldkit.ros import bridge
 from fieldkit.ros.bridge import Carrier, Side
@@ -26,7 +27,6 @@ from fieldkit.ros.ports import MOST_DOMAIN
 from fieldkit.ros.types import Distribution, MessageTypes
 
 _LOOKS_S: Final = 1.0
-_MASTER_PORT: Final = 11311
 _ROUTER_PORT: Final = 7447
 _NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
@@ -39,9 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
     with _until_signal() as over, bridge.bridged(near, far, crossings, types) as carriers:
         show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C ends it")
         _watch(carriers, over)
-        told = [one.told() for one in carriers]
+        told = [carrier.told() for carrier in carriers]
     if arguments.json:
-        print(json.dumps([asdict(one) for one in told]))
+        print(json.dumps([asdict(crossed) for crossed in told]))
     else:
         _show(told)
     return 0
@@ -73,7 +73,7 @@ def _network(over: str, arguments: argparse.Namespace) -> Network:
     common = {"address": _address(arguments.address), "domain": _domain(arguments.domain), "node": arguments.node}
     if over == "ros1":
         uri = os.environ.get("ROS_MASTER_URI", "")
-        host, port = _host(arguments.master or urlsplit(uri).netloc or arguments.address, _MASTER_PORT)
+        host, port = _host(arguments.master or urlsplit(uri).netloc or arguments.address, ROS_MASTER_PORT)
         settings = {"patience_s": str(arguments.patience), "tcp_nodelay": "1"}
         return Network(discovery="master", server=host, port=port, settings=settings, **common)
     if over == "zenoh" and arguments.router:
@@ -128,7 +128,7 @@ def _watch(carriers: Sequence[Carrier], over: threading.Event) -> None:
     """Wait for the end; tell once of each topic that others have with another type."""
     known: set[str] = set()
     while not over.wait(_LOOKS_S):
-        for sentence in (one for carrier in carriers for one in carrier.other_types()):
+        for sentence in chain.from_iterable(carrier.other_types() for carrier in carriers):
             if sentence not in known:
                 known.add(sentence)
                 show_error(f"{sentence}\n  remedy: name the topic with its own type; nothing of the other is carried")
@@ -138,17 +138,17 @@ def _show(told: Sequence[Crossed]) -> None:
     head = ("topic", "way", "messages", "a second", "bytes", "refused", "unreadable", "median", "99 %")
     rows = [
         (
-            one.topic,
-            f"{one.source} to {one.target}",
-            str(one.messages),
-            "" if one.per_s is None else f"{one.per_s:.4g}",
-            format_bytes(one.bytes),
-            str(one.refused),
-            str(one.unreadable),
-            _milliseconds(one.delay_median_s),
-            _milliseconds(one.delay_p99_s),
+            crossed.topic,
+            f"{crossed.source} to {crossed.target}",
+            str(crossed.messages),
+            "" if crossed.per_s is None else f"{crossed.per_s:.4g}",
+            format_bytes(crossed.bytes),
+            str(crossed.refused),
+            str(crossed.unreadable),
+            _milliseconds(crossed.delay_median_s),
+            _milliseconds(crossed.delay_p99_s),
         )
-        for one in told
+        for crossed in told
     ]
     table(head, rows, right=range(2, len(head)))
 

@@ -39,8 +39,7 @@ def _code(outcome: CampaignOutcome, folder: Path) -> int:
         show_error(f"skipped: {names}\n  remedy: give the same command again to run what was skipped")
     if outcome.unmet:
         unmet = format_count(outcome.unmet, "expectation")
-        which = typed("fieldkit", "export", "--format", "junit", "-o", "FILE", folder)
-        show_error(f"{unmet} not shown to hold; {which} tells which")
+        show_error(f"{unmet} not shown to hold\n  remedy: {typed('fieldkit', 'aggregate', folder)} tells which")
     if outcome.failed:
         return EvidenceError.exit_code
     return FieldkitError.exit_code if outcome.left or outcome.unmet else 0

@@ -50,7 +50,9 @@ def _columns_of(procedure: str) -> int:
     path = Path(procedure)
     found = read_procedure(path) if path.suffix == ".yaml" else load_procedure(procedure)
     filled = filled_by(placed.step for placed in found.walk())
-    rows = [(one.name, one.unit, one.figure.kind if one.figure else "", one.meaning) for one in filled]
+    rows = [
+        (column.name, column.unit, column.figure.kind if column.figure else "", column.meaning) for column in filled
+    ]
     table(("column", "unit", "repeats make a", "meaning"), rows)
     return 0
 
@@ -62,7 +64,7 @@ def _columns(name: str | None) -> int:
     trial = installed()
     files = {
         "trial.csv": trial,
-        "summary.csv": (*(one for one in trial if one.name in DEFAULT_BY), *declared(EstimateRow)),
+        "summary.csv": (*(column for column in trial if column.name in DEFAULT_BY), *declared(EstimateRow)),
         "compare": declared(DifferenceRow),
     }
     known = {column.name for own in files.values() for column in own}

@@ -1,7 +1,8 @@
 """`fieldkit compare A B`: field against simulation, or two runs."""
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
@@ -28,6 +29,7 @@ _HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the comparison."""
+    _demand_two([arguments.a, arguments.b, *arguments.more])
     a, b = sources.find_each([[arguments.a], [arguments.b]], show_note, rebuild=arguments.rebuild)
     by = a.condition(arguments.by)
     thresholds = dict(_threshold(text, a.quantities) for text in arguments.threshold)
@@ -36,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     _demand_measured(found, thresholds)
     if found.refusals and not arguments.force:
         raise ConfigurationError(
-            "A and B are not comparable:" + "".join(f"\n  {one}" for one in found.refusals),
+            "A and B are not comparable:" + "".join(f"\n  {refusal}" for refusal in found.refusals),
             remedy="run both alike (what a name means: fieldkit columns show NAME); "
             "or, to compare them all the same, add --force",
         )
@@ -47,6 +49,16 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print(_FORMATS[arguments.format](found), end="")
     return MISSED if found.missed else 0
+
+
+def _demand_two(paths: Sequence[Path]) -> None:
+    if len(paths) > 2:
+        beside = typed("fieldkit", "aggregate", *paths, "--by", "trial,protocol")
+        raise ConfigurationError(
+            f"two runs are compared, A and B, and {len(paths)} are named",
+            remedy="a run of several trials is the folder that they are in, or their table by fieldkit export; "
+            f"to see all of these side by side: {beside}",
+        )
 
 
 def _threshold(text: str, known: Mapping[str, Quantity]) -> tuple[str, float]:
@@ -101,7 +113,7 @@ def _other_way(found: Comparison, arguments: argparse.Namespace) -> str:
 
 
 def _demand_measured(found: Comparison, thresholds: Mapping[str, float]) -> None:
-    measured = {one.quantity.name for one in found.differences}
+    measured = {difference.quantity.name for difference in found.differences}
     for name in thresholds:
         if name not in measured:
             raise ConfigurationError(
@@ -125,7 +137,7 @@ def _markdown(found: Comparison) -> str:
         *((pair.name, *line) for pair in found.pairs if not pair.missing_in for line in _lines(found, pair)),
     ]
     differing = (*found.refusals, *found.varied)
-    said = [_DELTA, *wording.conclusions(found), *(f"{_weight(found, one)}: {one}" for one in differing)]
+    said = [_DELTA, *wording.conclusions(found), *(f"{_weight(found, concern)}: {concern}" for concern in differing)]
     return (
         "".join(map(tables.markdown_line, rows))
         + "\n"
@@ -141,13 +153,13 @@ _FORMATS: Final[Mapping[str, Callable[[Comparison], str]]] = MappingProxyType(
 def _lines(found: Comparison, pair: Pair) -> list[tuple[str, ...]]:
     figures: list[tuple[str, ...]] = [
         (
-            wording.label(one.quantity),
-            _value(one, one.a),
-            _value(one, one.b),
-            _delta(one),
-            wording.verdict(one, found.made),
+            wording.label(difference.quantity),
+            _value(difference, difference.a),
+            _value(difference, difference.b),
+            _delta(difference),
+            wording.verdict(difference, found.made),
         )
-        for one in pair.differences
+        for difference in pair.differences
     ]
     words = [(a.label, wording.tallied(a), wording.tallied(b), "", wording.NOT_JUDGED) for a, b in pair.words]
     return figures + words or [("nothing measured", "", "", "", "")]

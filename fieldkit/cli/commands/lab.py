@@ -56,14 +56,14 @@ def list_robots(_: argparse.Namespace) -> int:
     state = client.state(_here())
     rows = [
         (
-            one.name,
-            one.profile,
-            ", ".join(one.roles),
-            one.address,
-            _place(one.place_m),
-            ", ".join(one.programs) or "ended",
+            robot.name,
+            robot.profile,
+            ", ".join(robot.roles),
+            robot.address,
+            _place(robot.place_m),
+            ", ".join(robot.programs) or "ended",
         )
-        for one in state.robots
+        for robot in state.robots
     ]
     table(("robot", "profile", "roles", "address", "east, north, up (m)", "runs"), rows)
     print(f"up for {format_duration(state.up_s)}, pid {state.pid}")
@@ -86,7 +86,7 @@ def move(arguments: argparse.Namespace) -> int:
 def shell(arguments: argparse.Namespace) -> int:
     """Become ssh."""
     here = _here()
-    names = [one.name for one in client.state(here).robots]
+    names = [robot.name for robot in client.state(here).robots]
     if arguments.robot not in names:
         raise protocol.unknown_robot(arguments.robot, names)
     program = shutil.which("ssh")

@@ -22,8 +22,8 @@ def run(arguments: argparse.Namespace) -> int:
             heights=arguments.heights,
         )
         print(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
-    for one in positions.spotted(arguments.trial):
-        for line in _lines(one):
+    for spotted in positions.spotted(arguments.trial):
+        for line in _lines(spotted):
             print(line)
     return 0
 

@@ -11,7 +11,7 @@ from fieldkit.cli.terminal import interruptible
 from fieldkit.core.events import CommandPlanned, Note, Sink
 from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.core.units import format_count, format_duration, parse_distance
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.plan import Plan
@@ -70,20 +70,20 @@ def print_commands(plan: Plan) -> None:
     planned = list(_commands(plan))
     for protocol in plan.protocols:
         for role, robot in plan.cast.items():
-            mine = [one for one in planned if (one.protocol, one.role) == (protocol, role)]
+            mine = [command for command in planned if (command.protocol, command.role) == (protocol, role)]
             print(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {_folder(plan, protocol)}")
             if not mine:
                 print("nothing but the checks before repeat 1")
-            for one in mine:
-                print(f"{one.number}. {one.name}: {one.command}")
+            for command in mine:
+                print(f"{command.number}. {command.name}: {command.command}")
 
 
 def tell_commands(plan: Plan, sink: Sink) -> None:
     """Tell what `print_commands` prints as events, for a program."""
     for remark in _remarks(plan):
         sink(Note(remark))
-    for one in _commands(plan):
-        sink(one)
+    for command in _commands(plan):
+        sink(command)
 
 
 def _remarks(plan: Plan) -> Iterator[str]:
@@ -104,7 +104,7 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
     for protocol in plan.protocols:
         folder = _folder(plan, protocol)
         scene = plan.scene(RepeatId(protocol, 1), folder)
-        planned = list(plan.commands(scene))
+        everybodys = list(plan.commands(scene))
         for role, robot in scene.cast.items():
             if role not in plan.procedure.roles():
                 continue
@@ -112,11 +112,11 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
             mine = [
                 (0, "begin", quote(evidence.begin_command(*where))),
                 *(
-                    (number, one.job.name, in_shell(one.job))
-                    for number, one in enumerate(planned, start=1)
-                    if one.role is role
+                    (number, planned.job.name, in_shell(planned.job))
+                    for number, planned in enumerate(everybodys, start=1)
+                    if planned.role is role
                 ),
-                (len(planned) + 1, "pack", quote(evidence.pack_command(*where))),
+                (len(everybodys) + 1, "pack", quote(fetching.pack_command(*where))),
             ]
             for number, name, command in mine:
                 yield CommandPlanned(protocol, robot.name, role, folder, number, name, command)

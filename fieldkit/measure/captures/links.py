@@ -110,8 +110,8 @@ def _from_80211(integers: Integers, frames: Frames, mac: Ints, *, padded: Mask) 
 
 def _is_one_of(values: Ints, wanted: tuple[int, ...] | list[int]) -> Mask:
     found: Mask = values == wanted[0]
-    for one in wanted[1:]:
-        found |= values == one
+    for kind in wanted[1:]:
+        found |= values == kind
     return found
 
 

@@ -96,15 +96,15 @@ def _joined(captures: Iterable[Capture], size_bytes: int) -> Capture:
     chunks = -(-size_bytes // CHUNK_BYTES)
     joined: Packets | None = None
     rows, frames, damage = 0, 0, None
-    for one in captures:
-        stop = rows + len(one.packets)
+    for capture in captures:
+        stop = rows + len(capture.packets)
         if joined is None or stop > len(joined):
-            longer = one.packets.room(stop + max(stop * (chunks - 1), rows) * (_SPARE + 1) // _SPARE)
+            longer = capture.packets.room(stop + max(stop * (chunks - 1), rows) * (_SPARE + 1) // _SPARE)
             if joined is not None:
                 longer.write(0, joined.where(slice(0, rows)))
             joined = longer
-        joined.write(rows, one.packets)
-        rows, frames, damage = stop, frames + one.frames, one.damage
+        joined.write(rows, capture.packets)
+        rows, frames, damage = stop, frames + capture.frames, capture.damage
     if joined is None:
         raise ValueError("a capture file has one chunk at least")
     return Capture(joined.where(slice(0, rows)), frames, damage)

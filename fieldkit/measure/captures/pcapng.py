@@ -68,7 +68,7 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
             frames = frames.where(slice(0, int(sound.argmin())))
             damage = f"no packet block at byte {starts[len(frames)]}"
         if len(frames):
-            check_link_type(*(one.link_type for one in section.interfaces), where=where)
+            check_link_type(*(interface.link_type for interface in section.interfaces), where=where)
         if at < end and not damage:
             after = _redefined(section, data, at)
             if after is None:
@@ -112,10 +112,10 @@ def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]
     captured = np.where(simple, np.minimum(wire, _snap_bytes(section)), integers.u32(start + 20))
     link_type, time_ns = np.zeros_like(start), np.zeros_like(start)
     high, low = integers.u32(start + 12).astype(np.uint64), integers.u32(start + 16).astype(np.uint64)
-    for one in np.flatnonzero(np.bincount(number[number < len(section.interfaces)])).tolist():
-        its = np.flatnonzero(number == one)
-        link_type[its] = section.interfaces[one].link_type
-        time_ns[its] = section.interfaces[one].time_ns(high[its] << np.uint64(32) | low[its])
+    for interface in np.flatnonzero(np.bincount(number[number < len(section.interfaces)])).tolist():
+        its = np.flatnonzero(number == interface)
+        link_type[its] = section.interfaces[interface].link_type
+        time_ns[its] = section.interfaces[interface].time_ns(high[its] << np.uint64(32) | low[its])
     time_ns[simple] = NO_TIME
     frames = Frames(
         start=start + np.where(simple, 12, 28),

@@ -1,17 +1,17 @@
 """Read bags with rosbags; run by `bag` in a process of its own. The only module that reads bags."""
 
 import math
-import sqlite3
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rosbags import rosbag1, rosbag2
+from rosbags import rosbag1
 
 from fieldkit.measure.evidence import bag, confined
 from fieldkit.measure.evidence.confined import Json
 
 if TYPE_CHECKING:
+    from rosbags import rosbag2
     from rosbags.highlevel import AnyReader
 
 _BATTERY: Final = "sensor_msgs/msg/BatteryState"
@@ -36,16 +36,21 @@ def answer(question: Json) -> Json:
         share = battery_share(path, question["topic"])
         return {"share": None if math.isnan(share) else share}
     if "heard" in question:
-        ros2 = path.suffix in bag.ROS2
-        return {"topics": heard(rosbag2.Reader(path.parent) if ros2 else rosbag1.Reader(path))}
+        return {"topics": heard(_ros2(path.parent) if path.suffix in bag.ROS2 else rosbag1.Reader(path))}
     if path.suffix not in bag.ROS2:
         return contents(rosbag1.Reader(path))
     if path.suffix == ".db3":
         _check_database(path)
-    return contents(rosbag2.Reader(path)) | {"closed": contents(rosbag2.Reader(path.parent))["messages"]}
+    return contents(_ros2(path)) | {"closed": contents(_ros2(path.parent))["messages"]}
 
 
-def contents(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
+def _ros2(path: Path) -> "rosbag2.Reader":
+    from rosbags import rosbag2  # noqa: PLC0415 (SQLite, YAML and MCAP take a third of the start of this process)
+
+    return rosbag2.Reader(path)
+
+
+def contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
     """Return the contents of a bag, by the names of `Bag`."""
     with reader:
         by_topic = {_text(topic): _count(info.msgcount) for topic, info in reader.topics.items()}
@@ -62,7 +67,7 @@ def contents(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
         }
 
 
-def heard(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
+def heard(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
     """Return what came of each topic, by the names of `Heard`."""
     found: dict[str, dict[str, int]] = {}
     with reader:
@@ -107,10 +112,10 @@ def positions(path: Path, topic: str, child: str) -> Json:
         for connection, received_ns, data in reader.messages(chosen) if chosen else ():
             message: Any = reader.deserialize(data, connection.msgtype)
             kinds.add(connection.msgtype)
-            for one in message.transforms if connection.msgtype == _TREE else (message,):
-                if (found := _position(connection.msgtype, one, child)) is not None:
-                    stamp = one.header.stamp
-                    frames.add(_text(one.header.frame_id))
+            for part in message.transforms if connection.msgtype == _TREE else (message,):
+                if (found := _position(connection.msgtype, part, child)) is not None:
+                    stamp = part.header.stamp
+                    frames.add(_text(part.header.frame_id))
                     rows.append((int(stamp.sec) * 10**9 + int(stamp.nanosec), received_ns, *found))
     return {"types": sorted(kinds), "frames": sorted(frames), "rows": rows}
 
@@ -152,6 +157,8 @@ def _position(kind: str, message: Any, child: str) -> tuple[float, float, float,
 
 def _check_database(path: Path) -> None:
     """Look at every page: a count of messages can be right where messages are cut off."""
+    import sqlite3  # noqa: PLC0415 (as above)
+
     with closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as database:
         ((said, *_), *_) = database.execute("PRAGMA quick_check(1)")
     if said != "ok":

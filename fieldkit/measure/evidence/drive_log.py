@@ -1,11 +1,10 @@
-"""What a ground robot wrote down of a way that it drove by itself, and the columns of it.
+"""Log of a ground robot on a way that it drove by itself, and the columns of it.
 
 The robot's agent writes a JSON object a line, ten times a second (`fieldkit.agent.drive`): when, where it is by its
 own odometry, seen from where it began and as it faced there, and how far its wheels took it. The last line says how
 it ended. All of it is the robot's word.
 """
 
-import json
 import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ import numpy as np
 from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
+from fieldkit.core.text import brief
 from fieldkit.measure.evidence import reading
 
 FILE: Final = "drive.jsonl"
@@ -27,7 +27,12 @@ HOME: Final = "home"
 
 COLUMNS: Final = columns(
     100,
-    ("drive_out_m", "m", "How far it drove by its odometry, as all that follows, until it turned back."),
+    (
+        "drive_out_m",
+        "m",
+        "How far it drove by its odometry, as all that follows, until it turned back.",
+        Figure("way driven", Kind.MEDIAN),
+    ),
     ("drive_farthest_m", "m", "How far from its place its odometry had it at most."),
     (
         "drive_speed_median_m_s",
@@ -58,7 +63,6 @@ _SPAN_S: Final = 0.5
 """Speeds are over so long: a message of odometry more or less is 3 % of it at 50 a second, and 7 % at 30."""
 _LONGEST_M: Final = 1e6
 _LONGEST_S: Final = 1e6
-_MOST_LETTERS: Final = 200
 _ROUNDING: Final = 1e-4
 
 
@@ -98,14 +102,8 @@ def read(path: Path) -> tuple[DriveMoment, ...]:
     Raises:
         EvidenceError: It is missing, has no line, or one that no driver writes.
     """
-    lines = reading.text(path).split("\n")[:-1]
-    found = []
-    for number, line in enumerate(lines, 1):
-        try:
-            found.append(_moment(json.loads(line)))
-        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
-            raise EvidenceError(f"line {number} does not say where a robot drove", where=str(path)) from None
-    if any(after.at_s < one.at_s or after.driven_m < one.driven_m for one, after in pairwise(found)):
+    found = reading.json_lines(path, _moment, "does not say where a robot drove")
+    if any(after.at_s < before.at_s or after.driven_m < before.driven_m for before, after in pairwise(found)):
         raise EvidenceError("its lines are not in the order of time", where=str(path))
     if not found:
         raise EvidenceError("says nothing of where the robot drove", where=str(path))
@@ -113,7 +111,7 @@ def read(path: Path) -> tuple[DriveMoment, ...]:
 
 
 def _moment(said: Mapping[str, Any]) -> DriveMoment:
-    """Return what a line says; raises what `read` catches."""
+    """Return what a line says; raises what `reading.json_lines` catches."""
     at_s, driven_m, forward_m_s = (float(said[name]) for name in ("at_s", "driven_m", "forward_m_s"))
     x_m, y_m, yaw_rad = (float(said[name]) for name in ("x_m", "y_m", "yaw_rad"))
     phase, ended = said["phase"], said["ended"]
@@ -129,21 +127,20 @@ def _moment(said: Mapping[str, Any]) -> DriveMoment:
     if not is_possible:
         raise ValueError(said)
     yaw_rad = max(-math.pi, min(yaw_rad, math.pi))
-    words = "".join(letter if letter.isprintable() else "?" for letter in ended[:_MOST_LETTERS])
-    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, words)
+    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, brief(ended))
 
 
 def measure(log: Sequence[DriveMoment] | None) -> Measured:
     """Return the columns; all are missing where there is no log."""
     if not log:
         return Measured.nothing(COLUMNS, "the robot did not write down how it drove")
-    out = [one for one in log if one.phase in _OUT]
+    out = [record for record in log if record.phase in _OUT]
     home = log[-1] if log[-1].ended == HOME else None
-    speeds_m_s = _speeds_m_s([one for one in out if one.phase == "out"])
-    all_speeds_m_s = (*speeds_m_s, *_speeds_m_s([one for one in log if one.phase == "back"]))
+    speeds_m_s = _speeds_m_s([record for record in out if record.phase == "out"])
+    all_speeds_m_s = (*speeds_m_s, *_speeds_m_s([record for record in log if record.phase == "back"]))
     values: dict[str, Value | None] = {
         "drive_out_m": out[-1].driven_m if out else None,
-        "drive_farthest_m": max(one.off_m for one in log),
+        "drive_farthest_m": max(record.off_m for record in log),
         "drive_speed_median_m_s": float(np.median(speeds_m_s)) if speeds_m_s else None,
         "drive_speed_max_m_s": max(all_speeds_m_s, default=None),
         "drive_back_off_m": None if home is None else home.off_m,
@@ -155,10 +152,10 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
 
 def _speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:
     """Return the speed from each moment until half a second later, where it was told to drive at both."""
-    times_s = [one.at_s for one in log]
-    pairs = ((one, bisect_left(times_s, one.at_s + _SPAN_S)) for one in log if one.forward_m_s)
+    times_s = [record.at_s for record in log]
+    pairs = ((record, bisect_left(times_s, record.at_s + _SPAN_S)) for record in log if record.forward_m_s)
     return [
-        (log[later].driven_m - one.driven_m) / (log[later].at_s - one.at_s)
-        for one, later in pairs
+        (log[later].driven_m - record.driven_m) / (log[later].at_s - record.at_s)
+        for record, later in pairs
         if later < len(log) and log[later].forward_m_s
     ]

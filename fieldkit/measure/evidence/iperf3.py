@@ -1,4 +1,4 @@
-"""What iperf3 says of a test (`--json`), at either end, from version 3.1 on.
+"""Output of iperf3 (`--json`), of either end of a test, from version 3.1 on.
 
 Versions differ in what they sum up at the end, and where: of a UDP test a server says 0 bytes, 3.1 has one sum for
 both ends. What they count in each interval is the same in all, tried with 3.1.3, 3.7, 3.12 and 3.17, so figures are
@@ -17,6 +17,7 @@ from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol, Role
+from fieldkit.core.text import brief
 from fieldkit.measure.evidence import reading
 
 COLUMNS: Final = columns(
@@ -118,8 +119,8 @@ class IperfTest:
 
     @property
     def _whole(self) -> tuple[IperfInterval, ...]:
-        longest_s = max((one.lasted_s for one in self.intervals), default=0.0)
-        return tuple(one for one in self.intervals if one.lasted_s >= _WHOLE * longest_s)
+        longest_s = max((interval.lasted_s for interval in self.intervals), default=0.0)
+        return tuple(interval for interval in self.intervals if interval.lasted_s >= _WHOLE * longest_s)
 
     @property
     def steady(self) -> tuple[IperfInterval, ...]:
@@ -133,8 +134,8 @@ class IperfTest:
     @property
     def window_s(self) -> tuple[float, float]:
         """From when on, and until when, these are, in seconds from the first packet on."""
-        start_s = sum(one.lasted_s for one in self._whole[: len(self._whole) - len(self.steady)])
-        return start_s, start_s + sum(one.lasted_s for one in self.steady)
+        start_s = sum(interval.lasted_s for interval in self._whole[: len(self._whole) - len(self.steady)])
+        return start_s, start_s + sum(interval.lasted_s for interval in self.steady)
 
 
 def read(path: Path) -> IperfTest:
@@ -167,7 +168,7 @@ def parse(text: str) -> IperfTest:
     jitters_ms = [_number(_mapping(end, name), "jitter_ms") for name in ("sum_received", "sum")]
     jitter_ms = next((one for one in jitters_ms if one is not None), None)
     return IperfTest(
-        error=" ".join(str(found.get("error", "")).split())[:200],
+        error=brief(str(found.get("error", ""))),
         ports=tuple(_ports(start)),
         intervals=tuple(_intervals(found)),
         jitter_s=None if jitter_ms is None else jitter_ms / 1e3,
@@ -175,8 +176,8 @@ def parse(text: str) -> IperfTest:
 
 
 def _intervals(found: Mapping[str, Any]) -> Iterator[IperfInterval]:
-    for one in _items(found, "intervals"):
-        total = _mapping(one, "sum")
+    for interval in _items(found, "intervals"):
+        total = _mapping(interval, "sum")
         lasted_s, payload_bytes = _number(total, "seconds"), _count(total, "bytes")
         if total.get("omitted") is True or not lasted_s or payload_bytes is None:
             continue
@@ -185,8 +186,8 @@ def _intervals(found: Mapping[str, Any]) -> Iterator[IperfInterval]:
 
 
 def _ports(start: Mapping[str, Any]) -> Iterator[tuple[int, int]]:
-    for one in _items(start, "connected"):
-        own, other = _count(one, "local_port"), _count(one, "remote_port")
+    for connection in _items(start, "connected"):
+        own, other = _count(connection, "local_port"), _count(connection, "remote_port")
         if own is not None and other is not None:
             yield own, other
 
@@ -214,24 +215,26 @@ def _count(found: Mapping[str, Any], key: str) -> int | None:
 
 def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | None) -> Measured:
     """Return the columns of a test by what both ends say; None for an end whose word is not at hand."""
-    sent, received = (one.intervals if one else () for one in (sender, receiver))
-    received_bytes = sum(one.payload_bytes for one in received) if received else None
+    sent, received = (test.intervals if test else () for test in (sender, receiver))
+    received_bytes = sum(interval.payload_bytes for interval in received) if received else None
     steady = receiver.steady if receiver else ()
-    rates = [one.bit_s for one in steady]
-    lasted_s = sum(one.lasted_s for one in steady)
-    datagrams, lost = (_sum([getattr(one, name) for one in received]) for name in ("datagrams", "lost"))
+    rates = [interval.bit_s for interval in steady]
+    lasted_s = sum(interval.lasted_s for interval in steady)
+    datagrams, lost = (_sum([getattr(interval, name) for interval in received]) for name in ("datagrams", "lost"))
     got = None if datagrams is None or lost is None else max(datagrams - lost, 0)
     values = {
-        "iperf3_throughput_bit_s": 8 * sum(one.payload_bytes for one in steady) / lasted_s if steady else None,
+        "iperf3_throughput_bit_s": 8 * sum(interval.payload_bytes for interval in steady) / lasted_s
+        if steady
+        else None,
         "iperf3_interval_min_bit_s": min(rates, default=None),
         "iperf3_interval_median_bit_s": median(rates) if rates else None,
-        "iperf3_sent_bytes": sum(one.payload_bytes for one in sent) if sent else None,
+        "iperf3_sent_bytes": sum(interval.payload_bytes for interval in sent) if sent else None,
         "iperf3_received_bytes": received_bytes,
         "iperf3_datagrams_sent": datagrams,
         "iperf3_datagrams_received": got,
         "iperf3_loss": 1 - got / datagrams if got is not None and datagrams else None,
         "iperf3_jitter_s": receiver.jitter_s if receiver else None,
-        "iperf3_retransmits": _sum([one.retransmits for one in sent]),
+        "iperf3_retransmits": _sum([interval.retransmits for interval in sent]),
     }
     foreign = _OF_TCP if protocol is Protocol.UDP else _OF_UDP
     own = {name: value for name, value in values.items() if name not in foreign}
@@ -240,5 +243,5 @@ def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | 
 
 
 def _sum(counts: list[int | None]) -> int | None:
-    known = [one for one in counts if one is not None]
+    known = [count for count in counts if count is not None]
     return sum(known) if known and len(known) == len(counts) else None

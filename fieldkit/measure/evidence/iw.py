@@ -1,4 +1,4 @@
-"""What `iw` and the kernel print of a Wi-Fi link, by its stations and its channel.
+"""Output of `iw` and of the kernel about a Wi-Fi link: its stations and its channel.
 
 iw's lines are those of its station.c, link.c and survey.c, the same in versions 3 to 6 but for lines that came later;
 drivers leave out what they do not know. A power of 0 dBm or more is none that a radio receives: drivers that do

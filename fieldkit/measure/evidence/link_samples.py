@@ -48,9 +48,9 @@ def text(samples: Mapping[Role, Sequence[LinkSample]]) -> str:
 
 
 def _rows(role: Role, samples: Mapping[Role, Sequence[LinkSample]]) -> Iterator[str]:
-    for one in samples[role]:
-        radio = (one.utc_ns, role, _dbm(one.noise_dbm), one.active_ns, one.busy_ns)
-        for station in one.stations or (StationSample(""),):
+    for sample in samples[role]:
+        radio = (sample.utc_ns, role, _dbm(sample.noise_dbm), sample.active_ns, sample.busy_ns)
+        for station in sample.stations or (StationSample(""),):
             rates = (None if rate is None else round(rate) for rate in (station.tx_rate_bit_s, station.rx_rate_bit_s))
             counts = (station.tx_packets, station.rx_packets, station.tx_retries, station.tx_failures)
             values = (*radio, station.station, _dbm(station.signal_dbm), *rates, *counts)
@@ -104,9 +104,9 @@ def read_own(folder: Path, role: Role) -> Sequence[LinkSample]:
         raise EvidenceError("does not say what its clock showed", where=str(folder / host.before(role)))
     clock = told[0][0]
     ahead_ns = (clock.lowest_ns + clock.highest_ns) // 2
-    own = [LinkSample(one.first_ns, iw.stations(said)) for one, said in told if one is not None]
-    own += [replace(one, utc_ns=one.utc_ns + ahead_ns) for one in parse(_written(folder / file(role)))]
-    return tuple(sorted((one for one in own if _tells(one)), key=lambda one: one.utc_ns))
+    own = [LinkSample(exchange.first_ns, iw.stations(said)) for exchange, said in told if exchange is not None]
+    own += [replace(sample, utc_ns=sample.utc_ns + ahead_ns) for sample in parse(_written(folder / file(role)))]
+    return tuple(sorted((sample for sample in own if _tells(sample)), key=lambda one: one.utc_ns))
 
 
 def _written(path: Path) -> str:

@@ -208,7 +208,7 @@ def longest_gap(found: Ping) -> tuple[float, int] | None:
     None where no two answers have a time stamp, or the requests after the last one are at least as many: that gap has
     no end.
     """
-    stamped = sorted((one.seq, one.at_utc_ns) for one in found.answers if one.at_utc_ns is not None)
+    stamped = sorted((answer.seq, answer.at_utc_ns) for answer in found.answers if answer.at_utc_ns is not None)
     gaps = [(later_ns - ns, later - seq - 1) for (seq, ns), (later, later_ns) in pairwise(stamped)]
     if not gaps:
         return None

@@ -12,13 +12,11 @@ from typing import Any, Final
 
 from fieldkit.core.columns import MISSING, Column, Value
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.text import brief
 from fieldkit.measure.evidence import reading
 
 MOST_BYTES: Final = 1 << 20
 """What is kept of a program's output; one that prints more is cut."""
-
-_MOST_LETTERS: Final = 200
-"""Of a text in a table."""
 
 _TOO_DEEP: Final = "it is nested too deeply"
 
@@ -84,7 +82,7 @@ def document(path: Path) -> object:
         EvidenceError: As `text`, or it is none.
     """
     try:
-        found: object = json.loads(text(path))
+        found: object = json.loads(text(path).removeprefix("\ufeff"))
     except (ValueError, RecursionError) as error:
         why = _TOO_DEEP if isinstance(error, RecursionError) else str(error)
         raise EvidenceError(f"is no JSON: {why}", where=str(path)) from error
@@ -127,7 +125,7 @@ def value(column: Column, found: object) -> Value:
     if isinstance(found, list | dict):
         raise EvidenceError("it is not one value, but several")
     said = json.dumps(found) if isinstance(found, bool | int | float) else str(found).strip()
-    shown = "".join(char if char.isprintable() else "?" for char in " ".join(said.split()))[:_MOST_LETTERS]
+    shown = brief(said)
     if said in MISSING:
         raise EvidenceError("there is none")
     if column.type is str:

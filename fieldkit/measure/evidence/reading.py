@@ -1,14 +1,18 @@
 """Bytes and text of evidence files, with errors that say what to do."""
 
+import json
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final, TypeVar
 
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.text import JSON_ERRORS
+
+T = TypeVar("T")
 
 MOST_TEXT_BYTES: Final = 64 << 20
 """No tool says more during a repeat: a ping of an hour at 10 a second is 3 MB."""
@@ -69,6 +73,26 @@ def text(path: Path) -> str:
     if len(found) > MOST_TEXT_BYTES:
         raise EvidenceError(f"is longer than {MOST_TEXT_BYTES >> 20} MiB, as no tool's output is", where=str(path))
     return found.decode(errors="replace")
+
+
+def json_lines(path: Path, parse: Callable[[Any], T], wrong: str) -> list[T]:
+    """Return what stands in the lines of a log, a JSON value each; a last one that is not whole is left out.
+
+    Args:
+        path: The log.
+        parse: Makes of a line's value what it says; raises one of `JSON_ERRORS` where it is none.
+        wrong: What a wrong line does not: `does not say where a robot drove`.
+
+    Raises:
+        EvidenceError: As `text`; or a line is wrong.
+    """
+    found = []
+    for number, line in enumerate(text(path).split("\n")[:-1], 1):
+        try:
+            found.append(parse(json.loads(line)))
+        except JSON_ERRORS:
+            raise EvidenceError(f"line {number} {wrong}", where=str(path)) from None
+    return found
 
 
 @contextmanager

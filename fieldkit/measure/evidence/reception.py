@@ -1,4 +1,4 @@
-"""What a recorder heard of its topics, and how soon: from its log, and its bag, both by the robot's clock.
+"""Reception of a recorder's topics: how soon, and how steadily; by its log and its bag, both by the robot's clock.
 
 ROS 1's rosbag says `[ INFO] [1795208123.219164628]: Subscribing to /scan` before it asks the master who publishes
 it, and ROS 2's `[INFO] [1795208123.219164628] [rosbag2_recorder]: Listening for topics...` before it looks for any.

@@ -43,7 +43,7 @@ def declared(kind: FaultKind) -> tuple[Column, ...]:
     )
 
 
-COLUMNS: Final = tuple(one for kind in _ORDER for one in declared(kind))
+COLUMNS: Final = tuple(column for kind in _ORDER for column in declared(kind))
 
 
 def note_file(kind: FaultKind) -> str:

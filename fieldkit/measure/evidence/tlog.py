@@ -1,4 +1,4 @@
-"""What a telemetry log of an autopilot (`.tlog`) says, and what its recorder said of it; decoded confined."""
+"""Telemetry logs of autopilots (`.tlog`), and what their recorders said of them; decoded confined."""
 
 import json
 from collections.abc import Mapping
@@ -8,6 +8,7 @@ from typing import Any, Final
 from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
+from fieldkit.core.text import JSON_ERRORS
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError
 
@@ -113,7 +114,7 @@ def told(path: Path) -> Told:
         refused = {_whole(int(kind)): _whole(result) for kind, result in data["refused"].items()}
         frames, left_out, ended_us = (_whole(data[name]) for name in ("frames", "left_out", "ended_us"))
         return Told(frames, left_out, ended_us, refused)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except JSON_ERRORS as error:
         raise EvidenceError(
             "does not say what was recorded", where=str(path), remedy="read the recorder's log: was it ended?"
         ) from error
@@ -165,7 +166,9 @@ def read(path: Path, system: int, ended_us: int) -> Tlog:
     }
     values["armed"] = None if values.get("armed") is None else bool(values["armed"])
     return Tlog(
-        found["frames"], found["kinds"], {_PREFIX + name: one for name, one in values.items() if one is not None}
+        found["frames"],
+        found["kinds"],
+        {_PREFIX + name: value for name, value in values.items() if value is not None},
     )
 
 

@@ -69,7 +69,7 @@ def read(path: Path) -> tuple[Whereabouts, ...]:
     """
     what = "does not say where robots were"
     track = tuple(map(_parsed, counted_csv.read(path, _HEADER, _LINE, what)))
-    if any(one.utc_ns > other.utc_ns for one, other in pairwise(track)):
+    if any(before.utc_ns > after.utc_ns for before, after in pairwise(track)):
         raise EvidenceError(what, where=str(path))
     return track
 

@@ -1,1 +1,1 @@
-"""Where robots really stood: what told it, as paths over time, and as columns."""
+"""Positions of robots as they really were: who told them, paths over time, columns."""

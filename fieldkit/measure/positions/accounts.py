@@ -14,6 +14,7 @@ from typing import Any, Final
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role, Vector
+from fieldkit.core.text import JSON_ERRORS
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions.samples import PLACED
@@ -68,7 +69,7 @@ class Account:
         return (
             self.frame
             if self.frame == PLACED
-            else f"{', '.join(f'{one:.9g}' for one in self.place if one is not None)} in {self.frame}"
+            else f"{', '.join(f'{metres:.9g}' for metres in self.place if metres is not None)} in {self.frame}"
         )
 
 
@@ -100,10 +101,10 @@ def text(accounts: Accounts) -> str:
     """Return accounts as `read` reads them."""
     usual = asdict(Account())
     robots = {
-        role: {name: value for name, value in asdict(one).items() if value != usual[name]}
-        for role, one in accounts.robots.items()
+        role: {name: value for name, value in asdict(account).items() if value != usual[name]}
+        for role, account in accounts.robots.items()
     }
-    clocks = {role: asdict(one) for role, one in accounts.clocks.items()}
+    clocks = {role: asdict(offset) for role, offset in accounts.clocks.items()}
     return json.dumps({"robots": robots, "clocks": clocks, "heights": accounts.heights}, indent=2) + "\n"
 
 
@@ -115,10 +116,10 @@ def read(path: Path) -> Accounts:
     """
     try:
         data = json.loads(reading.text(path))
-        robots = {Role(role): _made(Account, one) for role, one in data.pop("robots").items()}
-        clocks = {Role(role): _made(Offset, one) for role, one in data.pop("clocks").items()}
+        robots = {Role(role): _made(Account, account) for role, account in data.pop("robots").items()}
+        clocks = {Role(role): _made(Offset, offset) for role, offset in data.pop("clocks").items()}
         heights = data.pop("heights")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except JSON_ERRORS as error:
         raise EvidenceError("does not say who tells where robots were", where=str(path)) from error
     if data or not isinstance(heights, bool):
         raise EvidenceError("says more than who tells where robots were", where=str(path))
@@ -132,7 +133,7 @@ def _made(record: type[Any], values: Mapping[str, Any]) -> Any:  # noqa: ANN401 
         ValueError: They are not its own.
         TypeError: They lack one.
     """
-    made = {one.name: _value(one.type, values[one.name]) for one in fields(record) if one.name in values}
+    made = {field.name: _value(field.type, values[field.name]) for field in fields(record) if field.name in values}
     parts = PurePosixPath(made.get("file", "")).parts  # of ROS 2, a bag is a folder
     if len(made) < len(values) or len(parts) > 2 or {"..", "/"} & {*parts}:
         raise ValueError
@@ -152,5 +153,5 @@ def _value(kind: Any, value: Any) -> Any:  # noqa: ANN401 (any JSON value)
     if kind in {Vector, Place | None} and isinstance(value, list) and len(value) == 3:
         if value[2] is None and kind is not Vector:
             return (_value(float, value[0]), _value(float, value[1]), None)
-        return tuple(_value(float, one) for one in value)
+        return tuple(_value(float, part) for part in value)
     raise ValueError

@@ -23,7 +23,11 @@ def answer(question: Json) -> Json:
     timed = [point for point in points if point.time is not None]
     if len(timed) < len(points):
         raise ValueError(f"{len(points) - len(timed)} of {len(points)} points have no time")
-    return {"points": [(utc_ns(one.time), one.latitude, one.longitude, one.elevation) for one in timed if one.time]}
+    return {
+        "points": [
+            (utc_ns(point.time), point.latitude, point.longitude, point.elevation) for point in timed if point.time
+        ]
+    }
 
 
 if __name__ == "__main__":

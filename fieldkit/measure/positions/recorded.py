@@ -53,7 +53,9 @@ def _read_gpx(path: Path) -> Samples:
     except EvidenceError as error:
         where = ", ".join(filter(None, (str(path), error.where)))
         raise EvidenceError(error.what, where=where, remedy=error.remedy) from error
-    values = np.array([[math.nan if one is None else one for one in point[1:]] for point in points], dtype=float)
+    values = np.array(
+        [[math.nan if value is None else value for value in point[1:]] for point in points], dtype=float
+    )
     if not (np.isfinite(values[:, :2]).all() and (abs(values[:, :2]) <= (90, 180)).all()):
         raise EvidenceError("has a point that is no place", where=str(path), remedy="export the track again")
     return Samples(np.array([at_ns for at_ns, *_ in points]), values, WGS84)

@@ -1,4 +1,4 @@
-"""Where robots were while something was measured, as columns, by whoever tells it best.
+"""Positions of robots while something was measured, as columns, by whoever tells them best.
 
 What `fieldkit positions` gave counts before what steps recorded, and that before what the testbed knows.
 """
@@ -56,7 +56,7 @@ def measure(
             what = f"what {told.robots[role].in_words} tells of the {role} {why}"
             return Measured.nothing(declared, what)
     found = trajectories.apart(source, destination, start_ns, end_ns)
-    return Measured.of({one.name: getattr(found, one.name.partition("_")[2]) for one in declared}, "")
+    return Measured.of({column.name: getattr(found, column.name.partition("_")[2]) for column in declared}, "")
 
 
 def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[tuple[int, float | None]]:
@@ -192,7 +192,7 @@ def _ahead_ns(told: Accounts, role: Role) -> int:
 
 def clock_error_s(evidence: AttemptEvidence) -> float | None:
     """Return the most that times of two robots can be wrong against each other; None where nobody asked for them."""
-    errors = sorted(one.error_s for one in given(evidence).clocks.values())
+    errors = sorted(offset.error_s for offset in given(evidence).clocks.values())
     return sum(errors[-2:]) if errors else None
 
 

@@ -66,7 +66,9 @@ def _earlier(sender: Packets, receiver: Packets, transfer: Transfer) -> str | No
     They came with payload from a port from which nothing left; or they had waited on the sender, and left from
     another port than the last that began. What a kernel still repeats of a connection that broke off begins none.
     """
-    left, came = (one.where(one.dport == transfer.port) for one in map(transfer.forward, (sender, receiver)))
+    left, came = (
+        packets.where(packets.dport == transfer.port) for packets in map(transfer.forward, (sender, receiver))
+    )
     carries = (came.tcp_payload_bytes > 0) | (came.udp_bytes > 0)
     if on_the_way := int((carries & ~np.isin(came.sport, left.sport)).sum()):
         return f"{format_count(on_the_way, 'packet')} of the transfer's port came from another than any that left"
@@ -91,9 +93,10 @@ def _amounts(files: _Files, left_bytes: int, arrived_bytes: int, transfer: Trans
 def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer) -> Iterator[str]:
     both = transfer.forward(sender), transfer.forward(receiver)
     # A capture also holds later fragments of what other programs send.
-    ids = np.concatenate([one.ip_id[one.dport == transfer.port] for one in both])
+    ids = np.concatenate([packets.ip_id[packets.dport == transfer.port] for packets in both])
     sent, received = (
-        one.where((one.dport == transfer.port) | (one.dport == NO_PORT) & np.isin(one.ip_id, ids)) for one in both
+        packets.where((packets.dport == transfer.port) | (packets.dport == NO_PORT) & np.isin(packets.ip_id, ids))
+        for packets in both
     )
     first, first_received = sent.dport == transfer.port, received.dport == transfer.port
     keys, keys_received = _keys(sent), _keys(received)
@@ -110,7 +113,9 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
     yield from _amounts(files, left_bytes, arrived_bytes, transfer)
     # Copies can make up for what is missing in sum, but not packet by packet. Of a fragment whose id is another
     # transfer's, too, nobody says whose it is.
-    others = np.concatenate([one.ip_id[(one.dport != transfer.port) & (one.dport != NO_PORT)] for one in both])
+    others = np.concatenate(
+        [packets.ip_id[(packets.dport != transfer.port) & (packets.dport != NO_PORT)] for packets in both]
+    )
     certain = first | ~np.isin(sent.ip_id, others)
     missing = int((~np.isin(keys[certain], keys_received)).sum())
     if missing and files.whole and files.received_bytes <= arrived_bytes:
@@ -127,10 +132,12 @@ def _tcp(
     sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer, *, finished: bool
 ) -> Iterator[str]:
     left, came = (
-        one.where(one.dport == transfer.port) for one in (transfer.forward(sender), transfer.forward(receiver))
+        packets.where(packets.dport == transfer.port)
+        for packets in (transfer.forward(sender), transfer.forward(receiver))
     )
     answered, answered_there = (
-        one.where(one.sport == transfer.port) for one in (transfer.backward(sender), transfer.backward(receiver))
+        packets.where(packets.sport == transfer.port)
+        for packets in (transfer.backward(sender), transfer.backward(receiver))
     )
     if _refused(left, answered):
         yield f"the {transfer.destination} refused the connection: nobody listened when the {transfer.source} began"

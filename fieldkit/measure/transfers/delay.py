@@ -120,7 +120,11 @@ def measure(
         return _withheld(
             "the packets of the transfer look alike" if alike else "no packet of the transfer is in both captures"
         )
-    if any((times == NO_TIME).any() for one in (own, others, reverse) for times in (one.sender_ns, one.receiver_ns)):
+    if any(
+        (times == NO_TIME).any()
+        for stamps in (own, others, reverse)
+        for times in (stamps.sender_ns, stamps.receiver_ns)
+    ):
         return _withheld("a capture lacks times")
     own = own.where(np.argsort(own.receiver_ns, kind="stable"))
     transit_ns = own.receiver_ns - own.sender_ns
@@ -165,10 +169,12 @@ def between(sender: Packets, receiver: Packets, sender_address: str, receiver_ad
         sender_address: Of the sender on the link under test.
         receiver_address: Of the receiver.
     """
-    forward = _seen(*(one.where(_is_way(one, sender_address, receiver_address)) for one in (sender, receiver)))
+    forward = _seen(
+        *(packets.where(_is_way(packets, sender_address, receiver_address)) for packets in (sender, receiver))
+    )
     reverse = _reverse(sender, receiver, sender_address, receiver_address)
     times = (forward.sender_ns, forward.receiver_ns, reverse.sender_ns, reverse.receiver_ns)
-    if any(not len(one) or (one == NO_TIME).any() for one in times):
+    if any(not len(stamps) or (stamps == NO_TIME).any() for stamps in times):
         return None
     return estimate(forward, reverse)
 
@@ -237,12 +243,16 @@ def _one_way(delay_s: Floats, error_s: float) -> Measured:
 def _others(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
     """Return what else went from sender to receiver: packets without payload, and ping's."""
     ends = transfer.sender_address, transfer.receiver_address
-    return _seen(*(one.where(_is_way(one, *ends) & ~_is_own(one, transfer)) for one in (sender, receiver)))
+    return _seen(
+        *(packets.where(_is_way(packets, *ends) & ~_is_own(packets, transfer)) for packets in (sender, receiver))
+    )
 
 
 def _reverse(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> StampPairs:
     """Return what went from receiver to sender."""
-    back = _seen(*(one.where(_is_way(one, receiver_address, sender_address)) for one in (receiver, sender)))
+    back = _seen(
+        *(packets.where(_is_way(packets, receiver_address, sender_address)) for packets in (receiver, sender))
+    )
     return StampPairs(sender_ns=back.receiver_ns, receiver_ns=back.sender_ns)
 
 

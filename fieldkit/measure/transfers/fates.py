@@ -90,11 +90,11 @@ def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None
 def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
     """Offload makes frames of both ends differ, so none is matched: what went again is told by its sequence range."""
     sent, received = (
-        one.where((one.dport == transfer.port) & (one.tcp_payload_bytes > 0))
-        for one in (transfer.forward(sender), transfer.forward(receiver))
+        packets.where((packets.dport == transfer.port) & (packets.tcp_payload_bytes > 0))
+        for packets in (transfer.forward(sender), transfer.forward(receiver))
     )
     base = int(sent.tcp_seq[0]) if len(sent) else 0
-    begins, begins_received = (_since(base, one.tcp_seq) for one in (sent, received))
+    begins, begins_received = (_since(base, packets.tcp_seq) for packets in (sent, received))
     reached = np.maximum.accumulate(begins + sent.tcp_payload_bytes)
     return Fates(
         sent_ns=sent.time_ns,

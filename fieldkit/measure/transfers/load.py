@@ -1,4 +1,4 @@
-"""What two captures say of an iperf3 test: its own figures' independent witness."""
+"""Figures of an iperf3 test by two captures: the independent witness of its own."""
 
 from typing import Final
 
@@ -81,24 +81,24 @@ def measure(flow: LoadFlow, sender: Packets | None, receiver: Packets | None) ->
 
 def _loss(flow: LoadFlow, left: list[Packets], came: list[Packets]) -> float | None:
     if flow.protocol is Protocol.UDP:
-        if any(one.more_fragments.any() for one in left):
+        if any(packets.more_fragments.any() for packets in left):
             return None
-        sent, received = (sum(map(len, one)) for one in (left, came))
+        sent, received = (sum(map(len, streams)) for streams in (left, came))
     else:
-        sent, received = (sum(int(stream.tcp_payload_bytes.sum()) for stream in one) for one in (left, came))
+        sent, received = (sum(int(stream.tcp_payload_bytes.sum()) for stream in streams) for streams in (left, came))
     return 1 - received / sent if sent else None
 
 
 def _rate(flow: LoadFlow, came: list[Packets]) -> float | None:
     """Return the rate at which payload came, each byte once; None where nothing tells it."""
     udp = flow.protocol is Protocol.UDP
-    data = [one if udp else one.where(one.tcp_payload_bytes > _COOKIE_BYTES) for one in came]
-    times_ns: Ints = np.concatenate([one.time_ns for one in data]) if data else np.array([], dtype=np.int64)
+    data = [packets if udp else packets.where(packets.tcp_payload_bytes > _COOKIE_BYTES) for packets in came]
+    times_ns: Ints = np.concatenate([packets.time_ns for packets in data]) if data else np.array([], dtype=np.int64)
     start_s, end_s = flow.window_s
     if not len(times_ns) or (times_ns == NO_TIME).any() or end_s <= start_s:
         return None
     start_ns, end_ns = (int(times_ns.min()) + round(1e9 * second) for second in flow.window_s)
-    inside = [one.where((start_ns <= one.time_ns) & (one.time_ns < end_ns)) for one in data]
+    inside = [packets.where((start_ns <= packets.time_ns) & (packets.time_ns < end_ns)) for packets in data]
     if udp:
         return 8 * flow.payload_bytes * sum(map(len, inside)) / (end_s - start_s)
     total = 0

@@ -187,15 +187,16 @@ def stamps(sent: Packets, received: Packets) -> tuple[Ints, Ints]:
     on the way took it out, or a capture cut it off.
     """
     lacking = [
-        (one.protocol == TCP) & (one.tcp_stamp == NO_STAMP) & (one.tcp_flags & RST == 0) for one in (sent, received)
+        (packets.protocol == TCP) & (packets.tcp_stamp == NO_STAMP) & (packets.tcp_flags & RST == 0)
+        for packets in (sent, received)
     ]
     if not any(these.any() for these in lacking):
         return sent.tcp_stamp, received.tcp_stamp
-    connections = [connection(one) for one in (sent, received)]
-    without = np.concatenate([one[these] for one, these in zip(connections, lacking, strict=True)])
+    connections = [connection(packets) for packets in (sent, received)]
+    without = np.concatenate([numbers[these] for numbers, these in zip(connections, lacking, strict=True)])
     left, came = (
-        np.where(np.isin(these, without), NO_STAMP, one.tcp_stamp)
-        for one, these in zip((sent, received), connections, strict=True)
+        np.where(np.isin(these, without), NO_STAMP, packets.tcp_stamp)
+        for packets, these in zip((sent, received), connections, strict=True)
     )
     return left, came
 
@@ -235,12 +236,12 @@ def _payload(sent: Packets, received: Packets, frames: Match) -> Payload:
 
 def _copies(sent: Packets, received: Packets, frames: Match) -> tuple[Ints, Ints]:
     """Return the number of the frame that is equal at the other end, 0 where there is none: told by its IP id."""
-    connections = [connection(one) for one in (sent, received)]
+    connections = [connection(packets) for packets in (sent, received)]
     carries = sent.tcp_payload_bytes > 0
     _, one_of_each = np.unique(mixed(connections[0][carries], sent.ip_id[carries]), return_index=True)
     these, ids = np.unique(connections[0][carries][one_of_each], return_counts=True)
     # Of frames that all have one id any may be a part of another.
-    named, came_named = (~np.isin(one, these[ids < 2]) for one in connections)
+    named, came_named = (~np.isin(numbers, these[ids < 2]) for numbers in connections)
     copy = np.where(frames.arrived & named, np.arange(len(sent)), NONE) + 1
     came_copy = np.where(came_named, frames.sent_index, NONE) + 1
     return copy, came_copy

@@ -34,7 +34,7 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
         transfer: What tells its packets, of which those count that have a port.
     """
     here, there = transfer.forward(sender), transfer.forward(receiver)
-    sent, came = (one.where(one.dport == transfer.port) for one in (here, there))
+    sent, came = (packets.where(packets.dport == transfer.port) for packets in (here, there))
     if why := _unfit(here, there, sent):
         return why
     if not len(sent):
@@ -105,7 +105,7 @@ def _readdressed(sender: Packets, receiver: Packets, sent: Packets, own: Packets
     if not len(found):
         return found
     found = found.where(~np.isin(connection(found), connection(sender)))
-    as_sent, as_own, anonymous = (_anonymous(one) for one in (sent, own, found))
+    as_sent, as_own, anonymous = (_anonymous(packets) for packets in (sent, own, found))
     return found.where(np.isin(anonymous, as_sent) & ~np.isin(anonymous, as_own))
 
 

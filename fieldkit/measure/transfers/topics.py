@@ -1,4 +1,4 @@
-"""What the logs of a topic's two ends, and the captures around it, say: loss, delay, age of information, traffic.
+"""Figures of a topic by the logs of its ends and the captures around it: loss, delay, age of information, traffic.
 
 Age of information is the time since the newest sample that has arrived was sent. It grows with time and falls when a
 newer sample comes. Its mean over time is of S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one
@@ -16,6 +16,7 @@ from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.captures.ip import UDP
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers.clocks import Clocks
+from fieldkit.measure.transfers.datagrams import with_ports
 from fieldkit.measure.transfers.delay import LARGEST_ERROR, between, jitter_s
 from fieldkit.measure.transfers.match import match
 from fieldkit.measure.transfers.topic_log import Stamped, TopicLog
@@ -267,12 +268,11 @@ def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
     if sender is None:
         return Measured.nothing(_TRAFFIC, "there is no whole capture of the publisher")
     data, discovery = list(flow.data_ports), list(flow.discovery_ports)
-    to_data, to_discovery = np.isin(sender.dport, data), np.isin(sender.dport, discovery)
-    of_data, of_discovery = np.isin(sender.sport, data), np.isin(sender.sport, discovery)
-    # A later fragment has no port, and what is so large is no discovery.
-    later = (sender.protocol == UDP) & (sender.fragment_offset > 0)
+    told = with_ports(sender)
+    to_data, to_discovery = np.isin(told.dport, data), np.isin(told.dport, discovery)
+    of_data, of_discovery = np.isin(told.sport, data), np.isin(told.sport, discovery)
     kinds = {
-        "data": to_data | (of_data & ~to_discovery) | later,
+        "data": to_data | (of_data & ~to_discovery),
         "discovery": to_discovery | (of_discovery & ~to_data),
     }
     found: dict[str, Value | None] = {}
@@ -287,13 +287,13 @@ def _packet_loss(flow: TopicTraffic, sender: Packets | None, receiver: Packets |
     if sender is None or receiver is None:
         return Measured.of({"topic_packet_loss": None}, "there are no whole captures of both ends")
 
-    def of_data(packets: Packets) -> Packets:
+    def on_way(packets: Packets) -> Packets:
         way = packets.are_from(flow.sender_address) & packets.are_to(flow.receiver_address)
-        # A later fragment has no port, and what is so large is no discovery.
-        data = np.isin(packets.dport, list(flow.data_ports)) | (packets.fragment_offset > 0)
-        return packets.where(way & data & (packets.protocol == UDP))
+        return packets.where(way & (packets.protocol == UDP))
 
-    left = of_data(sender)
-    arrived = match(left, of_data(receiver)).arrived
-    lost = 1 - float(arrived.mean()) if len(left) else None
+    left = on_way(sender)
+    # At the subscriber a first fragment may be missing, and with it the port of the others: the sender's tell it.
+    of_data = np.isin(with_ports(left).dport, list(flow.data_ports))
+    arrived = match(left, on_way(receiver)).arrived[of_data]
+    lost = 1 - float(arrived.mean()) if len(arrived) else None
     return Measured.of({"topic_packet_loss": lost}, "none of its data went over UDP")

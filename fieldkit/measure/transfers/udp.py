@@ -1,20 +1,13 @@
-"""Loss of a UDP transfer layer by layer: IP packets (fragments), datagrams, payload bytes.
-
-Only the first fragment of a datagram carries the port; the others belong to it by their IP id, which has 16 bits and
-comes again in a long transfer, or at once in packets that are never fragmented (RFC 6864, section 4).
-"""
-
-from typing import Final
+"""Loss of a UDP transfer layer by layer: IP packets (fragments), datagrams, payload bytes."""
 
 import numpy as np
 
 from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Ints, Mask
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
+from fieldkit.measure.transfers.datagrams import NO_DATAGRAM, datagrams
 from fieldkit.measure.transfers.match import Match, match, reordered
 from fieldkit.measure.transfers.transfer import Transfer, span_s
-
-_NO_DATAGRAM: Final = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +19,7 @@ class UdpPackets:
         received: In the receiver's.
         match: Which of these is a copy of which of those.
         first: Index of the first fragment of each datagram sent. Of shape (k,).
-        datagram: Datagram of each packet sent, `_NO_DATAGRAM` where its first fragment is not there. Of shape (n,).
+        datagram: Datagram of each packet sent, `NO_DATAGRAM` where its first fragment is not there. Of shape (n,).
         port: Port that the transfer goes to.
     """
 
@@ -39,7 +32,7 @@ class UdpPackets:
 
     @property
     def ours(self) -> Mask:
-        """Which datagrams are the transfer's; the last entry is that of `_NO_DATAGRAM`. Of shape (k + 1,)."""
+        """Which datagrams are the transfer's; the last entry is that of `NO_DATAGRAM`. Of shape (k + 1,)."""
         return np.append(self.sent.dport[self.first] == self.port, False)
 
     @property
@@ -89,7 +82,7 @@ class UdpCounts:
 def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> UdpPackets:
     """Return the UDP packets of both captures beside each other."""
     sent, received = transfer.forward(sender), transfer.forward(receiver)
-    return UdpPackets(sent, received, match(sent, received), *_datagrams(sent), transfer.port)
+    return UdpPackets(sent, received, match(sent, received), *datagrams(sent), transfer.port)
 
 
 def count(crossing: UdpPackets) -> UdpCounts:
@@ -122,33 +115,15 @@ def count(crossing: UdpPackets) -> UdpCounts:
     )
 
 
-def _datagrams(packets: Packets) -> tuple[Ints, Ints]:
-    """Return the index of each datagram's first fragment, and each packet's datagram.
-
-    A later fragment belongs to the latest first fragment with its id; one seen before any, to the next.
-    """
-    order = np.lexsort((packets.time_ns, packets.ip_id))
-    ip_id = packets.ip_id[order]
-    is_first = packets.fragment_offset[order] == 0
-    firsts_until = np.append(0, np.cumsum(is_first))
-    edges = np.append(np.flatnonzero(np.diff(ip_id, prepend=-1)), len(ip_id))
-    before_id, through_id = (np.repeat(firsts_until[side], np.diff(edges)) for side in (edges[:-1], edges[1:]))
-    number = np.maximum(firsts_until[1:] - 1, before_id)
-
-    datagram = np.empty(len(packets), dtype=np.int64)
-    datagram[order] = np.where(through_id > before_id, number, _NO_DATAGRAM)
-    return order[is_first], datagram
-
-
 def payload_bytes(packets: Packets) -> Ints:
     """Return the bytes that each packet carries for the application."""
     return packets.ip_payload_bytes - np.where(packets.fragment_offset == 0, UDP_HEADER_BYTES, 0)
 
 
 def whole(crossing: UdpPackets) -> Mask:
-    """Return whether all of each datagram was sent and arrived; the last entry is that of `_NO_DATAGRAM`."""
+    """Return whether all of each datagram was sent and arrived; the last entry is that of `NO_DATAGRAM`."""
     sent, first = crossing.sent, crossing.first
-    known = crossing.datagram != _NO_DATAGRAM
+    known = crossing.datagram != NO_DATAGRAM
     datagram, lost = crossing.datagram[known], ~crossing.match.arrived[known]
     missing = np.bincount(datagram, weights=lost, minlength=len(first))
     size = np.bincount(datagram, weights=sent.ip_payload_bytes[known], minlength=len(first))

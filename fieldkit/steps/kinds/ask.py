@@ -4,21 +4,33 @@ import math
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
-from fieldkit.config.schema import Field, Number
-from fieldkit.core.columns import Column, Figure, Kind, Measured, Value
+from fieldkit.config.schema import AfterValidator, Field, Number
+from fieldkit.core.columns import MISSING, Column, Figure, Kind, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.prompts import UNKNOWN, Question
 from fieldkit.measure.evidence import reading
-from fieldkit.steps.base import Step, View
+from fieldkit.steps.base import Step, StepName, View
 from fieldkit.steps.scene import Announce, Planned, Scene
 
-_Word = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_ -]{0,30}$")]
+_MOST_LETTERS: Final = 31
+
+
+def _can_be_chosen(word: str) -> str:
+    """Return a word that is neither a place in the list of choices nor what says that nobody knows."""
+    fits = 0 < len(word) <= _MOST_LETTERS and word.isprintable() and word == word.strip()
+    if not fits or word.isdigit() or word in {UNKNOWN, *MISSING}:
+        raise schema.complaint(f"{word[:40]!r} cannot be a choice: write words, {_MOST_LETTERS} characters at most")
+    return word
+
+
+_Word = Annotated[str, AfterValidator(_can_be_chosen)]
 
 
 class AskStep(Step):
@@ -37,9 +49,11 @@ class AskStep(Step):
         each: Whether it is asked in each repeat, or once for all of a trial.
     """
 
-    column: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,30}$")]
-    question: Annotated[str, Field(pattern=r"^\S[^\n]{0,200}$")]
-    unit: Annotated[str, Field(pattern=r"^[^\s0-9][^\s]{0,15}$")] | None = None
+    column: StepName
+    question: Annotated[str, schema.shaped(r"^\S[^\n]{0,200}$", "a question: one line")]
+    unit: (
+        Annotated[str, schema.shaped(r"^[^\s0-9][^\s]{0,15}$", "a unit: up to 16 characters, no digit first")] | None
+    ) = None
     choices: Annotated[tuple[_Word, ...], Field(min_length=2, max_length=20)] | None = None
     least: Number | None = None
     most: Number | None = None
@@ -52,8 +66,11 @@ class AskStep(Step):
             raise schema.complaint("choices are words: they take no unit, least or most", "choices")
         if self.least is not None and self.most is not None and self.least > self.most:
             raise schema.complaint("least is above most", "least")
+        if self.choices and len(set(self.choices)) < len(self.choices):
+            raise schema.complaint("a choice comes twice", "choices")
         if self.usual and self._asked.read(self.usual) is None:
-            raise schema.complaint(f"usual is no answer: {self._asked.how}", "usual")
+            how = replace(self._asked, usual="").how
+            raise schema.complaint(f"usual is {self.usual!r}, and what can be answered is {how}", "usual")
         return self
 
     @property

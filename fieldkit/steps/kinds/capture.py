@@ -12,7 +12,7 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Field, Int
 from fieldkit.core.columns import Measured, columns
-from fieldkit.core.errors import EvidenceError, FieldkitError, RobotError
+from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Protocol, Role, Verdict, in_order
 from fieldkit.core.threads import together
 from fieldkit.measure.captures import pcap
@@ -98,7 +98,7 @@ class CaptureStep(Nest):
                 self._filter(scene),
             ),
             # Never sooner than what it captures: a capture that ends at its limit looks whole.
-            limit_s=LIMIT_S + sum(one.job.limit_s for one in self.inside(scene)),
+            limit_s=LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log(role),
             ready="log:listening on",
             as_root=profile.tools.capture_right == "sudo",
@@ -154,10 +154,10 @@ class CaptureStep(Nest):
             prepared.append(first.prepare(scene, testbed))
 
         starts: list[Callable[[], None]] = [
-            partial(jobs.start, testbed.shells[one.role], one.job) for one in captures
+            partial(jobs.start, testbed.shells[capture.role], capture.job) for capture in captures
         ]
         # sudo may take seconds, where nothing resolves its host's name, and a UDP listener waits no longer.
-        rounds = ([*starts], [prepare]) if any(one.job.as_root for one in captures) else ([*starts, prepare],)
+        rounds = ([*starts], [prepare]) if any(capture.job.as_root for capture in captures) else ([*starts, prepare],)
         announce("start captures", None)
         try:
             for calls in rounds:
@@ -172,19 +172,16 @@ class CaptureStep(Nest):
                 self._stop(scene, testbed, captures)
             raise
         announce("drain captures", None)
-        for one, code in zip(captures, self._stop(scene, testbed, captures), strict=True):
+        for capture, code in zip(captures, self._stop(scene, testbed, captures), strict=True):
             if code != 0:
-                raise RobotError(
-                    f"tcpdump ended with exit code {code}",
-                    where=scene.robot(one.role).name,
-                    remedy=f"see {one.job.log} of this repeat",
-                )
+                raise scene.failure(capture, f"tcpdump ended with exit code {code}")
 
     def _stop(self, scene: Scene, testbed: Testbed, captures: Sequence[Planned]) -> list[int]:
-        def stop(one: Planned) -> int:
-            if not scene.tools(one.role).immediate_mode:
-                jobs.begin_wait(testbed.shells[one.role], one.job, RING_S).end(RING_S + jobs.REPLY_S)
-            return jobs.stop(testbed.shells[one.role], one.job, settle=self._file(one.role), parting=COUNTED)
+        def stop(capture: Planned) -> int:
+            if not scene.tools(capture.role).immediate_mode:
+                jobs.begin_wait(testbed.shells[capture.role], capture.job, RING_S).end(RING_S + jobs.REPLY_S)
+            shell, file = testbed.shells[capture.role], self._file(capture.role)
+            return jobs.stop(shell, capture.job, settle=file, parting=COUNTED)
 
         return together(stop, captures)
 

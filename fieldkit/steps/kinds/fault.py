@@ -51,7 +51,10 @@ class FaultStep(Nest):
     robot: Role
     kind: FaultKind
     lasts: Annotated[Duration, Field(gt=0)] | None = Field(default=None, alias="for")
-    process: Annotated[str, Field(pattern=r"^[A-Za-z0-9._-]{1,15}$")] | None = None
+    process: (
+        Annotated[str, schema.shaped(r"^[A-Za-z0-9._-]{1,15}$", "the name of a process, as ps -e -o comm shows it")]
+        | None
+    ) = None
     after: Duration = 1.0
     limit: Annotated[Duration, Field(gt=0)] = 60.0
     during: tuple[StepEntry, ...] = ()

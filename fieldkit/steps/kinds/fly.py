@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Annotated, Final
 
@@ -10,13 +10,17 @@ from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
+from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
-from fieldkit.core.text import harmless
+from fieldkit.core.text import JSON_ERRORS, harmless
+from fieldkit.core.units import format_duration
+from fieldkit.measure.evidence import fly_log
 from fieldkit.remote import agent
 from fieldkit.steps import piloting, streams
-from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.steps.base import Nest, Step, StepEntry, View
 from fieldkit.steps.kinds.move import PathLeg
-from fieldkit.steps.lease import orders_file
+from fieldkit.steps.lease import orders_file, run_inside
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Said, Scene
 
 _Way = Annotated[Length, Field(gt=0)] | None
@@ -125,7 +129,12 @@ class FlyStep(Nest):
             climb_m_s=self.climb,
             ceiling_m=limits.max_height_m or 0.0,
             least_charge=mavlink.least_charge if mavlink else 0.0,
+            log=self._log,
         )
+
+    @property
+    def _log(self) -> str:
+        return self.own_name(fly_log.FILE)
 
     def _pilot(self, scene: Scene) -> Planned:
         limit_s = _LIMIT_S + self.expected_s(scene.protocol)
@@ -141,10 +150,19 @@ class FlyStep(Nest):
         """See `Step.beside`."""
         way_m = sum(math.hypot(*leg.metres) for leg in self.path)
         name, then = scene.robot(self.robot).name, {"return": "comes back", "land": "lands there"}[self.then]
-        ends = {"return": "returns by itself", "land": "lands"}[piloting.abort_of(scene, self.robot)]
         way = f"rises to {self.height:g} m, flies {way_m:g} m at {self.speed:g} m/s, and {then}"
-        yield f"{name} {way}; cut short, by Ctrl-C twice for example, it {ends}"
+        yield f"{name} {way}; cut short, by Ctrl-C twice for example, it {self._given_up(scene)}"
         yield from super().beside(scene)
+
+    def _given_up(self, scene: Scene) -> str:
+        return {"return": "returns by itself", "land": "lands"}[piloting.abort_of(scene, self.robot)]
+
+    def cut_short(self, scene: Scene) -> Iterator[str]:
+        """See `Step.cut_short`."""
+        takes = format_duration(self._comes_down_s + _SLACK_S)
+        when = f"if it is in the air: for up to about {takes}, also when fieldkit has ended"
+        yield f"{scene.robot(self.robot).name} {self._given_up(scene)}, {when}"
+        yield from super().cut_short(scene)
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`: it flies within the limits of its profile, or not at all."""
@@ -194,8 +212,7 @@ class FlyStep(Nest):
             leash.until("up", self._rises_s + _SLACK_S)
             announce(f"fly {name}", None)
             leash.order(GO)
-            for entry in self.during:
-                entry.step.run(scene, testbed, announce)
+            run_inside(self, leash, scene, testbed, announce)
             announce(f"land {name}", self._comes_down_s)
             leash.order(HOME)
             leash.until("landed", ends_s)
@@ -210,12 +227,34 @@ class FlyStep(Nest):
 
     def claims(self) -> tuple[str, ...]:
         """See `Step.claims`."""
-        return (f"a flight of {self.robot}",)
+        return ("a flight",)
 
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`; where robots were is written for every repeat."""
+        """See `Step.files`."""
         name = self.own_name("fly")
-        return (f"{name}.log", orders_file(name))
+        return (f"{name}.log", orders_file(name), self._log)
+
+    def declared(self) -> tuple[Column, ...]:
+        """See `Step.declared`; a trial without a flight has no columns for it."""
+        return fly_log.COLUMNS
+
+    def problems(self, view: View) -> Iterator[str]:
+        """See `Step.problems`: where it flew is written down."""
+        try:
+            view.evidence.read(fly_log.read, self._log)
+        except EvidenceError as error:
+            yield f"{self._log}: {error.what}"
+
+    def measure(self, view: View) -> Measured:
+        """See `Step.measure`."""
+        return fly_log.measure(view.evidence.known(fly_log.read, self._log))
+
+    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
+        """See `Step.in_words`."""
+        if isinstance(farthest_m := values.get("fly_farthest_m"), float):
+            yield f"flew {farthest_m:.1f} m away"
+        if isinstance(height_m := values.get("fly_height_median_m"), float):
+            yield f"{height_m:.1f} m high"
 
     def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
         """See `Step.misplaced`."""
@@ -238,7 +277,7 @@ def _judged(said: Said) -> tuple[Verdict, str, str]:
         what, remedy = ("; ".join(harmless(fault[key]) for fault in faults) for key in ("what", "remedy"))
         name, charge = harmless(told["autopilot"]), told["charge"]
         has = f", its battery has {charge:.0%}" if charge is not None else ""
-    except (ValueError, KeyError, TypeError):
+    except JSON_ERRORS:
         last = (said.text.splitlines() or ["it does not say why"])[-1]
         remedy = (
             "see that it has power, and that its messages reach mavlink.connection or mavlink.port of the profile"

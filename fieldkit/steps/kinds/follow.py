@@ -6,7 +6,6 @@ from contextlib import suppress
 from typing import Final
 
 from fieldkit.backends.protocols import Testbed
-from fieldkit.core import geometry
 from fieldkit.core.columns import Measured, columns
 from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Role
@@ -67,12 +66,12 @@ def follow(
     def ask(role: Role) -> None:
         asked[role] += clocks.exchanges(testbed.shells[role], ASK_S)
 
-    def wait(one: Planned) -> None:
-        seconds = outlast(one)
-        jobs.begin_wait(testbed.shells[one.role], one.job, seconds).end(seconds + jobs.REPLY_S)
+    def wait(recording: Planned) -> None:
+        seconds = outlast(recording)
+        jobs.begin_wait(testbed.shells[recording.role], recording.job, seconds).end(seconds + jobs.REPLY_S)
 
     try:
-        together(lambda one: jobs.start(testbed.shells[one.role], one.job), recordings)
+        together(lambda planned: jobs.start(testbed.shells[planned.role], planned.job), recordings)
         together(ask, list(asked))
         began_utc_ns = time.time_ns()
         for entry in nest.during:
@@ -95,14 +94,17 @@ def follow(
 
 
 def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
-    return together(lambda one: jobs.stop(testbed.shells[one.role], one.job, grace_s=CLOSE_S), recordings)
+    def stop(recording: Planned) -> int:
+        return jobs.stop(testbed.shells[recording.role], recording.job, grace_s=CLOSE_S)
+
+    return together(stop, recordings)
 
 
 def standing(nest: Nest, scene: Scene) -> Mapping[Role, Account]:
     """Return who stands where it was placed while the steps inside run."""
-    placed_m = {} if scene.placement is None else geometry.positions_m(scene.placement)
     moved = {step.robot for step in steps_inside(nest) if isinstance(step, MoveStep)}
-    return {role: Account(place=placed_m[role]) for role in nest.roles() if role in placed_m and role not in moved}
+    standing_m = {role: place_m for role, place_m in scene.places_m.items() if role not in moved}
+    return {role: Account(place=standing_m[role]) for role in nest.roles() if role in standing_m}
 
 
 def steps_inside(nest: Nest) -> Iterator[Step]:

@@ -112,7 +112,7 @@ class Iperf3Step(LoadOptions, AlongStep):
 
     def _test(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         server, client = self.commands(scene)
-        listening, asking = (testbed.shells[one.role] for one in (server, client))
+        listening, asking = (testbed.shells[planned.role] for planned in (server, client))
         announce("iperf3", self.expected_s(scene.protocol))
         with ExitStack() as silent:
             for shell in (listening, asking):
@@ -122,13 +122,13 @@ class Iperf3Step(LoadOptions, AlongStep):
         left = jobs.begin_wait(listening, server.job, _LEAVES_S).end(_LEAVES_S + jobs.REPLY_S)
         if left == jobs.STILL_RUNNING:
             jobs.stop(listening, server.job)
-        for one, ended in ((client, code), (server, left)):
+        for planned, ended in ((client, code), (server, left)):
             if ended != 0:
                 how = "was not told of its end" if ended == jobs.STILL_RUNNING else f"ended with exit code {ended}"
                 raise RobotError(
-                    f"{one.job.name} {how}",
-                    where=scene.robot(one.role).name,
-                    remedy=f"see {one.job.stdout} and {one.job.log} of this repeat",
+                    f"{planned.job.name} {how}",
+                    where=scene.robot(planned.role).name,
+                    remedy=f"see {planned.job.stdout} and {planned.job.log} of this repeat",
                 )
 
     def roles(self) -> frozenset[Role]:

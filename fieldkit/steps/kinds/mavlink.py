@@ -10,8 +10,7 @@ from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Duration, Field, Hertz, Int
 from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import ConfigurationError, EvidenceError, RobotError
+from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import tlog
 from fieldkit.measure.evidence.tlog import GLOBAL, LOCAL, Tlog
@@ -47,7 +46,6 @@ _USUAL_HZ: Final = 40.0
 """About how many messages a second an autopilot sends to whom it is not asked by."""
 _FRAME_BYTES: Final = 40
 _STAMP_BYTES: Final = 8
-_INSTALLS_S: Final = 30.0
 _BEGINS_S: Final = 2.0
 _OUTLASTS_S: Final = 2
 """Behind the last step a message of each kind is to come, at the usual rates."""
@@ -113,7 +111,7 @@ class MavlinkStep(Nest):
             folder=scene.folder,
             name=self.own_name("mavlink"),
             argv=streams.agent_command(robot, "mavlink", streams.compact(told), self._file),
-            limit_s=follow.LIMIT_S + sum(one.job.limit_s for one in self.inside(scene)),
+            limit_s=follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log,
             stdout=self._told,
             ready="log:up,",
@@ -139,7 +137,7 @@ class MavlinkStep(Nest):
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
-        agent.install(testbed.shells[self.recorder], Deadline.after(_INSTALLS_S))
+        agent.install(testbed.shells[self.recorder])
         announce("record MAVLink", None)
         ((planned, code),) = follow.follow(
             self,
@@ -151,21 +149,16 @@ class MavlinkStep(Nest):
             outlast=lambda _: _OUTLASTS_S,
         )
         if code != 0:
-            raise RobotError(
-                f"{planned.job.name} ended with exit code {code}",
-                where=scene.robot(planned.role).name,
-                remedy=f"see {planned.job.log} of this repeat",
-            )
+            raise scene.failure(planned, f"{planned.job.name} ended with exit code {code}")
 
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
         """Return who tells where robots were in an attempt."""
-        placed_m = {} if scene.placement is None else geometry.positions_m(scene.placement)
         account = Account(
             file=self._file,
             topic=_POSITIONS[self.positions or "local"],
             stamps=self.times,
             gap_s=self.gap,
-            start=placed_m.get(self.robot, (0.0, 0.0, 0.0)),
+            start=scene.places_m.get(self.robot, (0.0, 0.0, 0.0)),
             heading_rad=None if self.facing is None else geometry.heading_rad(self.robot, self.facing),
             began_utc_ns=began_utc_ns,
             clock="" if self.recorder == self.robot else self.recorder,

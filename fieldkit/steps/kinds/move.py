@@ -2,10 +2,9 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from typing import Annotated, Final, Self
 
-from fieldkit.backends.protocols import Cast, Testbed
+from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Field, Length, Speed, Strict
 from fieldkit.core import geometry, model
@@ -15,6 +14,7 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import drive_log
 from fieldkit.steps import driving, streams
 from fieldkit.steps.base import Nest, Step, StepEntry, View
+from fieldkit.steps.lease import run_inside
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
 
 _Way = Annotated[Length, Field(gt=0)] | None
@@ -83,8 +83,8 @@ class MoveStep(Nest):
     robot: Role
     path: Annotated[tuple[PathLeg, ...], Field(min_length=1)]
     speed: Annotated[Speed, Field(gt=0)] | None = None
-    within_limits: Bool = Field(default=False, exclude_if=lambda within: not within)
-    driven: Bool = Field(default=False, exclude_if=lambda driven: not driven)
+    within_limits: Bool = Field(default=False, exclude_if=schema.is_empty)
+    driven: Bool = Field(default=False, exclude_if=schema.is_empty)
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     def fitted(self, cast: Cast, way_s: float | None = None) -> Self:  # noqa: ARG002 (its own is the innermost)
@@ -101,7 +101,7 @@ class MoveStep(Nest):
                 path = tuple(filter(None, map(PathLeg.of, geometry.within(legs, fence_m - short_m)))) or path
         update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or robot.drives}
         own = self.model_copy(update=update)
-        return super(MoveStep, own).fitted(cast, own.lasts_s)
+        return super(MoveStep, own).fitted(cast, own.way_s(robot))
 
     def shortened(self, cast: Cast) -> Iterator[str]:
         """See `Step.shortened`."""
@@ -128,9 +128,13 @@ class MoveStep(Nest):
 
     @property
     def lasts_s(self) -> float:
-        """How long its way takes at its speed, to the millisecond; turns at corners come to it."""
+        """How long its way takes at its speed, to the millisecond; what a robot needs to turn comes to it."""
         motion = self.motion
         return round(geometry.length_m(motion) / motion.speed_m_s, 3)
+
+    def way_s(self, robot: Robot) -> float:
+        """Return how long its way takes: of a robot that drives by itself with all turns, else `lasts_s`."""
+        return driving.way_s(robot, self.motion) if robot.drives else self.lasts_s
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`; a robot that is moved takes none."""
@@ -161,9 +165,15 @@ class MoveStep(Nest):
                 f", and back, by itself: velocities on {drive.topic}, odometry of {drive.odometry}; it stops where "
                 f"the laptop is silent for {drive.lease:g} s, and {robot.profile.limits.fence_m:g} m from its place"
             )
-        lasts = f"for up to {round(self.lasts_s, 1):g} s"
+        lasts = f"for up to {round(self.way_s(robot), 1):g} s"
         yield f"{robot.name} moves {geometry.in_words(self.motion)}, {lasts}{by_itself}"
         yield from super().beside(scene)
+
+    def cut_short(self, scene: Scene) -> Iterator[str]:
+        """See `Step.cut_short`."""
+        if scene.robot(self.robot).drives:
+            yield f"{scene.robot(self.robot).name} stands where it is"
+        yield from super().cut_short(scene)
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """See `Step.refusals`."""
@@ -188,17 +198,16 @@ class MoveStep(Nest):
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """See `Step.run`."""
-        announce(f"move {scene.robot(self.robot).name}", None)
-        moving: AbstractContextManager[None]
-        if scene.robot(self.robot).drives:
-            moving = driving.driven(scene, testbed, self._driving(scene), self.motion, self._form)
-        else:
-            moving = testbed.moving(self.motion)
-        with moving:
+        robot = scene.robot(self.robot)
+        announce(f"move {robot.name}", None)
+        if robot.drives:
+            with driving.driven(scene, testbed, self._driving(scene), self.motion, self._form) as held:
+                run_inside(self, held, scene, testbed, announce)
+                announce(f"drive {robot.name} back", self.way_s(robot))
+            return
+        with testbed.moving(self.motion):
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
-            if scene.robot(self.robot).drives:
-                announce(f"drive {scene.robot(self.robot).name} back", self.lasts_s)
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
@@ -210,7 +219,7 @@ class MoveStep(Nest):
 
     def claims(self) -> tuple[str, ...]:
         """See `Step.claims`."""
-        return (f"a move of {self.robot}",)
+        return ("a move",)  # each robot may write down how it drove
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`: what the driver of a robot writes, where that drives by itself."""

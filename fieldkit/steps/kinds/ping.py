@@ -10,7 +10,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Duration, Field, Int, Strict
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Mask
@@ -82,8 +82,8 @@ class PingStep(AlongStep):
     count: Annotated[Int, Field(gt=0, le=MOST)] = 10
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads.defaults()
-    gap: Bool = Field(default=False, exclude_if=lambda asked: not asked)
-    forwarded: Bool = Field(default=False, exclude_if=lambda asked: not asked)
+    gap: Bool = Field(default=False, exclude_if=schema.is_empty)
+    forwarded: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "PingStep":
@@ -140,11 +140,7 @@ class PingStep(AlongStep):
         with shell.silence(planned.job.limit_s):
             code = jobs.run(shell, planned.job)
         if code not in {0, 1}:  # 1: some or all replies are missing, which is a measurement
-            raise RobotError(
-                f"ping ended with exit code {code}",
-                where=scene.robot(self.sender).name,
-                remedy=f"see {planned.job.log} of this repeat",
-            )
+            raise scene.failure(planned, f"ping ended with exit code {code}")
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
@@ -208,7 +204,7 @@ class PingStep(AlongStep):
         capture = view.capture(role)
         if capture is None:
             return
-        asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
+        asks, answers = (view.scene.robot(end).address for end in (self.sender, self.receiver))
         packets = capture.packets
         echoes = packets.where((packets.echo != NO_ECHO) & _fits(packets, found.payload_bytes))
         seen = (
@@ -229,8 +225,8 @@ class PingStep(AlongStep):
         near, far = (view.capture(role) for role in (self.sender, self.receiver))
         if near is None or far is None:
             return 0
-        asks, answers = (view.scene.robot(one).address for one in (self.sender, self.receiver))
-        left, came = (_icmp(one.packets, asks, answers) for one in (near, far))
+        asks, answers = (view.scene.robot(role).address for role in (self.sender, self.receiver))
+        left, came = (_icmp(capture.packets, asks, answers) for capture in (near, far))
         back = _icmp(near.packets, answers, asks)
         asked = (came.echo != NO_ECHO) & (came.echo < ECHO_REPLY)
         own = np.isin(came.echo, left.echo)
@@ -255,10 +251,10 @@ class PingStep(AlongStep):
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""
+        if isinstance(gap_s := values.get("rtt_gap_s"), float):
+            yield f"longest gap {gap_s:.1f} s with {values['rtt_gap_lost']} lost"
         if isinstance(median_s := values.get("rtt_median_s"), float):
             yield f"RTT {1e3 * median_s:.1f} ms"
-        if isinstance(gap_s := values.get("rtt_gap_s"), float):
-            yield f"longest gap {gap_s:.1f} s, {values['rtt_gap_lost']} lost"
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""

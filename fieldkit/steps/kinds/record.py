@@ -5,7 +5,8 @@ from pathlib import PurePosixPath
 from typing import Annotated, Final, Self
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
-from fieldkit.config.profiles import Ros
+from fieldkit.config import schema
+from fieldkit.config.profiles import Ros, TopicName
 from fieldkit.config.schema import Bool, Duration, Field
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import ConfigurationError, EvidenceError, RobotError
@@ -15,7 +16,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import ros_master, variants
-from fieldkit.steps.base import NAME, Step, View
+from fieldkit.steps.base import Step, StepName, View
 from fieldkit.steps.scene import BY_ITSELF, BY_LIMIT, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
 from fieldkit.steps.variants import Recorder, Tool
 
@@ -64,10 +65,10 @@ class RecordStep(Step):
     """
 
     robot: Role
-    topics: Annotated[tuple[Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")], ...], Field(min_length=1)]
+    topics: Annotated[tuple[TopicName, ...], Field(min_length=1)]
     duration: Annotated[Duration, Field(gt=0)]
-    name: Annotated[str, Field(pattern=NAME)] = USUAL_BAG
-    reception: Bool = Field(default=False, exclude_if=lambda asked: not asked)
+    name: StepName = USUAL_BAG
+    reception: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @property
     def prefix(self) -> str:

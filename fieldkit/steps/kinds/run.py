@@ -9,13 +9,13 @@ from typing import Annotated, Final
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Bool, Bytes, Duration, Field, Int, Number, Strict
-from fieldkit.core.columns import Column, Figure, Kind, Measured, Value
+from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import host, printed
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Step, View
+from fieldkit.steps.base import FileName, Step, View
 from fieldkit.steps.scene import Announce, Planned, Scene
 
 _ADDRESS: Final = re.compile(r"\{address\.(?P<role>[^{}]*)\}")
@@ -25,6 +25,9 @@ _BOUNDED: Final = (
     'n=$1; shift; exec 5>&1 6>&2; exit "$( { { { "$@" 3>&- 5>&- 6>&-; echo $? >&3; } 2>&1 >&4 4>&- 5>&- 6>&- '
     '| head -c "$n" >&6; } 4>&1 | head -c "$n" >&5; } 3>&1 )"'
 )
+
+_OF_SHELLS: Final = frozenset({"|", "||", "&", "&&", ";", "<", ">", ">>", "2>", "2>&1", "&>"})
+"""Words that a program gets by mistake alone; who means one writes `argv`."""
 
 _Word = Annotated[str, Field(pattern=r"^[^\x00]*$")]
 
@@ -54,8 +57,16 @@ class PrintedColumn(Strict):
         label: What people call it; empty for its name.
     """
 
-    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
-    unit: Annotated[str, Field(pattern=r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$")]
+    name: Annotated[
+        str,
+        schema.shaped(
+            r"^[a-z][a-z0-9_]{0,40}$", "a name: small letters, digits and _, a small letter first, 41 in all"
+        ),
+    ]
+    unit: Annotated[
+        str,
+        schema.shaped(r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$", "a unit: 1 to 16 characters, none of them , ; or quotes"),
+    ]
     meaning: Annotated[str, Field(max_length=300)] = ""
     path: Annotated[str, AfterValidator(_is_path)] | None = Field(default=None, alias="json")
     expression: Annotated[str, AfterValidator(_is_expression)] | None = Field(default=None, alias="regex")
@@ -141,7 +152,7 @@ class RunStep(Step):
     argv: tuple[_Word, ...] = ()
     takes: Duration = 1.0
     limit: Annotated[Duration, Field(gt=0)] = 60.0
-    output: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")] = "run.txt"
+    output: FileName = "run.txt"
     prints: Bytes = 10_000.0
     figures: tuple[PrintedColumn, ...] = Field(default=(), alias="columns")
     expect: Expected = Field(default_factory=Expected)  # made, it would be built for whoever names no such step
@@ -155,6 +166,8 @@ class RunStep(Step):
         except ValueError as error:
             raise schema.complaint(f"{self.command!r} cannot be split into words: {error}", "command") from None
         self._check_roles()
+        if alien := next((word for word in shlex.split(self.command) if word in _OF_SHELLS), None):
+            raise schema.complaint(f"no shell sees this command, and {alien} is a shell's: sh -c '...'", "command")
         if not words[0]:
             raise schema.complaint("the first word, the program, is empty", "argv" if self.argv else "command")
         return self
@@ -167,7 +180,7 @@ class RunStep(Step):
 
     @schema.model_validator(mode="after")
     def _has_columns(self) -> "RunStep":
-        names = [one.name for one in self.figures]
+        names = [column.name for column in self.figures]
         for at, name in enumerate(names):
             if name in names[:at]:
                 raise schema.complaint(f"a column {name} is there already", "columns", at, "name")
@@ -244,7 +257,7 @@ class RunStep(Step):
 
     def declared(self) -> tuple[Column, ...]:
         """See `Step.declared`: what the procedure says."""
-        return tuple(one.column for one in self.figures)
+        return tuple(column.column for column in self.figures)
 
     def problems(self, view: View) -> Iterator[str]:
         """See `Step.problems`: the program ended as it is to, and printed what is to be read, within bounds."""
@@ -258,29 +271,29 @@ class RunStep(Step):
             yield f"{self._output}: {error.what}"
             return
         found = self.measure(view)
-        for one in self.figures:
-            if one.name in found.missing and not one.optional:
-                yield f"{self._output}: no {one.name}: {found.missing[one.name]}"
-            elif one.name in found.values and (bounds := self.expect.values.get(one.name)):
-                value = found.values[one.name]
+        for column in self.figures:
+            if column.name in found.missing and not column.optional:
+                yield f"{self._output}: no {column.name}: {found.missing[column.name]}"
+            elif column.name in found.values and (bounds := self.expect.values.get(column.name)):
+                value = found.values[column.name]
                 if why := bounds.problem(value):
-                    yield f"{self._output}: {one.name} is {value}, {why}"
+                    yield f"{self._output}: {column.name} is {value}, {why}"
 
     def measure(self, view: View) -> Measured:
         """See `Step.measure`."""
         values, missing = dict[str, Value](), dict[str, str]()
-        for one in self.figures:
+        for column in self.figures:
             try:
-                values[one.name] = one.value(view, self._output)
+                values[column.name] = column.value(view, self._output)
             except EvidenceError as error:
-                missing[one.name] = error.what
+                missing[column.name] = error.what
         return Measured(values, missing)
 
     def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
         """See `Step.in_words`."""
-        for one in self.figures:
-            if one.name in values:
-                value = values[one.name]
-                shown = f"{value:.4g}" if isinstance(value, float) else str(value)
-                unit = "" if one.unit in {"text", "bool", "count", "hash"} else f" {one.unit}"
-                yield f"{one.label or one.name} {shown}{unit}"
+        for column in self.figures:
+            if column.name in values:
+                value = values[column.name]
+                shown = f"{value:.4g}" if isinstance(value, float) else cell(value)
+                unit = "" if column.unit in {"text", "bool", "count", "hash"} else f" {column.unit}"
+                yield f"{column.label or column.name} {shown}{unit}"

@@ -1,19 +1,19 @@
 """Send a file that lies on a robot, or bytes that it makes up, from one robot to another with netcat."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config.schema import Bytes, Field, Int
-from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role, Verdict
 from fieldkit.core.units import format_bytes
 from fieldkit.measure.evidence import reading
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Nest, Step, View
-from fieldkit.steps.kinds.transfer import FileName, TransferStep
+from fieldkit.steps.base import FileName, Nest, Step, View
+from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.steps.scene import GOOD_BIT_S, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
 
 FILE: Final = "send.bin"
@@ -29,6 +29,7 @@ _MAKE: Final = (
 _WHOLE_PATH: Final = 'case $1 in /*) ;; *) set -- "$HOME/$1" "$2" ;; esac; '
 _COPY: Final = f'{_WHOLE_PATH}exec cp -- "$1" "$2"'
 _COUNT: Final = f'{_WHOLE_PATH}exec wc -c <"$1"'
+_SIZE: Final = re.compile(r"[0-9]{1,15}")
 
 _MADE_BYTES_PER_S: Final = 1e6
 """How fast a small robot makes bytes up, or copies them: busybox' awk makes 1.5 MB/s on a laptop of 2026."""
@@ -99,7 +100,7 @@ class SendStep(TransferStep):
 
     def _judged(self, answer: Said) -> tuple[Verdict, str, str]:
         """Return whether the file is there, and as large as the procedure says."""
-        if not answer.ok or not answer.text.strip().isdigit():
+        if not answer.ok or not _SIZE.fullmatch(answer.text.strip()):
             remedy = f"scp {quote((self.file or '',))} to it, or correct file: in the procedure"
             return Verdict.FAIL, answer.text, remedy
         size_bytes = int(answer.text)
@@ -114,11 +115,8 @@ class SendStep(TransferStep):
         """See `Step.prepare`: there is something to send, and the listener is up."""
         make = self._make(scene)
         if (code := jobs.run(testbed.shells[self.sender], make.job)) != 0:
-            raise RobotError(
-                f"what is to be sent could not be made: {make.program} ended with exit code {code}",
-                where=scene.robot(self.sender).name,
-                remedy=f"see {self._log} of this repeat",
-            )
+            why = f"{make.program} ended with exit code {code}"
+            raise scene.failure(make, f"what is to be sent could not be made: {why}")
         return super().prepare(scene, testbed)
 
     def files(self) -> tuple[str, ...]:

@@ -47,7 +47,7 @@ class SoakStep(LoadOptions, Nest):
 
     def _load(self, scene: Scene) -> tuple[Planned, Planned]:
         """Return server and client."""
-        limit_s = LIMIT_S + sum(one.job.limit_s for one in self.inside(scene))
+        limit_s = LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
         interface = scene.robot(self.sender).profile.radio.interface
         client = self.client(scene, "-t", str(_FOREVER_S))
         ends = {
@@ -71,18 +71,18 @@ class SoakStep(LoadOptions, Nest):
         server, client = self._load(scene)
         announce("start load", None)
         try:
-            for one in (server, client):
-                jobs.start(testbed.shells[one.role], one.job)
+            for planned in (server, client):
+                jobs.start(testbed.shells[planned.role], planned.job)
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
         except FieldkitError:
             # What failed first is the reason; what never started cannot be stopped.
-            for one in (client, server):
+            for planned in (client, server):
                 with suppress(FieldkitError):
-                    jobs.stop(testbed.shells[one.role], one.job)
+                    jobs.stop(testbed.shells[planned.role], planned.job)
             raise
-        for one in (client, server):
-            jobs.stop(testbed.shells[one.role], one.job)
+        for planned in (client, server):
+            jobs.stop(testbed.shells[planned.role], planned.job)
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""

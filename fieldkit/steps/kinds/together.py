@@ -40,7 +40,7 @@ class TogetherStep(Nest):
         if (most := _at_once(self)) > MOST:
             raise schema.complaint(f"{most} steps at the same time are more than {MOST}: leave some out", "during")
         for kind, at in _asking(self):
-            raise schema.complaint(f"a {kind} may ask the operator: no other step runs beside it", *at)
+            raise schema.complaint(f"{kind} may ask the operator: no other step runs beside it", *at)
         return self
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
@@ -59,7 +59,7 @@ class TogetherStep(Nest):
         prepared = self._each([partial(entry.step.prepare, inner, testbed) for entry in self.during], inner, testbed)
 
         def carry_out(announce: Announce) -> None:
-            self._each([partial(one, announce) for one in prepared], inner, testbed)
+            self._each([partial(work, announce) for work in prepared], inner, testbed)
 
         return carry_out
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role, in_order
 from fieldkit.core.threads import together
 from fieldkit.remote import agent, jobs
@@ -40,7 +39,6 @@ MASTER: Final = "rosmaster"
 _GRACE_S: Final = 5
 _ENDS_S: Final = 10.0
 """Starting Python and the middleware, and what the publisher waits at its end."""
-_INSTALLS_S: Final = 30.0
 _RECORD_BYTES: Final = 32
 """What an end writes down of a sample."""
 _ENVELOPE_BYTES: Final = 100
@@ -108,10 +106,10 @@ class TopicsStep(StreamOptions, AlongStep):
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         """See `Step.prepare`: the agent is there, and all but the publisher is up."""
         members = in_order(self.members)
-        together(lambda role: agent.install(testbed.shells[role], Deadline.after(_INSTALLS_S)), members)
+        together(lambda role: agent.install(testbed.shells[role]), members)
         *before, publish = self.commands(scene)
-        for one in before:
-            jobs.start(testbed.shells[one.role], one.job)
+        for planned in before:
+            jobs.start(testbed.shells[planned.role], planned.job)
         return partial(self._stream, scene, testbed, before, publish)
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
@@ -126,14 +124,13 @@ class TopicsStep(StreamOptions, AlongStep):
             for role in self.members:
                 silent.enter_context(testbed.shells[role].silence(publish.job.limit_s))
             code = jobs.run(testbed.shells[publish.role], publish.job)
-        stopped = [(one, jobs.stop(testbed.shells[one.role], one.job, grace_s=_GRACE_S)) for one in reversed(before)]
-        for one, left in ((publish, code), *stopped):
+        stopped = [
+            (planned, jobs.stop(testbed.shells[planned.role], planned.job, grace_s=_GRACE_S))
+            for planned in reversed(before)
+        ]
+        for planned, left in ((publish, code), *stopped):
             if left != 0:
-                raise RobotError(
-                    f"{one.job.name} ended with exit code {left}",
-                    where=scene.robot(one.role).name,
-                    remedy=f"see {one.job.log} of this repeat",
-                )
+                raise scene.failure(planned, f"{planned.job.name} ended with exit code {left}")
 
     def roles(self) -> frozenset[Role]:
         """See `Step.roles`."""
@@ -142,10 +139,6 @@ class TopicsStep(StreamOptions, AlongStep):
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """See `Step.expected_s`."""
         return self.duration + 3.0
-
-    def ports(self) -> tuple[int, ...]:
-        """See `Step.ports`."""
-        return tuple(sorted(self.wire.data | self.wire.discovery))
 
     def listens(self) -> tuple[ListeningPort, ...]:
         """See `Step.listens`: each domain has ports of its own."""
@@ -186,7 +179,7 @@ class TopicsStep(StreamOptions, AlongStep):
         ends = (self.sender, self.receiver)
         pairs = [ends, *((end, self.serves) for end in ends if self.serves and end != self.serves)]
         for source, destination in dict.fromkeys(pairs):
-            for port in self.ports():
+            for port in sorted(self.wire.data | self.wire.discovery):
                 yield Flow(source, destination, port, frames, group=self.wire.group)
                 frames = 0.0  # all of them have been counted
 

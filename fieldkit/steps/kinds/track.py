@@ -8,6 +8,7 @@ from typing import Annotated, Final, Literal
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
+from fieldkit.config.profiles import TopicName
 from fieldkit.config.schema import Duration, Field, Number, Strict
 from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured
@@ -82,7 +83,7 @@ class TrackedRobot(Strict):
         at: Where it stands instead, all the time.
     """
 
-    topic: Annotated[str, Field(pattern=r"^(/[A-Za-z][A-Za-z0-9_]*)+$")] | None = None
+    topic: TopicName | None = None
     facing: Literal["away", "towards", "left", "right"] | None = None
     child: str | None = None
     times: Literal["header", "received"] = "header"
@@ -118,8 +119,8 @@ class TrackStep(Nest):
 
     def _recordings(self, scene: Scene) -> list[Planned]:
         """Return what records each topic until it is stopped."""
-        limit_s = follow.LIMIT_S + sum(one.job.limit_s for one in self.inside(scene))
-        return [self._recording(scene, one) for one in self._recorders(limit_s).values()]
+        limit_s = follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
+        return [self._recording(scene, recorder) for recorder in self._recorders(limit_s).values()]
 
     def _recording(self, scene: Scene, recorder: RecordStep) -> Planned:
         (planned,) = recorder.commands(scene)
@@ -138,10 +139,15 @@ class TrackStep(Nest):
         made = RecordStep.model_validate
         return {
             role: made(
-                {"robot": role, "topics": [one.topic], "duration": f"{lasts_s:.9g}s", "name": f"track_{role}"[:31]}
+                {
+                    "robot": role,
+                    "topics": [tracked.topic],
+                    "duration": f"{lasts_s:.9g}s",
+                    "name": f"track_{role}"[:31],
+                }
             )
-            for role, one in self.robots.items()
-            if one.topic is not None
+            for role, tracked in self.robots.items()
+            if tracked.topic is not None
         }
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
@@ -154,31 +160,35 @@ class TrackStep(Nest):
             announce,
             self._recordings(scene),
             tell=partial(self._accounts, scene),
-            outlast=lambda one: self._period_s(scene, one.role),
+            outlast=lambda recording: self._period_s(scene, recording.role),
         )
 
     def _period_s(self, scene: Scene, role: Role) -> int:
         """Return the whole seconds in which a topic says something."""
         ros = scene.robot(role).profile.ros
-        rates_hz = [one.rate for one in ros.topics if one.name == self.robots[role].topic and one.rate] if ros else []
+        rates_hz = (
+            [topic.rate for topic in ros.topics if topic.name == self.robots[role].topic and topic.rate]
+            if ros
+            else []
+        )
         return math.ceil(_PERIODS / min(rates_hz, default=1.0))
 
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
         """Return who tells where robots were in an attempt."""
-        placed_m = {} if scene.placement is None else geometry.positions_m(scene.placement)
+        places_m = scene.places_m
         found = dict(follow.standing(self, scene))
-        for role, one in self.robots.items():
-            if one.at is not None:
-                found[role] = one.at.account
-            elif one.topic is not None:
+        for role, tracked in self.robots.items():
+            if tracked.at is not None:
+                found[role] = tracked.at.account
+            elif tracked.topic is not None:
                 found[role] = Account(
                     file=self._recorders(1.0)[role].bag(scene.robot(role)),
-                    topic=one.topic,
-                    child=one.child or "",
-                    stamps=one.times,
-                    gap_s=one.gap,
-                    start=placed_m.get(role, (0.0, 0.0, 0.0)),
-                    heading_rad=None if one.facing is None else geometry.heading_rad(role, one.facing),
+                    topic=tracked.topic,
+                    child=tracked.child or "",
+                    stamps=tracked.times,
+                    gap_s=tracked.gap,
+                    start=places_m.get(role, (0.0, 0.0, 0.0)),
+                    heading_rad=None if tracked.facing is None else geometry.heading_rad(role, tracked.facing),
                     began_utc_ns=began_utc_ns,
                 )
         return Accounts(found, offsets, self.heights)
@@ -224,7 +234,7 @@ class TrackStep(Nest):
 
     def files(self) -> tuple[str, ...]:
         """See `Step.files`."""
-        return (accounts.FILE, *(name for one in self._recorders(1.0).values() for name in one.files()))
+        return (accounts.FILE, *(name for recorder in self._recorders(1.0).values() for name in recorder.files()))
 
     def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         """See `Step.misplaced`."""

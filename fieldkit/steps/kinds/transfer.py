@@ -22,7 +22,7 @@ from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job, Pending
 from fieldkit.steps import netcat
-from fieldkit.steps.base import Nest, Step, View, capture_around
+from fieldkit.steps.base import FileName, Nest, Step, View, capture_around
 from fieldkit.steps.scene import (
     BY_ITSELF_OR_LIMIT,
     Announce,
@@ -36,8 +36,13 @@ from fieldkit.steps.scene import (
 )
 from fieldkit.steps.variants import Netcat, Tool
 
-FileName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}$")]
-BagName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$")]
+BagName = Annotated[
+    str,
+    schema.shaped(
+        r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$",
+        "the name of a recording, scan, or of its file, scan.bag or scan/scan_0.db3",
+    ),
+]
 
 _LISTEN: Final = "listen"
 _SEND: Final = "send"
@@ -94,7 +99,7 @@ class TransferStep(Step):
     def _sent(self, scene: Scene) -> RecordedFile:
         """Return the recording that is sent; the first where none has the name, which `refusals` tells."""
         made = scene.recorded[self.sender]
-        return next((one for one in made if self.file in {one.name, one.called}), made[0])
+        return next((file for file in made if self.file in {file.name, file.called}), made[0])
 
     def commands(self, scene: Scene) -> Iterator[Planned]:
         """See `Step.commands`."""
@@ -153,7 +158,7 @@ class TransferStep(Step):
 
     def _refused_file(self, scene: Scene) -> Iterator[Refusal]:
         """Yield why the file cannot be what is sent."""
-        made = [one.name for one in scene.recorded[self.sender]]
+        made = [file.name for file in scene.recorded[self.sender]]
         if self.file is not None and self.file not in {self._sent(scene).name, self._sent(scene).called}:
             what = f"it is to send {self.file}, and its recorder writes {', '.join(made)}"
             leave_out = "leave out file: in the transfer, or " if len(made) == 1 else ""

@@ -27,7 +27,7 @@ def judge(shell: Shell, report: Report) -> Offset | None:
     """Add that the robot answers, and return its clock's offset, if it tells the time; errors as `greet`."""
     greet(shell)
     exchanges = clocks.exchanges(shell, CONTACT_S)
-    fastest_s = min((one.answered_ns - one.asked_ns for one in exchanges), default=0) / 1e9
+    fastest_s = min((exchange.answered_ns - exchange.asked_ns for exchange in exchanges), default=0) / 1e9
     report.ok("connection", f"host key and login right, answers in {1e3 * fastest_s:.0f} ms")
     return offset(exchanges) if exchanges else None
 

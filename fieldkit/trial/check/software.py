@@ -65,7 +65,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     """
     profile = plan.cast[role].profile
     programs = dict.fromkeys(program for program, _ in _programs(plan, role))
-    remedies = {one.program: one.remedy for one in _planned(plan, role)}
+    remedies = {planned.program: planned.remedy for planned in _planned(plan, role)}
     if profile.ros is not None and profile.ros.bridge is not None:
         remedies[profile.ros.bridge.program] = _BRIDGE
     found = [program for program in programs if sections.get(_at(program), NOTHING).ok]
@@ -97,7 +97,7 @@ def ask_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: 
     """
     for need in _needs(plan, role, by_agent=True):
         if sections.get(_at(need.of), NOTHING).ok:
-            agent.install(shell, Deadline.after(_AGENT_S))
+            agent.install(shell)
             done = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
             text = (done.stdout + done.stderr).decode("utf-8", "replace")
             report.add(need.name, *need.judge(Said(text, done.exit_code)))
@@ -108,7 +108,7 @@ def _at(program: str) -> str:
 
 
 def _tools(plan: Plan, role: Role) -> set[Tool]:
-    return {one.tool for one in _planned(plan, role) if one.tool is not None}
+    return {planned.tool for planned in _planned(plan, role) if planned.tool is not None}
 
 
 def _judge_tools(profile: RobotProfile, said: Said, report: Report) -> Variants:
@@ -137,7 +137,7 @@ def can_record(plan: Plan, role: Role, sections: Sections) -> bool:
 def _programs(plan: Plan, role: Role) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield each program that a step starts, or fieldkit itself, with the files to source before looking for it."""
     yield from ((program, ()) for program in BASE_PROGRAMS)
-    yield from dict.fromkeys((one.program, one.setup) for one in _planned(plan, role))
+    yield from dict.fromkeys((planned.program, planned.setup) for planned in _planned(plan, role))
     ros = plan.cast[role].profile.ros
     if ros is not None and ros.bridge is not None:
         yield ros.bridge.program, ros.command.setup

@@ -30,6 +30,7 @@ _LOOK: Final = r"""look() {
 """
 _MARK: Final = re.compile(rb"^==> (?:(?P<name>[a-z]+)|exit (?P<code>[0-9]{1,3})) <==$", re.MULTILINE)
 _MISSING: Final = {126, 127}
+_KILLED: Final = 128 + 9
 _USER: Final = "user"
 _ECHO: Final = "echo"
 
@@ -96,7 +97,7 @@ def parse(output: bytes, profile: RobotProfile) -> Variants:
         immediate, versions[Tool.CAPTURE] = _capture(*said[Tool.CAPTURE], profile.tools.capture)
         variants = replace(variants, immediate_mode=immediate)
     if Tool.RECORDER in said:
-        variants = replace(variants, recorder=_recorder(said[Tool.RECORDER][0], profile))
+        variants = replace(variants, recorder=_recorder(*said[Tool.RECORDER], profile))
     return replace(variants, versions=MappingProxyType(versions))
 
 
@@ -152,13 +153,16 @@ def _capture(text: str, code: int, program: str) -> tuple[bool, str]:
     raise _unknown(text, code, program, "sudo apt-get install tcpdump, and capture: tcpdump in")
 
 
-def _recorder(text: str, profile: RobotProfile) -> Recorder:
+def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
     if profile.ros is None:
         return Recorder.NONE
-    if profile.ros.variant == "ros1":
-        return Recorder.ROSBAG if "rosbag record" in text else Recorder.NONE
-    if "ros2 bag record" not in text:
+    is_ros1 = profile.ros.variant == "ros1"
+    if ("rosbag record" if is_ros1 else "ros2 bag record") not in text:
+        if code == _KILLED:
+            raise _silent(" ".join((*_verb(profile), "--help")))
         return Recorder.NONE
+    if is_ros1:
+        return Recorder.ROSBAG
     words = profile.ros.command.record
     named = [words[at + 1] for at, word in enumerate(words[:-1]) if word in {"-s", "--storage"}]
     default = _STORAGE.search(text)
@@ -170,7 +174,15 @@ def _recorder(text: str, profile: RobotProfile) -> Recorder:
     return kinds.get(storage, Recorder.NONE)
 
 
+def _silent(command: str) -> RobotError:
+    return RobotError(
+        f"{command} did not end in time", remedy=f"is the robot busy? try again; on it: uptime; time {command}"
+    )
+
+
 def _unknown(text: str, code: int, program: str, remedy: str) -> RobotError:
+    if code == _KILLED:
+        return _silent(program)
     what = f"there is no {program}" if code in _MISSING else f"{program} is none that is known"
     said = printable(text.encode(), limit=100)
     return RobotError(f"{what}: {said}" if said else what, remedy=f"{remedy} its profile")

@@ -12,7 +12,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Role
 from fieldkit.measure.evidence import bag
 from fieldkit.measure.evidence.bag import Bag
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.kinds.record import RecordStep
@@ -85,7 +85,7 @@ def _topics(robot: Robot) -> tuple[PublishedTopic, ...]:
 
 def battery_of(robot: Robot) -> str:
     """Return the topic on which the robot tells its battery; empty if its profile has none."""
-    return next((one.name for one in _topics(robot) if one.type == _BATTERY), "")
+    return next((topic.name for topic in _topics(robot) if topic.type == _BATTERY), "")
 
 
 def has_shared_battery(plan: Plan, role: Role) -> bool:
@@ -123,7 +123,7 @@ def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient
     job = planned.job if patient else replace(planned.job, limit_s=min(planned.job.limit_s, _PATIENCE_S))
     evidence.begin(shell, *where)
     jobs.run(shell, job)
-    evidence.fetch(shell, *where, into)
+    fetching.fetch(shell, *where, into)
     path, log = into / step.bag(robot), into / job.log
     try:
         return path, bag.read(path)
@@ -160,7 +160,7 @@ def judge(robot: Robot, topics: Sequence[str], found: Bag | None, report: Report
 
 def _judge_rate(check: str, count: int, span_s: float, rate_hz: float, report: Report) -> None:
     # A message more or less may fall into the span, which is from the first message of any topic to the last.
-    low, high = ((count + one) / max(span_s, 1e-9) for one in (-1, 1))
+    low, high = ((count + sign) / max(span_s, 1e-9) for sign in (-1, 1))
     detail = f"{count} messages in {span_s:.1f} s, of {rate_hz:g} Hz"
     if high < (1 - TOLERANCE) * rate_hz or (count > 1 and low > (1 + TOLERANCE) * rate_hz):
         report.warn(check, detail, "correct the rate in the profile, or find out what slows the topic: top")

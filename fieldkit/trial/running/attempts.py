@@ -50,8 +50,8 @@ class Attempts:
         self._last_remote = ""
         self._reached: Status | None = None
 
-    def make(self, repeat: RepeatId) -> None:
-        """Make another attempt at a repeat and keep it, whatever it came to.
+    def make(self, repeat: RepeatId) -> str:
+        """Make another attempt at a repeat and keep it, whatever it came to; return what to do where a step failed.
 
         Raises:
             ConfigurationError: This machine has no room for its evidence.
@@ -66,7 +66,8 @@ class Attempts:
         self._reached = None
         with self._cut_short(begun, partial):
             self._robots.begin(remote, old=self._last_remote or None)
-            reasons = self._measure(begun, remote, partial)
+            failure = self._measure(begun, remote, partial)
+            reasons = [failure.located] if failure else []
             if not reasons:
                 self._ledger.measured(begun)
                 self._reached = Status.MEASURED
@@ -82,6 +83,7 @@ class Attempts:
         self._ledger.keep(
             partial, replace(begun, status=bad if reasons else Status.VALID, reason=why), judged.measured
         )
+        return failure.remedy if failure else ""
 
     def recover(self, cut: Attempt) -> None:
         """Settle an attempt that fieldkit was killed in; errors as `make`."""
@@ -101,7 +103,7 @@ class Attempts:
         self._ledger.keep(evidence_folder, ended, judged.measured)
         self._last_remote = remote
 
-    def _measure(self, begun: Attempt, remote: str, here: Path) -> list[str]:
+    def _measure(self, begun: Attempt, remote: str, here: Path) -> FieldkitError | None:
         """Run the steps of an attempt; return why it is not whole."""
         repeat = begun.repeat
         self._reached = Status.RUNNING
@@ -114,8 +116,8 @@ class Attempts:
         except (RobotError, LinkError, EvidenceError) as error:
             if error.ends_trial:
                 raise
-            return [error.located]
-        return []
+            return error
+        return None
 
     @contextmanager
     def _cut_short(self, begun: Attempt, partial: Path) -> Iterator[None]:

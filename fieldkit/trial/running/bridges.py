@@ -99,11 +99,11 @@ def running(cast: Cast, shells: Shells, session: str, *, sink: Sink) -> Iterator
                 sink(Note(f"the bridge on {cast[role].name} {error}"))
 
 
-def _start(robot: Robot, shell: Shell, role: Role, one: Job) -> None:
+def _start(robot: Robot, shell: Shell, role: Role, job: Job) -> None:
     jobs.install(shell, Deadline.after(_INSTALLS_S))
-    evidence.begin(shell, one.folder, role, robot.profile.radio.interface)
+    evidence.begin(shell, job.folder, role, robot.profile.radio.interface)
     try:
-        jobs.start(shell, one)
+        jobs.start(shell, job)
     except RobotError as error:
         raise RobotError(
             f"its bridge does not start: {error.what}",
@@ -112,12 +112,12 @@ def _start(robot: Robot, shell: Shell, role: Role, one: Job) -> None:
         ) from error
 
 
-def _end(shell: Shell, one: Job) -> str:
+def _end(shell: Shell, job: Job) -> str:
     """End a bridge; return what went wrong, empty if nothing did."""
     try:
-        runs = any(f"{one.folder}/" in line for line in jobs.left(shell, Deadline.after(jobs.REPLY_S)))
-        code = jobs.stop(shell, one, grace_s=_GRACE_S)
-        evidence.discard(shell, one.folder.split("/")[-2])
+        runs = any(f"{job.folder}/" in line for line in jobs.left(shell, Deadline.after(jobs.REPLY_S)))
+        code = jobs.stop(shell, job, grace_s=_GRACE_S)
+        evidence.discard(shell, job.folder.split("/")[-2])
     except FieldkitError as error:
         return f"was not ended: {error.what}"
     early = "" if runs else "before its time, "

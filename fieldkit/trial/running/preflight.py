@@ -114,7 +114,9 @@ def demand(findings: Sequence[Finding]) -> None:
     """
     failed = [finding for finding in findings if finding.status is Verdict.FAIL]
     if failed:
-        lines = "".join(f"\n  {one.robot}: {one.check}: {one.detail}\n    {one.remedy}" for one in failed)
+        lines = "".join(
+            f"\n  {finding.robot}: {finding.check}: {finding.detail}\n    {finding.remedy}" for finding in failed
+        )
         raise RobotError(
             f"preflight found {format_count(len(failed), 'problem')}:{lines}", remedy="mend these, then try again"
         )
@@ -150,7 +152,7 @@ def _check(plan: Plan, role: Role, shell: Shell, found: dict[Role, Variants], re
 
 def _judge_jobs(plan: Plan, left: Sequence[str], report: Report) -> None:
     ours = (f"/{plan.trial}/", f"/{bridges.folder_of(plan.session)}/")
-    others = [line for line in left if not any(one in line for one in ours)]
+    others = [line for line in left if not any(folder in line for folder in ours)]
     for line in others:
         report.fail("jobs", f"of an earlier trial: {line}", "fieldkit abort")
     if not others:

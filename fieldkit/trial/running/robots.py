@@ -14,8 +14,8 @@ from fieldkit.core.model import Role, Status
 from fieldkit.core.text import encodable
 from fieldkit.core.threads import together
 from fieldkit.measure.evidence import lateness, link_samples, track
-from fieldkit.remote import evidence, jobs
-from fieldkit.remote.evidence import FetchProgress, LateError, NoFolderError
+from fieldkit.remote import evidence, fetching, jobs
+from fieldkit.remote.fetching import FetchProgress, LateError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
@@ -132,7 +132,7 @@ class Robots:
         try:
             if not clean:
                 evidence.end_jobs(shell, remote)
-            evidence.fetch(
+            fetching.fetch(
                 shell, remote, role, self._interface(role), into, expected_bytes=expected_bytes, progress=progress
             )
         except LinkError as error:

@@ -148,15 +148,16 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
             attempts.recover(cut)
         for repeat in repeats:
             while not ledger.is_over(repeat):
-                began_s = time.monotonic()
-                with stop.finishing():
-                    attempts.make(repeat)
+                lasts_s = plan.procedure.expected_s(repeat.protocol)
+                with stop.finishing(lasts_s, plan.cut_short(plan.scene(repeat, ""))):
+                    began_s = time.monotonic()
+                    remedy = attempts.make(repeat)
                     if ledger.is_over(repeat):
                         took_s.append(time.monotonic() - began_s)
                     # A void attempt, which may have waited for a robot, says nothing of how long the others take.
                     per_repeat_s = fmean(took_s) if took_s else plan.expected_s() / len(repeats)
                     # Before a request to stop is taken up: what was let finish is told too.
-                    sink(_ended(plan, ledger, len(repeats), per_repeat_s))
+                    sink(_ended(plan, ledger, len(repeats), per_repeat_s, remedy))
     except BaseException as error:
         if told:
             sink(TrialStopped(str(folder), ledger.done, len(repeats)))
@@ -180,7 +181,7 @@ def _tell_left(robots: Robots, sink: Sink) -> None:
         sink(Note(f"{robot}: evidence that was not fetched stays on it; delete it when nobody needs it: {where}"))
 
 
-def _ended(plan: Plan, ledger: Ledger, total: int, per_repeat_s: float) -> RepeatEnded:
+def _ended(plan: Plan, ledger: Ledger, total: int, per_repeat_s: float, remedy: str) -> RepeatEnded:
     attempt, row = ledger.last
     return RepeatEnded(
         repeat=str(attempt.repeat),
@@ -191,6 +192,7 @@ def _ended(plan: Plan, ledger: Ledger, total: int, per_repeat_s: float) -> Repea
         done=ledger.done,
         total=total,
         left_s=per_repeat_s * (total - ledger.done),
+        remedy=remedy,
     )
 
 

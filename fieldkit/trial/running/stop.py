@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from fieldkit.core.deadline import Deadline
+
 
 class Stop:
     """One request to stop: taken up between two repeats while one runs, at once otherwise.
@@ -12,6 +14,7 @@ class Stop:
         patient: Whether a repeat runs that may be finished first.
         saving: Whether something is being written that must not be left half done.
         due: Whether to stop as soon as it is.
+        cut_short: In words what robots do that move where the repeat that runs is stopped at once; empty if none is.
     """
 
     def __init__(self) -> None:
@@ -19,19 +22,31 @@ class Stop:
         self.patient = False
         self.saving = False
         self.due = False
+        self.cut_short = ""
+        self._ends = Deadline.after(0.0)
+
+    @property
+    def left_s(self) -> float:
+        """About how many seconds the repeat that runs takes from now on; 0 where it takes longer than it should."""
+        return self._ends.remaining_s
 
     @contextmanager
-    def finishing(self) -> Iterator[None]:
+    def finishing(self, lasts_s: float, cut_short: str) -> Iterator[None]:
         """Let the body end before a request to stop is taken up.
+
+        Args:
+            lasts_s: About how long it takes.
+            cut_short: See the class.
 
         Raises:
             KeyboardInterrupt: The body has ended, and somebody asked meanwhile.
         """
+        self._ends, self.cut_short = Deadline.after(lasts_s), cut_short
         self.patient = True
         try:
             yield
         finally:
-            self.patient = False
+            self.patient, self.cut_short = False, ""
         if self.asked:
             raise KeyboardInterrupt
 

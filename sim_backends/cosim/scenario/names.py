@@ -2,9 +2,11 @@
 
 from typing import Annotated
 
-from fieldkit.config.schema import BeforeValidator, Field
+from fieldkit.config.schema import BeforeValidator, Field, shaped
 
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,30}$")]
+Name = Annotated[
+    str, shaped(r"^[a-z][a-z0-9-]{0,30}$", "a name: small letters, digits and -, a small letter first, 31 in all")
+]
 """Of an agent, or of one entry of the traffic."""
 
 

@@ -108,3 +108,10 @@ def fault(item: Item, home_m: Vector, fence_m: tuple[float, float]) -> int:
 def within_fence(goal: Vector, fence_m: tuple[float, float]) -> bool:
     """Return whether a point, seen from home, is one to which the drone may fly."""
     return math.hypot(*goal[:2]) <= fence_m[0] and 0 <= goal[2] <= fence_m[1]
+
+
+def inside_fence(goal: Vector, fence_m: tuple[float, float]) -> Vector:
+    """Return the point itself, or the one on the fence between home and it."""
+    (east, north, up), (far_m, high_m) = goal, fence_m
+    part = far_m / max(math.hypot(east, north), far_m)
+    return part * east, part * north, min(up, high_m)

@@ -14,7 +14,7 @@ from sim_backends.emulated.autopilot.firmware import LANDING, Firmware, Mode
 from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe, stop_m, velocity_to
 from sim_backends.emulated.autopilot.mission import Mission
 from sim_backends.emulated.autopilot.parameters import Parameters
-from sim_backends.emulated.autopilot.plan import Item, within_fence
+from sim_backends.emulated.autopilot.plan import Item, inside_fence, within_fence
 from sim_backends.physics.collisions import Footprint
 from sim_backends.physics.quadrotor import QuadrotorLimits
 
@@ -205,7 +205,7 @@ class Vehicle:
             if len(self.mission.items) <= self.firmware.first_item:
                 raise self._refusal("MISSION denied: no mission")
             self.mission.begin()
-        self._goal_m = stop_m(self.body, self.can)
+        self._goal_m = self._rest_m()
         if mode is Mode.OFFBOARD and self.firmware.guided_holds:
             self._wish = (self._goal_m, True)
         self.mode = mode
@@ -263,7 +263,11 @@ class Vehicle:
             self.remarks.append("Fence Breached")
             self.change_mode(Mode.RTL)
         elif not self._wished_lately():
-            self._wish = (stop_m(self.body, self.can), True)
+            self._wish = (self._rest_m(), True)
+
+    def _rest_m(self) -> Vector:
+        """Return where it waits if it brakes now; who brakes again and again comes no farther than the fence."""
+        return inside_fence(stop_m(self.body, self.can), self.fence_m)
 
     def _wished_lately(self) -> bool:
         since_ns = self._wished_ns

@@ -1,4 +1,4 @@
-"""What robots' devices carry: bare IP packets (TUN), or Ethernet frames (TAP), which name the next hop.
+"""Framing of packets on robots' devices: bare IP (TUN), or Ethernet (TAP), which names the next hop.
 
 Where robots talk directly, the address of an IP packet says who gets it. Where they forward for each other it does
 not: the next hop is whom the routing table names, and on the air, as in Ethernet, it is the MAC address of the frame.
@@ -92,4 +92,4 @@ def _mac_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Rout
 
 IP: Final = Framing("ip", 0, _is_ipv4, _by_ip, _ip_routes)
 ETHERNET: Final = Framing("ethernet", _ETHERNET_BYTES, _is_frame, _by_mac, _mac_routes)
-FRAMINGS: Final = {one.name: one for one in (IP, ETHERNET)}
+FRAMINGS: Final = {framing.name: framing for framing in (IP, ETHERNET)}

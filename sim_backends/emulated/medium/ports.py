@@ -79,7 +79,7 @@ def unpack_stats(message: Message) -> MediumStats:
 
 def pack_links(sampled: Iterable[Mapping[str, LinkSample]]) -> Message:
     """Return samples of links, each by robot, as a message."""
-    return {"links": [[name, astuple(one)] for samples in sampled for name, one in samples.items()]}
+    return {"links": [[name, astuple(sample)] for samples in sampled for name, sample in samples.items()]}
 
 
 def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
@@ -128,5 +128,5 @@ class Port:
     @property
     def counters(self) -> PortCounters:
         """What crossed the device so far."""
-        written = sum(one.packets for one in self.delay_parts().values())
+        written = sum(delay.packets for delay in self.delay_parts().values())
         return PortCounters(self.read, written, self.refused, self.unroutable, self.not_ipv4)

@@ -324,7 +324,9 @@ class Medium:
     def _stats(self) -> MediumStats:
         ports = {name: port.counters for name, port in self._ports.items()}
         delays = {
-            (source, name): one for name, port in self._ports.items() for source, one in port.delay_parts().items()
+            (source, name): parts
+            for name, port in self._ports.items()
+            for source, parts in port.delay_parts().items()
         }
         return MediumStats(self._scheduling, self._late, self._model.counters(), ports, delays)
 

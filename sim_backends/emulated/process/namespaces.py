@@ -101,13 +101,13 @@ def id_ranges(text: str) -> list[IdRange]:
 def _check_subordinates(user: str, uid: int) -> None:
     given = {path: id_ranges(_text(Path(path))) for path in _OPTION_OF}
     enough = {
-        path: any(one.owner in {user, str(uid)} and one.count >= _SUBORDINATES for one in ranges)
+        path: any(ids.owner in {user, str(uid)} and ids.count >= _SUBORDINATES for ids in ranges)
         for path, ranges in given.items()
     }
     if all(enough.values()):
         return
     lacking = [path for path in given if not enough[path]]
-    taken = (one.first + one.count for ranges in given.values() for one in ranges)
+    taken = (ids.first + ids.count for ranges in given.values() for ids in ranges)
     first = max((_FIRST_SUBORDINATE, *taken))
     options = " ".join(f"{_OPTION_OF[path]} {first}-{first + _USUAL_SUBORDINATES - 1}" for path in lacking)
     raise ConfigurationError(

@@ -55,7 +55,13 @@ class Worker:
                 stderr=self._log,
                 # Ctrl-C in a terminal reaches the whole group; the lab decides when its processes end.
                 start_new_session=True,
-                env={"PATH": PATH, "HOME": home, "LANG": "C.UTF-8", "PYTHONPATH": str(interpreter.PROJECT)},
+                env={
+                    "PATH": PATH,
+                    "HOME": home,
+                    "LANG": "C.UTF-8",
+                    "PYTHONPATH": str(interpreter.PROJECT),
+                    "OPENBLAS_NUM_THREADS": "1",  # numpy starts a thread per core, and each spins for a while
+                },
                 cwd="/",
             )
         except OSError as error:

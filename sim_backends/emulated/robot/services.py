@@ -4,7 +4,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -118,41 +118,20 @@ class Service:
 
 def services(spec: RobotSpec) -> list[Service]:
     """Return what runs in the robot that `spec` describes."""
-    publish = partial(
-        sensors.publish,
-        spec.sensors,
-        spec.definitions,
-        motion=MOTION,
-        steered=STEERED,
-        ready=ready_file("sensors"),
-    )
+    publish = partial(sensors.publish, spec.sensors, spec.definitions)
     found = [
         _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
-        Service("sensors", partial(fork, "sensors", publish), ready_file("sensors").exists),
+        _moving("sensors", publish),
     ]
     if spec.mavlink_port is not None:
-        fly = partial(
-            autopilot.serve,
-            _drone(spec, spec.mavlink_port),
-            motion=MOTION,
-            steered=STEERED,
-            ready=ready_file("autopilot"),
-        )
-        found.append(Service("autopilot", partial(fork, "autopilot", fly), ready_file("autopilot").exists))
+        found.append(_moving("autopilot", partial(autopilot.serve, _drone(spec, spec.mavlink_port))))
     if spec.base is not None:
-        drive = partial(base.serve, spec.base, motion=MOTION, steered=STEERED, ready=ready_file("base"))
-        found.append(Service("base", partial(fork, "base", drive), ready_file("base").exists))
+        found.append(_moving("base", partial(base.serve, spec.base)))
     if spec.mesh_hello_s is not None:
         argv = babeld.command(spec.interface, spec.address, spec.mesh_hello_s)
         found.append(_program("babeld", argv, {}, babeld.PID.exists))
     if spec.ros == "debian":
-        # Python as a script would find it: rospy is made for Debian's own interpreter.
-        ros = spec.ros1_environment | {"PYTHONPATH": str(interpreter.PROJECT)}
-        command = spec.base.topic if spec.base else ""
-        relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), command, *spec.registered)
-        if spec.runs_master:
-            found.append(_master(spec, ros))
-        found.append(_program("ros_relay", relay, ros, ready_file("ros_relay").exists))
+        found += _debian_ros(spec)
     if spec.bridge:
         argv = ("/usr/bin/env", *with_environment(spec.bridge, setup=spec.setup))
         found.append(_program(BRIDGE, argv, {}, _bridge_is_up))
@@ -160,11 +139,32 @@ def services(spec: RobotSpec) -> list[Service]:
         found.append(_ros2_program(ZENOH_ROUTER, "route", spec.ip))
     if spec.ros2 is not None:
         types = json.dumps({sensor.topic: sensor.type for sensor in spec.sensors})
-        velocities = spec.base.topic if spec.base else ""
         frames = json.dumps(static_frames.links(spec.sensors))
-        words = (spec.ip, ros_node(spec), velocities, json.dumps(asdict(spec.ros2)), types, frames)
+        words = (spec.ip, ros_node(spec), _velocities(spec), json.dumps(asdict(spec.ros2)), types, frames)
         found.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return found
+
+
+def _moving(name: str, serve: Callable[..., None]) -> Service:
+    """Return a service that is told how the robot moves, or tells it: a fork of this process."""
+    ready = ready_file(name)
+    work = partial(serve, motion=MOTION, steered=STEERED, ready=ready)
+    return Service(name, partial(fork, name, work), ready.exists)
+
+
+def _debian_ros(spec: RobotSpec) -> Iterator[Service]:
+    """Yield the robot's ROS master, if it has one of its own, and what publishes its sensors there."""
+    # Python as a script would find it: rospy is made for Debian's own interpreter.
+    variables = spec.ros1_environment | {"PYTHONPATH": str(interpreter.PROJECT)}
+    if spec.runs_master:
+        yield _master(spec, variables)
+    relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), _velocities(spec), *spec.registered)
+    yield _program("ros_relay", relay, variables, ready_file("ros_relay").exists)
+
+
+def _velocities(spec: RobotSpec) -> str:
+    """Return the topic of velocities that the robot's base listens to, empty without a base."""
+    return spec.base.topic if spec.base else ""
 
 
 def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:

@@ -173,7 +173,7 @@ class RobotSpec:
     def from_json(cls, data: dict[str, Any]) -> Self:
         """Return what `dataclasses.asdict` and JSON made of a specification."""
         sensors = tuple(_sensor(sensor) for sensor in data["sensors"])
-        definitions = {kind: Definition(**one) for kind, one in data["definitions"].items()}
+        definitions = {kind: Definition(**definition) for kind, definition in data["definitions"].items()}
         words = {name: tuple(data[name]) for name in ("setup", "registered", "bridge")}
         base = data["base"] and Base(**data["base"])
         ros2 = data["ros2"] and Ros2Spec.from_json(data["ros2"])

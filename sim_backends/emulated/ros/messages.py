@@ -48,7 +48,6 @@ NORTH_RADIUS_M: Final = 6_335_439.327
 
 _FLOATS_BYTES: Final = 16  # of a point, so that x stays x
 _ONE_TRANSFORM: Final = struct.pack("<I", 1)
-_ORIGIN: Final = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ class Source:
         if not self._stamped:
             return self._generate(self._sensor, self._noise, now)
         stamp = struct.pack("<3I", number & 0xFFFFFFFF, *divmod(stamp_ns, 10**9))
-        return self._lead + stamp + _string(self._sensor.frame) + self._generate(self._sensor, self._noise, now)
+        return self._lead + stamp + packed_string(self._sensor.frame) + self._generate(self._sensor, self._noise, now)
 
 
 def check(sensor: Sensor) -> None:
@@ -148,7 +147,7 @@ def check(sensor: Sensor) -> None:
         raise ConfigurationError(
             f"an emulated robot cannot publish {sensor.type}",
             where=f"topic {sensor.topic}",
-            remedy=f"{known} Or add a generator to sim_backends/emulated/messages.py",
+            remedy=f"{known} Or add a generator to sim_backends/emulated/ros/messages.py",
         )
     if sensor.rate_hz <= 0:
         raise ConfigurationError(
@@ -177,7 +176,8 @@ def _filled(template: Template) -> Generator:
     return generate
 
 
-def _string(text: str) -> bytes:
+def packed_string(text: str) -> bytes:
+    """Return a string as ROS 1 serializes it: behind its length."""
     data = text.encode()
     return struct.pack("<I", len(data)) + data
 
@@ -192,7 +192,11 @@ def _float64s(*parts: Sequence[float]) -> bytes:
 
 
 def _diagonal(*variances: float) -> list[float]:
-    return [one if row == column else 0.0 for row, one in enumerate(variances) for column in range(len(variances))]
+    return [
+        variance if row == column else 0.0
+        for row, variance in enumerate(variances)
+        for column in range(len(variances))
+    ]
 
 
 def _around(noise: Random, deviation: float, *means: float) -> list[float]:
@@ -234,7 +238,7 @@ def _laser_scan(sensor: Sensor, noise: Random, now: OwnMotion) -> bytes:
     turn_s = 1 / sensor.rate_hz
     angles = (0.0, step * (points - 1), step)
     scalars = struct.pack("<7f", *angles, turn_s / points, turn_s, low_m, high_m)
-    ranges = [_within(one, low_m, high_m) for one in seen_m]
+    ranges = [_within(range_m, low_m, high_m) for range_m in seen_m]
     return scalars + _float32s(ranges) + _float32s(noise.choices(LASER_INTENSITIES, k=points))
 
 
@@ -248,7 +252,7 @@ def _imu(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
 
 
 def _child(sensor: Sensor) -> bytes:
-    return _string(sensor.child_frame or "base_link")
+    return packed_string(sensor.child_frame or "base_link")
 
 
 def _odometry(sensor: Sensor, noise: Random, now: OwnMotion) -> bytes:
@@ -271,7 +275,7 @@ def _battery_state(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     measured = struct.pack("<7f", voltage, *[unknown] * 4, design_capacity, percentage)
     state = struct.pack("<3B?", discharging, good, polymer, present)
     no_cells = _float32s(()) * 2  # their voltages and temperatures
-    return measured + state + no_cells + _string("") * 2  # its place and serial number
+    return measured + state + no_cells + packed_string("") * 2  # its place and serial number
 
 
 def _range(_: Sensor, noise: Random, now: OwnMotion) -> bytes:

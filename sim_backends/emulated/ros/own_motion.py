@@ -1,4 +1,4 @@
-"""What an emulated robot knows of its own motion, for its sensors: its wheels count, and satellites see its place.
+"""Motion of an emulated robot as its sensors know it: its wheels count, and satellites see its place.
 
 The lab says each way when it begins, and the robot works out the rest, so that nothing is late. Who carries it back
 to its place turns no wheel: its odometry goes on from where it was. A robot that steers itself (`helm`) says where it
@@ -136,7 +136,7 @@ class Odometer:
 def _driven(way: OwnWay, base: OwnMotion, now_ns: int) -> OwnMotion:
     """Return how a robot is at a moment on its way, which was so when that began."""
     elapsed_ns = now_ns - way.began_ns
-    points_m = [(one[0], one[1], 0.0) for one in way.points_m]  # its speed is that over the map
+    points_m = [(point_m[0], point_m[1], 0.0) for point_m in way.points_m]  # its speed is that over the map
     (east_m, north_m, _), velocity_m_s, _ = WayPoints("", points_m, way.speed_m_s).at(elapsed_ns)[""]
     heading_rad = way.facing_rad
     if velocity_m_s != STILL:

@@ -169,7 +169,7 @@ def _summary(reader: Reader, name: str) -> str:
 
 
 def _types(reader: Reader) -> list[str]:
-    digests = {denormalize_msgtype(one.msgtype): one.digest for one in reader.connections}
+    digests = {denormalize_msgtype(connection.msgtype): connection.digest for connection in reader.connections}
     width = max(map(len, digests))
     return [f"{name:<{width}} [{digest}]" for name, digest in sorted(digests.items())]
 
@@ -177,9 +177,9 @@ def _types(reader: Reader) -> list[str]:
 def _topics(reader: Reader) -> list[str]:
     counts: Counter[str] = Counter()
     types: defaultdict[str, set[str]] = defaultdict(set)
-    for one in reader.connections:
-        counts[one.topic] += one.msgcount
-        types[one.topic].add(denormalize_msgtype(one.msgtype))
+    for connection in reader.connections:
+        counts[connection.topic] += connection.msgcount
+        types[connection.topic].add(denormalize_msgtype(connection.msgtype))
     topic_width = max(map(len, counts))
     count_width = max(len(str(count)) for count in counts.values())
     type_width = max(len(name) for names in types.values() for name in names)

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from sim_backends.emulated.ros.messages import Sensor
+from sim_backends.emulated.ros.messages import Sensor, packed_string
 
 TOPIC: Final = "/tf_static"
 TYPE: Final = "tf2_msgs/TFMessage"
@@ -36,10 +36,5 @@ def message(found: Sequence[Link], stamp_ns: int) -> bytes:
     """Return the message that says so, a `tf2_msgs/TFMessage` as ROS 1 serializes it."""
     stamp = struct.pack("<3I", 0, *divmod(stamp_ns, 10**9))
     return struct.pack("<I", len(found)) + b"".join(
-        stamp + _string(parent) + _string(child) + _IN_PLACE for parent, child in found
+        stamp + packed_string(parent) + packed_string(child) + _IN_PLACE for parent, child in found
     )
-
-
-def _string(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data

@@ -1,4 +1,4 @@
-"""What a robot that steers itself says of its motion: a small record that its sensors and the lab read.
+"""Record of the motion of a robot that steers itself, small, for its sensors and the lab to read.
 
 One process of a robot writes: its base controller, or its autopilot. It says where the robot is and how it moves,
 with the moment by the monotonic clock, which all processes of a machine share; readers reckon on from there. The

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from fieldkit.config.profiles import PublishedTopic
 from fieldkit.core.errors import ConfigurationError, nearest
-from sim_backends.emulated.ros.messages import GENERATORS, Definition, Template
+from sim_backends.emulated.ros.messages import GENERATORS, Definition, Template, packed_string
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -170,24 +170,20 @@ class _Packed:
         self.filling = argument[0]
 
 
-def _text(text: str) -> bytes:
-    return struct.pack("<I", len(text)) + text.encode()
-
-
 def _image(topic: PublishedTopic) -> Values:
     width, height = topic.width or 0, topic.height or 0
     numbers = {"height": height, "width": width, "step": 3 * width}
-    return {name: struct.pack("<I", value) for name, value in numbers.items()} | {"encoding": _text("rgb8")}
+    return {name: struct.pack("<I", value) for name, value in numbers.items()} | {"encoding": packed_string("rgb8")}
 
 
 def _compressed_image(_: PublishedTopic) -> Values:
-    return {"format": _text("jpeg")}
+    return {"format": packed_string("jpeg")}
 
 
 def _point_cloud(topic: PublishedTopic) -> Values:
     points = topic.points or 0
     names = ("x", "y", "z", "intensity")
-    fields = [_text(name) + struct.pack("<IBI", 4 * at, _FLOAT32, 1) for at, name in enumerate(names)]
+    fields = [packed_string(name) + struct.pack("<IBI", 4 * at, _FLOAT32, 1) for at, name in enumerate(names)]
     numbers = {"height": 1, "width": points, "point_step": _POINT_BYTES, "row_step": _POINT_BYTES * points}
     told = {name: struct.pack("<I", value) for name, value in numbers.items()}
     return told | {"fields": struct.pack("<I", len(fields)) + b"".join(fields), "is_dense": b"\x01"}

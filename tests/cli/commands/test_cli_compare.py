@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -147,6 +148,22 @@ def test_a_lab_has_the_same_hashes_in_the_field_and_emulated(lab: Path) -> None:
     assert field.cast != emulated.cast
     assert field.profiles_sha256 == emulated.profiles_sha256
     assert field.procedure_sha256 == emulated.procedure_sha256
+
+
+def test_more_than_two_runs_are_named_with_what_shows_them_side_by_side(
+    lab: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (lab / "field again").symlink_to("field")
+    assert main(["compare", "field", "sim", "field again"]) == 2
+    said = capsys.readouterr().err
+    assert "two runs are compared, A and B, and 3 are named" in said
+    command = said.partition("side by side: fieldkit ")[2].strip()
+    assert command == "aggregate field sim 'field again' --by trial,protocol"
+    assert main(shlex.split(command)) == 0
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        main(["compare", "--help"])
+    assert "A B\n" in capsys.readouterr().out, "it takes two"
 
 
 def test_equal_inputs_give_equal_bytes(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,6 @@
-"""What iw and the kernel print, read from real outputs of versions 3 to 6 and of ten drivers."""
+"""What iw and the kernel print, read from real outputs of versions 3 to 6 and of eleven drivers."""
+
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -16,6 +18,10 @@ STATIONS = {
     "station-mwlwifi-4": StationSample("84:ba:3b:07:53:07", None, 1e6, 1e6, 418, 463, 0, 0),
     "station-ath12k-6": StationSample("00:03:7f:12:03:03", -95.0, 688.2e6, 619.5e6, 191, 320, 99, 0, 0),
     "station-iwlwifi-6": StationSample("04:f0:21:32:3f:d2", -60.0, 650e6, 650e6, 3441, 12577, 976, 0, 0),
+    "station-hwsim-3": StationSample("02:00:00:00:00:00", -30.0, 1e6, None, 21, 3544, 0, 0),
+    "station-hwsim-4": StationSample("02:00:00:00:00:00", -30.0, 1e6, 1e6, 21, 3812, 0, 0),
+    "station-hwsim-5": StationSample("02:00:00:00:00:00", -30.0, 1e6, 1e6, 21, 3392, 0, 0, 1),
+    "station-hwsim-6": StationSample("02:00:00:00:00:00", -30.0, 1e6, 1e6, 22, 4014, 0, 0, 1),
 }
 
 
@@ -32,6 +38,8 @@ def test_several_stations_follow_each_other() -> None:
     both = iw.stations(said("station-iwlwifi-6") + said("station-mt7603-6"))
     assert both == (STATIONS["station-iwlwifi-6"], STATIONS["station-mt7603-6"])
     assert [one.signal_dbm for one in iw.stations(said("stations-ap"))] == [-57.0]
+    other, one = iw.stations(said("stations-hwsim-ap-6"))
+    assert (other.tx_packets, other.tx_failures, one.tx_packets, one.tx_failures) == (13, 7, 6, 0)
 
 
 def test_the_access_point_that_a_station_is_joined_to() -> None:
@@ -39,11 +47,19 @@ def test_the_access_point_that_a_station_is_joined_to() -> None:
     pi = iw.cell(said("link-station"))
     assert pi == StationSample("f0:99:bf:0e:86:98", -65.0, 65e6, None, 1263, 25943), "a Raspberry Pi's brcmfmac"
     assert iw.cell(said("link-none")) is iw.cell(said("link-ibss")) is iw.cell(said("no-wifi")) is None
+    assert iw.cell(said("link-hwsim-ibss-6")) is None
+    ours = StationSample("02:00:00:00:00:00", -30.0)
+    assert iw.cell(said("link-hwsim-3")) == replace(ours, tx_rate_bit_s=1e6, tx_packets=21, rx_packets=3530)
+    rates = replace(ours, tx_rate_bit_s=65e6, rx_rate_bit_s=1e6)
+    assert iw.cell(said("link-hwsim-5")) == replace(rates, tx_packets=19, rx_packets=3320)
+    rates = replace(ours, tx_rate_bit_s=1e6, rx_rate_bit_s=1e6)
+    assert iw.cell(said("link-hwsim-6")) == replace(rates, tx_packets=21, rx_packets=3950)
 
 
 def test_the_channel_in_use_is_the_one_that_counts() -> None:
     assert iw.channel(said("survey-ath9k-4")) == (-95.0, 1704490481 * 10**6, 945335227 * 10**6)
     assert iw.channel(said("survey-mt7996-6")) == (-84.0, 497753 * 10**6, 104676 * 10**6)
+    assert iw.channel(said("survey-hwsim-6")) == (None, None, None), "it does not say which one is in use"
     assert iw.channel(said("survey-ath10k-4")) == iw.channel("") == (None, None, None)
 
 
@@ -52,6 +68,7 @@ def test_the_kernels_own_line_tells_powers_where_they_are_powers() -> None:
         return said(name).splitlines()[-1].partition(":")[2].lstrip()
 
     assert iw.wireless(behind("wireless-iwlwifi")) == (-42.0, None)
+    assert iw.wireless(behind("wireless-hwsim")) == (-30.0, None)
     assert iw.wireless(behind("wireless-percent")) == (None, None)
     assert iw.wireless("0000   54.  -56.  -91.        0") == (-56.0, -91.0)
 

@@ -108,6 +108,43 @@ def test_a_station_that_roams_goes_on_counting() -> None:
     assert measured(found)["radio_tx_packets"] == 5 + 4 + 5
 
 
+def test_a_link_that_is_made_anew_counts_from_zero_whatever_the_one_before_had() -> None:
+    # As mac80211 told it of a robot that roamed: the next access point had counted more than the one before.
+    near = StationSample("02:00:00:00:00:00", -30.0, 1e6, 1e6, 11, 1522, 0, 0, 1)
+    far = StationSample("02:00:00:00:03:00", -30.0, 1e6, 1e6, 139, 1775, 0, 0, 0)
+    found = [
+        LinkSample(0, (near,)),
+        LinkSample(S, (replace(near, tx_packets=21, rx_packets=1530),), near.station),
+        LinkSample(2 * S, (far,)),
+    ]
+    assert measured(found)["roams"] == 1, "seen by its station alone"
+    assert measured(found)["radio_tx_packets"] == 10 + 139
+    assert measured(found)["radio_rx_packets"] == 8 + 1775
+    assert measured(found)["beacon_losses"] == 0
+
+
+def test_what_a_link_counted_unseen_before_it_was_made_anew_makes_a_sum_unknown() -> None:
+    # A robot that was deauthenticated 50 s after the last look, as mac80211 told it.
+    before = StationSample("02:00:00:00:00:00", -30.0, 1e6, 1e6, 33, 10211, 0, 0, 1)
+    after = replace(before, tx_packets=158, rx_packets=781, beacon_losses=0)
+    found = [LinkSample(0, (before,), before.station), LinkSample(50 * S, (after,))]
+    told = link.measure(Role.SENDER, found)
+    assert told.values["sender_roams"] == 0
+    for name in ("radio_tx_packets", "radio_rx_packets", "tx_retries", "tx_failures", "beacon_losses"):
+        assert "made anew" in told.missing[f"sender_{name}"]
+
+
+def test_a_station_that_knows_others_besides_is_joined_to_its_access_point() -> None:
+    peer = replace(ONE, station="peer", tx_packets=5000)
+    found = [
+        LinkSample(0, (ONE, peer)),
+        LinkSample(S, (replace(ONE, tx_packets=12),), "aa"),
+        LinkSample(2 * S, (replace(ONE, tx_packets=17), peer)),
+    ]
+    assert measured(found)["radio_tx_packets"] == 7
+    assert measured(found)["roams"] == 0
+
+
 @pytest.mark.parametrize("busy", [[0, 500, 100], [900, 1400, 1500]])
 def test_a_channels_counters_may_begin_anew(busy: list[int]) -> None:
     active = [1000, 2000, 200] if busy[-1] < busy[1] else [1000, 2000, 2200]

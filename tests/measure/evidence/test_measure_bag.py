@@ -1,5 +1,7 @@
 import contextlib
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +33,17 @@ def test_contents_of_a_bag(tmp_path: Path) -> None:
     assert found.messages == 77
     assert dict(found.messages_by_topic) == {"/scan": 74, "/odom": 3}
     assert found.duration_s == 14.6
+
+
+def test_a_ros_1_bag_is_read_without_what_those_of_ros_2_take(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "scan.bag", {"/scan": 2})
+    script = f"""
+import sys
+from fieldkit.measure.evidence import bag_reader
+print(bag_reader.answer({{"path": {str(path)!r}}})["messages"], {{"ruamel", "sqlite3"}} & set(sys.modules))
+"""
+    done = subprocess.run((sys.executable, "-c", script), stdout=subprocess.PIPE, text=True, timeout=60, check=True)
+    assert done.stdout == "2 set()\n"
 
 
 def test_a_bag_cut_at_any_byte_is_refused_with_a_remedy(tmp_path: Path) -> None:

@@ -105,6 +105,11 @@ def test_what_is_no_json_is_told(said: Path, text: str) -> None:
         printed.at_path(said, "a")
 
 
+def test_a_mark_of_byte_order_before_json_is_none_of_it_and_the_last_of_two_values_counts(said: Path) -> None:
+    said.write_text('\ufeff{"a": 3, "a": 4}', encoding="utf-8")
+    assert printed.at_path(said, "a") == 4
+
+
 def test_a_path_that_does_not_suit_the_data_is_told(said: Path) -> None:
     with pytest.raises(EvidenceError, match="sum"):
         printed.at_path(said, "sum(mode)")

@@ -211,6 +211,7 @@ def test_accounts_are_read_as_they_were_written(tmp_path_factory: pytest.TempPat
         {"robots": {"sender": {"file": "a/b/c.bag"}}},
         {"robots": {"sender": {"topic": 3}}},
         {"robots": {"sender": {"gap_s": "3"}}},
+        {"robots": {"sender": {"gap_s": 10**400}}},
         {"robots": {"sender": {"began_utc_ns": -1}}},
         {"robots": {"sender": {"began_utc_ns": True}}},
         {"clocks": {"sender": {"offset_s": 1.0}}},

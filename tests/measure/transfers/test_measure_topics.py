@@ -1,5 +1,6 @@
 """Figures of topics, against closed forms and what is counted by hand."""
 
+import random
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scapy.layers.inet import IP, UDP, fragment
 
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import topics
@@ -18,6 +20,7 @@ MS = 1_000_000
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
 DATA, DISCOVERY = 17911, 17900
+OTHER_DATA = 18161
 FLOW = TopicTraffic(SENDER, RECEIVER, frozenset({DATA}), frozenset({DISCOVERY}), deadline_s=0.15)
 EVERY = 100 * MS
 
@@ -175,6 +178,36 @@ def test_packets_of_data_that_the_subscriber_lacks_are_lost() -> None:
 
 def test_no_packets_of_udp_lose_nothing() -> None:
     assert "topic_packet_loss" not in measured(published(2), arrived([0]), *captures())
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_each_of_two_streams_of_one_pair_has_its_own_fragments(seed: int) -> None:
+    """As scapy cuts datagrams; ids come again in both streams, in answers, and in packets that are whole."""
+    draw = random.Random(seed)
+    cut: list[tuple[int, list[IP]]] = []
+    for number in range(30):
+        port, size = draw.choice([DATA, OTHER_DATA]), draw.choice([100, 3000, 9000])
+        src, dst = (SENDER, RECEIVER) if draw.random() < 0.8 else (RECEIVER, SENDER)
+        whole = (
+            IP(src=src, dst=dst, id=number % 3)
+            / UDP(sport=port, dport=port)
+            / bytes(draw.randrange(256) for _ in range(size))
+        )
+        cut.append((port, fragment(whole, 1480)))  # type: ignore[no-untyped-call]
+        if draw.random() < 0.3:  # between two fragments of the last one
+            alone = IP(src=SENDER, dst=RECEIVER, id=number % 3, flags="DF") / UDP(sport=OTHER_DATA, dport=OTHER_DATA)
+            cut[-1:] = [(port, cut[-1][1][:1]), (OTHER_DATA, [alone]), (port, cut[-1][1][1:])]
+    sent = [(START + MS * at, *one) for at, one in enumerate((port, one) for port, each in cut for one in each)]
+    came = [one for one in sent if draw.random() < 0.8]
+    near, far = (packets(Frame(at_ns, bytes(one)) for at_ns, _, one in every) for every in (sent, came))
+    for port in (DATA, OTHER_DATA):
+        flow = replace(FLOW, data_ports=frozenset({port}))
+        found = topics.measure(flow, None, None, near, far).values
+        own = [one for _, of, one in sent if of == port]
+        assert found["topic_data_packets"] == len(own)
+        assert found["topic_data_bytes"] == sum(map(len, own))
+        there, here = ([one for _, of, one in every if of == port and one.src == SENDER] for every in (sent, came))
+        assert found["topic_packet_loss"] == pytest.approx(1 - len(here) / len(there))
 
 
 def test_samples_of_another_stream_are_noticed() -> None:

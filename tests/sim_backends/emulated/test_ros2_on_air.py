@@ -301,7 +301,7 @@ def test_wrong_options_are_told(ros2: str, said: str) -> None:
     ("ros2", "profile", "said"),
     [
         (ROUTER, speaking("cyclonedds"), "speaks over DDS, which has none"),
-        ("{}", speaking("zenoh", ROS_DOMAIN_ID="250"), "ROS_DOMAIN_ID '250' of the profile is no domain"),
+        ("{}", speaking("zenoh", ROS_DOMAIN_ID="150"), "the ports of ROS_DOMAIN_ID 150 of the profile"),
     ],
 )
 def test_what_a_profile_cannot_have_is_told(

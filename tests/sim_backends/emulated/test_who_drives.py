@@ -17,7 +17,8 @@ robots:
   drone: {profile: duckiedrone}
 roles:
   master: {sender: one, receiver: two, relay: drone}
-emulated: {ros: ROS}
+emulated:
+  ros: ROS
 """
 OWN_TOPICS = {
     "/cmd_vel, odometry: /odom": "/two/cmd_vel, odometry: /two/odom",
@@ -52,8 +53,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ((ROS2, ROS2 | OWN_TOPICS), "auto", {"one", "two"}),
         ((ROS2, ROS2 | OWN_TOPICS), "builtin", set()),
         ((ROS2 | DOMAIN, ROS2), "auto", {"one", "two"}),
-        ((ZENOH, ROS2), "auto", set()),
-        ((ZENOH, ROS2 | OWN_TOPICS), "auto", {"two"}),
+        ((ZENOH, ROS2), "auto", {"one", "two"}),
+        ((ZENOH, ZENOH), "auto", set()),
+        ((ZENOH, ZENOH | OWN_TOPICS), "auto", {"one", "two"}),
+        ((ZENOH, ZENOH | OWN_TOPICS), "auto\n  ros2: {discovery: router, router: drone}", set()),
     ],
 )
 def test_who_drives_is_obeyed_by_nobody_else(

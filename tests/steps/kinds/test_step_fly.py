@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from fieldkit.config import schema
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
 from fieldkit.steps.kinds import fly
 from fieldkit.steps.kinds.fly import FlyStep
 from fieldkit.steps.scene import Said, Scene
@@ -106,6 +106,9 @@ def test_the_shipped_drones_say_their_limits() -> None:
         ('["PX4"]', 0, Verdict.FAIL),
         ('{"autopilot": 4, "charge": 1}', 0, Verdict.FAIL),
         ('{"autopilot": "PX4", "charge": "full"}', 0, Verdict.FAIL),
+        (f'{{"autopilot": "PX4", "charge": {10**400}}}', 0, Verdict.FAIL),
+        ('{"what": [1], "remedy": "", "grave": true}\n{"autopilot": "PX4", "charge": 1}', 0, Verdict.FAIL),
+        ("[" * 100_000, 0, Verdict.FAIL),
     ],
 )
 def test_what_preflight_makes_of_the_answer(text: str, code: int, verdict: Verdict) -> None:
@@ -153,3 +156,13 @@ steps: [{ping: {from: sender, to: receiver}}]
     assert plan.cast[Role.SENDER].profile.mavlink is None
     (refusal,) = plan.refusals({})
     assert re.search("no mavlink", refusal.what)
+
+
+def test_what_becomes_of_it_where_it_is_stopped_at_once_is_told() -> None:
+    flight = step(f"robot: {DRONE}, height: 2m")
+    assert list(flight.cut_short(SCENE)) == [
+        f"{CAST[DRONE].name} lands, if it is in the air: for up to about 37 s, also when fieldkit has ended"
+    ]
+    returns = Scene(Protocol.TCP, FREE, "f", on_abort={DRONE: OnAbort.RETURN})
+    (said,) = flight.cut_short(returns)
+    assert "returns by itself" in said

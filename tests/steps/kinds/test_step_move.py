@@ -166,10 +166,10 @@ def test_a_robot_within_its_limits_goes_as_fast_and_as_far_as_it_may() -> None:
     [
         (
             "turtlebot3_burger",
-            "turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.1 s, and back, by itself",
-            671,
+            "turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.4 s, and back, by itself",
+            672,
         ),
-        ("husky", "turtlebot-2 moves 60 m away, at 1 m/s, for up to 60 s, and back, by itself", 300),
+        ("husky", "turtlebot-2 moves 60 m away, at 1 m/s, for up to 62.6 s, and back, by itself", 313),
         ("duckiedrone", "turtlebot-2 moves 60 m away, at 2 m/s, for up to 30 s", 150),
     ],
 )

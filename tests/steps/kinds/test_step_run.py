@@ -54,8 +54,8 @@ def test_words_are_those_of_a_shell_and_addresses_are_filled_in() -> None:
 
 
 def test_a_shell_has_no_say_in_words() -> None:
-    (planned,) = run_step("{robot: sender, argv: [echo, '$HOME; rm *', '{print}']}").commands(SCENE)
-    assert planned.job.argv[-3:] == ("echo", "$HOME; rm *", "{print}")
+    (planned,) = run_step("{robot: sender, argv: [echo, '$HOME; rm *', '{print}', '|']}").commands(SCENE)
+    assert planned.job.argv[-4:] == ("echo", "$HOME; rm *", "{print}", "|")
 
 
 @pytest.mark.parametrize(
@@ -65,6 +65,7 @@ def test_a_shell_has_no_say_in_words() -> None:
         ("robot: sender\ncommand: a\nargv: [a]", 1, "one of them"),
         ("robot: sender\ncommand: echo 'a", 2, "cannot be split into words"),
         ("robot: sender\nargv: ['', a]", 2, "the program, is empty"),
+        ("robot: sender\ncommand: ls | wc", 2, "no shell sees this command, and | is a shell's"),
         ("robot: sender\ncommand: a {address.Receiver}", 1, "small letters"),
         ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V}", 4, "one of them"),
         ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V, json: 'a['}", 4, "no path into JSON"),
@@ -103,6 +104,11 @@ def test_values_are_read_and_told(tmp_path: Path) -> None:
     values, problems = judged(tmp_path, '{"cells": [{"V": 3.75}], "mode": "auto"}')
     assert (values, problems) == ({"volts": 3.75, "mode": "auto"}, [])
     assert list(run_step(BATTERY).in_words(values)) == ["battery 3.75 V", "mode auto"]
+
+
+def test_what_is_true_or_false_is_said_as_it_stands_in_the_table() -> None:
+    step = run_step("{robot: sender, command: a, columns: [{name: up, unit: bool, json: up}]}")
+    assert list(step.in_words({"up": False})) == ["up false"]
 
 
 @pytest.mark.parametrize(

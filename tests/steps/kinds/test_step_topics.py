@@ -50,7 +50,7 @@ def topics(keys: str = "over: dds") -> TopicsStep:
         ("qos: {profile: sensor}", "ROS 2 has no profile 'sensor'; there are default, sensor_data"),
         ("settings: {'Discovery/<x>': '1'}", "match pattern"),
         ("settings: tunde", "settings is default, tuned, or"),
-        ("topic: /a//b", "match pattern"),
+        ("topic: /a//b", "is not the name of a topic"),
     ],
 )
 def test_what_cannot_be_is_refused_with_its_line(keys: str, complaint: str) -> None:

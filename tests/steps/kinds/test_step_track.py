@@ -34,7 +34,7 @@ def track(robots: str, during: str = PING) -> TrackStep:
         ("{}", "at least 1 item"),
         ("{sender: {}}", "which topic tells it, or at which place"),
         ("{sender: {topic: /odom, at: {lat: 1, lon: 2}}}", "which topic tells it, or at which place"),
-        ("{sender: {topic: odom}}", "should match pattern"),
+        ("{sender: {topic: odom}}", "'odom' is not the name of a topic"),
         ("{sender: {topic: /odom, facing: north}}", "away.*towards"),
         ("{sender: {topic: /odom, gap: 3}}", "has no unit"),
         ("{sender: {topic: /odom, gap: 0s}}", "greater than 0"),

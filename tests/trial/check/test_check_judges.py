@@ -127,6 +127,17 @@ def test_an_ad_hoc_cell_is_no_missing_network() -> None:
     assert only(findings, "Wi-Fi").detail == "IBSS 'knowhere', at 02:11:87:86:a3:0f, channel 11"
 
 
+def test_the_kernels_own_wifi_stack_is_read_in_every_mode() -> None:
+    station = heard(SENDER, wifi_info=said("iw/info-hwsim-station-6.txt"), wifi_link=said("iw/link-hwsim-6.txt"))
+    assert only(station, "Wi-Fi").detail == "managed 'lawn', at 02:00:00:00:00:00, channel 6, -30 dBm, 1.0 MBit/s"
+    relay = heard(RELAY, wifi_info=said("iw/info-hwsim-ap-6.txt"), wifi_stations=said("iw/stations-hwsim-ap-6.txt"))
+    assert only(relay, "Wi-Fi").detail == "AP 'lawn', channel 6, 2 stations, -30 dBm"
+    ibss = heard(SENDER, wifi_info=said("iw/info-hwsim-ibss-5.txt"), wifi_link=said("iw/link-hwsim-ibss-6.txt"))
+    assert only(ibss, "Wi-Fi").detail == "IBSS 'lawn', at 26:9f:2e:55:bf:8b, channel 6"
+    down = heard(SENDER, wifi_info=said("iw/info-hwsim-down-5.txt"), wifi_link=said("iw/link-none.txt"))
+    assert only(down, "Wi-Fi").detail == "joined to no network"
+
+
 def test_an_interface_that_is_no_radio_has_no_wifi_findings() -> None:
     findings = heard(SENDER, wifi_info=said("iw/no-wifi.txt", 1))
     assert {one.check for one in findings} == {"interface wlan0", "control", "offloads"}

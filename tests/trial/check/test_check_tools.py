@@ -80,6 +80,12 @@ def test_a_tool_that_is_missing_or_unknown_is_refused_with_a_remedy(tool: str) -
     assert "apt-get install" in unknown.value.remedy
 
 
+def test_a_recorder_that_was_killed_is_not_taken_for_one_that_is_missing() -> None:
+    with pytest.raises(RobotError, match="rosbag record --help did not end in time") as slow:
+        tools.parse(USER + section("recorder", b"", 137), TURTLEBOT)
+    assert "is the robot busy?" in slow.value.remedy
+
+
 def test_a_ping_that_may_not_send_is_refused_with_a_remedy() -> None:
     denied = section("echo", b"ping: permission denied (are you root?)\n", 1)
     busybox = section("ping", about("busybox/1.35.0/ping-about.txt"))
@@ -156,7 +162,7 @@ def test_a_tool_that_never_ends_is_ended(tmp_path: Path) -> None:
     output = subprocess.run(
         ("sh", *rest), stdin=subprocess.PIPE, capture_output=True, check=False, timeout=tools.PROBE_S, cwd=tmp_path
     ).stdout
-    with pytest.raises(RobotError, match="none that is known"):
+    with pytest.raises(RobotError, match="nc did not end in time"):
         tools.parse(output, profile)
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)

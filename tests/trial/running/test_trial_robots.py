@@ -11,7 +11,7 @@ import pytest
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.core.model import Role
-from fieldkit.remote import evidence, jobs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.shell import Completed
 from fieldkit.trial import hosts
 from fieldkit.trial.running.robots import Robots
@@ -144,7 +144,7 @@ def test_no_piece_is_asked_for_after_somebody_hung_up(tmp_path: Path) -> None:
         shells[role] = Impatient(home)
         jobs.install(shells[role], Deadline.after(60))
         evidence.begin(shells[role], remote, role, "lo", need_kib=0)
-    (tmp_path / Role.SENDER / remote / "scan.bag").write_bytes(bytes(3 * evidence.PIECE_BYTES))
+    (tmp_path / Role.SENDER / remote / "scan.bag").write_bytes(bytes(3 * fetching.PIECE_BYTES))
     robots = Robots(plan, IdleTestbed(shells))
     shells[Role.SENDER].hang_up = robots.hang_up
     into = tmp_path / "into"

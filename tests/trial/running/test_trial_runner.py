@@ -121,6 +121,22 @@ def test_an_attempt_that_somebody_aborts_is_none_of_those_allowed(
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
 
 
+def test_what_to_do_about_a_step_that_failed_is_told(
+    tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures = iter([RobotError("sending began too late", remedy="a larger `idle` leaves it more time")])
+
+    def measure(*_: object) -> None:
+        for failure in failures:
+            raise failure
+
+    monkeypatch.setattr(Robots, "measure", measure)
+    run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
+    told = [(event.reason, event.remedy) for event in ended(events)]
+    assert told[0] == ("sending began too late", "a larger `idle` leaves it more time")
+    assert not any(remedy for _, remedy in told[1:])
+
+
 def test_a_step_that_fails_as_nobody_foresaw_is_told_from_an_interruption(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -100,6 +100,7 @@ def test_robots_ping_each_other_and_counters_say_so(bench: Bench) -> None:
     assert ("a", "r") not in stats.links or stats.links["a", "r"].sent == 0
     assert stats.ports["b"].written == 20
     assert stats.scheduling.startswith(("fifo", "normal"))
+    assert len([*Path(f"/proc/{medium.pid}/task").iterdir()]) == 1, "numpy's OpenBLAS has no threads there"
 
 
 def test_delay_is_met_in_both_directions_and_twice_through_the_relay(bench: Bench) -> None:

@@ -1,0 +1,97 @@
+"""A drone whose pilot can no longer write, or is no longer answered, comes down all the same."""
+
+import json
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from fieldkit.agent import flight, landing
+from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
+from fieldkit.core.deadline import Deadline
+from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
+from sim_backends.emulated.autopilot.autopilot import Autopilot
+from tests.helpers import drones
+from tests.helpers.sshd import wait_until
+
+HEIGHT_M = 0.6
+
+
+def plan(folder: Path, port: int) -> FlightPlan:
+    where, orders = f"udpout:127.0.0.1:{port}", str(folder / "orders")
+    return FlightPlan(where, orders, "land", 60.0, height_m=HEIGHT_M, ceiling_m=10.0)
+
+
+def order(folder: Path, number: int, what: str) -> None:
+    beside = folder / "orders.new"
+    beside.write_text(f"{number} {what} 60\n", encoding="ascii")
+    beside.replace(folder / "orders")
+
+
+def wait_until_up(autopilot: Autopilot) -> None:
+    wait_until(lambda: autopilot.vehicle.body.position_m[2] > 0.9 * HEIGHT_M, Deadline.after(60))
+
+
+def wait_until_down(autopilot: Autopilot) -> None:
+    wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
+    assert autopilot.vehicle.body.on_ground
+
+
+@contextmanager
+def agent(told: FlightPlan) -> Iterator["subprocess.Popen[bytes]"]:
+    words = (sys.executable, "-m", "fieldkit.agent", "fly", json.dumps(asdict(told)))
+    process = subprocess.Popen(words, stderr=subprocess.PIPE)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(60)
+
+
+def test_who_cannot_write_its_log_lands(tmp_path: Path) -> None:
+    """As on a full disk: what it says from then on is lost, and the drone is not."""
+    order(tmp_path, 1, CLIMB)
+    with drones.autopilot_at_udp() as (port, autopilot), agent(plan(tmp_path, port)) as process:
+        wait_until_up(autopilot)
+        assert process.stderr is not None
+        process.stderr.close()
+        order(tmp_path, 2, GO)
+        order(tmp_path, 3, HOME)
+        wait_until_down(autopilot)
+        assert process.wait(60) == 0
+
+
+def test_an_autopilot_that_is_silent_is_told_to_land(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may hear what it cannot answer."""
+    monkeypatch.setattr(flight, "_SILENT_S", 2.0)
+    silent, codes = threading.Event(), list[int]()
+    order(tmp_path, 1, CLIMB)
+    with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame]) as (port, autopilot):
+        told, over = plan(tmp_path, port), threading.Event()
+        pilot = threading.Thread(target=lambda: codes.append(flight.fly(told, over)))
+        pilot.start()
+        try:
+            wait_until_up(autopilot)
+            silent.set()
+            wait_until_down(autopilot)
+            silent.clear()
+        finally:
+            over.set()
+            pilot.join(60)
+    assert codes == [landing.REFUSED]
+
+
+def test_a_drone_whose_motors_stop_is_not_led_any_more(tmp_path: Path) -> None:
+    """As by a crash, or a kill switch; an ArduCopter stays in its mode."""
+    order(tmp_path, 1, CLIMB)
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), agent(plan(tmp_path, port)) as process:
+        wait_until_up(autopilot)
+        autopilot.vehicle.disarm(force=True)
+        assert process.wait(60) == landing.TAKEN
+        assert process.stderr is not None
+        assert b"its motors stand" in process.stderr.read()

@@ -1,0 +1,227 @@
+"""Readers of where robots were, how they drove and flew, and of what preflight asks for before they may."""
+
+import json
+import math
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+
+from fieldkit.config import schema
+from fieldkit.core.columns import cell
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Role
+from fieldkit.core.prompts import Question
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import drive_log, ping, reception
+from fieldkit.measure.offsets import Offset
+from fieldkit.measure.positions import accounts, recorded, where
+from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions.samples import LOCAL, WGS84, Samples
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+from fieldkit.steps.driving import DriveLease
+from fieldkit.steps.kinds import ask
+from fieldkit.steps.scene import Said
+from fieldkit.trial.check.report import Report
+from fieldkit.trial.procedure import Procedure
+from tests.fuzz.harness import Target
+from tests.helpers.casts import CAST, los_plan
+from tests.measure.evidence.test_drive_log import drive
+from tests.measure.evidence.test_reception import ROS2, log, write
+from tests.measure.positions.test_recorded import BEGAN_NS, S, fix, odometry, transform, written
+
+_ENDS: Final = (Role.SENDER, Role.RECEIVER)
+_JOB: Final = Job(folder="f", name="drive", argv=(), limit_s=1.0, log="drive.log")
+_STATUS: Final = b'{"phase": "back", "x_m": 0.1, "left_m": 1.5, "ended": "odometry was silent for 0.5 s"}'
+_ARMING: Final = (
+    b'{"what": "its battery has 10%", "remedy": "charge it", "grave": true}\n{"autopilot": "PX4", "charge": 0.1}\n',
+    b"rmw_cyclonedds_cpp\n",
+    b"HTTP/1.0 200 OK\n",
+    b"babeld\nbatman-adv\n",
+    b"5000000\n",
+)
+_NEEDY: Final = """\
+name: needy
+summary: Steps that ask robots for more than programs
+scenario: los
+topology: master
+protocols: [tcp]
+repeats: 1
+steps:
+  - record: {robot: sender, topics: [/scan], duration: 1s}
+  - fly:
+      robot: ROLE
+      height: 1m
+      during: [capture: {during: [send: {from: sender, to: receiver, size: 5MB, file: x}, {ping: PING}]}]
+  - topics: {from: sender, to: receiver, over: ros2}
+""".replace("PING", "{from: sender, to: receiver, forwarded: true}")
+_CSV: Final = b"t,x_m,y_m\n2026-11-22T12:00:00Z,0,0\n2026-11-22T12:00:02.5Z,1.5,-2\n2026-11-22T12:00:05Z,3,-2\n"
+_CSV_DEGREES: Final = b"t_ns,lat,lon,alt_m\n1795348800000000000,48.1,11.5,520\n1795348801000000000,48.2,11.6,521\n"
+_GPX: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
+<gpx version="1.1" creator="x" xmlns="http://www.topografix.com/GPX/1/1"><trk><name>walk</name><trkseg>
+<trkpt lat="48.1374" lon="11.5755"><ele>520.1</ele><time>2026-11-22T12:00:00Z</time></trkpt>
+<trkpt lat="48.1375" lon="11.5756"><time>2026-11-22T12:00:02.250Z</time></trkpt>
+<trkpt lat="48.1375" lon="11.5757"><time>2026-11-22T12:00:04.5Z</time></trkpt>
+</trkseg></trk></gpx>
+"""
+
+
+def _drove(data: bytes, place: Path) -> None:
+    (place / drive_log.FILE).write_bytes(data)
+    found = drive_log.measure(drive_log.read(place / drive_log.FILE))
+    for column in drive_log.COLUMNS:
+        assert column.problem(cell(found.values.get(column.name))) is None, column.name
+
+
+def _driver(data: bytes, _: Path) -> None:
+    lease = DriveLease(cast("Shell", None), _JOB, "{}", 1.0)
+    lease.said = data
+    assert lease.why.isprintable()
+
+
+def _answer(data: bytes, place: Path) -> None:
+    path = place / "answer-wind.txt"
+    path.write_bytes(data)
+    questions = (Question("how strong is the wind", unit="m/s"), Question("how is it", choices=("a", "b")))
+    for question in questions:
+        with suppress(EvidenceError):
+            assert ask._read(path, question).isprintable()
+
+
+@cache
+def _needy() -> Procedure:
+    """Return a procedure whose steps ask for something of robots, each kind of it at least once."""
+    drone = next(role for role, robot in CAST.items() if robot.profile.mavlink is not None)
+    return schema.validate(schema.parse(_NEEDY.replace("ROLE", drone), source="needy.yaml"), Procedure)
+
+
+def _needs(data: bytes, _: Path) -> None:
+    """Judge every answer that preflight asks a robot for by the input."""
+    asked = {"flies": True, "ros_master": CAST[Role.RELAY].address}
+    cast_of = {role: robot.model_copy(update=asked) for role, robot in CAST.items()}
+    scene = replace(los_plan().scenes()[0], cast=cast_of)
+    report, text = Report("robot"), data.decode(errors="replace")
+    for placed in _needy().walk():
+        for need in placed.step.needs(scene):
+            for code in (0, 1, Said.MISSING):
+                report.add(need.name, *need.judge(Said(text, code)))
+    assert all(one.detail.isprintable() and one.remedy.isprintable() for one in report.findings)
+
+
+def _kept(sender: Account, receiver: Account) -> bytes:
+    clocks = {Role.SENDER: Offset(0.2, 0.01), Role.RECEIVER: Offset(-0.2, 0.01)}
+    return accounts.text(Accounts({Role.SENDER: sender, Role.RECEIVER: receiver}, clocks)).encode()
+
+
+@cache
+def _tracks() -> dict[str, bytes]:
+    """Return bags that tell where a robot was, by the kind of message."""
+    made = {
+        "odometry": [odometry(BEGAN_NS + n * S, float(n), 0.0, 0.1 * n) for n in range(9)],
+        "fix": [fix(BEGAN_NS + n * S, 48 + n / 1e5, 11.0) for n in range(9)],
+        "transform": [transform(BEGAN_NS + n * S, float(n), 0.0, "base") for n in range(9)],
+    }
+    found = {}
+    for name, messages in made.items():
+        with tempfile.TemporaryDirectory() as folder:
+            found[name] = written(Path(folder), messages).read_bytes()
+    return found
+
+
+def _sound(samples: Samples) -> None:
+    assert len(samples.times_ns) == len(samples.values) > 0
+    assert (np.diff(samples.times_ns) > 0).all()
+    assert np.isfinite(samples.values[:, :2]).all()
+
+
+def _bag(data: bytes, place: Path) -> None:
+    path = place / "track.bag"
+    path.write_bytes(data)
+    for stamps in ("header", "received"):
+        account = Account(topic="/where", stamps=stamps, heading_rad=1.0, began_utc_ns=BEGAN_NS + S)
+        with suppress(EvidenceError):
+            found = recorded.read_topic(path, account)
+            _sound(found)
+            if found.yaws_rad is not None:
+                _sound(recorded.from_start(found, account))
+
+
+def _file(ending: str, data: bytes, place: Path) -> None:
+    path = place / f"walk.{ending}"
+    path.write_bytes(data)
+    _sound(recorded.read_file(path))
+
+
+def _whole(of_trial: bool, data: bytes, place: Path) -> None:
+    """Measure how far two robots were apart by a mutated account of an attempt, or of its trial."""
+    attempt = place / "repeats" / "udp-01"
+    attempt.mkdir(parents=True)
+    (attempt / "track.bag").write_bytes(_tracks()["odometry"])
+    (place / "positions-receiver.gpx").write_bytes(_GPX)
+    (place / "positions-receiver.csv").write_bytes(_CSV)
+    folder = place if of_trial else attempt
+    (folder / accounts.FILE).write_bytes(data)
+    evidence = AttemptEvidence(attempt)
+    times_ns = [BEGAN_NS + S, BEGAN_NS + 3 * S]
+    found = where.measure(evidence, ping.WAY_COLUMNS, _ENDS, times_ns)
+    assert all(math.isfinite(float(value)) for value in found.values.values())  # what is too far, gates refuse
+    where.distances_m(evidence, _ENDS)
+    where.told_of(evidence)
+    said = accounts.read(folder / accounts.FILE)
+    (place / "again.json").write_text(accounts.text(said), encoding="utf-8")
+    assert accounts.read(place / "again.json") == said
+    where.in_words(evidence)
+    assert math.isfinite(where.clock_error_s(evidence) or 0.0)
+
+
+def _accounts() -> tuple[bytes, ...]:
+    odometry_told = Account(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS + S)
+    standing = Account(place=(0.0, 0.0, 0.2))
+    degrees = Account(place=(48.1, 11.5, None), frame=WGS84)
+    metres = Account(place=(0.0, 0.0, 0.0), frame=LOCAL)
+    return (
+        _kept(standing, odometry_told),
+        _kept(degrees, Account(file="positions-receiver.gpx", offset_s=0.5)),
+        _kept(metres, Account(file="positions-receiver.csv")),
+    )
+
+
+@cache
+def _heard() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder), "", {"/scan": [BEGAN_NS + n * S for n in range(5)]})
+        return Path(folder, "scan.bag").read_bytes()
+
+
+def _received(data: bytes, place: Path) -> None:
+    """Read how soon topics were heard, by a mutated log beside a whole bag."""
+    (place / "log").write_bytes(data)
+    (place / "scan.bag").write_bytes(_heard())
+    found = reception.measure(reception.read(place, "log", "scan.bag", ["/scan"], 5.0))
+    for column in reception.COLUMNS:
+        assert column.problem(cell(found.values.get(column.name))) is None, column.name
+
+
+def _lines(lines: Iterator[dict[str, Any]]) -> bytes:
+    return "".join(f"{json.dumps(line)}\n" for line in lines).encode()
+
+
+def motion_targets() -> Iterator[Target]:
+    """Yield the targets."""
+    yield Target("drive-log", (_lines(drive(4.0, 0.5, 1.0)), _lines(drive(0.3, 0.1, 1.0))), _drove)
+    yield Target("drive-status", (_STATUS, b'{"phase": "out", "ended": ""}'), _driver)
+    yield Target("needs", _ARMING, _needs)
+    yield Target("answer", (b"3.5\n", b"-\n", b"a\n"), _answer)
+    logs = (log({"/scan": BEGAN_NS}), ROS2.format(s=BEGAN_NS // S, ns=BEGAN_NS % S))
+    yield Target("reception", tuple(one.encode() for one in logs), _received, 0.5)
+    yield Target("positions-csv", (_CSV, _CSV_DEGREES), partial(_file, "csv"))
+    yield Target("positions-gpx", (_GPX,), partial(_file, "gpx"))
+    yield Target("positions-bag", tuple(_tracks().values()), _bag, 0.3)
+    for name, of_trial in (("attempt", False), ("trial", True)):
+        yield Target(f"positions-of-{name}", _accounts(), partial(_whole, of_trial), 0.5)
