@@ -53,7 +53,7 @@ class WireTimer:
         self._planned_ns = None
         if self.due_ns is None:
             return
-        if self.due_ns > planned_ns:
+        if self.due_ns > self._wire.now_ns:
             self._plan(self.due_ns)
             return
         self.due_ns = None

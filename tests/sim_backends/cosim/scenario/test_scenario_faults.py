@@ -82,6 +82,18 @@ def test_who_is_lost_sends_and_hears_nothing_and_comes_back(run_of: RunOf) -> No
         assert 0 < recovered_s < period_s + 0.01
 
 
+@pytest.mark.parametrize("lost", ["b", "c"])
+def test_a_timer_that_was_moved_and_came_due_while_its_host_was_off_rings_when_that_is_on(
+    run_of: RunOf, lost: str
+) -> None:
+    """While they register at the master, whose connection's timers move with every answer."""
+    ros1 = {"traffic.1.protocol": "ros1", "relay": "b"}
+    _, run = run_of(f"{{kind: node-loss, agent: {lost}, from: 10ms, to: 500ms}}", ros1)
+    late = [fate for (flow, _), fate in run.fates.items() if flow == "cb/b" and fate.packet.sent_ns > 2500 * MS]
+    assert len(late) == pytest.approx(50, abs=1)
+    assert not any(fate.reason for fate in late)
+
+
 TOPIC = {"traffic.1.protocol": "topic"}
 FOUND_MS = 200
 """When publishers and subscribers have found each other."""
