@@ -7,6 +7,7 @@ The only module that imports pydantic. Profiles, procedures, site files and back
 import json
 import os
 from collections.abc import Callable, Mapping
+from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Generic, Self, TypeVar
@@ -111,7 +112,11 @@ def _written(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator:
 
 
 def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object, object]:
-    shown = PlainSerializer(lambda value: f"{value / factor:.12g}{symbol}", return_type=str)
+    def show(value: float) -> str:
+        # Quantities are written out in digits, and read so: a float's own text has an exponent below 0.0001.
+        return f"{Decimal(f'{value / factor:.12g}'):f}{symbol}"
+
+    shown = PlainSerializer(show, return_type=str)
     return _written(parse, symbol), shown, WithJsonSchema({"type": "string", "examples": [f"20{symbol}"]})
 
 

@@ -248,6 +248,20 @@ def test_text_that_looks_like_something_else_survives_being_written_and_read_aga
     assert schema.validate(schema.parse(schema.dump(written), source="x"), Text) == written
 
 
+class Quantities(schema.Strict):
+    step: schema.Duration
+    rate: schema.Bits
+    size: schema.Bytes
+
+
+@pytest.mark.parametrize("step", ["50us", "0.000000001s", "0s", "99999999999s"])
+def test_quantities_of_any_size_survive_being_written_and_read_again(step: str) -> None:
+    written = Quantities.model_validate({"step": step, "rate": "3bit/s", "size": "99GB"})
+    read = schema.validate(schema.parse(schema.dump(written), source="x"), Quantities)
+    assert read.model_dump_json() == written.model_dump_json()
+    assert read.step == pytest.approx(written.step)
+
+
 @pytest.mark.parametrize("model", [Tools, Payloads, RadioOptions, PhysicsOptions, PolicyChoice, EmulatedOptions])
 def test_defaults_are_what_an_empty_mapping_gives(model: type[Strict]) -> None:
     assert model.defaults() == model.model_validate({})
