@@ -4,6 +4,8 @@ Tables of 40 repeats each, every column filled, drawn by a fixed seed, over 160 
 started as its users start it, once per number of tables in every round, so that one sees whether cost grows linearly.
 The peer reads the fewest tables in the same round: pandas puts them together and groups them, scipy makes a bootstrap
 interval per cell and quantity. Both find the same means and medians, or the benchmark stops.
+
+`--rows N` adds one table of N repeats: the CSV that `fieldkit export` makes of a whole campaign.
 """
 
 import argparse
@@ -14,7 +16,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -27,7 +29,9 @@ from fieldkit.trial.columns import trial_columns
 
 REPEATS: Final = 40
 SENT: Final = 216
-_SENT: Final = {quantity.sent for quantity in quantities(trial_columns())}
+_COUNTED: Final = tuple(quantity for quantity in quantities(trial_columns()) if quantity.sent and quantity.arrived)
+START_NS: Final = 1_700_000_000 * 10**9
+TABLE: Final = "table.csv"
 ROOT: Final = Path(__file__).resolve().parents[1]
 
 Figures = dict[tuple[tuple[str, ...], str], tuple[float, ...]]
@@ -51,26 +55,45 @@ class Run:
 def write_tables(folder: Path, count: int) -> None:
     """Write `count` trials into a folder."""
     draw = np.random.default_rng(1)
-    columns = list(trial_columns())
-    header = ",".join(column.name for column in columns)
     for number in range(count):
-        fixed = _condition(number)
-        shares = draw.random((REPEATS, len(columns))).tolist()
-        counts = draw.binomial(SENT, 0.9, (REPEATS, len(columns))).tolist()
-        lines = [header]
-        for repeat in range(REPEATS):
-            fixed |= {"protocol": ("tcp", "udp")[repeat % 2], "repeat": str(1 + repeat // 2)}
-            fixed["status"] = "void" if shares[repeat][0] < 0.03 else "valid"
-            drawn = zip(columns, shares[repeat], counts[repeat], strict=True)
-            lines.append(",".join(fixed.get(column.name) or _drawn(column, *two) for column, *two in drawn))
-        path = folder / fixed["trial"] / "trial.csv"
+        path = folder / _condition(number)["trial"] / "trial.csv"
         path.parent.mkdir(parents=True)
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        path.write_text("".join((_header(), *_lines(draw, number))), encoding="utf-8")
+
+
+def write_table(path: Path, rows: int) -> None:
+    """Write one table of `rows` repeats."""
+    draw = np.random.default_rng(1)
+    with path.open("w", encoding="utf-8") as file:
+        file.write(_header())
+        for number in range(rows // REPEATS):
+            file.writelines(_lines(draw, number))
+
+
+def _header() -> str:
+    return ",".join(column.name for column in trial_columns()) + "\n"
+
+
+def _lines(draw: np.random.Generator, number: int) -> Iterator[str]:
+    """Yield the lines of a trial."""
+    columns = trial_columns()
+    fixed = _condition(number)
+    shares = draw.random((REPEATS, len(columns))).tolist()
+    counts = draw.binomial(SENT, 0.9, (REPEATS, len(columns))).tolist()
+    for repeat in range(REPEATS):
+        fixed |= {"protocol": ("tcp", "udp")[repeat % 2], "repeat": str(1 + repeat // 2)}
+        fixed["status"] = "void" if shares[repeat][0] < 0.03 else "valid"
+        fixed["started_utc_ns"] = str(START_NS + (number * REPEATS + repeat) * 10**10)
+        for quantity, arrived in zip(_COUNTED, counts[repeat], strict=False):
+            own = zip(quantity.columns, (f"{1 - arrived / SENT:.9g}", str(arrived), str(SENT)), strict=True)
+            fixed |= dict(own)
+        drawn = zip(columns, shares[repeat], counts[repeat], strict=True)
+        yield ",".join(fixed.get(column.name) or _drawn(column, *two) for column, *two in drawn) + "\n"
 
 
 def _drawn(column: Column, share: float, whole: int) -> str:
-    if column.unit in {"count", "B"}:
-        return str(SENT if column.name in _SENT else whole)
+    if column.type is int:
+        return str(whole)
     if column.unit == "bool":
         return "true" if share < 0.9 else "false"
     return "" if column.unit in {"text", "hash"} else f"{share:.9g}"
@@ -139,8 +162,8 @@ def check(ours: Path, theirs: Path) -> None:
         raise RuntimeError("fieldkit and pandas found different figures")
 
 
-def rounds(base: Path, counts: Sequence[int], number: int) -> dict[str, list[Run]]:
-    """Return the runs of each round, by program and number of tables."""
+def rounds(base: Path, counts: Sequence[int], number: int, rows: int) -> dict[str, list[Run]]:
+    """Return the runs of each round, by program and number of tables; `rows` as `--rows`."""
     found: dict[str, list[Run]] = {}
     for _ in range(number):
         for count in counts:
@@ -150,6 +173,9 @@ def rounds(base: Path, counts: Sequence[int], number: int) -> dict[str, list[Run
         done = by_pandas(base / str(fewest), base / "pandas.json")
         found.setdefault(f"pandas and scipy, {fewest:,} tables", []).append(done)
         check(base / f"{fewest}.json", base / "pandas.json")
+        if rows:
+            done = by_fieldkit(base / TABLE, base / "table.json")
+            found.setdefault(f"fieldkit, one table of {rows:,} rows", []).append(done)
     return found
 
 
@@ -160,7 +186,8 @@ def show(found: Mapping[str, Sequence[Run]]) -> None:
     for name, runs in found.items():
         walls = [one.wall_s for one in runs]
         wall = statistics.median(walls)
-        repeats = REPEATS * int(name.split()[-2].replace(",", ""))
+        number, unit = name.split()[-2:]
+        repeats = int(number.replace(",", "")) * (1 if unit == "rows" else REPEATS)
         processor = statistics.median(one.processor_s for one in runs)
         spread = f"{wall:.2f} ({min(walls):.2f} to {max(walls):.2f})"
         peak_mb = max(one.peak_mb for one in runs)
@@ -172,14 +199,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--tables", type=int, nargs="+", default=[1_000, 3_000, 10_000])
+    parser.add_argument("--rows", type=int, default=0, metavar="N")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     os.chdir(ROOT)
     with tempfile.TemporaryDirectory(prefix="fieldkit-bench-") as name:
         for count in arguments.tables:
             write_tables(Path(name) / str(count), count)
+        if arguments.rows:
+            write_table(Path(name) / TABLE, arguments.rows)
         load = os.getloadavg()[0]
-        found = rounds(Path(name), arguments.tables, arguments.rounds)
+        found = rounds(Path(name), arguments.tables, arguments.rounds, arguments.rows)
     if arguments.json:
         print(json.dumps({"load": load, "runs": {name: [vars(one) for one in runs] for name, runs in found.items()}}))
         return

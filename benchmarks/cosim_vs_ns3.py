@@ -49,10 +49,11 @@ or so many were made."""
 RATE_MBIT_S: Final = 2.0
 PAYLOAD_BYTES: Final = 1000
 MESSAGE_BYTES: Final = 14480
+SEGMENT_BYTES: Final = TcpOptions().segment_bytes
 HEIGHT_M: Final = 1.0
-Control = Literal["newreno", "cubic"]
-CONTROLS: Final[dict[Control, str]] = {"newreno": "TcpLinuxReno", "cubic": "TcpCubic"}
-"""What ns-3 calls them."""
+Control = Literal["newreno", "cubic-rfc9438"]
+CONTROLS: Final[dict[Control, str]] = {"newreno": "TcpLinuxReno", "cubic-rfc9438": "TcpCubic"}
+"""Congestion controls of `Control`, and their names in ns-3."""
 Peer = Literal["802.11g", "802.11a", "mended", "ours"]
 PEERS: Final[tuple[Peer, ...]] = ("802.11g", "802.11a", "mended", "ours")
 """Three of ns-3, and ours."""
@@ -139,14 +140,14 @@ class Link:
         arrivals, _ = network.advance(round((SECONDS + 5) * 1e9), packets, self._states)
         return len(arrivals) * PAYLOAD_BYTES * 8 / SECONDS / 1e6, 1 - len(arrivals) / len(packets)
 
-    def tcp(self, options: TcpOptions, seconds: float = SECONDS) -> tuple[float, Trace]:
+    def tcp(self, control: Control, seconds: float = SECONDS) -> tuple[float, Trace]:
         """Return goodput in Mbit/s of a stream that never ends, and its congestion window."""
         trace: Trace = []
 
         def note(sample: TcpSample) -> None:
-            trace.append((sample.at_ns / 1e9, sample.window_bytes / options.segment_bytes))
+            trace.append((sample.at_ns / 1e9, sample.window_bytes / SEGMENT_BYTES))
 
-        make = partial(Tcp, options=options, log=note)
+        make = partial(Tcp, options=TcpOptions(congestion=control), log=note)
         network = RadioNetwork(self._radio, "ab", transports={"tcp": make})
         count = round(seconds * 54e6 / 8 / MESSAGE_BYTES)
         packets = [self._packet(number, MESSAGE_BYTES, "tcp", 0) for number in range(count)]
@@ -174,11 +175,11 @@ class Ns3Link:
         goodput, lost = self._run(what="udp", rate=RATE_MBIT_S, payload=PAYLOAD_BYTES, seconds=SECONDS).split()
         return float(goodput), float(lost)
 
-    def tcp(self, options: TcpOptions, seconds: float = SECONDS) -> tuple[float, Trace]:
+    def tcp(self, control: Control, seconds: float = SECONDS) -> tuple[float, Trace]:
         """See `Link.tcp`."""
-        control = self._control.format(CONTROLS[options.congestion])
-        lines = self._run(what="tcp", control=control, seconds=seconds).splitlines()
-        trace = [(int(at) / 1e9, int(window) / options.segment_bytes) for at, _, window in map(str.split, lines[:-1])]
+        name = self._control.format(CONTROLS[control])
+        lines = self._run(what="tcp", control=name, seconds=seconds).splitlines()
+        trace = [(int(at) / 1e9, int(window) / SEGMENT_BYTES) for at, _, window in map(str.split, lines[:-1])]
         return float(lines[-1].split()[0]), trace
 
 
@@ -188,10 +189,7 @@ def once(ns3: Ns3, cell: Cell, run: int) -> list[list[float]]:
     def link(peer: Peer) -> Link | Ns3Link:
         return Link(cell, run) if peer == "ours" else Ns3Link(ns3, cell, run, peer)
 
-    return [
-        [*(link(peer).tcp(TcpOptions(congestion=control))[0] for control in CONTROLS), link(peer).udp()[1]]
-        for peer in PEERS
-    ]
+    return [[*(link(peer).tcp(control, SECONDS)[0] for control in CONTROLS), link(peer).udp()[1]] for peer in PEERS]
 
 
 def measured(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
@@ -235,9 +233,8 @@ def traces(ns3: Ns3) -> dict[Control, tuple[Trace, Trace]]:
     found: dict[Control, tuple[Trace, Trace]] = {}
     cell = Cell("g54", wall=False, distance_m=20)
     for control in CONTROLS:
-        options = TcpOptions(congestion=control)
         links = Ns3Link(ns3, cell, 1, "802.11g"), Link(cell, 1)
-        theirs, ours = (link.tcp(options, TRACE_S)[1] for link in links)
+        theirs, ours = (link.tcp(control, TRACE_S)[1] for link in links)
         found[control] = theirs, ours
     return found
 

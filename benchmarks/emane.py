@@ -1,7 +1,7 @@
 """The paper's EMANE experiment in a lab: `python -m benchmarks.emane [--rounds 3] [--json]`, as root.
 
 Ten robots; 100 pings of 64 bytes from the first to the tenth, before and after the tenth moves by 100 m in each axis.
-Per radio and round the lab is a new one, brought up by the commands of docs/emane.md. 64 bytes are what ping prints:
+Each radio and round has a new lab, started by the commands of docs/studies/emane.md. 64 bytes are what ping prints:
 56 of payload and 8 of ICMP header, 84 with the IP header. All times are round trips in ms; loss is in percent.
 """
 

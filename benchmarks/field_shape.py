@@ -2,7 +2,7 @@
 
 Four campaigns (benchmarks/lawn/: two topologies, with line of sight and behind the wall) run beside each other, for a
 repeat mostly waits; 640 repeats take 21 to 25 minutes. Stop it whenever you like: the same command goes on where it
-stopped. Then it prints the table of docs/field-shape.md and draws its two figures.
+stopped. Then it prints the table of docs/studies/field-shape.md and draws its two figures.
 """
 
 import argparse

@@ -42,9 +42,9 @@ def radio(delay: str) -> RadioOptions:
 
 
 @contextmanager
-def medium_path(options: RadioOptions) -> Iterator[tuple[Namespace, Namespace]]:
+def medium_path(options: RadioOptions, seed: int = 1) -> Iterator[tuple[Namespace, Namespace]]:
     """Yield two namespaces 9 m apart on a medium with `options`; the second has the address 10.9.0.2."""
-    with Namespace() as near, Namespace() as far, MediumClient(options, seed=1) as medium:
+    with Namespace() as near, Namespace() as far, MediumClient(options, seed=seed) as medium:
         for name, namespace, address in (("near", near, "10.9.0.1/24"), ("far", far, "10.9.0.2/24")):
             fd = namespace.tun("wlan0", address)
             medium.attach(name, address, RADIO, fd)

@@ -2,7 +2,7 @@
 
 Trials of four layouts and two hello intervals on emulated robots without fading, of five repeats each, run one after
 the other where FOLDER has none yet; 2 hours in all. Then a table of `rtt_gap_s`, with the bound of 13.7 hello
-intervals (docs/mesh.md), and a figure. Of the row, which has no other way, it is the time after the robot was back.
+intervals (docs/studies/mesh.md), and a figure. The row has no other path: its time is from when the robot was back.
 """
 
 import argparse
@@ -76,12 +76,12 @@ LAYOUTS: Final = {
 }
 
 
-def gaps_s(out: Path, name: str, hello_s: int) -> list[float]:
+def gaps_s(out: Path, name: str, hello_s: int, repeats: int) -> list[float]:
     """Return the gap of each valid repeat of a layout; the trial is run first where there is none."""
     layout, lab = LAYOUTS[name], out / f"{name}-{hello_s}s"
     if not (lab / "trials").exists():
         _make_lab(lab, layout, hello_s)
-        trial = ("trial", layout.procedure, layout.distance, "--repeats", "5")
+        trial = ("trial", layout.procedure, layout.distance, "--repeats", str(repeats))
         subprocess.run((sys.executable, "-m", "fieldkit", *trial), cwd=lab, check=True)
     rows = fieldkit.load(lab / "trials").repeats.to_pylist()
     return [row["rtt_gap_s"] - layout.away_s for row in rows if row["status"] == "valid"]
@@ -128,9 +128,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the labs and their trials")
     parser.add_argument("--figure", type=Path, help="SVG file to draw")
+    parser.add_argument("--repeats", type=int, default=5, help="of each trial (default: 5)")
     options = parser.parse_args()
     load_before = os.getloadavg()[0]
-    found = {(name, hello_s): gaps_s(options.out, name, hello_s) for name in LAYOUTS for hello_s in HELLOS_S}
+    found = {
+        (name, hello_s): gaps_s(options.out, name, hello_s, options.repeats)
+        for name in LAYOUTS
+        for hello_s in HELLOS_S
+    }
     print(table(found))
     print(f"load {load_before:.1f} before, {os.getloadavg()[0]:.1f} after")
     if options.figure:

@@ -1,12 +1,17 @@
-"""Which middleware on a lossy radio: `python -m benchmarks.middleware [--figures docs] [--page docs/middleware.md]`.
+"""Which middleware on a lossy radio: `python -m benchmarks.middleware [--figures docs/studies] [--page PAGE]`.
 
 As root. Six campaigns of benchmarks/middleware/ run beside each other, for a repeat mostly waits; `--only` takes some
-of them, `--full` those that last hours. Stop it whenever you like: the same command goes on where it stopped. Then it
-prints the tables of docs/middleware.md, or puts them there, and draws its figures.
+of them, `--full` those that last hours. Stop it at any time: the same command continues where it stopped. Then it
+prints the tables of docs/studies/middleware.md, or writes them into PAGE, and draws its figures.
+
+Two repeats, as the campaigns have, show large differences only. On a quiet machine `--repeats 12` measures each place
+twelve times, in about two and a half hours. Then the repeat is the unit of the intervals.
+`--from-page docs/studies/middleware.md --figures docs/studies` draws the figures from the tables of the page alone.
 """
 
 import argparse
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+from benchmarks import middleware_page
 from benchmarks.middleware_cells import BYTES, CAMPAIGNS, MiddlewareCell, MiddlewareFindings, read
 from fieldkit.core import files
 from fieldkit.report import figures
@@ -39,21 +45,41 @@ STYLES: Final[dict[str, Style]] = {
     "ROS 1": Style("green", "^"),
     "ROS 1, tuned": Style("green", "^", "dashed"),
 }
-KINDS: Final = {"best effort": "best effort (Zenoh by UDP)", "reliable": "reliable (Zenoh, ROS 1 by TCP)"}
+KINDS: Final = {"best effort": "best effort", "reliable": "reliable"}
 SIZES: Final = {100: "100 B", 1_000: "1 kB", 10_000: "10 kB", 100_000: "100 kB", 1_000_000: "1 MB"}
-DODGE_M: Final = 0.7
+DODGE_M: Final = 1.1
 """Between series at one distance, so that none hides another."""
-AROUND_M: Final = 6.0
+AROUND_M: Final = 7.0
+ROBOTS_DODGE: Final = 0.06
+"""Between series at one number of robots."""
 
 
-def lab(folder: Path) -> None:
-    """Put the lab's files into a folder where it lacks them: a campaign that was begun there keeps its own."""
+def lab(folder: Path, repeats: int | None = None) -> None:
+    """Put the lab's files into a folder where it lacks them: a campaign that was begun there keeps its own.
+
+    Args:
+        folder: Where to.
+        repeats: How often each place is measured in campaigns of their own; None for what the files say.
+    """
     robots = folder / "robots"
     robots.mkdir(parents=True, exist_ok=True)
     for source in LAB.glob("*.yaml"):
         if not (folder / source.name).exists():
             shutil.copy(source, folder)
+        if (
+            repeats
+            and source.stem in CAMPAIGNS
+            and not (made := folder / f"{called(source.stem, repeats)}.yaml").exists()
+        ):
+            text = source.read_text(encoding="utf-8")
+            text = re.sub(r"(?m)^name: .*$", f"name: {called(source.stem, repeats)}", text)
+            made.write_text(re.sub(r"(?m)^repeats: .*$", f"repeats: {repeats}", text), encoding="utf-8")
     (robots / "ros2_burger.yaml").write_text(ros2_robot(), encoding="utf-8")
+
+
+def called(campaign: str, repeats: int | None) -> str:
+    """Return the name of a campaign with its own number of repeats: `dds-12`."""
+    return f"{campaign}-{repeats}" if repeats else campaign
 
 
 def ros2_robot() -> str:
@@ -93,13 +119,13 @@ def by_distance(found: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> C
     ends = [one.distance_m for one in two] or [0.0]
     panels = []
     for size in BYTES:
-        for kind, called in KINDS.items():
+        for kind, how in KINDS.items():
             series = []
             for rank, label in enumerate(STYLES):
                 mine = [one for one in two if (one.kind, one.who, one.size_bytes) == (kind, label, size)]
                 shift_m = (rank - (len(STYLES) - 1) / 2) * DODGE_M
-                series.append(_series(label, [(one.distance_m + shift_m, drawn.value(one)) for one in mine]))
-            panel = drawn.panel(f"{SIZES[size]}, {called}", "distance (m)", series)
+                series.append(_series(label, [(one.distance_m + shift_m, one) for one in mine], drawn))
+            panel = drawn.panel(f"{SIZES[size]}, {how}{_counted(two, size)}", "distance (m)", series)
             panels.append(replace(panel, left=min(ends) - AROUND_M, right=max(ends) + AROUND_M))
     return Chart(name=name, title=name, caption="", panels=panels)
 
@@ -113,17 +139,39 @@ def by_robots(found: MiddlewareFindings) -> Chart:
                 mine = [one for one in _beside(found, metres) if one.size_bytes == size]
                 numbers = sorted({one.robots for one in mine})
                 series = [
-                    _series(label, sorted((one.robots, drawn.value(one)) for one in mine if one.who == label))
-                    for label in STYLES
+                    _series(
+                        label, [(one.robots + ROBOTS_DODGE * rank, one) for one in mine if one.who == label], drawn
+                    )
+                    for rank, label in enumerate(STYLES)
                 ]
                 panel = drawn.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
                 panels.append(replace(panel, x_ticks=[(number, str(number)) for number in numbers]))
     return Chart(name="middleware-robots", title="", caption="", panels=panels)
 
 
-def _series(label: str, points: Sequence[tuple[float, float | None]]) -> Series:
-    there = [(x, y) for x, y in points if y is not None]
-    return Series(label, STYLES[label], [x for x, _ in there], [y for _, y in there])
+def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn: "DrawnFigure") -> Series:
+    """Return the points of a middleware with their intervals; no line joins them, for these are too wide."""
+    known = sorted(((x, cell) for x, cell in points if drawn.value(cell) is not None), key=lambda pair: pair[0])
+    ends = [drawn.interval(cell) for _, cell in known]
+    return Series(
+        label,
+        STYLES[label],
+        [x for x, _ in known],
+        [drawn.value(cell) or 0.0 for _, cell in known],
+        low=[low for low, _ in ends],
+        high=[high for _, high in ends],
+        join="none",
+    )
+
+
+def _counted(cells: Sequence[MiddlewareCell], size: int) -> str:
+    """Return of how many samples and repeats each point of a size is: `, n = 80 (2 repeats)`."""
+    counts = sorted({(cell.samples, cell.repeats) for cell in cells if cell.size_bytes == size})
+    if not counts or not counts[-1][0]:
+        return ""
+    least, most = counts[0], counts[-1]
+    number = f"{least[0]}-{most[0]}" if least[0] != most[0] else str(most[0])
+    return f", n = {number} ({most[1]} repeats)"
 
 
 def _beside(found: MiddlewareFindings, distance_m: float) -> list[MiddlewareCell]:
@@ -137,6 +185,15 @@ def _lost(cell: MiddlewareCell) -> float | None:
     return None if cell.loss is None else 100 * cell.loss
 
 
+def _lost_interval(cell: MiddlewareCell) -> tuple[float | None, float | None]:
+    low, high = (None if end is None else 100 * end for end in (cell.loss_low, cell.loss_high))
+    return low, high
+
+
+def _no_interval(_cell: MiddlewareCell) -> tuple[None, None]:
+    return None, None
+
+
 def _late(cell: MiddlewareCell) -> float | None:
     return None if cell.delay_p95_s is None else 1e3 * cell.delay_p95_s
 
@@ -148,6 +205,7 @@ class DrawnFigure:
     Attributes:
         y_label: Its name and unit.
         value: Takes it of a cell.
+        interval: Takes its 95 % interval, if there is one.
         bottom: Lower end of its axis.
         top: Upper end.
         log: Whether that is logarithmic.
@@ -155,6 +213,7 @@ class DrawnFigure:
 
     y_label: str
     value: Callable[[MiddlewareCell], float | None]
+    interval: Callable[[MiddlewareCell], tuple[float | None, float | None]]
     bottom: float
     top: float
     log: bool = False
@@ -164,15 +223,23 @@ class DrawnFigure:
         return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
 
 
-LOST: Final = DrawnFigure("samples lost (%)", _lost, 0.0, 100.0)
-LATE: Final = DrawnFigure("delay, 95 % (ms)", _late, 1.0, 10_000.0, log=True)
+LOST: Final = DrawnFigure("samples lost (%)", _lost, _lost_interval, 0.0, 100.0)
+LATE: Final = DrawnFigure("delay, 95 % (ms)", _late, _no_interval, 1.0, 10_000.0, log=True)
+
+
+BIMODAL: Final = " *"
+BIMODAL_NOTE: Final = (
+    "`*`: not a rate. The loss is bimodal, a repeat loses few or nearly all "
+    "([every repeat](middleware-link.md#images-over-zenoh-every-repeat))."
+)
 
 
 def tables(found: MiddlewareFindings, conditions: str) -> Iterator[str]:
-    """Yield the lines that stand in docs/middleware.md."""
+    """Yield the lines that stand in docs/studies/middleware.md."""
     yield conditions
     yield ""
     yield "Two robots: samples lost, and the delay that 95 % of the others keep; - where the clocks do not tell it."
+    yield BIMODAL_NOTE
     yield ""
     two = [one for one in found.cells if one.robots == 2]
     yield from _table(two, "distance_m", lambda metres: f"{metres:g} m", _loss_and_delay)
@@ -207,7 +274,8 @@ def _loss_and_delay(cell: MiddlewareCell) -> str:
     lost, late = _lost(cell), _late(cell)
     if lost is None:
         return "not found"
-    return f"{lost:.1f} %, " + ("-" if late is None else f"{late:.0f} ms")
+    is_bimodal = (cell.who, cell.kind) == ("Zenoh", "reliable") and cell.size_bytes >= middleware_page.IMAGE_BYTES
+    return f"{lost:.1f} %, " + ("-" if late is None else f"{late:.0f} ms") + BIMODAL * is_bimodal
 
 
 def _beside_expected(cell: MiddlewareCell) -> str:
@@ -232,15 +300,21 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("middleware"), help="folder of the lab and its trials")
     parser.add_argument("--figures", type=Path, help="write middleware-loss, -delay and -robots.svg there")
     parser.add_argument("--page", type=Path, help="put the tables into this page")
-    parser.add_argument("--full", action="store_true", help="the campaigns that take hours")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--full", action="store_true", help="the campaigns that take hours")
+    size.add_argument("--repeats", type=int, help="how often each place is measured, in campaigns of their own")
     parser.add_argument("--only", nargs="+", choices=CAMPAIGNS, default=CAMPAIGNS, help="run these; all are read")
     parser.add_argument("--no-run", action="store_true", help="read what is there")
+    parser.add_argument("--from-page", type=Path, help="draw the figures from the tables of this page, run nothing")
     options = parser.parse_args()
+    if options.from_page:
+        draw(MiddlewareFindings(middleware_page.cells(options.from_page), "", 0.0, 0.0), options.figures)
+        return
     prefix = "full-" if options.full else ""
-    names = [f"{prefix}{one}" for one in CAMPAIGNS]
+    names = [f"{prefix}{called(one, options.repeats)}" for one in CAMPAIGNS]
     if not options.no_run:
-        lab(options.out)
-        run(options.out, [f"{prefix}{one}" for one in options.only])
+        lab(options.out, options.repeats)
+        run(options.out, [f"{prefix}{called(one, options.repeats)}" for one in options.only])
     found = read(options.out, names)
     conditions = (
         f"{time.strftime('%Y-%m-%d', time.gmtime(found.ended_s))}: {found.ended}; packets handed over late by up to "
@@ -252,12 +326,17 @@ def main() -> None:
     else:
         print("\n".join(lines))
     if options.figures:
-        for chart in (
-            by_distance(found, "middleware-loss", LOST),
-            by_distance(found, "middleware-delay", LATE),
-            by_robots(found),
-        ):
-            files.write(options.figures / f"{chart.name}.svg", figures.paper(chart, "svg"))
+        draw(found, options.figures)
+
+
+def draw(found: MiddlewareFindings, folder: Path) -> None:
+    """Write the figures of docs/studies/middleware.md into a folder."""
+    for chart in (
+        by_distance(found, "middleware-loss", LOST),
+        by_distance(found, "middleware-delay", LATE),
+        by_robots(found),
+    ):
+        files.write(folder / f"{chart.name}.svg", figures.paper(chart, "svg"))
 
 
 if __name__ == "__main__":

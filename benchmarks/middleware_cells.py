@@ -2,12 +2,15 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
+import numpy as np
+
 import fieldkit
+from fieldkit.analysis.statistics import shares
 
 CAMPAIGNS: Final = ("dds", "zenoh", "ros1", "robots", "ros2", "ros2-robots")
 BYTES: Final = (100, 1_000, 10_000, 100_000, 1_000_000)
@@ -36,6 +39,10 @@ class MiddlewareCell:
         delay_p95_s: Median over repeats of the 95th percentile of the delay; None where the clocks do not tell.
         expected_loss: What that loss were if each packet were lost by itself, with the share of packets that was;
             None where samples do not go in packets of UDP.
+        loss_low: Lower end of the 95 % interval of the loss, over repeats; None without one.
+        loss_high: Upper end.
+        samples: How many samples the loss is of.
+        repeats: Of how many repeats.
     """
 
     who: str
@@ -46,6 +53,10 @@ class MiddlewareCell:
     loss: float | None
     delay_p95_s: float | None
     expected_loss: float | None = None
+    loss_low: float | None = None
+    loss_high: float | None = None
+    samples: int = 0
+    repeats: int = 0
 
 
 @dataclass(frozen=True)
@@ -79,8 +90,13 @@ def read(folder: Path, names: Sequence[str]) -> MiddlewareFindings:
     statuses = [row["status"] for row in every]
     ended = ", ".join(f"{statuses.count(one)} repeats {one}" for one in sorted(set(statuses), reverse=True))
     late_s = max((row["emulator_late_max_s"] or 0.0 for some in valid.values() for row in some), default=0.0)
-    cells = [cell for name, some in valid.items() for cell in _cells(name.removeprefix("full-"), some)]
+    cells = [cell for name, some in valid.items() for cell in _cells(_kind(name), some)]
     return MiddlewareFindings(cells, ended or "nothing", newest_s, late_s)
+
+
+def _kind(name: str) -> str:
+    """Return which of `CAMPAIGNS` a campaign is: `dds` of `full-dds` and `dds-12`."""
+    return re.sub(r"-[0-9]+$", "", name.removeprefix("full-"))
 
 
 def _cells(campaign: str, rows: Sequence[Row]) -> Iterator[MiddlewareCell]:
@@ -91,23 +107,42 @@ def _cells(campaign: str, rows: Sequence[Row]) -> Iterator[MiddlewareCell]:
             if campaign.endswith("robots") and (one := _SHARED.fullmatch(stream)):
                 together = [name for name in streams if re.fullmatch(rf"{stream}(_[0-9])?", name)]
                 who, size, robots = _NAMES[one["over"]], int(one["bytes"]), int(one["robots"])
-                yield MiddlewareCell(
+                cell = MiddlewareCell(
                     who, "reliable", size, metres, robots, _loss(here, together), _delay_s(here, stream)
                 )
+                yield _with_interval(cell, here, together)
             elif one := _STREAM.fullmatch(stream):
                 who = _NAMES[campaign] + (", tuned" if one["settings"] == "tuned" else "")
                 kind = "best effort" if one["kind"] in _BEST_EFFORT else "reliable"
                 expected = _expected(here, stream) if kind == "best effort" else None
                 loss, delay_s = _loss(here, [stream]), _delay_s(here, stream)
-                yield MiddlewareCell(who, kind, int(one["bytes"]), metres, 2, loss, delay_s, expected)
+                cell = MiddlewareCell(who, kind, int(one["bytes"]), metres, 2, loss, delay_s, expected)
+                yield _with_interval(cell, here, [stream])
 
 
 def _loss(rows: Sequence[Row], streams: Sequence[str]) -> float | None:
+    wanted, received = (sum(counts) for counts in _counts(rows, streams))
+    return 1 - received / wanted if wanted else None
+
+
+def _counts(rows: Sequence[Row], streams: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Return per repeat how many samples there were to be, and how many arrived."""
     wanted, received = (
-        sum(row[f"{one}.topic_{name}"] or 0 for row in rows for one in streams for name in names)
+        [sum(row[f"{one}.topic_{name}"] or 0 for one in streams for name in names) for row in rows]
         for names in (("sent", "refused", "skipped"), ("received",))
     )
-    return 1 - received / wanted if wanted else None
+    return wanted, received
+
+
+def _with_interval(cell: MiddlewareCell, rows: Sequence[Row], streams: Sequence[str]) -> MiddlewareCell:
+    """Return a cell with the interval of its loss, the repeat being the independent unit."""
+    counts = [pair for pair in zip(*_counts(rows, streams), strict=True) if pair[0]]
+    if len(counts) < 2:
+        return replace(cell, samples=sum(wanted for wanted, _ in counts), repeats=len(counts))
+    wanted, received = (np.array([column], dtype=np.float64) for column in zip(*counts, strict=True))
+    found = shares(wanted - received, wanted)
+    low, high = float(found.low[0]), float(found.high[0])
+    return replace(cell, loss_low=low, loss_high=high, samples=int(wanted.sum()), repeats=len(counts))
 
 
 def _delay_s(rows: Sequence[Row], stream: str) -> float | None:

@@ -8,7 +8,8 @@ the paper's counts. The peers, dpkt, tshark and scapy, count lost packets only. 
 first packets; tshark is left out where it is not installed. Time is that of the processor, children included, so that
 a busy machine disturbs it less.
 
-At the end fieldkit streams a sparse file of 10 GB in a process of its own, whose peak memory is printed.
+At the end fieldkit streams a sparse file of 10 GB in a process of its own, whose peak memory is printed. With
+`--whole MIB` it also reads a capture of this size into columns, as a trial does, in another process.
 """
 
 import argparse
@@ -56,6 +57,11 @@ before = peak_kb()
 print(json.dumps([sum(len(one.packets) for one in pcap.stream(pathlib.Path(sys.argv[1]))), before, peak_kb()]))
 """
 """Prints how many packets a file has, and this process's peak memory before and after reading them."""
+
+READ: Final = STREAM.replace("sum(len(one.packets) for one in pcap.stream(", "len(pcap.read(").replace(
+    "sys.argv[1])))", "sys.argv[1])).packets)"
+)
+"""The same, all packets kept as columns."""
 
 Peer = Callable[[Path, Path], int]
 Key = tuple[int, int]
@@ -191,6 +197,29 @@ def big_file(folder: Path) -> dict[str, float]:
     return {"file_gb": size / 1e9, "seconds": taken, "rss_before_mb": before / 1e3, "peak_rss_mb": peak / 1e3}
 
 
+def whole_file(folder: Path, mib: int) -> dict[str, float]:
+    """Return what it takes to read a capture of `mib` MiB into columns."""
+    path = folder / "whole.pcap"
+    part, written = list(islice(fragments(), 60_000)), 0
+    with path.open("wb") as file:
+        file.write(FILE_HEADER)
+        while file.tell() < mib << 20:
+            file.writelines(record(written + index, frame, 1514) for index, frame in enumerate(part))
+            written += len(part)
+    argv = [sys.executable, "-c", READ, str(path)]
+    count, before, peak = json.loads(subprocess.run(argv, capture_output=True, text=True, check=True).stdout)
+    if count != written:
+        raise RuntimeError(f"{path} has {written} packets, {count} were read")
+    size = path.stat().st_size
+    path.unlink()
+    return {
+        "whole_mib": size / 2**20,
+        "packets": count,
+        "rss_before_mib": before / 2**10,
+        "peak_rss_mib": peak / 2**10,
+    }
+
+
 def processor_s() -> float:
     """Return the seconds of processor time that this process and its ended children took."""
     return sum(
@@ -224,12 +253,15 @@ def main() -> None:
     """Run the rounds and print a table, or JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--whole", type=int, default=0, metavar="MIB")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as name:
         found = rates(Path(name), arguments.rounds)
         big = big_file(Path(name))
+        if arguments.whole:
+            big |= whole_file(Path(name), arguments.whole)
     if arguments.json:
         print(json.dumps({"load": load, "packets_s": found, "big": big}))
         return

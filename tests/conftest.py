@@ -9,7 +9,8 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from fieldkit.bags import contents
-from fieldkit.measure.evidence import bag, tlog
+from fieldkit.measure.evidence import bag
+from fieldkit.measure.motion import tlog
 from fieldkit.measure.positions import recorded
 from tests.helpers.sshd import server
 
@@ -31,9 +32,11 @@ _LONG: Final = (
     "test_chaos",
     "test_tool_variants",
     "test_hanging_tools",
+    "test_fly_repeats",
     "test_trial_resumed",
     "test_trial_emulated",
     "test_docs",
+    "test_smallest_emulated",
     "test_known_loss_udp",
     "test_selfheal",
     "test_master_loss",

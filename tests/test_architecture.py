@@ -56,7 +56,15 @@ MAY_IMPORT = {
 }
 # Measuring and computing must not even know how a file of a lab is read.
 LEAVES = {
-    room: {"core.model", "core.units", "core.errors", "core.columns", "core.lazy", "core.text"}
+    room: {
+        "core.model",
+        "core.units",
+        "core.errors",
+        "core.columns",
+        "core.text",
+        "core.crosschecks",
+        "core.laptop_files",
+    }
     for room in ("analysis", "measure")
 }
 
@@ -68,8 +76,8 @@ MOST_MODULES = 28
 WALK = ROOT / "docs" / "walk.md"
 """The first page for who is new."""
 
-TESTS_APART = {"data", "e2e", "fuzz", "helpers"}
-"""Folders of tests that are about no room: real outputs, whole runs, hostile inputs, and what tests share."""
+TESTS_APART = {"benchmarks", "data", "e2e", "fuzz", "helpers"}
+"""Folders of tests of no shipped package: benchmarks, real outputs, whole runs, hostile inputs, shared helpers."""
 
 ONE_IMPORTER = {
     "yaml": "fieldkit/config/documents.py",
@@ -81,18 +89,18 @@ ONE_IMPORTER = {
     # Trials' messages, those of recordings of the co-simulation, and what is left of bags that are cut off.
     "mcap": "fieldkit/bags/salvage.py fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
     # Trials and simulations draw different things; what they look like is `report.theme`'s.
-    "matplotlib": "fieldkit/report/figures.py sim_backends/cosim/plots.py",
+    "matplotlib": "fieldkit/report/drawing.py fieldkit/report/figures.py sim_backends/cosim/plots.py",
     "jinja2": "fieldkit/report/page.py",
     "gpxpy": "fieldkit/measure/positions/gpx_reader.py",
     "jmespath": "fieldkit/measure/evidence/printed.py",
     "re2": "fieldkit/measure/evidence/printed.py",
-    "paramiko": "fieldkit/remote/ssh_library.py",
-    "ruamel": "fieldkit/config/documents.py",
+    # Connections, and the formats of keys.
+    "paramiko": "fieldkit/remote/keys.py fieldkit/remote/link.py",
     "keyring": "fieldkit/remote/passwords.py",
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # What the drone says, and, in a process of its own, what a log of it holds.
-    "pymavlink": "fieldkit/measure/evidence/tlog_reader.py sim_backends/emulated/autopilot/mavlink.py",
+    "pymavlink": "fieldkit/measure/motion/tlog_reader.py sim_backends/emulated/autopilot/mavlink.py",
     "lz4": "fieldkit/bags/salvage.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",
@@ -153,7 +161,7 @@ def test_imports_point_one_way(path: Path) -> None:
 
 # A command that a package adds declares, shows and draws as fieldkit's own do (docs/add-a-command.md).
 COMMAND_SEAMS = (
-    "fieldkit.cli.arguments.shared",
+    "fieldkit.cli.shared_arguments",
     "fieldkit.cli.display",
     "fieldkit.cli.parser",
     "fieldkit.report.theme",
@@ -278,7 +286,7 @@ def test_pages_for_contributors_name_files_that_are_there(page: Path) -> None:
 
 
 def test_the_walk_names_each_question_that_a_step_is_asked() -> None:
-    asked = {name for name, what in vars(Step).items() if isfunction(what)} - {"own_name"}
+    asked = {name for name, what in vars(Step).items() if isfunction(what)} - {"own_name", "kind_name"}
     rows = WALK.read_text(encoding="utf-8").split("| asked by | question |")[1]
     assert {name for name in in_quotes(rows) if name.isidentifier()} == {
         name for name in asked if not name.startswith("_")

@@ -1,4 +1,4 @@
-"""The program on a robot: `agent.pyz publish|subscribe|mavlink|drive|route|fly|arming`, told what to do as JSON.
+"""The program on a robot: `agent.pyz VERB JSON [LOG]`; the JSON says what to do, and `_USAGE` lists the verbs.
 
 Arguments: the verb, the JSON, and for all but a router, a flight and its checks a log. It says `up` on standard error
 when it is, and ends well on SIGINT and SIGTERM.
@@ -21,9 +21,28 @@ from fieldkit.agent.middleware import MiddlewareError, Network, Topic
 from fieldkit.agent.records import Log, LogError
 from fieldkit.agent.stream import Stream
 
-_USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route|fly|arming JSON"
+_USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route|fly|arming|survey|link JSON"
 
 Told = Mapping[str, Any]
+
+
+class EndRequest(threading.Event):
+    """Asks the program to end; a signal handler's request is visible before the next statement of the main thread.
+
+    A program that was suspended (SIGSTOP) when the signal came sees it before it sends anything.
+    """
+
+    _signalled = False
+
+    def from_signal(self) -> None:
+        """Ask from a signal handler."""
+        self._signalled = True
+        # In a thread of its own: this one may be inside `wait` and have the lock that `set` waits for.
+        threading.Thread(target=self.set).start()
+
+    def is_set(self) -> bool:
+        """Return whether the program is to end."""
+        return self._signalled or super().is_set()
 
 
 def main(argv: Sequence[str]) -> int:
@@ -35,10 +54,9 @@ def main(argv: Sequence[str]) -> int:
     else:
         sys.stderr.write(f"{_USAGE}\n")
         return 2
-    over = threading.Event()
+    over = EndRequest()
     for number in (signal.SIGINT, signal.SIGTERM):
-        # In a thread of its own: this one may be inside `over.wait` and have the lock that `set` waits for.
-        signal.signal(number, lambda *_: threading.Thread(target=over.set).start())
+        signal.signal(number, lambda *_: over.from_signal())
     try:
         return work(json.loads(argv[1]), over)
     except (MiddlewareError, LogError) as error:
@@ -63,7 +81,10 @@ def _record(told: Told, over: threading.Event, path: str) -> int:
     from fieldkit.agent import mavlink  # noqa: PLC0415 (only where it is asked for)
 
     with _talking(told["connection"]):
-        mavlink.record(mavlink.FlightRecording(**told), path, over)
+        try:
+            mavlink.record(mavlink.FlightRecording(**told), path, over)
+        except mavlink.MissingMessageError as error:
+            raise MiddlewareError(str(error)) from error
     return 0
 
 
@@ -98,6 +119,23 @@ def _look(told: Told, over: threading.Event) -> int:
         return arming.look(told["connection"], flight_plan.FlightNeeds(**told["needs"]), over)
 
 
+def _survey(told: Told, over: threading.Event) -> int:
+    """Print whether a connection works, and which others there may be; return the exit code."""
+    from fieldkit.agent.links import survey  # noqa: PLC0415 (only where it is asked for)
+
+    with _talking(told["connection"]):
+        return survey.survey(told["connection"], over)
+
+
+def _link(told: Told, over: threading.Event) -> int:
+    """Serve a connection to an autopilot for the other programs here, in a process of its own."""
+    from fieldkit.agent.links import server  # noqa: PLC0415 (only where it is asked for)
+
+    with _talking(told["connection"]):
+        server.serve(told["connection"], over)
+    return 0
+
+
 @contextmanager
 def _talking(connection: str) -> Iterator[None]:
     """Say of what goes wrong with a connection to an autopilot which one it was."""
@@ -112,6 +150,7 @@ def _stream(told: Told, over: threading.Event, path: str, *, publishes: bool) ->
     what = Stream(**told["stream"])
     start = middleware.adapter(what.over)
     log = Log(path)
+    log.origin(time.time_ns(), records.PUBLISHER if publishes else records.SUBSCRIBER, told["topic"]["name"])
     log.note(records.BEGUN, time.time_ns())
     begun = start(Network(**told["network"]))
     try:
@@ -135,7 +174,13 @@ _WITH_LOG: Mapping[str, Callable[..., int]] = {
     "mavlink": _record,
     "drive": _drive,
 }
-_WITHOUT_LOG: Mapping[str, Callable[..., int]] = {"route": _route, "fly": _fly, "arming": _look}
+_WITHOUT_LOG: Mapping[str, Callable[..., int]] = {
+    "route": _route,
+    "fly": _fly,
+    "arming": _look,
+    "survey": _survey,
+    "link": _link,
+}
 
 
 if __name__ == "__main__":

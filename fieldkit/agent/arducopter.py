@@ -10,16 +10,44 @@ from fieldkit.agent.mavlink_frames import EKF_STATUS_REPORT
 _ARDUPILOT = 3
 _COPTERS = frozenset((2, 3, 4, 13, 14, 15, 29, 35))
 """MAV_TYPE: quadrotor, coaxial, helicopter, hexarotor, octorotor, tricopter, dodecarotor, decarotor."""
-_GUIDED, _RTL, _LAND = 4, 6, 9
+_AUTO, _GUIDED, _RTL, _LAND, _SMART_RTL, _AUTO_RTL = 3, 4, 6, 9, 21, 27
+_MODES = {
+    0: "STABILIZE",
+    1: "ACRO",
+    2: "ALT_HOLD",
+    _AUTO: "AUTO",
+    _GUIDED: "GUIDED",
+    5: "LOITER",
+    _RTL: "RTL",
+    7: "CIRCLE",
+    _LAND: "LAND",
+    11: "DRIFT",
+    13: "SPORT",
+    14: "FLIP",
+    15: "AUTOTUNE",
+    16: "POSHOLD",
+    17: "BRAKE",
+    18: "THROW",
+    19: "AVOID_ADSB",
+    20: "GUIDED_NOGPS",
+    _SMART_RTL: "SMART_RTL",
+    22: "FLOWHOLD",
+    23: "FOLLOW",
+    24: "ZIGZAG",
+    25: "SYSTEMID",
+    26: "AUTOROTATE",
+    _AUTO_RTL: "AUTO_RTL",
+    28: "TURTLE",
+}
 """Its modes by their numbers (ArduCopter/mode.h; https://ardupilot.org/copter/docs/parameters.html#fltmode1)."""
 _CLIMB_SPEED = 2
 _FENCE_TOP, _FENCE_CIRCLE = 1, 2
 
 
 class ArduCopter:
-    """See `FlightDialect`. On the ground no set-point moves it: it takes off by command, and follows them then.
+    """See `FlightDialect`. On the ground it ignores set-points: it takes off by command, and follows them then.
 
-    In GUIDED it holds the last place for ever: nobody's silence ends that.
+    In GUIDED it holds the last position without any time limit (GUID_TIMEOUT is for velocities).
     """
 
     name = "ArduCopter"
@@ -35,6 +63,22 @@ class ArduCopter:
     def is_guided(self, mode: int) -> bool:
         """See `FlightDialect.is_guided`."""
         return mode == _GUIDED
+
+    def is_led(self, mode: int) -> bool:
+        """See `FlightDialect.is_led`: in LOITER and the others a person flies it."""
+        return mode in (_AUTO, _GUIDED)
+
+    def comes_down(self, mode: int) -> bool:
+        """See `FlightDialect.comes_down`."""
+        return mode in (_RTL, _LAND, _SMART_RTL, _AUTO_RTL)
+
+    def waits(self, mode: int) -> bool:  # noqa: ARG002
+        """See `FlightDialect.waits`: it stays in GUIDED."""
+        return False
+
+    def mode_name(self, mode: int) -> str:
+        """See `FlightDialect.mode_name`."""
+        return _MODES.get(mode, str(mode))
 
     def guide(self) -> Command:
         """See `FlightDialect.guide`."""

@@ -6,14 +6,15 @@ import json
 import sys
 import threading
 import time
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Iterator
 
-from fieldkit.agent.autopilot import AutopilotState, AutopilotTalk
+from fieldkit.agent.autopilot import PREFLIGHT, AutopilotState
 from fieldkit.agent.dialect import PREARM_CHECKS
 from fieldkit.agent.flight_plan import FlightNeeds
+from fieldkit.agent.flying.talk import AutopilotTalk
 from fieldkit.agent.mavlink_frames import HOME_POSITION, LOCAL_POSITION_NED, SYS_STATUS
-from fieldkit.agent.mavlink_links import opened
 
 _TURN_S = 0.1
 _AGAIN_S = 0.4
@@ -23,6 +24,10 @@ _PATIENCE_S = 5.0
 """So long it waits for what every autopilot says."""
 _SPARE_S = 1.5
 """And so long for what only some do."""
+_STARTS_S = 10.0
+"""A preflight check waits this long for an estimate of position: the autopilot may have been switched on just now."""
+_NO_ESTIMATE = "Need Position Estimate"
+"""Text of an ArduCopter whose estimate is not ready."""
 _SETTLED_S = 0.3
 """So long after its checks ran its status is that of these."""
 _RATE_HZ = 5.0
@@ -83,24 +88,22 @@ class ArmingCheck:
         self._asked_s = 0.0
         self._checked_s: float | None = None
         drone.status = drone.estimate = None
-        drone.texts = []
+        drone.texts.forget()
         drone.answers.pop(PREARM_CHECKS, None)
 
     def ask(self) -> None:
-        """Ask for what it has not told yet; to be called again and again."""
+        """Request what it has not reported yet; to be called with each turn."""
         drone, now_s = self._drone, time.monotonic()
         if self._checked_s is None and PREARM_CHECKS in drone.answers:
             self._checked_s = now_s
         if now_s < self._asked_s or drone.dialect is None:
             return
         self._asked_s = now_s + _AGAIN_S
-        for kind, told in (
-            (SYS_STATUS, drone.status),
-            (LOCAL_POSITION_NED, drone.place_m),
-            (drone.dialect.estimate, drone.estimate),
-        ):
-            if told is None:
-                drone.ask_for(kind, _RATE_HZ)
+        for kind, value in ((SYS_STATUS, drone.status), (LOCAL_POSITION_NED, drone.place_m)):
+            if value is None:
+                drone.request_stream(kind, _RATE_HZ)
+        if drone.estimate is None:
+            drone.request_stream(drone.dialect.estimate, _RATE_HZ)
         if self._checked_s is None:
             drone.command(PREARM_CHECKS)
         if self._needs.returns and not drone.has_home:
@@ -114,6 +117,12 @@ class ArmingCheck:
         either = [names.split("|") for names in dialect.bounds_from] if dialect else []
         told = self._drone.parameters.keys()
         return [name for names in either if told.isdisjoint(names) for name in names]
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether its estimate of position is not ready, as within about 30 s after it was switched on."""
+        warned = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
+        return self._drone.dialect is not None and (warned or any(True for _ in self._position()))
 
     @property
     def done(self) -> bool:
@@ -169,11 +178,15 @@ class ArmingCheck:
     def _own_checks(self) -> Iterator[ArmingFault]:
         drone = self._drone
         assert drone.dialect is not None
-        why = [text[len(prefix) :] for text in drone.texts for prefix in _PREFIXES if text.startswith(prefix)]
+        why = [
+            text[len(prefix) :] for text in drone.texts.warnings for prefix in _PREFIXES if text.startswith(prefix)
+        ]
         ill = drone.status.ill if drone.status else 0
         if not why and not ill & _PREARM:
             return
-        why = list(dict.fromkeys(why)) or drone.texts or [name for bit, name in _SENSORS.items() if ill & bit]
+        why = (
+            list(dict.fromkeys(why)) or drone.texts.warnings or [name for bit, name in _SENSORS.items() if ill & bit]
+        )
         what = f"{drone.dialect.name} does not let itself be armed: {', '.join(why) or 'it does not say why'}"
         remedy = "see to that; a ground station (QGroundControl, MAVProxy) shows the same"
         yield ArmingFault(what, remedy, grave=drone.guided or not drone.dialect.says_now)
@@ -201,24 +214,25 @@ def look(connection: str, needs: FlightNeeds, over: threading.Event) -> int:
     """Ask an autopilot, and print a line of JSON for each fault, and one with its family; return the exit code.
 
     Raises:
-        OSError: The connection cannot be opened, or has ended.
-        ValueError: It is none.
+        OSError: The connection cannot be opened.
+        ValueError: It is not the name of a connection.
     """
-    talk = AutopilotTalk(opened(connection))
-    end_s = time.monotonic() + _HEARTBEAT_S
-    while not talk.drone.alive and not over.is_set():
-        if time.monotonic() > end_s:
-            sys.stderr.write(f"error: no heartbeat of an autopilot at {connection} in {_HEARTBEAT_S:g} s\n")
-            return 1
-        talk.turn(_TURN_S)
-    check = ArmingCheck(talk.drone, needs)
-    while not check.done and not over.is_set():
-        check.ask()
-        talk.turn(_TURN_S)
+    with closing(AutopilotTalk(connection, component=PREFLIGHT)) as talk:
+        end_s = time.monotonic() + _HEARTBEAT_S
+        while not talk.drone.alive and not over.is_set():
+            if time.monotonic() > end_s:
+                sys.stderr.write(f"error: no heartbeat of an autopilot at {connection} in {_HEARTBEAT_S:g} s\n")
+                return 1
+            talk.turn(_TURN_S)
+        check, starts_s = ArmingCheck(talk.drone, needs), time.monotonic() + _STARTS_S
+        while not over.is_set():
+            check.ask()
+            talk.turn(_TURN_S)
+            if check.done:
+                if not check.is_starting or time.monotonic() > starts_s:
+                    break
+                check = ArmingCheck(talk.drone, needs)
     dialect, status = talk.drone.dialect, talk.drone.status
-    if dialect is not None:
-        for kind in (SYS_STATUS, LOCAL_POSITION_NED, dialect.estimate):
-            talk.drone.ask_for(kind, 0)
     lines = [json.dumps(asdict(fault)) for fault in check.faults()]
     told = {"autopilot": dialect.name if dialect else "", "charge": status.charge if status else None}
     sys.stdout.write("\n".join([*lines, json.dumps(told), ""]))

@@ -40,10 +40,10 @@ class FlightDialect(Protocol):
 
     Attributes:
         name: Of the family.
-        guided: What its mode is called in which set-points lead it.
+        guided: Name of the mode in which it follows set-points.
         estimate: Message with the flags of its estimate of position.
-        bounds_from: Parameters that say its bounds; `|` between names of the same one, of which it has one.
-        says_now: Whether what it says of arming is about the mode that it is in now.
+        bounds_from: Parameters with its bounds; `|` between names of the same one, of which it has one.
+        says_now: Whether its arming checks are about the mode that it is in now.
     """
 
     name: str
@@ -56,16 +56,28 @@ class FlightDialect(Protocol):
         """Return whether an autopilot is of it: MAV_AUTOPILOT and MAV_TYPE of its heartbeat."""
 
     def is_guided(self, mode: int) -> bool:
-        """Return whether it goes where set-points say, by the custom mode of its heartbeat."""
+        """Return whether it follows set-points, by the custom mode of its heartbeat."""
+
+    def is_led(self, mode: int) -> bool:
+        """Return whether programs lead it in a mode, by set-points, a mission or commands, and not a person."""
+
+    def comes_down(self, mode: int) -> bool:
+        """Return whether it lands, or returns to land, by itself in a mode."""
+
+    def waits(self, mode: int) -> bool:
+        """Return whether its failsafe for missing set-points waits in a mode for what a program commands."""
+
+    def mode_name(self, mode: int) -> str:
+        """Return the name of a mode; its number for one that is not known."""
 
     def guide(self) -> Command:
-        """Return the command for the mode in which set-points lead it."""
+        """Return the command for the mode in which it follows set-points."""
 
     def take_off(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
-        """Return what makes it rise when it is armed; empty where set-points do."""
+        """Return the commands for the take-off when it is armed; empty where set-points do it."""
 
     def bring_down(self, how: str) -> Command:
-        """Return the command that lets it `land` where it is, or `return`."""
+        """Return the command to `land` where it is, or to `return`."""
 
     def bounds(self, values: Mapping[str, float]) -> AutopilotBounds:
-        """Return its bounds, from those of `bounds_from` that it told."""
+        """Return its bounds, from the values of the parameters of `bounds_from`."""

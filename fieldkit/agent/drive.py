@@ -12,17 +12,23 @@ import math
 import struct
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, Callable, Mapping
+from typing import Any, Callable, Mapping
 
+from fieldkit.agent.boot_clock import boot_id, now_s
 from fieldkit.agent.drive_plan import ORDERS, DriveTask
 from fieldkit.agent.middleware import Middleware, MiddlewareError, Publisher, Topic
+from fieldkit.agent.numbered_lines import NumberedLines
 from fieldkit.agent.orders import Orders
+from fieldkit.agent.standstill import Standstill
 from fieldkit.agent.steering import STAND, Driver, DriveVelocity, OdometryPose
 
 RATE_HZ = 20.0
 _ENDS_S = 0.5
 """For so long zero Twists are sent at the end: one may be lost."""
+_BRAKES_S = 1.5
+"""And for this long at most while odometry shows that the robot still moves."""
 _PATIENCE_S = 15.0
 """Within this somebody hears the velocity, and odometry comes."""
 _LOG_S = 0.1
@@ -40,7 +46,8 @@ def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: thre
     Args:
         middleware: It has started.
         told: `command` and `odometry`, the topics; `task`, what is driven; `orders`, the laptop's file, and
-            `status`, the file in which it finds how far the robot is; `cdr`, whether messages are encoded as in
+            `status`, the file in which it finds how far the robot is; `stationary`, a file that is made when the
+            robot is stationary at the end (it may be missing); `cdr`, whether messages are encoded as in
             ROS 2.
         log: What is written down, a line of JSON ten times a second.
         over: Set when it is to end.
@@ -59,33 +66,39 @@ def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: thre
     def take(data: bytes, _at_ns: int) -> None:
         pose = read_odometry(data, cdr=cdr)
         if pose is not None:
-            heard.append((time.monotonic(), pose))
+            heard.append((now_s(), pose))
 
     middleware.subscribe(Topic.from_json(told["odometry"]), take)
     _wait("nobody hears " + told["command"]["name"], lambda: publisher.matched() > 0, over)
     _wait("nothing comes from " + told["odometry"]["name"], lambda: bool(heard), over)
     task = DriveTask.from_json(told["task"])
-    driver = Driver(task, time.monotonic())
+    driver = Driver(task, now_s())
     orders, status = Orders(told["orders"], ORDERS, task.lease_s), Path(told["status"])
-    with log.open("w", encoding="ascii") as lines:
+    with log.open("w", encoding="ascii") as file:
+        lines = NumberedLines(file)
         logged_s, velocity = -math.inf, STAND
+        if task.origin is not None and task.frame_id != boot_id():
+            driver.odometry(*heard.pop(0))
+            driver.refuse("its computer was restarted since its place was recorded, so its odometry is another one")
         try:
             while not driver.over and not over.is_set():
-                now_s = time.monotonic()
+                turn_s = now_s()
                 while heard:
                     driver.odometry(*heard.pop(0))
                 if orders.look():
-                    driver.renewed(now_s, orders.order)
-                velocity = driver.tick(now_s)
+                    driver.renewed(turn_s, orders.order)
+                velocity = driver.tick(turn_s)
+                if over.is_set():  # the signal may have come while this process was suspended
+                    velocity = STAND
                 publisher.write(twist(velocity, cdr=cdr))
-                if now_s - logged_s >= _LOG_S:
-                    logged_s = now_s
-                    _tell(driver, velocity, lines, status)
+                if turn_s - logged_s >= _LOG_S:
+                    logged_s = turn_s
+                    _report(driver, velocity, lines, status)
                 over.wait(1 / RATE_HZ)
         finally:
-            _stand(publisher, cdr=cdr)
-        stopped = driver.stopped or ("" if driver.phase == "home" else "asked to")
-        _tell(driver, STAND, lines, status, ended=stopped or "home")
+            _stand(publisher, heard, told.get("stationary", ""), cdr=cdr)
+        stopped = driver.stopped or ("" if driver.phase == "home" else "ordered to stop")
+        _report(driver, STAND, lines, status, ended=stopped or "home")
     return stopped
 
 
@@ -127,20 +140,42 @@ def _wait(what: str, condition: Callable[[], bool], over: threading.Event) -> No
             raise MiddlewareError(what)
 
 
-def _stand(publisher: Publisher, *, cdr: bool) -> None:
-    """Say zero for `_ENDS_S`."""
-    until_s = time.monotonic() + _ENDS_S
-    while time.monotonic() < until_s:
+def _stand(publisher: Publisher, heard: list[tuple[float, OdometryPose]], confirm: str, *, cdr: bool) -> None:
+    """Send zero velocities until the robot is stationary, for `_ENDS_S` at least and `_BRAKES_S` at most.
+
+    Args:
+        publisher: Of the velocity topic.
+        heard: Poses of the odometry, which other threads append.
+        confirm: File that is made when the robot is stationary; empty for none.
+        cdr: See `twist`.
+    """
+    began_s, standstill, confirmed = time.monotonic(), Standstill(), False
+    heard.clear()  # poses from before the first zero
+    while True:
         publisher.write(twist(STAND, cdr=cdr))
+        while heard:
+            standstill.odometry(*heard.pop(0))
+        if standstill.stationary and not confirmed:
+            confirmed = True
+            if confirm:
+                with suppress(OSError):  # a full disk is no reason to send no more zeros
+                    Path(confirm).touch()
+        lasted_s = time.monotonic() - began_s
+        if lasted_s >= _BRAKES_S or (confirmed and lasted_s >= _ENDS_S):
+            return
         time.sleep(1 / RATE_HZ)
 
 
-def _tell(driver: Driver, velocity: DriveVelocity, lines: IO[str], status: Path, ended: str = "") -> None:
-    """Write down how far the robot is, for the evidence and for the laptop."""
-    here = driver.here
-    if here is None:
-        return  # ended before its first odometry
-    said = {
+def _report(driver: Driver, velocity: DriveVelocity, lines: NumberedLines, status: Path, ended: str = "") -> None:
+    """Write where the robot is, to the log from its start on, and to the status for the laptop.
+
+    The status has in addition: `pose`, in the frame of the odometry; `frame_id`; `ready`, whether the robot is
+    stationary and may start; `refused`, whether it did not start because it is not where it must be.
+    """
+    here, pose = driver.here, driver.pose
+    if here is None or pose is None:
+        return  # before its origin is known
+    line = {
         "utc_ns": time.time_ns(),
         "at_s": round(driver.lasted_s, 3),
         "phase": driver.phase,
@@ -153,9 +188,16 @@ def _tell(driver: Driver, velocity: DriveVelocity, lines: IO[str], status: Path,
         "left_m": round(driver.left_m, 4),
         "ended": ended,
     }
-    line = json.dumps(said)
-    lines.write(line + "\n")
-    lines.flush()
+    if ended:
+        lines.end(line)
+    elif driver.phase not in ("waits", "returns"):
+        lines.write(line)
+    more = {
+        "pose": [round(value, 6) for value in pose],
+        "frame_id": boot_id(),
+        "ready": driver.ready,
+        "refused": driver.refused,
+    }
     beside = status.with_name(status.name + ".new")
-    beside.write_text(line + "\n", encoding="ascii")
+    beside.write_text(json.dumps({**line, **more}) + "\n", encoding="ascii")
     beside.replace(status)

@@ -6,11 +6,21 @@ import math
 from dataclasses import dataclass
 from typing import Any, Mapping, Sequence
 
+WAIT = "wait"
 OUT = "out"
 BACK = "back"
 END = "end"
-ORDERS = (OUT, BACK, END)
-"""What the laptop can want: that the robot goes its way, comes back, or stands for good."""
+ORDERS = (WAIT, OUT, BACK, END)
+"""What the laptop can order: that the robot waits where it is, goes its way, comes back, or stops for good."""
+
+START_M = 0.3
+START_RAD = 0.3
+"""A robot starts no farther than this from its origin, in place and heading: more than a drive back leaves
+(`ARRIVED_M`, `FACES_RAD`, and its braking), and less than a robot that was moved."""
+OFF_PATH_M = 1.0
+"""A robot that is farther off its path than this does not drive back to its origin by itself."""
+GAP_S = 0.5
+"""Longer than this between two turns of its loop the program was suspended: the drive ends."""
 
 ARRIVED_M = 0.02
 """So near a corner it is there."""
@@ -27,14 +37,18 @@ class DriveTask:
     """What a robot is to drive, and what must hold meanwhile.
 
     Attributes:
-        legs: Of each how far ahead, and to the left, as the robot faces where it begins; in metres.
+        legs: Of each how far ahead, and to the left, as the robot faces at its origin; in metres.
         speed_m_s: How fast it drives.
         turn_rad_s: Most that it turns.
         acceleration_m_s2: Most that its speed grows per second.
-        fence_m: Farther than this from where it began it stops.
+        fence_m: Farther than this from its origin it stops.
         lease_s: It stops where the laptop has not renewed its lease for so long.
         odometry_s: It stops where its odometry was silent for so long.
         limit_s: It stops where one way takes longer.
+        origin: Its origin in the frame of its odometry: x and y in m, heading in rad; None for where it is now.
+        last: Where its last motion ended, likewise; None if that is unknown.
+        frame_id: The boot ID of its computer when the origin was recorded; empty without an origin.
+        may_return: Whether it may first drive back to its origin along its path.
     """
 
     legs: Sequence[tuple[float, float]]
@@ -45,6 +59,10 @@ class DriveTask:
     lease_s: float
     odometry_s: float
     limit_s: float
+    origin: Sequence[float] | None = None
+    last: Sequence[float] | None = None
+    frame_id: str = ""
+    may_return: bool = False
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> DriveTask:

@@ -1,21 +1,22 @@
-"""What a flight leaves behind: where the drone was by its autopilot, ten times a second, seen from where it stood."""
+"""The log of a flight: positions by the autopilot, ten times a second, relative to the flight's origin."""
 
 from __future__ import annotations
 
-import json
-import math
 import time
 from contextlib import suppress
-from typing import IO
+from dataclasses import asdict
 
-from fieldkit.agent.flight_plan import Place
+from fieldkit.agent.autopilot import AutopilotState
+from fieldkit.agent.flying.origin import FlightOrigin
+from fieldkit.agent.mavlink_frames import LOCAL_POSITION_NED
+from fieldkit.agent.numbered_lines import NumberedLines
 
 
 class FlightLog:
     """Writes a JSON object a line, as long as there is room: a drone does not come down for a full disk.
 
     Args:
-        path: Where to; empty for nowhere.
+        path: The file; empty for none.
 
     Attributes:
         phase: What the flight is about: `standing`, `climbing`, `up`, `flying`, `there`, `coming back` or
@@ -24,34 +25,47 @@ class FlightLog:
 
     def __init__(self, path: str) -> None:
         self.phase = ""
-        self._lines: IO[str] | None = None
-        self._begin_m: Place = (0.0, 0.0, 0.0)
-        self._cos, self._sin, self._began_s = 1.0, 0.0, 0.0
+        self._lines: NumberedLines | None = None
+        self._origin: FlightOrigin | None = None
+        self._ground_m = self._began_s = 0.0
         if path:
-            with suppress(OSError):  # the laptop sees that it is not there
-                self._lines = open(path, "w", encoding="ascii")  # noqa: SIM115, PTH123 (for the flight)
+            with suppress(OSError):  # the laptop sees that it is missing
+                self._lines = NumberedLines(open(path, "w", encoding="ascii"))  # noqa: SIM115, PTH123 (for the flight)
 
-    def begin(self, begin_m: Place, yaw_rad: float) -> None:
-        """Take the place where it stands, and where its nose points, for what all lines are seen from."""
-        self._begin_m, self._began_s = begin_m, time.monotonic()
-        self._cos, self._sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    def begin(self, origin: FlightOrigin, ground_m: float) -> None:
+        """Write the origin, and take it and the position of the ground, down, as reference of all lines."""
+        self._origin, self._ground_m, self._began_s = origin, ground_m, time.monotonic()
+        self._write({"utc_ns": time.time_ns(), "origin": asdict(origin)})
 
-    def note(self, place_m: Place | None, speed_m_s: float) -> None:
-        """Write down where it is, if it says so, and how fast it moves; nothing before it stood."""
-        if self._lines is None or place_m is None or not self.phase:
+    def note(self, drone: AutopilotState) -> None:
+        """Write where the drone is, its speed and mode, and the rate of its reports; nothing before `begin`."""
+        if self._lines is None or self._origin is None or drone.place_m is None or not self.phase:
             return
-        north_m, east_m, down_m = (now - then for now, then in zip(place_m, self._begin_m))
-        said = {
-            "utc_ns": time.time_ns(),
-            "at_s": round(time.monotonic() - self._began_s, 3),
-            "phase": self.phase,
-            "ahead_m": round(north_m * self._cos + east_m * self._sin, 3),
-            "left_m": round(north_m * self._sin - east_m * self._cos, 3),
-            "up_m": round(-down_m, 3),
-            "speed_m_s": round(speed_m_s, 3),
-        }
-        try:
-            self._lines.write(json.dumps(said) + "\n")
-            self._lines.flush()
-        except OSError:
-            self._lines = None
+        ahead_m, left_m = self._origin.seen(drone.place_m)
+        self._write(
+            {
+                "utc_ns": time.time_ns(),
+                "at_s": round(time.monotonic() - self._began_s, 3),
+                "phase": self.phase,
+                "ahead_m": round(ahead_m, 3),
+                "left_m": round(left_m, 3),
+                "up_m": round(self._ground_m - drone.place_m[2], 3),
+                "speed_m_s": round(drone.speed_m_s, 3),
+                "mode": drone.mode_name,
+                "rate_hz": round(drone.stream_hz(LOCAL_POSITION_NED), 3),
+            }
+        )
+
+    def _write(self, values: dict[str, object]) -> None:
+        if self._lines is not None:
+            try:
+                self._lines.write(values)
+            except OSError:
+                self._lines = None
+
+    def end(self, ended: str) -> None:
+        """Write how the flight ended, and a checksum; a log without them is not complete."""
+        if self._lines is not None:
+            with suppress(OSError):
+                self._lines.end({"utc_ns": time.time_ns(), "ended": ended})
+        self._lines = None

@@ -1,34 +1,38 @@
-"""Bring a drone down, whatever speaks against it, and say so."""
+"""Bring a drone down, in the modes in which that is ours to do, and report it."""
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Iterator
+from typing import Callable, Iterator
 
-from fieldkit.agent.autopilot import AutopilotTalk
+from fieldkit.agent.autopilot import AutopilotState
 from fieldkit.agent.dialect import ARM
+from fieldkit.agent.flying.talk import AutopilotTalk
 from fieldkit.agent.mavlink_frames import ACCEPTED
 from fieldkit.agent.px4 import Px4
 
-LAPSED, REFUSED, TAKEN, CALLED_OFF = 4, 5, 6, 7
-"""Exit codes: the laptop was gone, the autopilot did not do it, somebody else flies it, it was told to end."""
+LAPSED, REFUSED, TAKEN, CALLED_OFF, GONE, FENCED = 4, 5, 6, 7, 8, 9
+"""Exit codes: the lease lapsed; the autopilot refused or was silent; another party flies the drone; the job was
+ended; the other program of the flight does not run any more; the drone was beyond its fence."""
 
 AGAIN_S = 0.4
-"""After so long without an answer a command is sent again."""
+"""A command without an answer is sent again after this time."""
 ANSWERS_S = 5.0
+"""An autopilot has this time to do what was commanded."""
 _TURN_S = 0.1
-_TELLS_S = 30.0
-"""So long one that is silent is told to come down: it may hear what it cannot answer."""
 _DOWN_S = 600.0
-"""And so long one that says that its motors turn."""
+"""For this long a drone whose motors turn is commanded to come down."""
+UNHEARD_S = 60.0
+"""And for this long while its autopilot is not heard: a router or a line that is down may come back."""
 
 
 class FlightError(Exception):
-    """It does not go on; the text is for people.
+    """The flight does not go on; the text is for people.
 
     Args:
         code: Exit code.
@@ -40,36 +44,79 @@ class FlightError(Exception):
         self.code = code
 
 
-def bring_down(talk: AutopilotTalk, how: str) -> None:
-    """Let it `land` or `return`, and wait until its motors stand; one that does not return lands.
+def bring_down(
+    talk: AutopilotTalk,
+    how: str,
+    led: Callable[[], bool],
+    each_turn: Callable[[], None] = lambda: None,
+) -> None:
+    """Command a drone to `land` or `return`, and wait until its motors have stopped; if it does not return, it lands.
+
+    Commands are sent only while `led` holds: while the drone is in a mode in which it is ours to bring down. A drone
+    that lands or returns by itself already is only watched. An autopilot that is not heard may hear what it cannot
+    answer, and its connection may come back: it counts as in its last reported mode, for `UNHEARD_S`. The log has an
+    alarm as soon as it is not heard.
+
+    Args:
+        talk: The conversation with its autopilot.
+        how: `land` or `return`.
+        led: Whether the drone is in such a mode.
+        each_turn: Called with each turn.
 
     Raises:
-        FlightError: It is silent, or its motors turn on: nobody knows what became of it.
+        FlightError: Another party flies the drone (`TAKEN`), its autopilot was not heard for `UNHEARD_S`, or its
+            motors still turn after `_DOWN_S`.
     """
-    drone, asked_s, began_s = talk.drone, 0.0, time.monotonic()
-    command = (drone.dialect or Px4()).bring_down(how)  # others know the commands that PX4 does
+    drone, asked_s, began_s, warned = talk.drone, 0.0, time.monotonic(), False
+    command = (drone.dialect or Px4()).bring_down(how)  # other families know the commands of PX4
     number = int(command[0])
     drone.answers.pop(number, None)
     while drone.armed:
-        if time.monotonic() > began_s + (_DOWN_S if drone.alive else _TELLS_S):
-            state = "says that its motors turn" if drone.alive else "is silent"
-            raise FlightError(REFUSED, f"the autopilot {state}; it was told to {how}")
-        does = drone.answers.get(number) == ACCEPTED and not drone.guided
-        if not does and how == "return" and time.monotonic() > began_s + ANSWERS_S:
-            say(f"land: it does not return: {drone.said or 'it does not say why'}")
-            bring_down(talk, "land")
-            return
-        if not does and time.monotonic() > asked_s:
-            asked_s = time.monotonic() + AGAIN_S
-            drone.command(*command)
-            if number in drone.answers:
-                drone.command(ARM, 0)  # it stands on the ground, and so does not land; in the air it refuses this
+        now_s = time.monotonic()
+        if now_s > began_s + _DOWN_S:
+            raise FlightError(REFUSED, f"the autopilot reports that its motors turn; it was commanded to {how}")
+        if min(drone.silent_s, now_s - began_s) > UNHEARD_S:
+            raise FlightError(REFUSED, f"no heartbeat of the autopilot for {UNHEARD_S:g} s")
+        if not drone.alive and not warned:
+            say(alarm(drone))
+        warned = not drone.alive
+        if led():
+            if how == "return" and drone.alive and now_s > began_s + ANSWERS_S:
+                say(f"land: it does not return ({drone.said})")
+                bring_down(talk, "land", led, each_turn)
+                return
+            if now_s > asked_s:
+                asked_s = now_s + AGAIN_S
+                drone.command(*command)
+                if drone.answers.get(number, ACCEPTED) != ACCEPTED:
+                    drone.command(ARM, 0)  # refused in the air; on the ground it may refuse to land
+        elif not drone.comes_down and (drone.dialect is not None or drone.answers.get(number) != ACCEPTED):
+            raise FlightError(TAKEN, f"another party flies it, nothing more is sent ({drone.said})")
+        each_turn()
         talk.turn(_TURN_S)
+
+
+def alarm(drone: AutopilotState) -> str:
+    """Return the alarm of a flight that ends without a landing: the last known state, and what a person can do."""
+    where = "ITS POSITION IS UNKNOWN"
+    if drone.last_place_m is not None:
+        north_m, east_m, down_m = drone.last_place_m
+        where = (
+            f"LAST KNOWN {drone.unplaced_s:.0f} S AGO {north_m:.1f} M NORTH, {east_m:.1f} M EAST, {-down_m:.1f} M UP "
+            "IN ITS LOCAL FRAME"
+        )
+    heard = "NO HEARTBEAT"
+    if math.isfinite(drone.silent_s):
+        heard = f"MODE {drone.mode_name}, LAST HEARTBEAT {drone.silent_s:.0f} S AGO"
+    return f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {where}, {heard}. {MANUAL_ACTION}"
+
+
+MANUAL_ACTION = "TAKE IT OVER BY REMOTE CONTROL, OR COMMAND LAND OR RTL AT THE GROUND STATION."
 
 
 @contextmanager
 def unhurried(path: str) -> Iterator[None]:
-    """Let a file be there while the body runs, if it is named and has room; see `FlightPlan.unhurried`."""
+    """Let a file exist while the body runs, if it is named and has room; see `FlightPlan.unhurried`."""
     if path:
         with suppress(OSError):
             Path(path).touch()

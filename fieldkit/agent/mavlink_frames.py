@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import Iterator
 
 HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, COMMAND_LONG, COMMAND_ACK, SET_POINT, STATUSTEXT = 0, 30, 32, 76, 77, 84, 253
-SYS_STATUS, PARAM_REQUEST_READ, PARAM_VALUE, HOME_POSITION = 1, 20, 22, 242
+SYS_STATUS, PARAM_REQUEST_READ, PARAM_VALUE, GLOBAL_POSITION_INT, HOME_POSITION = 1, 20, 22, 33, 242
 EKF_STATUS_REPORT, ESTIMATOR_STATUS = 193, 230
 """Ids of messages (https://mavlink.io/en/messages/common.html; EKF_STATUS_REPORT is of ardupilotmega); a set-point is
 SET_POSITION_TARGET_LOCAL_NED."""
 SET_MESSAGE_INTERVAL = 511
 """MAV_CMD_SET_MESSAGE_INTERVAL: the message, and the time between two in microseconds; 0 for as often as usual."""
-ACCEPTED = 0
-"""MAV_RESULT_ACCEPTED: what a COMMAND_ACK says of a command that is done."""
+ACCEPTED, IN_PROGRESS = 0, 5
+"""MAV_RESULT: ACCEPTED is the result of a command that is done; IN_PROGRESS is not a final result yet."""
 NO_AUTOPILOT = 8
 """MAV_AUTOPILOT_INVALID: what beats is a ground station, a camera, a logger."""
 
@@ -41,6 +41,7 @@ EXTRA = {
     SYS_STATUS: 124,
     PARAM_REQUEST_READ: 214,
     PARAM_VALUE: 220,
+    GLOBAL_POSITION_INT: 104,
     EKF_STATUS_REPORT: 71,
     ESTIMATOR_STATUS: 163,
     HOME_POSITION: 104,

@@ -6,8 +6,9 @@ They come in a file, a line `NUMBER ORDER SECONDS` with a higher number each tim
 from __future__ import annotations
 
 import math
-import time
 from typing import Sequence
+
+from fieldkit.agent.boot_clock import now_s
 
 _LONGEST_S = 86_400.0
 _MOST_BYTES = 100
@@ -30,7 +31,7 @@ class Orders:
         self._path = path
         self._known = known
         self._number = 0
-        self._until_s = time.monotonic() + lease_s
+        self._until_s = now_s() + lease_s
 
     def look(self) -> bool:
         """Take a new order, which may be the last one renewed; return whether there was one."""
@@ -43,10 +44,10 @@ class Orders:
         if count <= self._number or order not in self._known or math.isnan(lease_s):
             return False
         self._number, self.order = count, order
-        self._until_s = time.monotonic() + min(max(lease_s, 0.0), _LONGEST_S)
+        self._until_s = now_s() + min(max(lease_s, 0.0), _LONGEST_S)
         return True
 
     @property
     def lapsed(self) -> bool:
-        """Whether nobody renewed the last order in time."""
-        return time.monotonic() > self._until_s
+        """Whether the last order was not renewed in time; time in which the computer was suspended counts."""
+        return now_s() > self._until_s

@@ -14,6 +14,7 @@ import mmap
 import os
 import struct
 import threading
+import zlib
 
 MAGIC = b"fieldkit topic 1"
 RECORD = struct.Struct("<HHIqqq")
@@ -35,7 +36,16 @@ SKIPPED = 5
 FOREIGN = 6
 """Something arrived that is no sample of this stream."""
 END = 7
-"""Nothing follows; `sequence` is the number of samples."""
+"""Nothing follows; `sequence` is the number of samples.
+
+With `CHECKED` in place of the time when it was sent, `size` is the CRC-32 of the whole file with 0 in that field.
+"""
+ORIGIN = 8
+"""The end of the topic that writes the log, `PUBLISHER` or `SUBSCRIBER`, as `sequence`; `size` is the CRC-32 of the
+topic's name."""
+
+PUBLISHER, SUBSCRIBER = 1, 2
+CHECKED = 1
 
 PIECE_BYTES = 16 * mmap.ALLOCATIONGRANULARITY
 """By which a log grows: some 2,000 records, 40 s of a stream at 50 Hz."""
@@ -75,26 +85,46 @@ class Log:
         """
         record = RECORD.pack(kind, 0, size, sequence, sent_ns, at_ns)
         with self._lock:
-            end = self._at + RECORD.size
-            if end > PIECE_BYTES:
-                self._map_from(self._begins + self._at)
-                end = self._at + RECORD.size
-            self._piece[self._at : end] = record
-            self._at = end
+            self._write(record)
             self._samples += kind == SAMPLE
 
+    def _write(self, record: bytes) -> None:
+        end = self._at + RECORD.size
+        if end > PIECE_BYTES:
+            self._map_from(self._begins + self._at)
+            end = self._at + RECORD.size
+        self._piece[self._at : end] = record
+        self._at = end
+
+    def origin(self, at_ns: int, end: int, topic: str) -> None:
+        """Write which end of which topic writes this log; see `ORIGIN`.
+
+        Raises:
+            LogError: As `note`.
+        """
+        self.note(ORIGIN, at_ns, size=zlib.crc32(topic.encode()), sequence=end)
+
     def end(self, at_ns: int) -> None:
-        """Write that nothing follows, and see that it is on disk.
+        """Write that nothing follows, with a checksum, and see that it is on disk.
 
         Raises:
             LogError: The disk is full.
         """
-        self.note(END, at_ns, sequence=self._samples)
         with self._lock:
+            blank = RECORD.pack(END, 0, 0, self._samples, CHECKED, at_ns)
+            self._write(RECORD.pack(END, 0, self._sum(blank), self._samples, CHECKED, at_ns))
             self._piece.close()
             os.ftruncate(self._file, self._begins + self._at)
             os.fsync(self._file)
             os.close(self._file)
+
+    def _sum(self, end: bytes) -> int:
+        """Return the CRC-32 of what was written and the end of it; the file is read piece by piece."""
+        total, at, size = 0, 0, self._begins + self._at
+        while at < size:
+            piece = os.pread(self._file, min(PIECE_BYTES, size - at), at)
+            total, at = zlib.crc32(piece, total), at + len(piece)
+        return zlib.crc32(end, total)
 
     def _map_from(self, position: int) -> None:
         """Map a piece of the log that begins at a position, or at the page that this is in."""

@@ -16,7 +16,11 @@ from fieldkit.agent.drive_plan import (
     BACK,
     END,
     FACES_RAD,
+    GAP_S,
+    OFF_PATH_M,
     OUT,
+    START_M,
+    START_RAD,
     TURNS_UP_S,
     DriveTask,
     turning_rad_s,
@@ -30,6 +34,9 @@ _CREEP_M_S = 0.03
 """As slow as a robot's motors still turn."""
 _JUMP_M = 0.5
 """No odometry of a robot that drives is off by so much at once."""
+_STILL_M, _STILL_RAD, _STILL_S = 0.05, 0.05, 0.4
+"""A robot whose odometry changed by less than this in that time is stationary."""
+_WAITS, _RETURNS = "waits", "returns"
 _STUCK_M, _STUCK_S = 0.5, 2.0
 """A robot that was told to drive so far, and for so long at its speed, has come a quarter of that at least."""
 
@@ -63,18 +70,23 @@ class Driver:
 
     Attributes:
         stopped: Why it stopped before its end; empty while it has not.
-        phase: `waits` for its first odometry, then `out`, `there`, `back`, `home`.
-        driven_m: How far it went.
+        phase: `waits` until it is stationary and ordered to start; `returns` while it drives to its origin first;
+            then `out`, `there`, `back`, `home`.
+        driven_m: How far it went since it was `out`.
+        refused: Whether it stopped because it is not where it must be to start.
     """
 
     def __init__(self, task: DriveTask, now_s: float) -> None:
         self.stopped = ""
-        self.phase = "waits"
+        self.phase = _WAITS
         self.driven_m = 0.0
+        self.refused = False
         self._task = task
         self._made_s = now_s
         self._now_s = self._renewed_s = self._heard_s = self._began_s = now_s
-        self._start: OdometryPose | None = None
+        self._start = None if task.origin is None else OdometryPose(*task.origin)
+        self._still: OdometryPose | None = None
+        self._still_s = now_s
         self._here: OdometryPose | None = None
         self._order = ""
         self._corners = [(0.0, 0.0)]
@@ -91,8 +103,22 @@ class Driver:
 
     @property
     def here(self) -> OdometryPose | None:
-        """Where it is, from where it began and as it faced there; None before the first odometry."""
+        """Where it is, seen from its origin; None before the first odometry."""
         return None if self._start is None or self._here is None else _seen_from(self._start, self._here)
+
+    @property
+    def pose(self) -> OdometryPose | None:
+        """Where it is in the frame of its odometry; None before the first odometry."""
+        return self._here
+
+    @property
+    def ready(self) -> bool:
+        """Whether it is stationary at a place where it may start."""
+        return self._start is not None and self._here is not None and not self.over and self._is_still
+
+    @property
+    def _is_still(self) -> bool:
+        return self._heard_s - self._still_s >= _STILL_S
 
     @property
     def lasted_s(self) -> float:
@@ -119,20 +145,82 @@ class Driver:
             if gone_m > _JUMP_M + 2 * self._task.speed_m_s * max(now_s - self._heard_s, 0.0):
                 self._stop(f"odometry jumped by {gone_m:.2f} m")
             self.driven_m += gone_m
-        else:
-            self._start, self.phase, self._began_s = pose, OUT, now_s
         self._here, self._heard_s = pose, now_s
+        if self.phase == _WAITS and not self.stopped:
+            self._before_start(now_s, pose)
+
+    def refuse(self, why: str) -> None:
+        """Stop it for good because it is not where it must be to start."""
+        self.refused = self.refused or not self.stopped
+        self._stop(why)
+
+    def _before_start(self, now_s: float, pose: OdometryPose) -> None:
+        """See that it is stationary, and where it must be."""
+        still = self._still
+        if (
+            still is None
+            or math.dist(pose[:2], still[:2]) > _STILL_M
+            or abs(wrapped(pose.yaw_rad - still.yaw_rad)) > _STILL_RAD
+        ):
+            self._still, self._still_s = pose, now_s
+        if not self._is_still:
+            return
+        task = self._task
+        if self._start is None:
+            self._start = pose  # and it stays: the laptop records it
+        here, last = self.here, task.last
+        assert here is not None
+        off_m, off_rad = math.hypot(here.x_m, here.y_m), abs(here.yaw_rad)
+        if last is not None and (
+            math.dist(pose[:2], last[:2]) > START_M or abs(wrapped(pose.yaw_rad - last[2])) > START_RAD
+        ):
+            self.refuse(
+                f"its odometry is {math.dist(pose[:2], last[:2]):.2f} m and "
+                f"{abs(wrapped(pose.yaw_rad - last[2])):.2f} rad from where its last motion ended"
+            )
+        elif off_m > task.fence_m:
+            self.refuse(f"it is {off_m:.2f} m from its place, outside its fence of {task.fence_m:g} m")
+        elif off_m > START_M or off_rad > START_RAD:
+            if not task.may_return:
+                self.refuse(f"it is {off_m:.2f} m and {off_rad:.2f} rad from its place")
+            elif self._path_home(here) is None:
+                self.refuse(f"it is {off_m:.2f} m from its place, and more than {OFF_PATH_M:g} m off its path")
+
+    def _path_home(self, here: OdometryPose) -> list[tuple[float, float]] | None:
+        """Return the corners of the way back from a place on its path; None off it."""
+        nearest_m, before = min(
+            (_off_leg_m(here[:2], begin, end), number)
+            for number, (begin, end) in enumerate(zip(self._corners, self._corners[1:]))
+        )
+        return None if nearest_m > OFF_PATH_M else [here[:2], *reversed(self._corners[: before + 1])]
+
+    def _set_off(self, now_s: float) -> None:
+        """Start: out, or first back to its origin."""
+        here = self.here
+        assert here is not None
+        path = self._path_home(here)
+        if path is not None and (math.hypot(here.x_m, here.y_m) > START_M or abs(here.yaw_rad) > START_RAD):
+            self._ways = [(begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > ARRIVED_M]
+            self.phase, self._began_s = _RETURNS, now_s
+        else:
+            self._go_out(now_s)
+        self._from = (here.x_m, here.y_m)
+
+    def _go_out(self, now_s: float) -> None:
+        self._ways = [*zip(self._corners, self._corners[1:])]
+        self.phase, self._began_s, self.driven_m, self._turning = OUT, now_s, 0.0, True
 
     def renewed(self, now_s: float, order: str) -> None:
         """Take in that the laptop is there, and what it wants."""
         self._renewed_s = now_s
         if order == END and not self.over:
-            self._stop("asked to")
+            self._stop("ordered to stop")
         elif order == BACK and self._order != BACK and not self.stopped:
             self._order = BACK
             self._turn_back(now_s)
-        elif not self._order:
-            self._order, self._began_s = order, now_s
+        elif order == OUT and not self._order and self.ready:
+            self._order = OUT
+            self._set_off(now_s)
 
     def tick(self, now_s: float) -> DriveVelocity:
         """Return how fast to drive and to turn from now on."""
@@ -149,13 +237,15 @@ class Driver:
         task, here = self._task, self.here
         if self.over:
             return
-        if now_s - self._renewed_s > task.lease_s:
+        if for_s > GAP_S:
+            self._stop(f"its program was suspended for {for_s:.1f} s")
+        elif now_s - self._renewed_s > task.lease_s:
             self._stop(f"the laptop was silent for {task.lease_s:g} s")
-        elif self.phase != "waits" and now_s - self._heard_s > task.odometry_s:
+        elif self._here is not None and now_s - self._heard_s > task.odometry_s:
             self._stop(f"odometry was silent for {task.odometry_s:g} s")
-        elif here is not None and math.hypot(here.x_m, here.y_m) > task.fence_m:
-            self._stop(f"beyond the fence, {task.fence_m:g} m from where it began")
-        elif self._order and self.phase in (OUT, BACK) and now_s - self._began_s > task.limit_s:
+        elif here is not None and self.phase != _WAITS and math.hypot(here.x_m, here.y_m) > task.fence_m:
+            self._stop(f"beyond the fence, {task.fence_m:g} m from its place")
+        elif self._order and self.phase in (_RETURNS, OUT, BACK) and now_s - self._began_s > task.limit_s:
             self._stop(f"not there after {task.limit_s:g} s")
         elif here is not None and not self._drives(here, for_s):
             self._stop(f"told to drive {self._told_m:.1f} m, it came {self._came_m:.1f} m, as its odometry says")
@@ -181,8 +271,11 @@ class Driver:
         """Go back by the corners that it has passed."""
         here = self.here
         passed = self._corners[: len(self._corners) - len(self._ways)]
-        if here is None:
+        if here is None or self.phase == _WAITS:  # it has not moved
             self.phase = "home"
+            return
+        if self.phase == _RETURNS:  # its way leads there already
+            self.phase, self._began_s = BACK, now_s
             return
         path = [(here.x_m, here.y_m), *reversed(passed)]
         self._ways = [(begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > ARRIVED_M]
@@ -190,7 +283,7 @@ class Driver:
 
     def _wanted(self, here: OdometryPose) -> DriveVelocity:
         """Return the velocity that leads on, before it is limited; go over to the next way where this one ends."""
-        if self.phase in ("there", "home"):
+        if self.phase in (_WAITS, "there", "home"):
             return STAND
         while self._ways:
             begin, end = self._ways[0]
@@ -204,8 +297,11 @@ class Driver:
                 return self._along(left_m, wrapped(heading_rad - here.yaw_rad))
             del self._ways[0]
             self._turning = True
-        if self.phase == BACK and abs(wrapped(here.yaw_rad)) > FACES_RAD:
+        if self.phase in (_RETURNS, BACK) and abs(wrapped(here.yaw_rad)) > FACES_RAD:
             return DriveVelocity(0.0, self._turn_rad_s(wrapped(-here.yaw_rad)))
+        if self.phase == _RETURNS:
+            self._go_out(self._now_s)
+            return STAND
         self.phase = "there" if self.phase == OUT else "home"
         return STAND
 
@@ -228,6 +324,15 @@ class Driver:
         forward = _near(self._last.forward_m_s, wanted.forward_m_s, most)
         turn = _near(self._last.turn_rad_s, wanted.turn_rad_s, turn_most)
         return DriveVelocity(_within(forward, task.speed_m_s), _within(turn, task.turn_rad_s))
+
+
+def _off_leg_m(place: tuple[float, float], begin: tuple[float, float], end: tuple[float, float]) -> float:
+    """Return the distance of a place from a straight piece of a path, in metres."""
+    along = end[0] - begin[0], end[1] - begin[1]
+    off = place[0] - begin[0], place[1] - begin[1]
+    square = along[0] ** 2 + along[1] ** 2
+    share = min(max((off[0] * along[0] + off[1] * along[1]) / square, 0.0), 1.0) if square else 0.0
+    return math.hypot(off[0] - share * along[0], off[1] - share * along[1])
 
 
 def _near(now: float, wanted: float, most: float) -> float:

@@ -30,7 +30,7 @@ _CDR_HEADER = b"\0\1\0\0"
 _POLL_S = 0.001
 WAKES_S = 0.2
 """A wait without end ends so often: a signal that the kernel gives to another thread wakes nobody who waits."""
-_SETTLES_S = 0.5
+SETTLES_S = 0.5
 """Between the moment at which a publisher knows a subscription, and the first sample: that is to know it, too."""
 _DRAINS_S = 2.0
 
@@ -104,7 +104,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
         if time.monotonic() > deadline_s or over.wait(_POLL_S):
             return
     log.note(records.MATCHED, time.time_ns())
-    over.wait(_SETTLES_S)
+    over.wait(SETTLES_S)
     begun_s, sequence, tick, ticks = time.monotonic(), 0, 0, round(stream.duration_s * stream.rate_hz)
     while tick < ticks:
         early_s = begun_s + tick / stream.rate_hz - time.monotonic()
@@ -120,7 +120,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over
             log.note(records.SKIPPED, time.time_ns(), sequence=due - tick - 1)
         tick = max(tick + 1, due)
     publisher.drain(_DRAINS_S)
-    over.wait(_SETTLES_S)
+    over.wait(SETTLES_S)
 
 
 def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, over: threading.Event) -> None:

@@ -107,9 +107,11 @@ class ZenohMiddleware:
             made: Any = zenoh.ext.declare_advanced_publisher(
                 self._session, topic.key, cache=cache, publisher_detection=True, **options
             )
+            # An advanced publisher does not report whether a subscription matches it; a plain one with its key does.
+            matching: Any = self._session.declare_publisher(topic.key, **options)
         else:
-            made = self._session.declare_publisher(topic.key, **options)
-        return ZenohPublisher(made, gid(self._tell(topic, "publisher")))
+            made = matching = self._session.declare_publisher(topic.key, **options)
+        return ZenohPublisher(made, matching, gid(self._tell(topic, "publisher")))
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
         """See `Middleware.subscribe`."""
@@ -156,8 +158,9 @@ class ZenohMiddleware:
 class ZenohPublisher:
     """A publisher whose samples have attachments."""
 
-    def __init__(self, publisher: Any, identifier: bytes) -> None:  # noqa: ANN401 (untyped)
+    def __init__(self, publisher: Any, matching: Any, identifier: bytes) -> None:  # noqa: ANN401 (untyped)
         self._publisher = publisher
+        self._matching = matching
         self._gid = identifier
         self._sequence = 0
 
@@ -170,7 +173,7 @@ class ZenohPublisher:
 
     def matched(self) -> int:
         """See `Publisher.matched`."""
-        return int(self._publisher.matching_status.matching)
+        return int(self._matching.matching_status.matching)
 
     def drain(self, limit_s: float) -> None:
         """See `Publisher.drain`: Zenoh tells nobody."""

@@ -1,6 +1,7 @@
 """Comparability of two runs: what makes their numbers differ, other than what is being compared."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -9,7 +10,6 @@ from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.core.columns import cell, plain_name
-from fieldkit.core.lazy import dataclass
 
 UNKNOWN: Final = "unknown"
 
@@ -22,6 +22,7 @@ SAME: Final = (
     "protocol",
     "rtt_payload_bytes",
     "paper_window_bytes",
+    "tcp_congestion_control",
 )
 """Columns that must hold the same values on both sides."""
 

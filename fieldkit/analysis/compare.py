@@ -1,7 +1,7 @@
 """Two runs beside each other: per condition and quantity, how far B is from A."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -14,7 +14,6 @@ from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.analysis.words import Tally
 from fieldkit.core.columns import cell
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Interval, Status
 
 PAIRED_BY: Final = ("scenario", "topology", "distance_m", "protocol")
@@ -206,6 +205,9 @@ def _differences(
 
 def _measured(rows: Repeats, quantity: Quantity) -> Numbers:
     known = np.isfinite([rows.numbers[name] for name in quantity.columns]).all(axis=0)  # as cells take them
+    if quantity.at_least is not None:
+        values, _ = rows.observed(quantity)
+        return values[np.isfinite(values)]
     return rows.numbers[quantity.name][known]
 
 

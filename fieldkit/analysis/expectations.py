@@ -2,29 +2,53 @@
 
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
 from typing import Final
 
 from fieldkit.analysis.quantities import Quantity, parse_amount
+from fieldkit.core.columns import Kind
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol
 
 _TEXT: Final = re.compile(
-    rf"(?:(?P<protocol>{'|'.join(Protocol)})\s+)?(?P<name>[a-z][a-z0-9_.]{{0,100}})\s*(?P<sign><|>)\s*(?P<amount>[^<>=]+)",
+    rf"(?:(?P<protocol>{'|'.join(Protocol)})\s+)?"
+    r"(?:(?P<repeats>every|max|min)\s+|(?P<share>[0-9][0-9.]{0,20}\s*%)\s+of\s+)?"
+    r"(?P<name>[a-z][a-z0-9_.]{0,100})\s*(?P<sign><=|>=|<|>)\s*(?P<amount>[^<>=]+?)(?P<packets>\s+of\s+all\s+packets)?",
     re.ASCII,
 )
+_FORMS: Final = "ip_loss < 2 %; every rtt_gap_s < 300 ms; 90 % of rtt_gap_s < 300 ms; ip_loss < 2 % of all packets"
+MOST_SHARE: Final = 0.9999
+"""Largest share of all repeats that an expectation may demand."""
+_LEAST_LOSS: Final = 1e-9
+
+
+class Scope(StrEnum):
+    """What an expectation is about.
+
+    `figure`: the figure that all repeats make, by its 95 % interval; `every`: every repeat of the trial; `share`: a
+    share of all repeats that could be run, with 95 % confidence; `packets`: the packets of all repeats together.
+    """
+
+    FIGURE = "figure"
+    EVERY = "every"
+    SHARE = "share"
+    PACKETS = "packets"
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """A demand on a figure: `udp up.file_loss < 2 %`.
+    """A demand on a figure: `udp up.file_loss < 5 %`.
 
     Attributes:
         text: As it was written.
         quantity: Name of the figure.
-        is_below: Whether it is to be below the bound, or else above it.
+        is_below: Whether it must be below the bound, or else above it.
         bound: The bound, in the figure's unit.
         protocol: For the repeats of which protocol; None for all.
+        is_inclusive: Whether it may be the bound itself: `<=`, `>=`.
+        scope: What it is about.
+        share: Of which share of all repeats; None unless that is its scope.
     """
 
     text: str
@@ -32,32 +56,78 @@ class Expectation:
     is_below: bool
     bound: float
     protocol: Protocol | None = None
+    is_inclusive: bool = False
+    scope: Scope = Scope.FIGURE
+    share: float | None = None
+
+    def is_met(self, value: float) -> bool:
+        """Return whether a value is where it must be."""
+        if value == self.bound:
+            return self.is_inclusive
+        return (value < self.bound) is self.is_below
 
 
 def parse(text: str, known: Iterable[Quantity]) -> Expectation:
     """Return what an expectation says.
 
     Args:
-        text: `NAME < AMOUNT` or `NAME > AMOUNT`, with `tcp` or `udp` before it for one protocol alone.
+        text: `NAME < AMOUNT`, with `<`, `<=`, `>` or `>=`; `every` before it for every repeat (or `max` with `<`,
+            `min` with `>`), `90 % of` for a share of all repeats, `of all packets` behind it for all packets
+            together; `tcp` or `udp` before all for one protocol alone.
         known: The figures that there can be.
 
     Raises:
-        ConfigurationError: It says nothing, or of a figure that there is not.
+        ConfigurationError: It is none of these, or of an unknown figure.
     """
     by_name = {quantity.name: quantity for quantity in known}
-    found = _TEXT.fullmatch(text.strip())
-    if found is None:
-        raise ConfigurationError(
-            f"{text[:60]!r} is no expectation", remedy="write for example: ip_loss < 2 %; or: udp jitter_s < 5 ms"
-        )
-    if (name := found["name"]) not in by_name:
+    match = _TEXT.fullmatch(text.strip())
+    if match is None:
+        raise ConfigurationError(f"{text[:60]!r} is not an expectation", remedy=f"write for example: {_FORMS}")
+    if (name := match["name"]) not in by_name:
         raise ConfigurationError(
             f"there is no figure {name!r} to expect something of",
             remedy=nearest(name, by_name, f"there are: {', '.join(by_name)}"),
         )
-    amount = found["amount"].strip()
+    quantity, amount = by_name[name], match["amount"].strip()
+    is_below = match["sign"].startswith("<")
+    scope, share = _scope(match, quantity, is_below=is_below)
     sign = -1.0 if amount.startswith("-") else 1.0
-    unit = by_name[name].unit
-    bound = sign * parse_amount(amount.removeprefix("-"), unit, f"bound for {name}")
-    protocol = Protocol(found["protocol"]) if found["protocol"] else None
-    return Expectation(text.strip(), name, found["sign"] == "<", bound, protocol)
+    bound = sign * parse_amount(amount.removeprefix("-"), quantity.unit, f"bound for {name}")
+    if scope is Scope.PACKETS and bound < _LEAST_LOSS:
+        raise ConfigurationError(
+            f"no number of packets shows a loss below {amount}", remedy=f"write for example: every {name} <= 0 %"
+        )
+    return Expectation(
+        text.strip(),
+        name,
+        is_below,
+        bound,
+        Protocol(match["protocol"]) if match["protocol"] else None,
+        is_inclusive=match["sign"].endswith("="),
+        scope=scope,
+        share=share,
+    )
+
+
+def _scope(match: re.Match[str], quantity: Quantity, *, is_below: bool) -> tuple[Scope, float | None]:
+    """Return what a text is about, and of which share of repeats."""
+    if match["packets"]:
+        if match["repeats"] or match["share"] or not is_below or quantity.kind is not Kind.COUNTED:
+            raise ConfigurationError(
+                f"{match[0][:60]!r}: only an upper bound of a loss that is counted is over all packets",
+                remedy="write for example: ip_loss < 2 % of all packets",
+            )
+        return Scope.PACKETS, None
+    if match["share"]:
+        share = parse_amount(match["share"], "share", "share of repeats")
+        if not 0 < share <= MOST_SHARE:
+            raise ConfigurationError(
+                f"{match['share']} is not a share that repeats can show",
+                remedy="write a share above 0 % and below 100 %; or every, for every repeat of the trial",
+            )
+        return Scope.SHARE, share
+    if match["repeats"] in {"max", "min"} and (match["repeats"] == "max") is not is_below:
+        raise ConfigurationError(
+            f"{match[0][:60]!r}: that is about one repeat alone", remedy="write max with <, min with >, or every"
+        )
+    return (Scope.EVERY if match["repeats"] else Scope.FIGURE), None

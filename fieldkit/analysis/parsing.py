@@ -3,6 +3,7 @@
 import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import count
 from typing import Any, Final
 
 import numpy as np
@@ -14,6 +15,7 @@ from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.core.columns import MISSING, SCHEMA_VERSION, Column, Kind
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError
 from fieldkit.core.model import ENDED
+from fieldkit.core.text import unguarded
 
 Numbers = NDArray[np.float64]
 Texts = NDArray[np.object_]
@@ -66,6 +68,12 @@ def columns(
                 np.asarray(np.full(rows, np.nan, _width(declaration))) if column is None else _numbers(column)
             )
     return numbers, texts, rows
+
+
+def codes(column: Texts) -> NDArray[np.int64]:
+    """Return a number for each text of a column: the index of the first row with an equal one."""
+    first: dict[str, int] = {}
+    return np.fromiter(map(first.setdefault, column, count()), np.int64, len(column))
 
 
 def are_possible(values: Numbers, column: Column) -> bool:
@@ -131,7 +139,7 @@ def _width(column: Column) -> type[np.float64] | type[np.longdouble]:
 
 def _texts(column: pa.ChunkedArray) -> Texts:
     encoded = column.unify_dictionaries().combine_chunks()
-    known = np.array([*encoded.dictionary.to_pylist(), ""], dtype=np.object_)
+    known = np.array([*map(unguarded, encoded.dictionary.to_pylist()), ""], dtype=np.object_)
     return np.asarray(known[_plain(encoded.indices, np.int32)], dtype=np.object_)
 
 

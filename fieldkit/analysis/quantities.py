@@ -3,15 +3,18 @@
 import re
 import sys
 from collections.abc import Iterable
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Self
 
-from fieldkit.core.columns import BACKGROUND, FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name
+from fieldkit.core.columns import BACKGROUND, FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name, prefixed
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
 _NUMBER: Final = re.compile(r"\d{1,15}(?:\.\d{1,30})?|\.\d{1,30}", re.ASCII)
+_IMPLIED_BY: Final = MappingProxyType(
+    {"rtt_median_s": "rtt_loss", "goodput_bit_s": "file_loss", "topic_delay_median_s": "topic_loss"}
+)
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,8 @@ class Quantity:
         sent: Column that counts of how many; None unless counted.
         possible: Smallest and largest value of a repeat.
         rank: Place among others, from the first.
+        at_least: Column of lower bounds of what had not ended, None if there is none; see `columns.Figure`.
+        of_sent: Column of the same statistic over all that was sent, likewise.
     """
 
     name: str
@@ -37,6 +42,8 @@ class Quantity:
     sent: str | None = None
     possible: Bounds = (-sys.float_info.max, sys.float_info.max)
     rank: int = FIRST_OF_OTHERS
+    at_least: str | None = None
+    of_sent: str | None = None
 
     @classmethod
     def of(cls, column: Column) -> Self | None:
@@ -44,8 +51,18 @@ class Quantity:
         one = column.figure
         if one is None or one.kind is Kind.WORDS:
             return None
-        unit = "share" if one.kind is Kind.FLAG else column.unit
-        return cls(column.name, one.label, one.kind, unit, one.arrived, one.sent, column.possible, one.rank)
+        return cls(
+            column.name,
+            one.label,
+            one.kind,
+            unit="share" if one.kind is Kind.FLAG else column.unit,
+            arrived=one.arrived,
+            sent=one.sent,
+            possible=column.possible,
+            rank=one.rank,
+            at_least=one.at_least,
+            of_sent=one.of_sent,
+        )
 
     @property
     def step(self) -> str:
@@ -63,9 +80,34 @@ class Quantity:
         return not FIRST_OF_OTHERS <= self.rank < BACKGROUND
 
     @property
+    def payload(self) -> str | None:
+        """Column with the ICMP payload size, without which a round-trip time cannot be read; None for others."""
+        return prefixed(self.step, "rtt_payload_bytes") if plain_name(self.name) == "rtt_median_s" else None
+
+    @property
+    def implied_by(self) -> str | None:
+        """Column whose value shows that a repeat was measured for this quantity too; None if none is known."""
+        name = _IMPLIED_BY.get(plain_name(self.name))
+        return name and prefixed(self.step, name)
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """All columns that a table of it is made of: `columns`, `companions`, and those that say how to read it."""
+        return (
+            *self.columns,
+            *self.companions,
+            *(name for name in (self.payload, self.implied_by) if name is not None),
+        )
+
+    @property
     def columns(self) -> tuple[str, ...]:
-        """All columns that it is made of, itself first."""
+        """The columns without which a repeat does not have it, itself first."""
         return tuple(name for name in (self.name, self.arrived, self.sent) if name is not None)
+
+    @property
+    def companions(self) -> tuple[str, ...]:
+        """The columns that say more of it where they are there: lower bounds, the figure over all that was sent."""
+        return tuple(name for name in (self.at_least, self.of_sent) if name is not None)
 
 
 def quantities(columns: Iterable[Column]) -> tuple[Quantity, ...]:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import count
 from pathlib import Path
 from typing import Final, Self
 
@@ -20,7 +19,7 @@ from fieldkit.analysis.words import worded
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
-from fieldkit.core.units import format_count
+from fieldkit.core.text import unguarded
 
 Key = tuple[str | float | None, ...]
 """Values of some columns in one row; a missing text is empty, a missing number None."""
@@ -88,9 +87,27 @@ class Repeats:
         values[missing] = None
         return list(values)
 
+    def observed(self, quantity: Quantity) -> tuple[Numbers, NDArray[np.bool_]]:
+        """Return a quantity row by row, and in which rows that is only a lower bound; NaN where it is missing."""
+        values = self.numbers[quantity.name]
+        bounds = self.numbers.get(quantity.at_least or "")
+        if bounds is None:
+            return values, np.zeros(len(values), np.bool_)
+        censored = np.isnan(values) & np.isfinite(bounds)
+        return np.where(censored, bounds, values), censored
+
     def keys(self, names: Sequence[str]) -> list[Key]:
         """Return what the columns `names` hold, row by row."""
         return list(zip(*map(self.column, names), strict=True)) if names else [()] * len(self)
+
+    def codes(self, names: Sequence[str]) -> NDArray[np.int64]:
+        """Return a number per row, equal where the columns `names` hold the same, counted from 0."""
+        found = np.zeros(len(self), np.int64)
+        for name in names:
+            texts = self.texts.get(name)
+            own = np.unique(self.numbers[name], return_inverse=True)[1] if texts is None else parsing.codes(texts)
+            found = np.unique(found * (own.max(initial=0) + 1) + own, return_inverse=True)[1]
+        return found
 
     def groups(self, names: Sequence[str]) -> dict[Key, NDArray[np.int64]]:
         """Return the index of the rows of each key, both in the order of the rows."""
@@ -143,10 +160,22 @@ class Repeats:
         return rows[0]
 
 
-def parse(content: bytes, declared: Iterable[Column]) -> Repeats:
-    """Return what a trial.csv holds; columns that it lacks are missing throughout."""
+def parse(content: bytes, declared: Iterable[Column], where: str = "trial.csv") -> Repeats:
+    """Return what a trial.csv holds; columns that it lacks are missing throughout.
+
+    Raises:
+        EvidenceError: A value is not what its column is declared to hold.
+    """
     header, _, body = content.partition(b"\n")
-    return _parse(_names(header), body, _named(declared))
+    named = _named(declared)
+    try:
+        return _parse(_names(header), body, named)
+    except ValueError as error:
+        raise parsing.first_problem(where, content, named) or EvidenceError(
+            f"its values are not what its columns are declared to hold: {error}",
+            where=where,
+            remedy="correct columns: of trial.yaml, which says what each is",
+        ) from error
 
 
 def _named(declared: Iterable[Column]) -> dict[str, Column]:
@@ -186,6 +215,10 @@ def read(
         order.append(np.repeat(batch.numbers, counts))
 
     for number, path in enumerate(paths):
+        if content == Path.read_bytes and (large := _large(path, named)) is not None:
+            parts.append(large)
+            order.append(np.full(len(large), number))
+            continue
         header, body = _split(path, content)
         if header not in batches:
             batches[header] = _Batch(header, _header(path, header))
@@ -221,29 +254,6 @@ def names(path: Path) -> tuple[str, ...]:
     """
     with _readable(path), path.open("rb") as file:
         return _names(file.readline(_MOST_HEADER_BYTES))
-
-
-def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
-    """Return each attempt once, where it is first, and a note on each source of which something was left out.
-
-    Raises:
-        ConfigurationError: Two sources say different things of an attempt.
-    """
-    first: dict[object, int] = {}
-    columns = (repeats.column(name) for name in ("protocol", "repeat", "attempt"))
-    # An attempt of no named trial cannot be told from another.
-    trials = [trial or row for row, trial in enumerate(repeats.texts["trial"])]
-    firsts = np.fromiter(map(first.setdefault, zip(trials, *columns, strict=True), count()), np.int64, len(repeats))
-    again = np.flatnonzero(firsts != np.arange(len(repeats)))
-    if not len(again):
-        return repeats, ()
-    _demand_equal(repeats.where(firsts[again]), repeats.where(again))
-    pairs = Counter(zip(repeats.texts[SOURCE][again], repeats.texts[SOURCE][firsts[again]], strict=True))
-    notes = tuple(
-        f"{source}: {format_count(rows, 'row')} of {kept} again, counted once"
-        for (source, kept), rows in pairs.items()
-    )
-    return repeats.where(np.setdiff1d(firsts, again)), notes
 
 
 @dataclass
@@ -283,6 +293,29 @@ class _Batch:
             return _parse(self.names, body, declared)
         except ValueError as error:
             raise EvidenceError(str(error), where=str(path), remedy="mend the file") from error
+
+
+def _large(path: Path, declared: Mapping[str, Column]) -> Repeats | None:
+    """Return the rows of a large table, which is never in memory whole; None for a small one, or a damaged one.
+
+    Errors of its header as `_header`.
+    """
+    with _readable(path):
+        if path.stat().st_size < 2 * _BATCH_BYTES:
+            return None
+        with path.open("rb") as file:
+            names = _header(path, file.readline(_MOST_HEADER_BYTES).removesuffix(b"\n"))
+            parts = []
+            while block := file.read(_BATCH_BYTES) + file.readline():
+                try:
+                    rows = _parse(names, block, declared)
+                except ValueError:
+                    return None
+                if len(rows) != block.count(b"\n") or not _is_sound(rows, declared):
+                    return None
+                parts.append(rows)
+    together = _concatenated(parts)
+    return replace(together, texts={**together.texts, SOURCE: np.full(len(together), _source(path), np.object_)})
 
 
 def _is_sound(rows: Repeats, declared: Mapping[str, Column]) -> bool:
@@ -334,7 +367,7 @@ def _demand_end(path: Path, body: bytes) -> None:
 def _names(header: bytes) -> tuple[str, ...]:
     """Return the names in a header line, none where one is of more than 128 kB, in whatever this is."""
     try:
-        return tuple(next(csv.reader([header.decode("utf-8-sig", errors="replace")]), ()))
+        return tuple(map(unguarded, next(csv.reader([header.decode("utf-8-sig", errors="replace")]), ())))
     except csv.Error:
         return ()
 
@@ -359,22 +392,11 @@ def _parse(names: Sequence[str], body: bytes, declared: Mapping[str, Column]) ->
 
 
 def _concatenated(parts: Sequence[Repeats]) -> Repeats:
+    """Return the rows of all parts; a column of the parts is freed as soon as it is joined, as large as all are."""
+    numbers, texts = ([dict(getattr(part, kind)) for part in parts] for kind in ("numbers", "texts"))
+    names, words, columns = list(numbers[0]), list(texts[0]), parts[0].columns
     return Repeats(
-        {name: np.concatenate([part.numbers[name] for part in parts]) for name in parts[0].numbers},
-        {name: np.concatenate([part.texts[name] for part in parts]) for name in parts[0].texts},
-        parts[0].columns,
+        {name: np.concatenate([part.pop(name) for part in numbers]) for name in names},
+        {name: np.concatenate([part.pop(name) for part in texts]) for name in words},
+        columns,
     )
-
-
-def _demand_equal(kept: Repeats, other: Repeats) -> None:
-    differ = {name: column != other.texts[name] for name, column in kept.texts.items() if name != SOURCE}
-    for name, column in kept.numbers.items():
-        differ[name] = (column != other.numbers[name]) & ~(np.isnan(column) & np.isnan(other.numbers[name]))
-    for name, column in differ.items():
-        for index in np.flatnonzero(column)[:1]:
-            raise ConfigurationError(
-                f"{kept.name(index)} of {kept.texts['trial'][index]} has another {name} "
-                f"than in {kept.texts[SOURCE][index]}",
-                where=other.texts[SOURCE][index],
-                remedy="name one of the two",
-            )

@@ -1,10 +1,11 @@
 """Statistics over repeats, all intervals at 95 %: shares, means and medians, and how far two samples are apart.
 
 What is over repeats takes each repeat as one independent draw, whatever goes on inside it. All is in closed form and
-vectorized over cells: nothing is resampled, so no figure depends on a seed. docs/method.md has the coverage.
+vectorized over cells. Nothing is resampled, so no figure depends on a seed. Coverage: docs/method-intervals.md.
 """
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 from statistics import NormalDist
 from typing import Final
@@ -12,7 +13,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Interval
 
 Floats = NDArray[np.float64]
@@ -158,7 +158,9 @@ def means(values: ArrayLike) -> Intervals:
     return Intervals(value, low, high)
 
 
-def medians(values: ArrayLike, least: float = -math.inf, most: float = math.inf) -> Intervals:
+def medians(
+    values: ArrayLike, least: float = -math.inf, most: float = math.inf, *, upper: ArrayLike | None = None
+) -> Intervals:
     """Return of each cell the median over repeats with its interval.
 
     From six repeats on from one order statistic to another, the innermost two that hold the median in 95 % whatever
@@ -166,26 +168,36 @@ def medians(values: ArrayLike, least: float = -math.inf, most: float = math.inf)
     enough apart: then Student's interval, which takes the repeats as normal, and all of the repeats, which together
     hold it in `assured` at least.
 
+    A repeat of which only a lower bound is known (it is censored) has that as its value, and infinity as `upper`. The
+    lower end is that of the lower bounds and the upper end that of the upper ones, so that the interval holds what it
+    would hold if all were known. With fewer than six repeats it is then that of all repeats alone.
+
     Args:
         values: Shape (cells, n).
         least: What no value can be below: 0 for a time.
         most: What none can be above.
+        upper: The largest that each value can be, same shape, infinity where that is not known; None for the values.
 
     Returns:
-        No interval for n = 1.
+        No interval for n = 1; infinity for an upper end that is not known.
     """
     values = np.asarray(values, dtype=np.float64)
+    tops = values if upper is None else np.asarray(upper, dtype=np.float64)
     n, value = values.shape[1], np.median(values, axis=1)
     if n < 2:
         return _without(value)
     if n < FEWEST_FOR_ORDER:
         centre = values.mean(axis=1)
         half = student(np.array(n - 1.0)) * values.std(axis=1, ddof=1) / math.sqrt(n)
-        low, high = np.minimum(centre - half, values.min(axis=1)), np.maximum(centre + half, values.max(axis=1))
-        return _around(value, np.maximum(low, least), np.minimum(high, most))
+        half = np.where((tops > values).any(axis=1), 0, half)
+        low, high = np.minimum(centre - half, values.min(axis=1)), np.maximum(centre + half, tops.max(axis=1))
+        return _around(value, np.maximum(low, least), np.where(np.isinf(high), high, np.minimum(high, most)))
     rank = _rank(n)
-    ends = np.partition(values, (rank - 1, n - rank), axis=1)
-    return _around(value, ends[:, rank - 1], ends[:, n - rank])
+    return _around(
+        value,
+        np.partition(values, rank - 1, axis=1)[:, rank - 1],
+        np.partition(tops, n - rank, axis=1)[:, n - rank],
+    )
 
 
 def assured(n: int) -> float:

@@ -1,23 +1,24 @@
 """Cells and comparisons as tables: CSV and JSON for programs, Markdown for GitHub, LaTeX for a paper."""
 
-import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from itertools import groupby
 from typing import Any, Final
 
 from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.compare import Comparison, Difference, Pair
+from fieldkit.analysis.lines import TableLine, lines
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.words import Tally
 from fieldkit.core.columns import SCHEMA_VERSION, DifferenceRow, EstimateRow, Kind, csv_text, declared
-from fieldkit.core.lazy import dataclass
+from fieldkit.core.text import json_text, one_line
 
 MORE: Final = "more_wanted"
 _MARKUP: Final = re.compile(r"[\\|`*]|<(?=[A-Za-z/!?])|(?<=\])[(\[:]")
 _ACROSS: Final = ("scenario", "protocol")
+_LATEX_AT_LEAST: Final = r"$\geq$ "
 _LATEX_SPECIAL: Final = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -32,9 +33,9 @@ def estimate_rows(cell: Cell) -> Iterator[EstimateRow]:
     if not cell.estimates and not cell.tallies:
         yield EstimateRow(**counts)
     for name, estimate in cell.estimates.items():
-        same = {item.name: getattr(estimate, item.name) for item in fields(estimate) if item.name != "quantity"}
+        same = {item.name: getattr(estimate, item.name, None) for item in fields(EstimateRow)}
         yield EstimateRow(
-            quantity=name, unit=estimate.quantity.unit, estimate=estimate.quantity.kind, **counts, **same
+            **{**same, **counts, "quantity": name, "unit": estimate.quantity.unit, "estimate": estimate.quantity.kind}
         )
     for tally in cell.tallies.values():
         for word, events in tally.counts.items():
@@ -60,13 +61,13 @@ def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str,
     """
     names = [column.name for column in declared(EstimateRow)]
     wanted = more or ({},) * len(cells)
-    lines = (
+    rows = (
         [*(cell.key[name] for name in by), *(getattr(row, name) for name in names)]
         + ([counts.get(row.quantity or "")] if more else [])
         for cell, counts in zip(cells, wanted, strict=True)
         for row in estimate_rows(cell)
     )
-    return csv_text([*by, *names, *([MORE] if more else [])], lines)
+    return csv_text([*by, *names, *([MORE] if more else [])], rows)
 
 
 def to_json(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str, int]] = ()) -> str:
@@ -75,7 +76,7 @@ def to_json(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str
     listed = [_object(cell, counts if more else None) for cell, counts in zip(cells, wanted, strict=True)]
     cautions = list(wording.cautions(cells))
     whole = {"schema_version": SCHEMA_VERSION, "by": list(by), "cautions": cautions, "cells": listed}
-    return json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return json_text(whole, indent=1, allow_nan=False) + "\n"
 
 
 def _object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
@@ -116,7 +117,7 @@ def comparison_csv(comparison: Comparison) -> str:
 
 def comparison_json(comparison: Comparison) -> str:
     """Return a comparison as one JSON object: conclusions in words, concerns, and differences as in the CSV."""
-    text = json.dumps(
+    text = json_text(
         {
             "schema_version": SCHEMA_VERSION,
             "by": list(comparison.by),
@@ -129,7 +130,6 @@ def comparison_json(comparison: Comparison) -> str:
             ],
         },
         indent=1,
-        ensure_ascii=False,
         allow_nan=False,
     )
     return f"{text}\n"
@@ -180,26 +180,20 @@ def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Q
     The columns of words that cells have follow.
     """
     apart, common = wording.told_by(by, cells)
-    scales = {quantity: wording.scale(quantity, cells) for quantity in wording.shown(cells, quantities)}
+    shown = [(line, line.scale(cells)) for line in lines(cells, quantities)]
     words = wording.worded(cells)
-    head = [
-        *apart,
-        "repeats",
-        *(scale.head(wording.label(quantity)) for quantity, scale in scales.items()),
-        *words.values(),
-    ]
-    marks = ["---"] * (len(apart) + 1) + ["---:"] * len(scales) + ["---"] * len(words)
-    lines = [markdown_line(head), markdown_line(marks)]
+    head = [*apart, "repeats", *(scale.head(line.label) for line, scale in shown), *words.values()]
+    marks = ["---"] * (len(apart) + 1) + ["---:"] * len(shown) + ["---"] * len(words)
+    rows = [markdown_line(head), markdown_line(marks)]
     for cell in cells:
-        found = [(scale, cell.estimates.get(quantity.name)) for quantity, scale in scales.items()]
-        figures = (f"{s.number(e.value)} {wording.interval(s, e)}".rstrip() if e else "" for s, e in found)
-        said = (wording.tally(cell, name) for name in words)
         conditions = (wording.key(cell, name) for name in apart)
-        lines.append(markdown_line([*conditions, wording.counts(cell), *figures, *said]))
+        figures = (line.number(cell, scale) for line, scale in shown)
+        said = (wording.tally(cell, name) for name in words)
+        rows.append(markdown_line([*conditions, wording.counts(cell), *figures, *said]))
     above = markdown_escaped(", ".join(f"{name} {wording.key(cells[0], name)}" for name in common))
     how = f"{above}; each value with its 95 % interval" if above else "Each value with its 95 % interval"
     below = "".join(f"\n{markdown_escaped(caution)}.\n" for caution in wording.cautions(cells))
-    return f"{how}.\n\n" + "".join(lines) + below
+    return f"{how}.\n\n" + "".join(rows) + below
 
 
 def markdown_line(parts: Iterable[str]) -> str:
@@ -209,7 +203,7 @@ def markdown_line(parts: Iterable[str]) -> str:
 
 def markdown_escaped(text: str) -> str:
     """Return a text, of whoever wrote the evidence, that neither ends a cell nor is markup, a link or HTML."""
-    return _MARKUP.sub(r"\\\g<0>", " ".join(text.splitlines()))
+    return _MARKUP.sub(r"\\\g<0>", one_line(text))
 
 
 @dataclass(frozen=True)
@@ -217,30 +211,30 @@ class _Column:
     """One column of figures; its head has a line for each of these, empty where cells are not told apart by it."""
 
     scenario: str
-    quantity: Quantity
+    line: TableLine
     protocol: str
 
     def has(self, cell: Cell) -> bool:
-        return self.quantity.name in cell.estimates and (self.scenario, self.protocol) == _across(cell)
+        is_there = self.line.estimate(cell) is not None or self.line.is_lacking(cell)
+        return is_there and (self.scenario, self.protocol) == _across(cell)
 
 
 def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
     """Return a `table` as wide as a column; it needs booktabs and graphicx. Columns without a figure are left out."""
     down, common = ([name for name in names if name not in _ACROSS] for names in wording.told_by(by, cells))
-    shown = wording.shown(cells, quantities)
+    scales = {line: line.scale(cells) for line in lines(cells, quantities)}
     scenarios, protocols = (dict.fromkeys(values) for values in zip(*map(_across, cells), strict=True))
     columns = [
         column
         for column in (
-            _Column(scenario, quantity, other) for scenario in scenarios for quantity in shown for other in protocols
+            _Column(scenario, line, other) for scenario in scenarios for line in scales for other in protocols
         )
         if any(column.has(cell) for cell in cells)
     ]
-    scales = {quantity: wording.scale(quantity, cells) for quantity in shown}
     rows: dict[tuple[str, ...], list[Cell]] = {}
     for cell in cells:
         rows.setdefault(tuple(wording.key(cell, name) for name in down), []).append(cell)
-    lines = [
+    parts = [
         r"\begin{table}",
         r"\centering",
         rf"\caption{{{_latex_caption(common, cells)}}}",
@@ -257,7 +251,7 @@ def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quan
         r"\end{tabular}}",
         r"\end{table}",
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(parts) + "\n"
 
 
 def _across(cell: Cell) -> tuple[str, str]:
@@ -274,10 +268,10 @@ def _latex_caption(common: Sequence[str], cells: Sequence[Cell]) -> str:
 
 
 def _latex_head(
-    down: Sequence[str], columns: Sequence[_Column], scales: dict[Quantity, wording.Scale]
+    down: Sequence[str], columns: Sequence[_Column], scales: Mapping[TableLine, wording.Scale]
 ) -> Iterator[str]:
     """Yield the lines of the head: what stands over several columns is ruled off below."""
-    named = [scales[column.quantity].head(wording.label(column.quantity)) for column in columns]
+    named = [scales[column.line].head(column.line.label) for column in columns]
     levels: list[list[tuple[str, ...]]] = [
         [(column.scenario,) for column in columns],
         [(column.scenario, name) for column, name in zip(columns, named, strict=True)],
@@ -298,14 +292,11 @@ def _latex_head(
 
 
 def _latex_figures(
-    columns: Sequence[_Column], scales: dict[Quantity, wording.Scale], row: Sequence[Cell]
+    columns: Sequence[_Column], scales: Mapping[TableLine, wording.Scale], row: Sequence[Cell]
 ) -> Iterator[str]:
     for column in columns:
-        scale = scales[column.quantity]
-        found = (cell.estimates[column.quantity.name] for cell in row if column.has(cell))
-        yield " ".join(
-            f"{scale.number(estimate.value)} {wording.interval(scale, estimate)}".rstrip() for estimate in found
-        )
+        figures = " ".join(column.line.number(cell, scales[column.line]) for cell in row if column.has(cell))
+        yield _latex_escaped(figures).replace(">= ", _LATEX_AT_LEAST)
 
 
 def _latex_line(parts: Sequence[str]) -> str:
@@ -313,4 +304,4 @@ def _latex_line(parts: Sequence[str]) -> str:
 
 
 def _latex_escaped(text: str) -> str:
-    return "".join(_LATEX_SPECIAL.get(char, char) for char in text)
+    return "".join(_LATEX_SPECIAL.get(char, char) for char in one_line(text))

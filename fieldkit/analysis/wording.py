@@ -2,18 +2,19 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.compare import Comparison, Difference
+from fieldkit.analysis.expectations import Scope
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import APART, Quantity, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, FEWEST_FOR_ORDER, assured
 from fieldkit.analysis.words import Tally
 from fieldkit.core import columns
 from fieldkit.core.columns import Kind
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import format_count
 
@@ -61,8 +62,10 @@ class Scale:
         return f"{label} ({self.unit})" if self.unit else label
 
     def interval(self, low: float | None, high: float | None) -> str:
-        """Return `[low, high]`, empty without one."""
-        return "" if low is None or high is None else f"[{self.number(low)}, {self.number(high)}]"
+        """Return `[low, high]`, `[low, ...)` where the upper end is open, empty without an interval."""
+        if low is None:
+            return ""
+        return f"[{self.number(low)}, ...)" if high is None else f"[{self.number(low)}, {self.number(high)}]"
 
 
 def interval(scale: Scale, found: Estimate) -> str:
@@ -71,13 +74,75 @@ def interval(scale: Scale, found: Estimate) -> str:
     return said and said + ("*" if is_few(found) else "") + ("!" if hangs_together(found) else "")
 
 
+def number(scale: Scale, found: Estimate, other: float | None = None) -> str:
+    """Return the figure to quote without its unit, `>= 2.30` where only a lower bound is known.
+
+    Args:
+        scale: How it is written.
+        found: The estimate.
+        other: Its mean or 95th percentile instead, which any censored repeat makes a lower bound.
+    """
+    if other is not None:
+        return f"{_at_least(found.n_censored > 0)}{scale.number(other)}"
+    return f"{_at_least(found.is_lower_bound)}{scale.number(found.value)}"
+
+
+def amount(scale: Scale, found: Estimate) -> str:
+    """Return the same with its unit."""
+    return f"{_at_least(found.is_lower_bound)}{scale.amount(found.value)}"
+
+
+def _at_least(is_bound: bool) -> str:
+    return ">= " if is_bound else ""
+
+
+def incomplete(found: Estimate) -> str:
+    """Return of how many repeats a figure is, `7 of 10`, and of how many there are lower bounds; empty if of all."""
+    parts = []
+    if found.missing:
+        parts.append(f"{found.n} of {found.n_valid}")
+    if found.n_censored:
+        parts.append(f"{found.n_censored} of {found.n} not ended")
+    return ", ".join(parts)
+
+
+def quoted(figure: str, scale: Scale, found: Estimate, between: str = " ") -> str:
+    """Return a figure with its interval, and with of how many repeats it is if not of all.
+
+    Args:
+        figure: As `number` or `amount` give it.
+        scale: How it is written.
+        found: The estimate.
+        between: What is between the parts.
+    """
+    of = incomplete(found)
+    return between.join(filter(None, (figure, interval(scale, found), f"({of})" if of else "")))
+
+
 def judged(one: Judgement) -> tuple[str, str, str, str, str]:
     """Return an expectation, of what it is, what was measured with its interval, and the ruling, in words."""
     of = str((one.cell and one.cell.key.get("protocol")) or one.expectation.protocol or "").upper()
+    ruling = f"{one.ruling}: {one.why}" if one.why else str(one.ruling)
     if one.found is None:
-        return one.expectation.text, of, "nothing", "", one.ruling
-    how = scale_of(one.found.quantity, [one.found.value])
-    return one.expectation.text, of, how.amount(one.found.value), interval(how, one.found), one.ruling
+        return one.expectation.text, of, "nothing", "", ruling
+    measured, bounds = _measured(one, one.found)
+    part = incomplete(one.found)
+    return one.expectation.text, of, f"{measured} ({part})" if part else measured, bounds, ruling
+
+
+def _measured(one: Judgement, found: Estimate) -> tuple[str, str]:
+    """Return what was measured for a judgement, and the interval or bound by which it was judged."""
+    expectation = one.expectation
+    how = scale_of(found.quantity, [found.value])
+    if expectation.scope is Scope.EVERY:
+        worst = found.maximum if expectation.is_below else found.minimum
+        how = scale_of(found.quantity, [worst])
+        return f"{_at_least(expectation.is_below and found.n_censored > 0)}{how.amount(worst)}", ""
+    if expectation.scope is Scope.SHARE and one.met is not None and one.limit is not None:
+        return f"{one.met} of {found.n} repeats", f"{Scale(100.0, '%').amount(one.limit)} or more"
+    if expectation.scope is Scope.PACKETS and one.limit is not None:
+        return how.amount(found.value), f"{how.amount(one.limit)} or less"
+    return amount(how, found), interval(how, found)
 
 
 def is_few(found: Estimate) -> bool:
@@ -90,14 +155,24 @@ def hangs_together(found: Estimate) -> bool:
     return found.p_order is not None and found.p_order < 1 - CONFIDENCE
 
 
-def cautions(cells: Sequence[Cell]) -> Iterator[str]:
-    """Yield what the marks of intervals mean, each with what to do."""
-    every = [(cell, estimate) for cell in cells for estimate in cell.estimates.values()]
-    if few := sorted({estimate.n for _, estimate in every if is_few(estimate)}):
-        held = ", ".join(f"{100 * assured(n):.0f} % of {n}" for n in reversed(few))
+def cautions(cells: Sequence[Cell], names: Collection[str] | None = None) -> Iterator[str]:
+    """Yield what the marks of intervals mean, each with what to do.
+
+    Args:
+        cells: What is shown.
+        names: Which quantities of them; None for all.
+    """
+    every = [
+        (cell, estimate)
+        for cell in cells
+        for name, estimate in cell.estimates.items()
+        if names is None or name in names
+    ]
+    if few := sorted({estimate.n for _, estimate in every if is_few(estimate)}, reverse=True):
+        held = ", ".join(f"{n} repeats give {100 * assured(n):.0f} %" for n in few)
         yield (
-            f"* a median of fewer than {FEWEST_FOR_ORDER} repeats: its interval holds it in 95 % if they spread as "
-            f"a normal distribution does, and whatever they do in {held} repeats; run {FEWEST_FOR_ORDER} at least"
+            f"* 95 % interval assuming a normal distribution; without that assumption {held}. "
+            f"Use {FEWEST_FOR_ORDER} or more repeats"
         )
     apart = [name for name in (cells[0].key if cells else ()) if len({cell.key[name] for cell in cells}) > 1]
     if together := [
@@ -107,9 +182,10 @@ def cautions(cells: Sequence[Cell]) -> Iterator[str]:
     ]:
         more = f" and {len(together) - _NAMED} more" if len(together) > _NAMED else ""
         yield (
-            f"! repeats that hang together in time, by a trend or as neighbours that are alike: "
-            f"{'; '.join(together[:_NAMED])}{more}; their intervals are too narrow, so shuffle the order of what you "
-            "compare (a campaign does), and measure on several days"
+            f"! repeats are not independent in time (trend or autocorrelation): "
+            f"{'; '.join(together[:_NAMED])}{more}. Their intervals are too narrow. Randomize the order of "
+            "conditions, as a campaign does, and measure on "
+            "several days"
         )
 
 

@@ -6,10 +6,10 @@ observation, however many they are. So a share of words has no interval, and a d
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.core.columns import Column, Kind
-from fieldkit.core.lazy import dataclass
 
 _OF: Final = "="
 """Between a column and one of its words, where a table has a line for each: `grass=wet`. No column's name has it."""

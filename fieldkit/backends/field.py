@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Final
 
+from fieldkit.backends import field_shells
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.backends.registry import cast_of
 from fieldkit.config.profiles import RobotProfile
@@ -18,10 +19,7 @@ from fieldkit.core.model import Control, Fault, FaultKind, Move, Placement, Role
 from fieldkit.core.prompts import Answer, Operator
 from fieldkit.core.units import format_distance
 from fieldkit.remote import passwords
-from fieldkit.remote.keys import read_private_key
-from fieldkit.remote.link import over_tcp
 from fieldkit.remote.shell import Shell
-from fieldkit.remote.ssh import SshShell
 
 
 class FieldBackend:
@@ -34,6 +32,7 @@ class FieldBackend:
 
     Attributes:
         allow_motion: Whether robots may be driven by fieldkit; otherwise the operator is asked to move them.
+        allow_motion_after_fault: Whether robots may move again after a fault stopped one, without a confirmation.
     """
 
     by_hand: Final = True
@@ -59,7 +58,8 @@ class FieldBackend:
         self._document = document
         self._ask = ask
         self.allow_motion = False
-        self._passwords: dict[str, str] = {}
+        self.allow_motion_after_fault = False
+        self._passwords: dict[str, str | None] = {}
 
     def cast(self, topology: Topology) -> Cast:
         """See `Backend.cast`."""
@@ -86,7 +86,7 @@ class FieldBackend:
         try:
             for role, robot in cast.items():
                 shells[role] = self._shell(robot.name, sink)
-            yield FieldTestbed(cast, shells, operator)
+            yield FieldTestbed(cast, shells, operator, allow_motion_after_fault=self.allow_motion_after_fault)
         finally:
             for shell in shells.values():
                 shell.close()
@@ -104,27 +104,16 @@ class FieldBackend:
 
     def _shell(self, name: str, sink: Sink) -> Shell:
         robot = self._site.robots[name]
-        host, user = robot.host or "", robot.user or ""
-        return SshShell(
+        if name not in self._passwords:  # looked up once per run
+            self._passwords[name] = field_shells.find_password(name, robot, self._ask)
+        return field_shells.open_shell(
             name,
-            connect=over_tcp(host, robot.port),
-            user=user,
-            host_key=robot.host_key or "",
-            private_key=None if robot.key is None else read_private_key(robot.key, where=name),
-            password=self._password(name, robot.password, user, host),
-            host=host,
-            port=robot.port,
+            robot,
+            self._passwords[name],
             patience_s=self._site.patience,
             notice=lambda text: sink(Note(text)),
             on_air=self._site.control is Control.RADIO,
         )
-
-    def _password(self, name: str, source: str | None, user: str, host: str) -> str | None:
-        """Return the password of a robot, asked for or looked up once per run."""
-        if source is not None and name not in self._passwords:
-            find = self._ask if source == "ask" else passwords.in_keyring
-            self._passwords[name] = find(user, host, name)
-        return self._passwords.get(name)
 
 
 def _tried(make: Callable[[], Shell]) -> Shell | FieldkitError:
@@ -141,11 +130,20 @@ class FieldTestbed:
         cast: Who plays which role.
         shells: Their control connections.
         operator: The person.
+        allow_motion_after_fault: See `Attended`.
     """
 
     oracle: Final = None
 
-    def __init__(self, cast: Cast, shells: Mapping[Role, Shell], operator: Operator) -> None:
+    def __init__(
+        self,
+        cast: Cast,
+        shells: Mapping[Role, Shell],
+        operator: Operator,
+        *,
+        allow_motion_after_fault: bool = False,
+    ) -> None:
+        self.allow_motion_after_fault = allow_motion_after_fault
         self._cast = cast
         self._shells = shells
         self.operator = operator

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
@@ -205,6 +205,37 @@ class Testbed(Protocol):
         Raises:
             FieldkitError: It could not be brought.
         """
+        ...
+
+
+@runtime_checkable
+class Transient(Protocol):
+    """An optional part of a `Testbed`: its robots, and all files on them, end with it."""
+
+    def demand_up(self) -> None:
+        """Return if every process that the robots need runs.
+
+        Raises:
+            TestbedLostError: One of them has ended, or does not answer any more.
+        """
+        ...
+
+
+@runtime_checkable
+class Attended(Protocol):
+    """An optional part of a `Testbed` whose robots are real: who confirms that robots may move again after a fault.
+
+    Without it nobody does, and after a fault nothing moves by itself again.
+    """
+
+    @property
+    def operator(self) -> Operator:
+        """Who is asked."""
+        ...
+
+    @property
+    def allow_motion_after_fault(self) -> bool:
+        """Whether robots may move from where a fault stopped them, as `--allow-motion-after-fault` says."""
         ...
 
 

@@ -23,7 +23,7 @@ from rosbags.typesys.store import Typestore
 from fieldkit.bags import salvage
 from fieldkit.bags.formats import BagFiles, BagFormat, find
 from fieldkit.bags.salvage import BagConnection, DamagedError
-from fieldkit.measure.evidence import confined
+from fieldkit.measure.evidence import bag_paths, confined
 from fieldkit.measure.evidence.confined import Json
 
 _MOST_PROBLEMS: Final = 20
@@ -229,4 +229,5 @@ def _told(error: Exception) -> str:
 
 
 if __name__ == "__main__":
+    bag_paths.allow_any()
     confined.serve(answer)

@@ -101,8 +101,14 @@ class CampaignJournal:
         self._entries.append(entry)
 
     def ended(self) -> dict[str, CampaignEntry]:
-        """Return the last entry of each trial that is over."""
-        return {entry.planned: entry for entry in self._entries if entry.progress is TrialProgress.ENDED}
+        """Return the last entry of each trial that is over; one that was begun once more is not."""
+        over: dict[str, CampaignEntry] = {}
+        for entry in self._entries:
+            if entry.progress is TrialProgress.ENDED:
+                over[entry.planned] = entry
+            elif entry.progress is TrialProgress.STARTED:
+                over.pop(entry.planned, None)
+        return over
 
     def interrupted(self, planned: PlannedTrial) -> Path | None:
         """Return the folder that a trial which is not over began in, None where there is nothing to go on with."""

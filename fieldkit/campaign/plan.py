@@ -10,11 +10,12 @@ from fieldkit.campaign import order
 from fieldkit.campaign.order import PlannedTrial
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Document, Duration, Field, Int, Length, Span, Strict
+from fieldkit.core import laptop_files
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Topology
 from fieldkit.trial.procedure import Procedure, Repeats, expecting, load_procedure
 
-CAMPAIGN_FILE: Final = "campaign.yaml"
+CAMPAIGN_FILE: Final = laptop_files.CAMPAIGN
 
 Item = TypeVar("Item")
 
@@ -54,20 +55,24 @@ class LeftOut(Strict):
 
 
 class CampaignFile(Strict):
-    """A campaign file: trials of every procedure at every distance in every topology.
+    """The file of `fieldkit campaign`: trials of every procedure at every distance in every topology.
+
+    How to write one: [campaign](campaign.md).
 
     Attributes:
-        name: Part of the folder's name.
-        procedures: Names of procedures; each brings its scenario.
-        distances: Distances.
-        topologies: Topologies.
-        protocols: Protocols; empty takes each procedure's.
-        repeats: Per protocol; None takes each procedure's.
-        record: Duration of every recording, in seconds; None takes each procedure's.
-        seed: Seed of the order, and of everything random in the trials.
-        walk: How far people walk between the places at most, in metres; None for three times the shortest way.
-        left_out: Trials that are left out.
-        expect: What is demanded of the figures of each trial that has them, beside what its procedure demands.
+        name: Letters, digits, `-` and `_`; the folder is `campaign_NAME`.
+        procedures: List of procedures; each determines its scenario.
+        distances: List of distances.
+        topologies: List of `master`, `masterless`.
+        protocols: List of `tcp`, `udp`; if empty, those of each procedure.
+        repeats: Repeats per protocol; without it, those of each procedure.
+        record: Duration of every recording; without it, that of each procedure.
+        seed: Seed of the order and of all randomness in the trials, from 0.
+        walk: Maximum distance over which the robots are carried in total, `300m`; without it, three times the
+            shortest path.
+        left_out: List of exclusions: trials that match every key of an entry are left out.
+        expect: [Expectations](values.md#expectations) of every trial that measures the figure, in addition to those
+            of its procedure.
     """
 
     name: Annotated[

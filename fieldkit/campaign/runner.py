@@ -1,6 +1,7 @@
 """Run a campaign, or go on with one: each trial once, those that the operator skips offered again at the end."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import groupby
@@ -12,11 +13,13 @@ from fieldkit.campaign.journal import CampaignJournal, TrialProgress
 from fieldkit.campaign.order import PlannedTrial, walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent, Note, Sink
 from fieldkit.core.model import Topology
 from fieldkit.core.prompts import Operator
-from fieldkit.core.units import format_bytes
+from fieldkit.core.units import TimeEstimate, format_bytes
+from fieldkit.trial import estimates, journal
+from fieldkit.trial.estimates import Taken
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running.opening import opened
@@ -54,15 +57,19 @@ class CampaignRun:
         journal: What became of its trials so far.
         backend: Where its robots come from.
         sink: Told what happens.
+        failed: Whether failed repeats of trials that are over are redone.
 
     Raises:
         ConfigurationError: A trial lacks a robot for a role.
     """
 
-    def __init__(self, plan: CampaignPlan, journal: CampaignJournal, backend: Backend, sink: Sink) -> None:
+    def __init__(
+        self, plan: CampaignPlan, journal: CampaignJournal, backend: Backend, sink: Sink, *, failed: bool = False
+    ) -> None:
         self._plan = plan
         self._journal = journal
         self._backend = backend
+        self._failed = self._redoes = failed
         self._sink = sink
         self._trials = plan.trials()
         self._rigged: Topology | None = None
@@ -73,6 +80,7 @@ class CampaignRun:
         """Tell what there is to be done, and what of it is less than the procedures ask for."""
         left = self._left()
         needed_bytes, free_bytes = self._room(left)
+        lasts = self._lasts(left)
         self._sink(
             CampaignPlanned(
                 name=self._plan.campaign.name,
@@ -82,13 +90,15 @@ class CampaignRun:
                 done=len(self._trials) - len(left),
                 total=len(self._trials),
                 walk_m=walk_m(left),
-                left_s=self._left_s(left),
+                left_s=lasts.likely_s,
+                left_most_s=lasts.most_s,
             )
         )
         shortened = (
-            line for trial in left for line in self._plan.procedure(trial).shortened(self._plans[trial].cast)
+            line for trial in left for line in self._plan.procedure(trial).adjustments(self._plans[trial].cast)
         )
-        for line in dict.fromkeys(shortened):
+        shortfalls = (line for trial in left for line in self._plans[trial].shortfalls())
+        for line in dict.fromkeys((*shortened, *shortfalls)):
             self._sink(Note(line))
 
     def run(self, operator: Operator, stop: Stop) -> CampaignOutcome:
@@ -108,6 +118,7 @@ class CampaignRun:
         with self._journal.kept(self._plan):
             try:
                 self._demand_room()
+                self._reopen()
                 self._offer(self._left(), operator, stop)
                 # All that were skipped are left; without any, nothing is.
                 self._offer(self._left(), operator, stop)
@@ -161,15 +172,25 @@ class CampaignRun:
                 plan = plan.with_note(placing.answer.note)
                 outcome = begin(plan, testbed, self._journal.folder, self._sink, stop, told=False)
             else:
-                outcome = go_on(folder, testbed, self._sink, stop, told=False)
+                outcome = go_on(folder, testbed, self._sink, stop, told=False, failed=self._failed)
             trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
             unmet = sum(not judgement.holds for judgement in outcome.judgements)
             self._journal.add(trial, TrialProgress.ENDED, trial=trial_name, valid=valid, failed=failed, unmet=unmet)
         left = self._left()
-        self._sink(CampaignWent(str(trial), total - len(left), total, self._left_s(left)))
+        lasts = self._lasts(left)
+        self._sink(CampaignWent(str(trial), total - len(left), total, lasts.likely_s, lasts.most_s))
+
+    def _reopen(self) -> None:
+        """Enter that trials with failed repeats begin once more, if these are redone."""
+        over = self._journal.ended()
+        for trial in self._left():
+            if entry := over.get(str(trial)):
+                self._journal.add(trial, TrialProgress.STARTED, trial=entry.trial)
+        self._redoes = False
 
     def _left(self) -> tuple[PlannedTrial, ...]:
-        over = self._journal.ended()
+        """Return the trials that are not over, and with `--failed`, until `_reopen`, those with failed repeats."""
+        over = {name for name, entry in self._journal.ended().items() if not (self._redoes and entry.failed)}
         return tuple(trial for trial in self._trials if str(trial) not in over)
 
     def _room(self, trials: Sequence[PlannedTrial]) -> tuple[int, int]:
@@ -185,9 +206,25 @@ class CampaignRun:
                 remedy="free some space, or choose another --out",
             )
 
-    def _left_s(self, trials: Sequence[PlannedTrial]) -> float:
+    def _lasts(self, trials: Sequence[PlannedTrial]) -> TimeEstimate:
+        """TimeEstimate how long trials take, by what those took that are over."""
         placing_s = self._journal.placing_s(PLACING_S if self._backend.by_hand else 0.0)
-        return sum(self._plans[trial].expected_s() + placing_s for trial in trials)
+        placing = TimeEstimate(placing_s, placing_s)
+        known = self._known()
+        return estimates.total(
+            part for trial in trials for part in (placing, estimates.of_trial(self._plans[trial], known))
+        )
+
+    def _known(self) -> list[Taken]:
+        """Return what the repeats of trials took that are over; a journal that cannot be read says nothing here."""
+        known: list[Taken] = []
+        for name, entry in self._journal.ended().items():
+            plan = next((self._plans[trial] for trial in self._trials if str(trial) == name), None)
+            with suppress(EvidenceError):
+                known += (
+                    [] if plan is None else estimates.taken(plan, journal.read(self._journal.folder / entry.trial))
+                )
+        return known
 
     def _trial_plan(self, trial: PlannedTrial, cast: Cast) -> Plan:
         campaign = self._plan.campaign

@@ -1,7 +1,7 @@
 """The command line: parse, call one library function, print, return an exit code.
 
-`commands` lists every command. What one takes (`arguments`) is imported when it is named, and the module that runs it
-when it runs: help, typing errors and completion need no library. `outside` adds the commands of other packages.
+`commands` lists every command, and imports its module when it is named: help, typing errors and completion need no
+library but rich. `outside` adds the commands of other packages.
 """
 
 import argparse
@@ -9,8 +9,9 @@ import errno
 import gc
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from fieldkit import __version__
@@ -19,6 +20,16 @@ from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 
 INTERRUPTED: Final = 130
+
+EXIT_CODES: Final[Mapping[int, str]] = MappingProxyType(
+    {
+        0: "Done; for `trial`: every repeat ended valid.",
+        1: "A threshold was missed, an expectation was not shown to hold, or something was left open because the "
+        "operator skipped it.",
+        INTERRUPTED: "Interrupted by Ctrl-C; everything that had ended is saved.",
+    }
+)
+"""Exit codes that are not those of a family of errors."""
 
 _COLLECT_AFTER: Final = 50_000
 """How many new objects the collector of cycles lets pass: imports make fewer, of which it would free none."""
@@ -101,15 +112,12 @@ def _guarded(top: Parser, argv: Sequence[str] | None, known: hints.Given) -> int
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Import the module that runs the command, and run it; without a command, show what there is."""
+    """Run the command; without one, print the help."""
     if arguments.run is None:
         arguments.parser.print_help()
         return 0
     run: Callable[[argparse.Namespace], int]
-    if arguments.outside is not None:
-        run = outside.load(arguments.outside, arguments.run)
-    else:
-        run = commands.load(arguments.run)
+    run = arguments.run if arguments.outside is None else outside.load(arguments.outside, arguments.run)
     return run(arguments)
 
 

@@ -1,6 +1,6 @@
 """Show events, tables, findings and errors: as a live line, plain lines or JSON. The only user of rich."""
 
-import json
+import io
 import os
 import re
 import sys
@@ -10,21 +10,23 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from itertools import zip_longest
 from pathlib import Path
 from typing import Final
 
+from rich import box
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
+from typing_extensions import override
 
 from fieldkit.cli.hints import completed
 from fieldkit.cli.progress import ProgressBar, Words
 from fieldkit.core import prompts
 from fieldkit.core.errors import typed
 from fieldkit.core.events import (
+    NOTHING_ARRIVED,
     Asked,
     CampaignEnded,
     CampaignPlanned,
@@ -41,19 +43,20 @@ from fieldkit.core.events import (
     TrialStopped,
 )
 from fieldkit.core.model import Status, Verdict
-from fieldkit.core.text import harmless
-from fieldkit.core.units import format_bytes, format_duration
+from fieldkit.core.text import harmless, json_text
+from fieldkit.core.units import TimeEstimate, format_bytes
 
 _PLAIN_WIDTH: Final = 160
 _INDENT: Final = 8
+_RULE: Final = " ─"
 _STYLE: Final = {Status.VALID: "green", Status.VOID: "yellow", Status.FAILED: "red"}
 
 
 class _Output(Console):
     """A stream whose reader may go away, which is for the command line to see, as of what is printed without rich."""
 
+    @override
     def on_broken_pipe(self) -> None:
-        """See `Console.on_broken_pipe`."""
         raise BrokenPipeError
 
 
@@ -79,6 +82,7 @@ def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
 
 def prose(text: str) -> None:
     """Print a text of several words, folded between them where the output is a terminal."""
+    text = harmless(text)
     print(textwrap.fill(text, _console().width) if sys.stdout.isatty() else text)
 
 
@@ -93,10 +97,9 @@ def table(
     """Print a table; columns whose index is in `right` are aligned to the right. A cell may have several lines.
 
     Words are folded in the columns `fold` alone, in this order, by default in the last one unless that is aligned to
-    the right: a name or a figure broken in two is read as another, so in a narrow terminal the table is too wide
-    rather than wrong.
+    the right: a name or a figure broken in two is read as another. Where a terminal is too narrow even so, each row
+    is a block of lines instead, a cell per line.
     """
-    # Not by `rich.table`, which measures and cuts every cell several times: 100 ms for the list of all columns.
     console = _console()
     cells = [[harmless(cell) for cell in row] for row in (head, *rows)]
     widths = _widths(cells)
@@ -105,12 +108,64 @@ def table(
         words = (word for row in cells for word in row[index].split())
         room = console.width - sum(widths) + widths[index] - 2 * len(widths) - 1
         widths[index] = min(widths[index], max([room, *map(cell_len, words)]))
-    rule = " " + "─" * (_table_width(widths) - 1)
-    first, *others = ("\n".join(_table_lines(row, widths, right, console)) for row in cells)
+    if sys.stdout.isatty() and _table_width(widths) > console.width:
+        _print_blocks(cells, title, console)
+        return
     if title:
         console.print(Text(harmless(title), style="bold"))
-    console.print(Text(first, style="bold"))
-    print("\n".join(text for text in (rule, *others) if text))
+    lines = _drawn(cells, widths, right)
+    rule = next(index for index, line in enumerate(lines) if line.startswith(_RULE))
+    console.print(Text("\n".join(lines[:rule]), style="bold"))
+    print("\n".join(lines[rule:]))
+
+
+def _drawn(cells: Sequence[Sequence[str]], widths: Sequence[int], right: Sequence[int]) -> list[str]:
+    """Return the lines of a table without styles, trailing spaces and blank lines; the first row is its head."""
+    grid = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    head, *rows = cells
+    for index, (name, width) in enumerate(zip(head, widths, strict=True)):
+        grid.add_column(Text(name), justify="right" if index in right else "left", width=width, no_wrap=True)
+    for row in rows:
+        grid.add_row(*(Text(_wrapped(cell, width)) for cell, width in zip(row, widths, strict=True)))
+    drawn = io.StringIO()
+    Console(file=drawn, width=_table_width(widths) + 1, color_system=None).print(grid)
+    return [line.rstrip() for line in drawn.getvalue().splitlines() if line.strip()]
+
+
+def _wrapped(cell: str, width: int) -> str:
+    """Return a cell whose lines are folded between words where they are wider than `width`.
+
+    rich's own wrapping cuts lines that contain characters of two columns.
+    """
+    return "\n".join(
+        line if cell_len(line) <= width else "\n".join(_folded(line.split(), width)) for line in cell.split("\n")
+    )
+
+
+def _print_blocks(cells: Sequence[Sequence[str]], title: str, console: Console) -> None:
+    """Print rows as blocks: the first cell, then a line per other cell, folded between words, with its head."""
+    head, *rows = cells
+    indent = 2 + max(map(cell_len, head[1:]), default=0) + 2
+    if title:
+        console.print(Text(harmless(title), style="bold"))
+    for first, *others in rows:
+        console.print(Text("\n".join(_folded(first.split() or [head[0]], console.width)), style="bold"))
+        for name, cell in zip(head[1:], others, strict=True):
+            if words := cell.split():
+                begin = f"  {name}{' ' * (indent - 2 - cell_len(name))}"
+                print(begin + f"\n{' ' * indent}".join(_folded(words, console.width - indent)))
+
+
+def _folded(words: Sequence[str], width: int) -> list[str]:
+    """Return lines of whole words; one that is longer than `width` has a line of its own, and is not broken."""
+    lines = [""]
+    for word in words:
+        longer = f"{lines[-1]} {word}".lstrip()
+        if cell_len(longer) <= width or not lines[-1]:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
 
 
 def _widths(cells: Sequence[Sequence[str]]) -> list[int]:
@@ -121,24 +176,6 @@ def _widths(cells: Sequence[Sequence[str]]) -> list[int]:
 
 def _table_width(widths: Sequence[int]) -> int:
     return sum(widths) + 2 * len(widths)
-
-
-def _table_lines(row: Sequence[str], widths: Sequence[int], right: Sequence[int], console: Console) -> Iterator[str]:
-    """Yield the lines of a row: one, or as many as its longest cell takes when it is folded."""
-    folded = [_fold(cell, width, console) for cell, width in zip(row, widths, strict=True)]
-    for parts in zip_longest(*folded, fillvalue=""):
-        aligned = []
-        for index, (part, width) in enumerate(zip(parts, widths, strict=True)):
-            blank = " " * (width - cell_len(part))
-            aligned.append(blank + part if index in right else part + blank)
-        if line := f" {'  '.join(aligned)}".rstrip():
-            yield line
-
-
-def _fold(cell: str, width: int, console: Console) -> Sequence[str]:
-    if "\n" not in cell and cell_len(cell) <= width:
-        return (cell.rstrip(),)
-    return [line.plain.rstrip() for line in Text(cell).wrap(console, width)]
 
 
 _MARKS: Final = {Verdict.OK: ("ok", "green"), Verdict.WARN: ("warn", "yellow"), Verdict.FAIL: ("FAIL", "bold red")}
@@ -285,10 +322,13 @@ def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEn
         case CampaignPlanned():
             names = (f"\n{number:5d}  {name}" for number, name in enumerate(event.trials, start=event.done + 1))
             room = f"{format_bytes(event.needed_bytes)} of disk ({format_bytes(event.free_bytes)} free)"
-            cost = f"{event.walk_m:.0f} m to carry robots, about {format_duration(event.left_s)}, up to {room}"
+            lasts = TimeEstimate(event.left_s, event.left_most_s)
+            dead = " if links are dead" if not lasts.is_certain else ""
+            cost = f"{event.walk_m:.0f} m to carry robots, about {lasts}{dead}; at most {room}"
             return ((f"{done}; {cost}{''.join(names)}", ""),)
         case CampaignWent():
-            left = f", about {format_duration(event.left_s)} left" if event.done < event.total else ""
+            lasts = TimeEstimate(event.left_s, event.left_most_s)
+            left = f", about {lasts} left" if event.done < event.total else ""
             return ((f"{done}{left}", ""),)
         case CampaignEnded():
             how = "" if event.done == event.total else "; to go on, give the same command again"
@@ -296,23 +336,32 @@ def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEn
 
 
 def _repeat(event: RepeatEnded, width: int | None) -> Words:
-    """Return a repeat as one line; in a terminal, why it is not valid is folded below it where it is longer."""
+    """Return a repeat as one line; in a terminal, what it measured is folded below it where the line is longer."""
     head, status = f"{event.done:3d}/{event.total}  {event.repeat:7} ", f"{event.status:6} "
     measured = f"measured: {event.summary}" if event.reason and event.summary else event.summary
     said = "; ".join(filter(None, (event.reason, measured)))
-    left = f"  ({format_duration(event.left_s)} left)" if event.left_s > 0 else ""
+    left = f"  ({TimeEstimate(event.left_s, event.left_most_s)} left)" if event.left_s > 0 else ""
     if width is not None:  # the live line says what is left
         left, room = "", width - len(head) - len(status)
-        parts = event.summary.split(", ")
-        while not event.reason and len(parts) > 1 and len(", ".join(parts)) > room:
-            parts.pop()
-        if not event.reason:
-            said = ", ".join(parts)
-        if len(said) > room:
-            indent = f"\n{' ' * _INDENT}"
-            said = indent + indent.join(textwrap.wrap(said, max(width - _INDENT, _INDENT)))
+        if cell_len(said) > room:
+            said = _below(said, width) if event.reason else _continued(said, width - room, width)
     remedy = f"\n{' ' * _INDENT}remedy: {event.remedy}" if event.remedy else ""
-    return ((head, ""), (status, _STYLE[event.status]), (said, ""), (left, "dim"), (remedy, ""))
+    style = _STYLE[Status.FAILED] if event.summary.startswith(NOTHING_ARRIVED) else ""
+    return ((head, ""), (status, _STYLE[event.status]), (said, style), (left, "dim"), (remedy, ""))
+
+
+def _below(text: str, width: int) -> str:
+    """Return a text folded into indented lines below the one where it begins."""
+    indent = f"\n{' ' * _INDENT}"
+    return indent + indent.join(textwrap.wrap(text, max(width - _INDENT, _INDENT)))
+
+
+def _continued(text: str, begin: int, width: int) -> str:
+    """Return a text that begins in column `begin` and is folded into indented lines."""
+    lines = textwrap.wrap(
+        text, max(width, begin + _INDENT), initial_indent=" " * begin, subsequent_indent=" " * _INDENT
+    )
+    return "\n".join(lines)[begin:]
 
 
 def _harmless(text: Text) -> Text:
@@ -328,7 +377,7 @@ def _print_plain(event: Event) -> None:
 def _print_json(event: Event) -> None:
     name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(event).__name__).lower()
     fields = {key: completed(value) if isinstance(value, str) else value for key, value in asdict(event).items()}
-    print(json.dumps({"event": name, "utc_ns": time.time_ns(), **fields}), flush=True)
+    print(json_text({"event": name, "utc_ns": time.time_ns(), **fields}), flush=True)
 
 
 class _LiveLine:

@@ -15,6 +15,8 @@ from fieldkit.cli.parser import Parser
 
 _CARRIED: Final = ("site", "backend", "topology", "protocol", "repeats", "record")
 """Options that say which robots, and what is tried on them, by the name under which argparse keeps them."""
+_CARRIED_FLAGS: Final = ("allow_motion",)
+"""Options without a value, without which a trial that was begun with them is not resumed."""
 
 # Words in small letters: a command of fieldkit, and one of `fieldkit lab`.
 _COMMAND: Final = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)(?P<rest>[^;\n`]*)")
@@ -37,6 +39,9 @@ class Given:
             value = getattr(arguments, name, None)
             values = value if isinstance(value, list) else [] if value is None else [value]
             self._options += [(f"--{name}", str(one)) for one in values]
+        for name in _CARRIED_FLAGS:
+            if getattr(arguments, name, False):
+                self._options.append((f"--{name.replace('_', '-')}", ""))
 
     def completed(self, found: re.Match[str]) -> str:
         """Return a command with the options that it takes, and that were given."""
@@ -47,7 +52,7 @@ class Given:
                 break
             parser, words = inner, [*words, word]
         missing = [
-            shlex.join((option, value))
+            shlex.join((option, value) if value else (option,))
             for option, value in self._options
             if parser.takes(option, value) and f"{option} " not in f"{found[0]} "
         ]

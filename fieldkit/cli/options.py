@@ -9,10 +9,9 @@ from typing import Final, TextIO
 
 from fieldkit.backends.protocols import Backend
 from fieldkit.backends.registry import load_backend
+from fieldkit.cli.sites import backend_name, lab_site
 from fieldkit.cli.terminal import Terminal
 from fieldkit.config.locations import SITE_FILE
-from fieldkit.config.schema import Document
-from fieldkit.config.site import Site, load_site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Distance, Protocol, Topology
@@ -21,7 +20,6 @@ from fieldkit.core.units import parse_duration_s
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest
 
-DEFAULT_BACKEND: Final = "emulated"
 _STANDARD_INPUT: Final = "-"
 
 
@@ -82,19 +80,9 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
     site, document = lab_site(arguments)
     if site is None and arguments.backend is None:
         sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
-    name = arguments.backend or (DEFAULT_BACKEND if site is None else site.backend)
+    name = backend_name(arguments, site)
     found = load_backend(name, site, document)
     found.allow_motion = getattr(arguments, "allow_motion", False)  # which only commands that run trials have
+    if hasattr(found, "allow_motion_after_fault"):  # an optional attribute of a backend with real robots
+        found.allow_motion_after_fault = getattr(arguments, "allow_motion_after_fault", False)
     return name, found
-
-
-def lab_site(arguments: argparse.Namespace) -> tuple[Site, Document] | tuple[None, None]:
-    """Return the site file that the options choose, with its document; none where there is none.
-
-    Raises:
-        ConfigurationError: As `load_site`.
-    """
-    path: Path | None = arguments.site
-    if path is None and Path(SITE_FILE).is_file():
-        path = Path(SITE_FILE)
-    return (None, None) if path is None else load_site(path)

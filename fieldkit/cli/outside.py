@@ -6,6 +6,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from importlib.metadata import EntryPoint
 from typing import Any
 
 from fieldkit.cli.parser import Commands, Parser
@@ -31,7 +32,7 @@ def load(name: str, target: str) -> Any:  # noqa: ANN401 (whatever another packa
     Raises:
         ConfigurationError: It cannot be imported.
     """
-    return plugins.load(plugins.EntryPoint(name, target, plugins.COMMANDS))
+    return plugins.load(EntryPoint(name, target, plugins.COMMANDS))
 
 
 def names() -> Mapping[str, Sequence[str]]:
@@ -61,5 +62,5 @@ def _declare(name: str, targets: Sequence[str], parser: Parser) -> None:
         raise ConfigurationError(
             f"it cannot say what it takes: {type(error).__name__}: {error}",
             where=f"entry point {name} = {targets[0]}",
-            remedy="mend or uninstall its package",
+            remedy=plugins.REMEDY,
         ) from error

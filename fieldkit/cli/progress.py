@@ -26,8 +26,14 @@ Words = tuple[tuple[str, str], ...]
 _BARS: Final = {100: 24, 60: 12, 0: 6}
 """Width of the bar by the least width of the line, so that it does not jump with the words beside it."""
 _APART: Final = "  "
+_CUT: Final = "..."
 _FULL: Final = "\N{BOX DRAWINGS HEAVY HORIZONTAL}"
 _EMPTY: Final = "\N{BOX DRAWINGS LIGHT HORIZONTAL}"
+
+
+def shortened(text: str, width: int) -> str:
+    """Return a text of at most `width` characters; one that is cut ends in `...`."""
+    return text if len(text) <= width else f"{text[: max(width - len(_CUT), 0)]}{_CUT}"[:width]
 
 
 class ProgressBar:
@@ -92,5 +98,5 @@ class ProgressBar:
             if text is count and bar + len(_APART) <= room:
                 full = int(bar * self._done / self._total)
                 words += [(_FULL * full, "green"), (_EMPTY * (bar - full), "dim"), (_APART, "")]
-            words.append((text[:width], style))
+            words.append((shortened(text, width), style))
         return tuple(words)

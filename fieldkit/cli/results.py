@@ -1,24 +1,26 @@
-"""Print the results of trials: a table per condition, what failed, and the exit code."""
+"""Print the results of trials: a table per condition, what to type next, what failed, and the exit code."""
 
 import argparse
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.judgements import Judgement
-from fieldkit.analysis.quantities import Quantity
-from fieldkit.analysis.wording import Scale
-from fieldkit.cli.display import fits, prose, show_error, table
+from fieldkit.cli import summary
+from fieldkit.cli.display import show_error, table
+from fieldkit.cli.hints import completed
+from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, typed
+from fieldkit.core.printing import say
 from fieldkit.core.units import format_count
 from fieldkit.export import junit
 from fieldkit.trial import store
 from fieldkit.trial.running.runner import Outcome
 
-Row = tuple[str, ...]
-_Table = tuple[Row, list[Row]]
-"""Its head and its rows."""
+_LENGTH: Final = re.compile(r"(?P<number>[0-9]+(?:\.[0-9]+)?)(?P<unit>[a-z]+)")
 
 
 def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) -> int:
@@ -26,18 +28,24 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
 
     Args:
         outcomes: What trials came to.
-        arguments: Of the command: `json`, which prints no table, and `junit`, a file that gets them too.
+        arguments: Of the command: `json`, which prints no table, `all` quantities in it, and `junit`, a file that
+            gets them too.
     """
     ended, quiet = [outcome for outcome in outcomes if outcome is not None], arguments.json
+    left_out = 0
     for outcome in ended:
         if not quiet:
-            summary_table(outcome.cells)
+            expected = {judgement.expectation.quantity for judgement in outcome.judgements}
+            left_out = max(left_out, summary.show(outcome.cells, every=arguments.all, expected=expected))
             expectation_table(outcome.judgements)
         if outcome.failed:
             reasons = outcome.folder / store.TRIAL_CSV
-            failed, cell = format_count(outcome.failed, "repeat"), outcome.cells[0].key
-            remedy = f"fieldkit check {cell['procedure']} --topology {cell['topology']}"
+            failed = format_count(outcome.failed, "repeat")
+            again = typed("fieldkit", "resume", outcome.folder, "--failed")
+            remedy = f"correct what the reasons name, then redo them: {again}"
             show_error(f"{failed} failed; reasons in {reasons}\n  remedy: {remedy}")
+    if not quiet:
+        _show_next(ended, left_out)
     skipped = len(outcomes) - len(ended)
     if skipped:
         show_error(f"{skipped} of {len(outcomes)} skipped\n  remedy: run the command again for what was skipped")
@@ -66,46 +74,6 @@ def keep_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
         ) from error
 
 
-def summary_table(cells: Sequence[Cell]) -> None:
-    """Print per condition a table: measures down, protocols across, each value with its 95 % interval.
-
-    Where the terminal is too narrow for that, each protocol has a table of its own; and where that is too wide,
-    intervals stand below their values, and words are folded.
-    """
-    groups: dict[tuple[str | float | None, ...], list[Cell]] = {}
-    for one in cells:
-        condition = tuple(one.key[name] for name in ("procedure", "distance", "topology", "backend"))
-        groups.setdefault(condition, []).append(one)
-    for condition, group in groups.items():
-        title = ", ".join(str(part) for part in condition)
-        layouts: Sequence[tuple[list[_Table], Sequence[int]]] = (
-            ([_summary(group)], ()),
-            ([_summary([one]) for one in group], ()),
-            ([_summary([one], between="\n") for one in group], (0,)),
-        )
-        tables, fold = next((one for one in layouts if all(fits(*made) for made in one[0])), layouts[-1])
-        for head, rows in tables:
-            table(head, rows, title=title, right=range(1, len(head)), fold=fold)
-    for caution in wording.cautions(cells):
-        prose(caution)
-
-
-def _summary(group: Sequence[Cell], between: str = " ") -> _Table:
-    """Return the head and the rows of a table of one condition, with this between the parts of a cell."""
-    rows = [
-        ("repeats", *map(wording.counts, group)),
-        *(
-            (wording.label(one), *(_value(cell, one, wording.scale(one, group), between) for cell in group))
-            for one in wording.measured(group)
-        ),
-        *(
-            (label, *(wording.tally(cell, name, f",{between}") for cell in group))
-            for name, label in wording.worded(group).items()
-        ),
-    ]
-    return ("[95 % interval]", *(str(one.key["protocol"]).upper() for one in group)), rows
-
-
 def expectation_table(judgements: Sequence[Judgement]) -> None:
     """Print what the figures say of expectations, a line each; nothing where nothing was expected."""
     if judgements:
@@ -113,8 +81,34 @@ def expectation_table(judgements: Sequence[Judgement]) -> None:
         table(("expected", "of", "measured", "[95 % interval]", ""), rows, fold=(0, 4))
 
 
-def _value(one: Cell, quantity: Quantity, scale: Scale, between: str) -> str:
-    found = one.estimates.get(quantity.name)
-    if found is None:
+def _show_next(ended: Sequence[Outcome], left_out: int) -> None:
+    """Print the commands that a person most likely types next; nothing after trials without a valid repeat."""
+    if any(outcome.valid for outcome in ended):
+        for index, command in enumerate(_next(ended, left_out)):
+            say(f"{'      ' if index else 'next: '}{completed(command)}")  # never folded, so that it can be copied
+
+
+def _next(ended: Sequence[Outcome], left_out: int) -> Iterator[str]:
+    folders = [outcome.folder for outcome in ended]
+    yield typed("fieldkit", "report", *folders)
+    if left_out:
+        yield f"{typed('fieldkit', 'aggregate', *folders, '--all')}  # {summary.more(left_out)}"
+    cells = [cell for outcome in ended for cell in outcome.cells[:1]]
+    farther = _farther([str(cell.key["distance"]) for cell in cells])
+    if farther and not any(_lost_all(cell) for outcome in ended for cell in outcome.cells):
+        yield f"{typed('fieldkit', 'trial', cells[-1].key['procedure'], farther)}  # another distance"
+
+
+def _lost_all(cell: Cell) -> bool:
+    """Return whether no ping of a cell was answered: no reason to go farther away."""
+    return any(plain_name(name) == "rtt_loss" and estimate.value >= 1 for name, estimate in cell.estimates.items())
+
+
+def _farther(distances: Sequence[str]) -> str:
+    """Return a distance beyond the last one: as far again as that is from the one before; empty for a word."""
+    matches = [match for distance in distances[-2:] if (match := _LENGTH.fullmatch(distance))]
+    if not matches:
         return ""
-    return f"{scale.amount(found.value)}{between}{wording.interval(scale, found)}".rstrip()
+    last = float(matches[-1]["number"])
+    before = float(matches[0]["number"]) if len(matches) > 1 and matches[0]["unit"] == matches[1]["unit"] else 0.0
+    return f"{last + abs(last - before):.9g}{matches[-1]['unit']}" if last != before else ""

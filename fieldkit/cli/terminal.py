@@ -2,7 +2,9 @@
 
 import os
 import signal
+import socket
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -18,6 +20,7 @@ from fieldkit.trial.running.stop import Stop
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _FINISHING: Final = "finishing the repeat that runs{left}; Ctrl-C again stops it now"
 _STOPPING: Final = "stopping: ending what runs on the robots"
+_ABANDONED: Final = "not waiting for confirmations any longer; the order to stop remains"
 _CLEAR_LINE: Final = "\r\x1b[K"
 
 
@@ -91,8 +94,14 @@ def _typed() -> str:
 def interruptible() -> Iterator[Stop]:
     """Turn Ctrl-C into a request to stop while the body runs.
 
-    The second one raises `KeyboardInterrupt`, as SIGTERM and SIGHUP do at once: a closed terminal does not wait.
-    What comes after that is ignored, since the clean-up that follows is bounded by its own deadlines.
+    While a robot moves by itself, or may begin to, the first SIGINT, SIGTERM or SIGHUP orders all robots to stop and
+    raises `KeyboardInterrupt`; leaving the body waits for the confirmations, and the next signal ends that wait.
+    Otherwise the first SIGINT lets the repeat end, and the second raises `KeyboardInterrupt`, as SIGTERM and SIGHUP
+    do at once: a closed terminal does not wait. What comes after that is ignored, since the clean-up that follows is
+    bounded by its own deadlines.
+
+    A thread gives the order: the signal reaches it by a descriptor (`signal.set_wakeup_fd`), also while the main
+    thread cannot run a handler.
     """
     stop = Stop()
     stopping = False
@@ -100,28 +109,56 @@ def interruptible() -> Iterator[Stop]:
     def take(number: int, _frame: FrameType | None) -> None:
         nonlocal stopping
         if stopping:
+            if stop.motions.called:
+                stop.motions.abandon()
+                _say(_ABANDONED)
+            return
+        if stop.motions.order(_say):
+            stopping = stop.due = True
+            if not stop.saving:
+                raise KeyboardInterrupt
             return
         if number == signal.SIGINT and stop.patient and not stop.asked:
             stop.asked = True
             left = f", about {format_duration(stop.left_s)} more" if stop.left_s else ""
-            _say(_with(_FINISHING.format(left=left), stop.cut_short))
+            _say(_FINISHING.format(left=left))
             return
         stopping = True
-        _say(_with(_STOPPING, stop.cut_short))
+        _say(_STOPPING)
         stop.due = True
         if not stop.saving:
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, take) for number in _SIGNALS}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with _watched(stop):
+        before = {number: signal.signal(number, take) for number in _SIGNALS}
+        try:
+            yield stop
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
-def _with(text: str, cut_short: str) -> str:
-    return f"{text}: {cut_short}" if cut_short else text
+@contextmanager
+def _watched(stop: Stop) -> Iterator[None]:
+    """Let a thread order robots to stop when a signal comes, whatever the main thread does."""
+    ours, kernels = socket.socketpair()
+
+    def watch() -> None:
+        while numbers := ours.recv(64):
+            if any(number in _SIGNALS for number in numbers):
+                stop.motions.order(_say)
+
+    thread = threading.Thread(target=watch, name="signals", daemon=True)
+    with ours, kernels:
+        kernels.setblocking(False)
+        thread.start()
+        before = signal.set_wakeup_fd(kernels.fileno(), warn_on_full_buffer=False)
+        try:
+            yield
+        finally:
+            signal.set_wakeup_fd(before)
+            kernels.shutdown(socket.SHUT_RDWR)
+            thread.join()
 
 
 def _say(text: str) -> None:

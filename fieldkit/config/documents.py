@@ -1,6 +1,6 @@
-"""YAML documents: read, with the line that each value stands in; written; and edited, one value and nothing else.
+"""YAML documents: read with the line of each value, written, and edited one value at a time.
 
-The only module that imports pyyaml, which reads and writes, and ruamel.yaml, which tells where in a text a value is.
+The only module that imports PyYAML.
 """
 
 import codecs
@@ -9,9 +9,10 @@ import os
 import re
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import yaml
 from yaml.composer import Composer
@@ -22,10 +23,6 @@ from yaml.resolver import Resolver
 from yaml.scanner import Scanner
 
 from fieldkit.core.errors import ConfigurationError, typed
-from fieldkit.core.lazy import dataclass
-
-if TYPE_CHECKING:
-    from ruamel.yaml.nodes import MappingNode, Node
 
 _MAX_BYTES: Final = 1 << 20
 _MAX_DEPTH: Final = 50
@@ -39,13 +36,16 @@ Location = tuple[str | int, ...]
 """Keys and indices that lead from the root of a document to a value."""
 
 
-class _Loader(Composer, SafeConstructor, Resolver):
-    """A parser's events to values by YAML 1.2: only true and false are booleans, `1:30` or `on` stay text, 010 is 10.
+class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
+    """Reads YAML 1.2: only true and false are booleans, `1:30` and `on` are text, 010 is 10.
 
-    What this dialect leaves out is refused with its line: aliases, tags, deep nesting, numbers that overflow.
+    It refuses aliases, tags, deep nesting and numbers that overflow, with their line.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, text: str) -> None:
+        Reader.__init__(self, text)
+        Scanner.__init__(self)
+        Parser.__init__(self)
         Composer.__init__(self)
         SafeConstructor.__init__(self)
         Resolver.__init__(self)
@@ -53,7 +53,7 @@ class _Loader(Composer, SafeConstructor, Resolver):
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         """Return a node, as PyYAML does, unless it is of what is left out."""
-        event = self.peek_event()  # type: ignore[attr-defined] # of the parser
+        event = self.peek_event()  # type: ignore[no-untyped-call]
         # Aliases hide what a file says, and nested ones grow without bound.
         if isinstance(event, yaml.events.AliasEvent):
             raise _problem("aliases (*name) are not supported", event)
@@ -123,32 +123,8 @@ for _tag, (_pattern, _first) in _CORE_SCHEMA.items():
         _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
 
 
-class _PureLoader(_Loader, Reader, Scanner, Parser):
-    """By PyYAML's own parser, which says what is wrong."""
-
-    def __init__(self, text: str) -> None:
-        Reader.__init__(self, text)
-        Scanner.__init__(self)
-        Parser.__init__(self)
-        _Loader.__init__(self)
-
-
-if yaml.__with_libyaml__:
-    from yaml.cyaml import CParser  # type: ignore[attr-defined]
-
-    class _QuickLoader(_Loader, CParser):
-        """By libyaml, in a fifth of the time."""
-
-        def __init__(self, text: str) -> None:
-            CParser.__init__(self, text)
-            _Loader.__init__(self)
-
-
 # PyYAML makes numbers and characters of a few escapes and directives, and does not look whether it can.
 _NOT_YAML: Final = (yaml.YAMLError, ValueError, OverflowError)
-
-_READ_OTHERWISE: Final = re.compile("[\t?|>\ufeff]")
-"""What libyaml lets pass in places where PyYAML does not: tabs, `[a?b]`, heads of block scalars, byte order marks."""
 
 
 @dataclass(frozen=True)
@@ -233,18 +209,15 @@ def parse(text: str, *, source: str) -> Document:
     Raises:
         ConfigurationError: Not YAML, an alias, a tag, a duplicate key, or a key that is no text.
     """
-    if yaml.__with_libyaml__ and not _READ_OTHERWISE.search(text):
-        with suppress(*_NOT_YAML):  # which PyYAML's own parser then explains
-            return _document(_QuickLoader(text), source)
     loader = None
     try:
-        loader = _PureLoader(text)
+        loader = _Loader(text)
         return _document(loader, source)
     except _NOT_YAML as error:
         raise _explained(error, text, source, loader.line + 1 if loader else 1) from error
 
 
-def _document(loader: "_PureLoader | _QuickLoader", source: str) -> Document:
+def _document(loader: _Loader, source: str) -> Document:
     lines: dict[Location, int] = {}
     try:
         node = loader.get_single_node()
@@ -256,6 +229,7 @@ def _document(loader: "_PureLoader | _QuickLoader", source: str) -> Document:
 _REMEDIES: Final = {
     "character '\\t'": "indent by spaces, not by tabs",
     "cannot start any token": "put this text in quotes",
+    "expected <block end>": "indent this line as the others of its list or mapping are, by the same number of spaces",
     "mapping values are not allowed": "put text that has a colon in quotes; indent the keys of one mapping alike",
 }
 """What mends a line, by what PyYAML says of it."""
@@ -304,47 +278,50 @@ def to_text(data: object) -> str:
 
 
 def with_value(text: str, location: tuple[str, ...], value: str) -> str:
-    """Return a document with a key of one of its mappings set to a plain text; every other character stays.
+    """Return a document with one key of a mapping set to a plain text; every other character is unchanged.
 
-    A key that is new goes to the end of its mapping. Whether the result says what it should, the caller checks: not
-    every way to write YAML can be edited so.
+    A new key is added at the end of its mapping. The caller must check the result, because not every layout of YAML
+    can be edited in this way.
 
     Args:
         text: The document.
-        location: Keys that lead to the value; the mapping that holds the last is there and not empty.
-        value: Written as it is, without quotes.
+        location: Keys that lead to the value; the mapping that contains the last key exists and is not empty.
+        value: Written without quotes.
 
     Raises:
-        ValueError: It is YAML for PyYAML alone.
+        ValueError: The document is not valid YAML.
     """
-    # Only who edits a file pays for this import.
-    from ruamel.yaml import YAML  # noqa: PLC0415
-    from ruamel.yaml.error import YAMLError  # noqa: PLC0415
-    from ruamel.yaml.nodes import MappingNode  # noqa: PLC0415
-
     *parents, key = location
     try:
-        node = YAML(typ="rt", pure=True).compose(text)
-    except YAMLError as error:
+        node = _Loader(text).get_single_node()
+    except yaml.YAMLError as error:
         raise ValueError(str(error)) from error
-    assert isinstance(node, MappingNode)
     for parent in parents:
         node = _value(node, parent)
-        assert isinstance(node, MappingNode)
     old = _value(node, key)
     if old is not None:
         begin, end = old.start_mark.index, old.end_mark.index
         return f"{text[:begin]}{'' if begin < end else ' '}{value}{text[end:]}"
-    last_key, last_value = node.value[-1]
-    at: int = last_value.end_mark.index
+    assert isinstance(node, yaml.MappingNode)
+    at = _end(node.value[-1][1])
     if node.flow_style:
         return f"{text[:at]}, {key}: {value}{text[at:]}"
     line_end = re.compile(r"\r?\n|\Z").search(text, at)
     assert line_end is not None
     at = line_end.start()
-    return f"{text[:at]}{line_end[0] or os.linesep}{' ' * last_key.start_mark.column}{key}: {value}{text[at:]}"
+    column = node.value[-1][0].start_mark.column
+    return f"{text[:at]}{line_end[0] or os.linesep}{' ' * column}{key}: {value}{text[at:]}"
 
 
-def _value(mapping: "MappingNode", key: str) -> "Node | None":
-    """Return the value of a key, None where the mapping has none."""
+def _value(mapping: yaml.Node | None, key: str) -> yaml.Node | None:
+    """Return the value of a key, or None if the mapping does not have it."""
+    assert isinstance(mapping, yaml.MappingNode)
     return next((value for name, value in mapping.value if name.value == key), None)
+
+
+def _end(node: yaml.Node) -> int:
+    """Return the index after a node. PyYAML's end of a block collection is the start of what follows it."""
+    while isinstance(node, yaml.CollectionNode) and not node.flow_style:
+        last = node.value[-1]
+        node = last[1] if isinstance(node, yaml.MappingNode) else last
+    return node.end_mark.index

@@ -28,12 +28,25 @@ def folders(kind: Kind) -> tuple[Path, ...]:
 
 
 def names(kind: Kind) -> dict[str, Path]:
-    """Return every name of `kind` with its file, sorted by name."""
+    """Return every name of `kind` with its file, sorted by name.
+
+    An empty file hides no other: a shell makes it before `fieldkit robots show NAME > robots/NAME.yaml` runs.
+    """
     found: dict[str, Path] = {}
     for folder in folders(kind):
         for path in folder.glob("*.yaml"):
-            found.setdefault(path.stem, path)
+            if path.stem not in found or _is_empty(found[path.stem]):
+                found[path.stem] = path
     return dict(sorted(found.items()))
+
+
+def _is_empty(path: Path) -> bool:
+    return path.is_file() and not path.stat().st_size
+
+
+def own_copy(name: str) -> str:
+    """Return the command that makes a lab's own copy of a robot profile, to be edited."""
+    return f"mkdir -p robots; fieldkit robots show {name} > robots/{name}.yaml; then edit that copy"
 
 
 def find(kind: Kind, name: str) -> Path:

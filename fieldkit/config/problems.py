@@ -14,6 +14,7 @@ SHAPES: Final[dict[str, str]] = {}
 
 _WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
 _SHOWN: Final = 60
+_NOTHING: Final = ", and nothing stands here; keys that belong to this line are indented more than it is"
 _SAID: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
 
 
@@ -37,6 +38,8 @@ def explain(found: Sequence[Any], document: Document) -> ConfigurationError:
         message = f"required key {missing!r} is missing"
     elif place and place[-1] == "[key]":
         place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {_worded(first)}"
+    elif first.get("ctx", {}).get("outer"):
+        message = _too_far_in(first, document)
     else:
         message = _worded(first)
     path = ".".join(str(part) for part in (*document.place, *document.known(place)))
@@ -47,8 +50,18 @@ def explain(found: Sequence[Any], document: Document) -> ConfigurationError:
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",
         where=document.where(location),
-        remedy=f"{remedy}; docs/reference.md lists the keys of every file",
+        remedy=f"{remedy}; keys of every file: fieldkit docs reference",
     )
+
+
+def _too_far_in(problem: Any, document: Document) -> str:  # noqa: ANN401 (as in `explain`)
+    """Return that a key is of a mapping around the one in which it is, and how that mapping's keys are indented."""
+    place, context = problem["loc"], problem["ctx"]
+    key, outer = context["key"], context["outer"]
+    depth = max((depth for depth, part in enumerate(place) if part in outer), default=0)
+    names = [part for part in document.known(place[:depth]) if isinstance(part, str)]
+    of = f"of {names[-1]}" if names else "of the whole file"
+    return f"unknown key {key} here; it is a key {of}: indent it as {place[depth]}: is"
 
 
 def _missing_key(problem: Any) -> str:  # noqa: ANN401 (as in `explain`)
@@ -81,7 +94,7 @@ def _worded(problem: Mapping[str, Any]) -> str:
     found, context = problem["input"], problem.get("ctx", {})
     match problem["type"]:
         case "model_type" | "dict_type":
-            message = f"keys with values are needed here{', and nothing stands here' * (found is None)}"
+            message = f"keys with values are needed here{_NOTHING * (found is None)}"
         case "value_error":
             message = str(context["error"])
         case "union_tag_not_found":

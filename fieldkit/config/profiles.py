@@ -27,16 +27,17 @@ class PublishedTopic(Strict):
     """One ROS topic that the robot publishes.
 
     Attributes:
-        name: For example `/scan`.
+        name: Name, `/scan`.
         type: ROS message type, `package/Name`.
-        rate: Messages per second while the robot is up, in Hz.
+        rate: Messages per second, `5Hz`.
         frame: `frame_id` of the header.
-        child_frame: For odometry and for a transform, the frame of the robot that moves in `frame`.
+        child_frame: For `nav_msgs/Odometry` and `tf2_msgs/TFMessage`, the robot's own frame, which moves in `frame`.
+            Emulated robots use `base_link` if it is empty.
         points: For a laser scan, beams per turn; for a point cloud, points of 16 bytes.
-        width: For an image, in pixels of 3 bytes.
-        height: As `width`.
-        size: For any other type, bytes of the first list of numbers in each message.
-        definition: What the type is made of, as `rosmsg show -r` prints it; needed where ROS itself has no such type.
+        width: For an image, width in pixels of 3 bytes.
+        height: For an image, height in pixels.
+        size: For any other type, size of the first list of numbers in each message, `100kB`.
+        definition: Message definition, as `rosmsg show -r` prints it; needed for types that ROS does not have.
     """
 
     name: TopicName
@@ -82,11 +83,14 @@ class RecordCommand(Strict):
 
     Attributes:
         distribution: ROS distribution, for example `noetic`.
-        setup: Shell files to source first: a non-interactive SSH session skips `.bashrc`.
-        record: Argument list; `{duration_s}`, `{name}` and `{topics}` are filled in.
-        ends: `itself` after its duration, or on `sigint` (ros2 bag record has no duration).
-        writes: The file that holds the messages, `{name}` filled in; for ROS 2 in a folder.
-        rmw: The middleware of ROS 2 where the environment names none: `cyclonedds` (DDS) or `zenoh`.
+        setup: Shell files to source first: an SSH session without a terminal skips `.bashrc`.
+        record: Argument list of the record command. `{duration_s}` and `{name}` are filled in; the word `{topics}`
+            becomes one word per topic.
+        ends: `itself`: it ends after its duration. `sigint`: fieldkit ends it by SIGINT (`ros2 bag record` has no
+            duration).
+        writes: The file that holds the messages, with `{name}` filled in: `{name}.bag`, for ROS 2
+            `{name}/{name}_0.db3` or `.mcap`.
+        rmw: Middleware of ROS 2, `cyclonedds` (DDS) or `zenoh`, unless `RMW_IMPLEMENTATION` names one.
     """
 
     distribution: str
@@ -113,10 +117,10 @@ class RobotBridge(Strict):
 
     Attributes:
         to: `dds` or `zenoh`.
-        topics: Carried there, each as a word of that command: `/scan:sensor_msgs/LaserScan:sensor_data`.
-        back: Carried the other way.
-        domain: ROS domain.
-        router: Host, and port if it is another than usual, of a router of Zenoh; None scouts.
+        topics: Topics carried there, each `NAME:TYPE` or `NAME:TYPE:QOS` as for `fieldkit bridge`.
+        back: Topics carried in the other direction.
+        domain: ROS 2 domain, 0 to 101.
+        router: Host of a Zenoh router, and its port if it is not 7447; without it, peers are found by scouting.
         program: The robot's fieldkit, a name or a path.
     """
 
@@ -159,11 +163,13 @@ class Ros(Strict):
     """The ROS side of a robot.
 
     Attributes:
-        variant: Which of `variants` this model runs.
+        variant: Which of `ros.variants` the robot runs: `ros1` or `ros2`.
         variants: Record command per ROS generation, `ros1` or `ros2`.
-        environment: Variables that the robot's shell would set.
-        topics: What it publishes.
-        bridge: What is carried to DDS or Zenoh; None for nothing.
+        environment: Variables set for the record command and for the bridge. `ROS_DOMAIN_ID` (0 to 232) and
+            `RMW_IMPLEMENTATION` also determine how the robot [is driven](motion.md) and which middleware an emulated
+            robot uses.
+        topics: Topics that the robot publishes; emulated robots publish them.
+        bridge: Topics of a robot with ROS 1 that [a bridge](bridge.md#in-a-profile) on it carries.
     """
 
     variant: Annotated[str, Field(pattern="^(ros1|ros2)$")]
@@ -209,11 +215,14 @@ class Tools(Strict):
     """Programs that the robot offers under these names, and how it grants the right to capture.
 
     Attributes:
-        netcat: Its netcat, a name or a path; which variant it is, is found out before each trial.
-        capture: tcpdump.
-        ping: Its ping.
-        python: Its Python, for steps that bring a program of fieldkit's along.
-        capture_right: `direct` (root or capabilities) or `sudo` (`sudo -n`, never a prompt).
+        netcat: Its netcat: traditional, OpenBSD, ncat or busybox. The variant is
+            [detected](method-loss.md#tools-that-differ) before each trial; a dry run assumes it from the name, and
+            takes `nc` for the traditional one.
+        capture: Its tcpdump.
+        ping: Its ping: iputils (old or new) or busybox.
+        python: Its Python, 3.8 or later, for the step `topics`; searched after the setup files of ROS are sourced.
+        capture_right: `direct`: the user has the right to capture. `sudo`: captures are started by `sudo -n` (never a
+            prompt), see [the right to capture](field.md#the-right-to-capture).
     """
 
     netcat: str = "nc.traditional"
@@ -227,11 +236,12 @@ class Radio(Strict):
     """The robot's radio.
 
     Attributes:
-        interface: Name of the network interface under test.
-        standard: For example `802.11n 2.4 GHz`.
-        access_point: Whether the robot runs its own access point.
-        tx_power_dbm: Transmit power in dBm.
-        sensitivity_dbm: Weakest signal it still receives, in dBm.
+        interface: Name of the network interface under test, `wlan0`.
+        standard: For example `802.11n 2.4 GHz`, for information only.
+        access_point: Whether the robot runs its own access point, for information only.
+        tx_power_dbm: Transmit power in dBm; used by the emulated radio.
+        sensitivity_dbm: Weakest signal that it receives, in dBm; used by the emulated radio, and by `check` to report
+            a weak signal.
     """
 
     interface: Annotated[str, shaped(r"^[a-z][a-z0-9._-]{0,14}$", "the name of a network interface, as wlan0")]
@@ -247,15 +257,22 @@ LEAST_CHARGE: Final = 0.2
 _CONNECTION: Final = r"^((udpout|udpin|tcp):[0-9A-Za-z.-]+:[0-9]{1,5}|/dev/[0-9A-Za-z/_.-]+:[0-9]{3,7})$"
 
 
+BOOT_S: Final = 2.0
+"""Boot time of an emulated autopilot; a real one takes about 30 s."""
+
+
 class Mavlink(Strict):
     """The MAVLink endpoint of an autopilot.
 
     Attributes:
-        port: UDP port at which others reach it over the radio.
-        connection: How the robot itself reaches it: `udpout:HOST:PORT`, which speaks first, `udpin:HOST:PORT`,
-            `tcp:HOST:PORT` or `/dev/ttyAMA0:921600`; None for that port.
-        autopilot: As which an emulated one answers: `px4` or `ardupilot`. A real one says itself what it is.
-        least_charge: What its battery must have, of 1, before a step flies it.
+        port: UDP port at which it listens on the radio.
+        connection: How the robot's own computer reaches it, for the step `mavlink`: `udpout:HOST:PORT` (sends first),
+            `udpin:HOST:PORT`, `tcp:HOST:PORT` or `/dev/ttyAMA0:921600`; without it, `port` on the robot itself.
+        autopilot: Firmware of an emulated autopilot: `px4` or `ardupilot`. A real one reports its own.
+        system: System id of an emulated autopilot after power-on, 1 to 250.
+        boot_s: Time from power-on until the position estimate of an emulated autopilot has an origin, 0 to 120 s; a
+            real one takes about 30 s.
+        least_charge: Minimum battery charge before a step flies it.
     """
 
     port: Annotated[Int, Field(gt=0, lt=65536)]
@@ -263,6 +280,8 @@ class Mavlink(Strict):
         Annotated[str, shaped(_CONNECTION, "a connection, as udpout:127.0.0.1:14550 or /dev/ttyAMA0:921600")] | None
     ) = None
     autopilot: Annotated[str, Field(pattern="^(px4|ardupilot)$", exclude_if=lambda name: name == "px4")] = "px4"
+    system: Annotated[Int, Field(gt=0, le=250, exclude_if=lambda number: number == 1)] = 1
+    boot_s: Annotated[Number | Int, Field(ge=0, le=120, exclude_if=lambda time_s: time_s == BOOT_S)] = BOOT_S
     least_charge: Annotated[Fraction, Field(exclude_if=lambda share: share == LEAST_CHARGE)] = LEAST_CHARGE
 
     @property
@@ -275,11 +294,11 @@ class Drive(Strict):
     """How a ground robot is driven: by velocities on a topic, `geometry_msgs/Twist`.
 
     Attributes:
-        topic: That its base listens to.
-        odometry: That says where it is, `nav_msgs/Odometry`.
-        turn_rad_s: Most that it is turned, in radians per second.
-        acceleration_m_s2: Most that its speed is made to grow per second, in m/s^2.
-        lease: It stops where the laptop has been silent for so long.
+        topic: Topic of velocities (`geometry_msgs/Twist`) that its base subscribes to.
+        odometry: Topic of its odometry (`nav_msgs/Odometry`).
+        turn_rad_s: Maximum turn rate, in radians per second.
+        acceleration_m_s2: Maximum acceleration, in m/s^2.
+        lease: The robot stops when it has heard nothing from the laptop for this time, 0.5 to 30 s.
     """
 
     topic: TopicName = "/cmd_vel"
@@ -293,10 +312,12 @@ class Limits(Strict):
     """What the robot can do.
 
     Attributes:
-        max_speed_m_s: Top speed in m/s.
-        max_height_m: How high over where it took off a drone may fly, in metres; None for one that no step may fly.
-        fence_m: How far from where it began it may go, over the ground, in metres; None for one that no step moves.
-        battery_min: Rough running time on one charge, in minutes.
+        max_speed_m_s: Top speed in m/s; no step `move` may be faster.
+        max_height_m: Maximum height of a drone above its take-off point, in metres; without it no step flies the
+            drone.
+        fence_m: Maximum horizontal distance from where the robot began, in metres; required by steps that fly or
+            drive it.
+        battery_min: Approximate running time on one charge, in minutes, for information only.
     """
 
     max_speed_m_s: Number | Int
@@ -308,15 +329,26 @@ class Limits(Strict):
 class RobotProfile(catalog.Named):
     """What a robot model is: one YAML file in `robots/`.
 
+    How to write one: [add a robot](add-a-robot.md). A key described as "for information only" has no effect in this
+    version.
+
+    An emulated robot has its setup files wherever they are, except at the very top and in `/proc`, `/sys` and `/dev`;
+    those in `/run` and `/tmp` are lost at a reboot. It publishes topics of any type at their rates and sizes. For
+    `sensor_msgs/LaserScan` (needs `points`), `Imu`, `BatteryState`, `Range`, `NavSatFix`, `MagneticField`,
+    `FluidPressure`, `Temperature`, `nav_msgs/Odometry`, `tf2_msgs/TFMessage` and `geometry_msgs/PoseStamped` the
+    values are those of such a sensor on a robot that [moves as it does](add-a-robot.md#what-an-emulated-robot-says).
+    In messages of other types, strings are empty, numbers 0 and quaternions the identity, and the first list of
+    numbers is noise of the size that the profile gives. Types with a `definition` need ROS 1.
+
     Attributes:
-        kind: `ugv`, `uav` or `usv`: on the ground, in the air, on water.
-        computer: The on-board computer.
-        radio: Its radio.
-        tools: Its programs.
-        ros: Its ROS side; None for a robot without, on which no step records.
-        limits: What it can do.
-        mavlink: Its autopilot, if it has one.
-        drive: How it is driven; None for one that a person moves.
+        kind: `ugv` (ground), `uav` (air) or `usv` (water).
+        computer: The on-board computer, for information only.
+        radio: The radio under test.
+        tools: Programs on the robot, each a name or a path.
+        ros: Its ROS side; a robot without one records nothing.
+        limits: Limits of the robot.
+        mavlink: Its autopilot, if it has one; an emulated robot has an [emulated autopilot](emulated-autopilot.md).
+        drive: How a ground robot is [driven](motion.md); without it, a person moves the robot.
     """
 
     kind: Annotated[str, Field(pattern="^(ugv|uav|usv)$")]

@@ -6,7 +6,8 @@ The only module that imports pydantic. Profiles, procedures, site files and back
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextvars import ContextVar
 from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    ModelWrapValidatorHandler,
     PlainSerializer,
     SerializationInfo,
     SerializerFunctionWrapHandler,
@@ -32,7 +34,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, core_schema
 
-from fieldkit.config import problems
+from fieldkit.config import misplaced, problems
 from fieldkit.config.documents import Document, Location, parse, read, to_text
 from fieldkit.core import units
 from fieldkit.core.errors import ConfigurationError, nearest
@@ -62,6 +64,7 @@ __all__ = [
     "by_kind",
     "complaint",
     "dump",
+    "folder",
     "is_empty",
     "load",
     "model_serializer",
@@ -76,6 +79,10 @@ __all__ = [
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 Quantity = TypeVar("Quantity")
+
+_AROUND: ContextVar[tuple[type["Strict"], ...]] = ContextVar("_AROUND", default=())
+"""The models of the mappings around the one that is validated now, the outermost first."""
+_FOLDER: ContextVar[Path] = ContextVar("_FOLDER", default=Path())
 
 
 def complaint(text: str, *at: str | int) -> Exception:
@@ -176,12 +183,39 @@ class Strict(BaseModel):
     def _known_keys(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
-        valid = [field.alias or name for name, field in cls.model_fields.items()]
+        fields = _types(cls)
         for key in data:
-            if key not in valid:
-                hint = nearest(str(key), valid, f"valid keys: {', '.join(valid)}")
-                raise PydanticCustomError("unknown_key", "unknown key {key}; {hint}", {"key": str(key), "hint": hint})
+            if key not in fields:
+                outer = [_types(model) for model in _AROUND.get()[:-1]]
+                hint, of = misplaced.hint(key, data, fields, outer)
+                raise _unknown(str(key), hint, outer[of] if of >= 0 else ())
         return data
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _knows_what_is_around(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        token = _AROUND.set((*_AROUND.get(), cls))
+        try:
+            return handler(data)
+        finally:
+            _AROUND.reset(token)
+
+
+def _types(model: type[Strict]) -> dict[str, Any]:
+    """Return the type of each key of a model."""
+    return {field.alias or name: field.annotation for name, field in model.model_fields.items()}
+
+
+def _unknown(key: str, hint: str, outer: Iterable[str] = ()) -> Exception:
+    """Return the exception for an unknown key.
+
+    Args:
+        key: The key.
+        hint: What to do about it.
+        outer: All keys of the mapping around, where the key is one of these.
+    """
+    context = {"key": key, "hint": hint, "outer": tuple(outer)}
+    return PydanticCustomError("unknown_key", "unknown key {key}; {hint}", context)
 
 
 def is_empty(value: object) -> bool:
@@ -213,10 +247,11 @@ def by_kind(
             return _made(data)
         known = kinds()
         if unknown := next((str(key) for key in data if key not in known), None):
-            around = next((str(key) for key in data if key in known and unknown in known[key].model_fields), None)
+            around = next((str(key) for key in data if key in known and unknown in _types(known[key])), None)
             valid = f"valid keys: {', '.join(known)}; a {what} of another kind comes with a package to be installed"
             hint = f"it is a key of {around}: write it inside" if around else nearest(unknown, known, valid)
-            raise PydanticCustomError("unknown_key", "unknown key {key}; {hint}", {"key": unknown, "hint": hint})
+            outer = [] if around else [types for model in _AROUND.get() if unknown in (types := _types(model))]
+            raise _unknown(unknown, hint, outer[-1] if outer else ())
         if len(data) != 1:
             raise complaint(f"a {what} has one kind, one of: {', '.join(known)}")
         ((kind, value),) = data.items()
@@ -264,10 +299,18 @@ def validate(document: Document, model: type[Model]) -> Model:
             nearest valid one.
     """
     document = model.written_out(document)
+    token = _FOLDER.set(Path(document.source).parent)
     try:
         return model.model_validate(document.data)
     except ValidationError as error:
         raise problems.explain(error.errors(), document) from error
+    finally:
+        _FOLDER.reset(token)
+
+
+def folder() -> Path:
+    """Return the folder of the file that is validated now; the current directory where none is."""
+    return _FOLDER.get()
 
 
 def dump(model: Strict) -> str:

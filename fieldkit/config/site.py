@@ -41,13 +41,14 @@ class SiteRobot(Strict):
 
     Attributes:
         profile: Name of its profile.
-        host: Name or address for SSH; needed by the field backend.
+        host: Name or address for SSH; required by the field backend.
         port: SSH port.
-        user: SSH user.
-        key: Path of the private key; None asks the SSH agent.
-        password: Instead of a key: `ask` at the terminal, or look it up in the `keyring`.
-        host_key: Pinned host key, `ssh-ed25519 AAAA...`.
-        address: Its IPv4 address on the radio under test, where that differs from `host`.
+        user: SSH user; required by the field backend.
+        key: Path of the private key; without it, keys of the SSH agent are used.
+        password: Instead of a key: `ask` at the terminal once per run, or read it from the system's `keyring`. The
+            password itself is never written into the file.
+        host_key: Pinned host key, `ssh-ed25519 AAAA...`; required by the field backend. `fieldkit enroll` writes it.
+        address: Its IPv4 address on the radio under test; without it, `host`.
     """
 
     profile: str
@@ -67,17 +68,31 @@ class SiteRobot(Strict):
 
 
 class Site(Strict):
-    """A lab: `fieldkit.yaml`.
+    """A lab: which robots exist, and which robot has which role. `fieldkit.yaml` in the current folder.
+
+    For real robots see [field](field.md). Without a site file the emulated backend uses two TurtleBots and a
+    Duckiedrone.
+
+    The emulated backend ignores `host`, `port`, `user`, `key`, `host_key` and `address`: its robots have addresses
+    from 10.42.0.1 on, in the order of the file, and generated keys. With `control: radio` the operator's laptop is a
+    station too, `laptop` at 10.42.0.254: it is 2 m from the relay in `master` and from the receiver in `masterless`,
+    never behind the wall, with the same radio as the robots, and every packet of SSH is subject to the radio model.
+    In `master`, packets from sender to receiver cross two links, so `loss` and `delay` apply twice. What the radio
+    models: [method](method-radio.md#the-emulated-radio).
 
     Attributes:
         backend: Backend used when the command line names none.
-        control: Whether SSH has a network of its own, or shares the radio under test.
-        ros_master: The role whose robot runs the ROS master of all with ROS 1, in topologies where somebody plays it;
-            elsewhere, and without it, each has the master that its own setup files name.
-        patience: How long a lost control connection is awaited, in seconds.
-        robots: The lab's robots by name.
-        roles: Which robot plays which role, per topology.
-        emulated: Options of the emulated backend, checked by that backend.
+        control: `separate`: SSH has a network of its own. `radio`: SSH uses the radio under test, see [two ways of
+            control](field.md#two-ways-of-control).
+        ros_master: Role of the robot that runs the ROS master of all robots with ROS 1, in topologies that have this
+            role: [one ROS master](ros-master.md). Without it, each robot uses the master that its setup files name.
+        patience: How long a command waits for a lost control connection before it fails. The first connection of a
+            run is not retried.
+        robots: The robots of the lab by name: lower-case letters, digits and hyphens.
+        roles: Which robot has which role, per topology. `master` needs `sender`, `receiver` and `relay`, `masterless`
+            the first two. Further roles are for procedures that have `places` for them; trials of other procedures do
+            not use their robots.
+        emulated: Options of the emulated backend; other backends ignore them.
     """
 
     backend: str = "field"

@@ -9,14 +9,14 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import Any, Final, Self
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import FaultKind
+from fieldkit.core.text import guarded, one_line
 
-SCHEMA_VERSION: Final = 4
+SCHEMA_VERSION: Final = 6
 """Version of the columns of trial.csv that fieldkit itself declares."""
 
 Value = int | float | bool | str
@@ -90,6 +90,12 @@ class Figure:
         sent: Column that counts of how many; None unless counted.
         rank: Place among the figures of a table, from the first; equal ranks keep the order of columns. fieldkit's
             own are below `FIRST_OF_OTHERS`, or from `BACKGROUND` on.
+        at_least: Column with the observed length of what had not ended (a right-censored value). It has a number in
+            a repeat in which the figure's own column is empty for that reason, and is empty in every other. Medians
+            only, and of the same unit; it has no figure of its own.
+        of_sent: Column with the same statistic over all that was sent, where what was lost counts as later than all
+            that arrived; empty where that is infinite. For statistics of what arrived alone: a median RTT. An
+            expectation `NAME < AMOUNT` is judged by both. Medians only, and of the same unit.
     """
 
     label: str
@@ -97,6 +103,8 @@ class Figure:
     arrived: str | None = None
     sent: str | None = None
     rank: int = FIRST_OF_OTHERS
+    at_least: str | None = None
+    of_sent: str | None = None
 
 
 def _column(unit: str, meaning: str) -> Any:  # noqa: ANN401 (as dataclasses.field)
@@ -157,6 +165,8 @@ class Column:
             return "repeats of a text make words, and of nothing else"
         if (figure.kind is Kind.FLAG) is not (self.type is bool):
             return "repeats of what is true or false make a flag, and of nothing else"
+        if figure.kind is not Kind.MEDIAN and (figure.at_least or figure.of_sent):
+            return "only a median has lower bounds, or a figure over all that was sent"
         is_counted = figure.kind is Kind.COUNTED
         if (figure.arrived is not None) is not is_counted or (figure.sent is not None) is not is_counted:
             return "what is counted, and nothing else, has columns of what arrived and what was sent"
@@ -206,8 +216,12 @@ def named(name: str, column: Column) -> Column:
         return column
     figure = column.figure
     if figure is not None:
-        arrived, sent = (one and prefixed(name, one) for one in (figure.arrived, figure.sent))
-        figure = replace(figure, label=f"{name}: {figure.label}", arrived=arrived, sent=sent)
+        arrived, sent, at_least, of_sent = (
+            other and prefixed(name, other)
+            for other in (figure.arrived, figure.sent, figure.at_least, figure.of_sent)
+        )
+        label = f"{name}: {figure.label}"
+        figure = replace(figure, label=label, arrived=arrived, sent=sent, at_least=at_least, of_sent=of_sent)
     return replace(column, name=prefixed(name, column.name), figure=figure)
 
 
@@ -324,6 +338,12 @@ class EstimateRow:
     p95: float | None = _column("unit", "95th percentile over repeats.")
     minimum: float | None = _column("unit", "Smallest of a single repeat.")
     maximum: float | None = _column("unit", "Largest of a single repeat.")
+    n_censored: int | None = _column(
+        "count",
+        "Of n, the repeats of which only a lower bound is known, since what was timed had not ended. Above 0, mean, "
+        "p95 and maximum are lower bounds, and `high` is empty where the data give no upper end.",
+    )
+    is_lower_bound: bool | None = _column("bool", "Whether `value` and `median` are lower bounds, too.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -361,12 +381,12 @@ def declared(row: type[Any]) -> tuple[Column, ...]:
 
 
 def cell(value: object) -> str:
-    """Return `value` as it stands in a CSV: empty for None, `true`/`false`, floats to 9 digits, text in one line."""
+    """Return `value` as text: empty for None, `true`/`false`, floats to 9 digits, text in one printable line."""
     if value is None:
         return ""
     if isinstance(value, bool):
         return "true" if value else "false"
-    return f"{value:.9g}" if isinstance(value, float) else " ".join(str(value).splitlines())
+    return f"{value:.9g}" if isinstance(value, float) else one_line(str(value))
 
 
 def csv_text(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
@@ -375,7 +395,8 @@ def csv_text(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 
 
 def csv_line(values: Iterable[object]) -> str:
-    """Return a line of values as CSV, with its end."""
+    """Return a line of values as CSV, with its end; texts that a spreadsheet takes for formulas are `guarded`."""
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerow(map(cell, values))
+    cells = (guarded(cell(value)) if isinstance(value, str) else cell(value) for value in values)
+    csv.writer(out, lineterminator="\n").writerow(cells)
     return out.getvalue()

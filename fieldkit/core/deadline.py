@@ -3,9 +3,8 @@
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final, TypeVar
-
-from fieldkit.core.lazy import dataclass
 
 T = TypeVar("T")
 

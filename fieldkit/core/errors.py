@@ -35,13 +35,13 @@ class FieldkitError(Exception):
 
 
 class ConfigurationError(FieldkitError):
-    """A file, option or installation is not what it must be."""
+    """Usage or configuration: an option, a file, or something missing on this machine."""
 
     exit_code = 2
 
 
 class RobotError(FieldkitError):
-    """A robot answered, but cannot do what the trial asks of it."""
+    """A robot answered, but cannot do what the trial needs."""
 
     exit_code = 3
 
@@ -49,6 +49,16 @@ class RobotError(FieldkitError):
 class LockLostError(RobotError):
     """Somebody else took the robot, or broke its lock: the trial ends, its repeat is not tried again."""
 
+    ends_trial = True
+
+
+class MotionHeldError(RobotError):
+    """A fault stopped a robot that moves; it must not move before a person [confirms it](motion.md#after-a-fault).
+
+    The trial ends.
+    """
+
+    exit_code = 5
     ends_trial = True
 
 
@@ -68,8 +78,14 @@ class LinkLostError(LinkError):
     """The connection broke or could not be made: what was asked may or may not have been done."""
 
 
+class TestbedLostError(LinkError):
+    """A process that the robots need has ended and does not come back: the trial stops, its repeat is redone."""
+
+    ends_trial = True
+
+
 class EvidenceError(FieldkitError):
-    """Raw evidence is missing, damaged or contradicts itself."""
+    """Evidence is missing, damaged or contradicts itself: a repeat failed, or `verify` found a difference."""
 
     exit_code = 4
 

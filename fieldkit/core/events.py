@@ -1,14 +1,19 @@
 """Events of a trial, a campaign or a computation: a stream that display, log and `--json` subscribe to."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Status, Verdict
 
 
 @dataclass(frozen=True)
 class Note:
-    """Something the operator should know, in one line."""
+    """Something that the operator should know.
+
+    Attributes:
+        text: One line.
+    """
 
     text: str
 
@@ -154,6 +159,10 @@ class Finding:
     remedy: str = ""
 
 
+NOTHING_ARRIVED: Final = "NOTHING ARRIVED"
+"""How the summary of a repeat begins that lost all that it sent."""
+
+
 @dataclass(frozen=True)
 class RepeatEnded:
     """A repeat ended.
@@ -168,6 +177,7 @@ class RepeatEnded:
         total: Repeats planned.
         left_s: Estimated time left.
         remedy: What to do about a step that failed, where the step says it.
+        left_most_s: What that may come to, repeats that have to be redone apart.
     """
 
     repeat: str
@@ -179,11 +189,12 @@ class RepeatEnded:
     total: int
     left_s: float
     remedy: str = ""
+    left_most_s: float = 0.0
 
 
 @dataclass(frozen=True)
 class TrialStarted:
-    """A trial began, or is gone on with.
+    """A trial began, or is continued.
 
     Attributes:
         folder: Its folder.
@@ -197,8 +208,42 @@ class TrialStarted:
 
 
 @dataclass(frozen=True)
+class ExpectationJudged:
+    """An expectation of a trial was judged by the repeats of one protocol.
+
+    Attributes:
+        expectation: As it was written.
+        protocol: Of the repeats; empty where there are none.
+        ruling: `holds`, `does not hold` or `undecided`.
+        why: Why it does not hold, beside the numbers; empty where they say it.
+        measured: What was measured, for people.
+        interval: Its interval or bound, likewise; empty without one.
+        n: Valid repeats that have the figure.
+        n_valid: Valid repeats.
+        n_censored: Of n, the ones of which only a lower bound is known.
+    """
+
+    expectation: str
+    protocol: str
+    ruling: str
+    why: str
+    measured: str
+    interval: str
+    n: int
+    n_valid: int
+    n_censored: int
+
+
+@dataclass(frozen=True)
 class TrialEnded:
-    """The trial ended; its folder is complete."""
+    """The trial ended; its folder is complete.
+
+    Attributes:
+        folder: Its folder.
+        valid: Number of valid repeats.
+        void: Number of void attempts.
+        failed: Number of failed repeats.
+    """
 
     folder: str
     valid: int
@@ -208,7 +253,13 @@ class TrialEnded:
 
 @dataclass(frozen=True)
 class TrialStopped:
-    """The trial stopped before its end; `fieldkit resume FOLDER` goes on."""
+    """The trial stopped before its end; `fieldkit resume FOLDER` continues it.
+
+    Attributes:
+        folder: Its folder.
+        done: Repeats that are over.
+        total: Repeats planned.
+    """
 
     folder: str
     done: int
@@ -228,6 +279,7 @@ class CampaignPlanned:
         left_s: Estimated time.
         needed_bytes: What their evidence may need on this machine.
         free_bytes: What is free there.
+        left_most_s: What `left_s` may come to, repeats that have to be redone apart.
     """
 
     name: str
@@ -238,6 +290,7 @@ class CampaignPlanned:
     left_s: float
     needed_bytes: int
     free_bytes: int
+    left_most_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -264,17 +317,25 @@ class CampaignWent:
         done: Trials that are over.
         total: All trials.
         left_s: Estimated time left.
+        left_most_s: What that may come to, repeats that have to be redone apart.
     """
 
     trial: str
     done: int
     total: int
     left_s: float
+    left_most_s: float = 0.0
 
 
 @dataclass(frozen=True)
 class CampaignEnded:
-    """The campaign ended or stopped; the same command goes on."""
+    """The campaign ended or stopped; the same command continues it.
+
+    Attributes:
+        folder: Its folder.
+        done: Trials that are over.
+        total: All trials.
+    """
 
     folder: str
     done: int
@@ -294,6 +355,7 @@ Event = (
     | Finding
     | RepeatEnded
     | TrialStarted
+    | ExpectationJudged
     | TrialEnded
     | TrialStopped
     | CampaignPlanned

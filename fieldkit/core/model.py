@@ -2,10 +2,9 @@
 
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, ClassVar, Final
-
-from fieldkit.core.lazy import dataclass
 
 
 class Role(str):
@@ -228,6 +227,30 @@ class Move:
     role: Role
     legs: tuple[Leg, ...]
     speed_m_s: float
+
+
+@dataclass(frozen=True)
+class MotionOrigin:
+    """Place and heading of a robot at its first start in a trial: centre of its fence, reference of all directions.
+
+    Attributes:
+        frame: Frame of the coordinates: `odometry`, or `local` for MAVLink's LOCAL_POSITION_NED.
+        frame_id: Identifies the life of that frame, for example the boot ID of the robot; a frame that was lost and
+            made anew has another one.
+        x_m: x of `nav_msgs/Odometry`, or metres north.
+        y_m: y of `nav_msgs/Odometry`, or metres east.
+        heading_rad: Where the robot faces, from x towards y: counterclockwise in `odometry`, clockwise in `local`.
+        latitude_deg: Latitude of the place (WGS 84); None if unknown.
+        longitude_deg: Its longitude; None if unknown.
+    """
+
+    frame: str
+    frame_id: str
+    x_m: float
+    y_m: float
+    heading_rad: float
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
 
 
 Vector = tuple[float, float, float]

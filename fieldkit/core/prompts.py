@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Answered, Asked, Entered, Request, Sink
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.text import harmless
 
 SKIP: Final = "s"

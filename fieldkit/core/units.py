@@ -1,13 +1,14 @@
 """Quantities as people write them (`30ft`, `200ms`, `20Mbit/s`), SI inside."""
 
 import re
+from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Distance
 
 # The foot is exact by definition (international yard and pound agreement, 1959).
-METRES_PER_UNIT: Final = {"m": 1.0, "ft": 0.3048, "km": 1000.0, "cm": 0.01}
+METRES_PER_UNIT: Final = {"m": 1.0, "ft": 0.3048, "km": 1000.0, "cm": 0.01, "mm": 0.001}
 SECONDS_PER_UNIT: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
 HERTZ_PER_UNIT: Final = {"Hz": 1.0, "kHz": 1e3}
 METRES_PER_S_PER_UNIT: Final = {"m/s": 1.0, "km/h": 1 / 3.6, "ft/s": 0.3048, "cm/s": 0.01}
@@ -38,6 +39,8 @@ def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
     """
     match = _QUANTITY.match(text)
     example = f"write for example {_example(match['number'] if match else '15', units)}; units are {', '.join(units)}"
+    if match is None and text.lstrip().startswith("-"):
+        raise ConfigurationError(f"{what} {text.strip()[:40]!r} is below zero", remedy=example)
     if match is None:
         raise ConfigurationError(f"{text[:40]!r} is not a {what}", remedy=example)
     if not match["unit"]:
@@ -102,6 +105,33 @@ def format_duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+_CLEARLY: Final = 1.2
+"""Upper ends beyond this multiple of the likely time are stated beside it."""
+
+
+@dataclass(frozen=True)
+class TimeEstimate:
+    """A duration that is not known yet.
+
+    Attributes:
+        likely_s: What is expected.
+        most_s: What it may come to, repeats that have to be redone apart.
+    """
+
+    likely_s: float
+    most_s: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it may come to little more than what is expected."""
+        return self.most_s <= _CLEARLY * self.likely_s
+
+    def __str__(self) -> str:
+        """Return it for people: `4 min 00 s`, with `, up to 19 min 00 s` where that is clearly more."""
+        most = "" if self.is_certain else f", up to {format_duration(self.most_s)}"
+        return f"{format_duration(self.likely_s)}{most}"
 
 
 def format_bytes(size_bytes: float) -> str:

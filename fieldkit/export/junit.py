@@ -42,7 +42,11 @@ def write(path: Path, folders: Iterable[Path]) -> None:
 def text(folders: Iterable[Path]) -> bytes:
     """Return trials as XML; errors as `write`."""
     top = ET.Element("testsuites", name="fieldkit")
-    top.extend(map(_suite, folders))
+    # A list: `extend` turns an error of what it is given into a TypeError of its own.
+    top.extend([_suite(folder) for folder in folders])
+    for element in top.iter():  # every text and attribute, whatever wrote it
+        element.text = element.text and harmless(element.text)
+        element.attrib.update({name: harmless(value) for name, value in element.attrib.items()})
     ET.indent(top)
     return bytes(ET.tostring(top, encoding="utf-8", xml_declaration=True)) + b"\n"
 
@@ -55,7 +59,7 @@ def _suite(folder: Path) -> ET.Element:
         case.set("classname", group)
     failed, skipped = (sum(case.find(kind) is not None for case in cases) for kind in ("failure", "skipped"))
     said = {"name": plan.trial, "tests": len(cases), "failures": failed, "errors": 0, "skipped": skipped}
-    suite = ET.Element("testsuite", {name: harmless(str(value)) for name, value in said.items()})
+    suite = ET.Element("testsuite", {name: str(value) for name, value in said.items()})
     suite.extend(cases)
     return suite
 
@@ -80,25 +84,27 @@ def _repeats(plan: Plan, entries: Iterable[JournalEntry]) -> Iterator[ET.Element
         elif last is not Status.VALID:
             _add(case, "skipped", "it is not over; fieldkit resume goes on with the trial")
         if said:
-            ET.SubElement(case, "system-out").text = harmless("\n".join(said))
+            ET.SubElement(case, "system-out").text = "\n".join(said)
         yield case
 
 
 def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
-    content = files.read(folder / store.TRIAL_CSV) if (folder / store.TRIAL_CSV).exists() else b""
-    if not content or not plan.procedure.expect:
+    """Judge what a trial expects; without its table, which it has from the first attempt on, nothing is decided."""
+    if not plan.procedure.expect:
         return ()
-    cells = aggregate(repeats.parse(content, plan.table), quantities=quantities(plan.table))
+    table = folder / store.TRIAL_CSV
+    rows = repeats.read([table], plan.table) if table.exists() else None
+    cells = () if rows is None else aggregate(rows, quantities=quantities(plan.table))
     return judgements.judge(plan.procedure.expectations, cells)
 
 
 def _expected(one: Judgement) -> ET.Element:
     expected, of, measured, interval, ruling = wording.judged(one)
-    case = ET.Element("testcase", name=harmless(f"{expected} ({of})" if of else expected), time="0")
+    case = ET.Element("testcase", name=f"{expected} ({of})" if of else expected, time="0")
     if not one.holds:
         _add(case, "failure", f"{ruling}: {measured} {interval}".rstrip())
     return case
 
 
 def _add(case: ET.Element, kind: str, message: str) -> None:
-    ET.SubElement(case, kind, message=harmless(message))
+    ET.SubElement(case, kind, message=message)

@@ -3,7 +3,6 @@
 File format: https://mcap.dev/spec; what Foxglove expects of JSON: https://docs.foxglove.dev, custom schema encodings.
 """
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Final
@@ -11,6 +10,7 @@ from typing import Any, BinaryIO, Final
 from mcap.writer import CompressionType, Writer
 
 from fieldkit import __version__
+from fieldkit.core.text import json_text
 
 Json = Mapping[str, Any]
 
@@ -103,4 +103,4 @@ class _Channels:
 
 
 def _encoded(value: Json) -> bytes:
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
+    return json_text(value, separators=(",", ":"), allow_nan=False).encode()

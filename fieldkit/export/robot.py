@@ -48,9 +48,9 @@ class AttemptRecord:
 
 def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptRecord:
     """Return what is left of an attempt."""
-    captures = {name: evidence.known(pcap.read, name) for name in plan.captures()}
-    pings = {pinging.file: evidence.known(ping.read, pinging.file) for pinging in plan.pingings()}
-    bags = {role: evidence.known(bag.read, name) for role, name in plan.bags().items()}
+    captures = {name: evidence.read_or_none(pcap.read, name) for name in plan.captures()}
+    pings = {pinging.file: evidence.read_or_none(ping.read, pinging.file) for pinging in plan.pingings()}
+    bags = {role: evidence.read_or_none(bag.read, name) for role, name in plan.bags().items()}
     return AttemptRecord(
         plan=plan,
         attempt=attempt,

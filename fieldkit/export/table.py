@@ -13,7 +13,7 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.tables import estimate_rows
-from fieldkit.core.columns import SCHEMA_VERSION, Column, EstimateRow, csv_text, declared
+from fieldkit.core.columns import SCHEMA_VERSION, Column, EstimateRow, cell, csv_text, declared
 from fieldkit.measure.transfers import crossings
 from fieldkit.measure.transfers.crossings import Crossings
 
@@ -104,7 +104,9 @@ def _of_rows(columns: Sequence[Column], rows: Sequence[Sequence[Any]]) -> Table:
 def _schema(columns: Sequence[Column]) -> pa.Schema:
     return pa.schema(
         [
-            pa.field(column.name, _TYPES[column.type], metadata={"unit": column.unit, "meaning": column.meaning})
+            pa.field(
+                cell(column.name), _TYPES[column.type], metadata={"unit": column.unit, "meaning": column.meaning}
+            )
             for column in columns
         ],
         metadata={"fieldkit_version": __version__, "schema_version": str(SCHEMA_VERSION)},
@@ -112,7 +114,9 @@ def _schema(columns: Sequence[Column]) -> pa.Schema:
 
 
 def _texts(column: Texts) -> pa.Array:
-    return pa.array(column, pa.string(), mask=column == "").dictionary_encode()
+    printable = {text: cell(text) for text in set(column.tolist())}
+    texts = [printable[text] or None for text in column.tolist()]
+    return pa.array(texts, pa.string()).dictionary_encode()
 
 
 def _numbers(column: Numbers, kind: pa.DataType) -> pa.Array:

@@ -120,7 +120,7 @@ def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, i
         # What held when the attempt began is told then.
         found = [
             _place(plan, whereabouts.role, max(whereabouts.utc_ns, attempt.started_utc_ns), whereabouts.position_m)
-            for whereabouts in evidence(attempt).known(track.read, track.FILE) or ()
+            for whereabouts in evidence(attempt).read_or_none(track.read, track.FILE) or ()
             if whereabouts.position_m is not None and whereabouts.role in plan.cast.keys() - told.keys()
         ]
         for role in filter(told.__contains__, plan.cast):

@@ -3,12 +3,10 @@
 import hashlib
 import os
 import shutil
-import stat
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core import runtime
 
 
 @dataclass(frozen=True)
@@ -48,8 +46,8 @@ class LabFolder:
 
     @property
     def claim(self) -> str:
-        """Abstract name of a socket that only one process can have."""
-        return f"\0fieldkit lab {os.geteuid()} {self.path.name}"
+        """Name that only one process can hold, see `runtime.held`."""
+        return f"lab-{self.path.name}"
 
 
 def of_directory(directory: Path) -> LabFolder:
@@ -59,9 +57,9 @@ def of_directory(directory: Path) -> LabFolder:
         ConfigurationError: Somebody else owns the place.
     """
     digest = hashlib.sha256(os.fsencode(directory.resolve())).hexdigest()[:16]
-    path = _in_memory() / f"fieldkit-{os.geteuid()}-{digest}"
+    path = runtime.base_folder() / f"fieldkit-{os.geteuid()}-{digest}"
     if not _is_own(path):
-        raise _taken(path)
+        raise runtime.not_private(path)
     return LabFolder(path)
 
 
@@ -75,7 +73,7 @@ def make(folder: LabFolder) -> None:
     try:
         folder.path.mkdir(mode=0o700)
     except FileExistsError as error:
-        raise _taken(folder.path) from error
+        raise runtime.not_private(folder.path) from error
 
 
 def remove(folder: LabFolder) -> None:
@@ -83,26 +81,9 @@ def remove(folder: LabFolder) -> None:
     shutil.rmtree(folder.path, ignore_errors=True)
 
 
-def _in_memory() -> Path:
-    """Return this user's folder for what lives in memory, or where everybody may make folders."""
-    user = os.geteuid()
-    for folder in filter(None, (os.environ.get("XDG_RUNTIME_DIR"), f"/run/user/{user}")):
-        path = Path(folder)
-        # After sudo the variable still names another user's.
-        if path.is_dir() and path.stat().st_uid == user:
-            return path
-    return Path(tempfile.gettempdir())
-
-
 def _is_own(path: Path) -> bool:
     """Return whether nobody else can change what lies there, if anything does."""
     try:
-        status = path.lstat()
+        return runtime.is_private(path.lstat())
     except FileNotFoundError:
         return True
-    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077
-
-
-def _taken(path: Path) -> ConfigurationError:
-    remedy = f"remove it, or set XDG_RUNTIME_DIR: {typed('ls', '-ld', path)}"
-    return ConfigurationError("is not this user's alone", where=str(path), remedy=remedy)

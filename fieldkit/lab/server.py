@@ -5,12 +5,14 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from types import FrameType
 from typing import Final
 
+from fieldkit.core import runtime
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Sink
+from fieldkit.core.runtime import NameHeldError
 from fieldkit.lab import answers, ssh
 from fieldkit.lab.answers import LabState, RobotState
 from fieldkit.lab.folder import LabFolder, make, remove
@@ -54,11 +56,11 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready:
 
 @contextmanager
 def _claimed(folder: LabFolder) -> Iterator[None]:
-    """Be the only lab of the directory: the name ends with its process, however that ends."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
+    """Be the only lab of the directory."""
+    with ExitStack() as stack:
         try:
-            name.bind(folder.claim)
-        except OSError as error:
+            stack.enter_context(runtime.held(folder.claim))
+        except NameHeldError as error:
             raise ConfigurationError("this directory has a lab that is up", remedy="fieldkit lab down") from error
         yield
 
@@ -122,7 +124,7 @@ def _hand_over(client: socket.socket, robots: Lab, name: str) -> None:
         stream = robots.connect(name, REQUEST_S)
     except KeyError:
         client.sendall(f"there is no robot {name!r} in this lab".encode())
-    except OSError as error:
+    except (OSError, FieldkitError) as error:
         client.sendall(f"{name} does not answer: {error}".encode())
     else:
         with closing(stream):

@@ -8,7 +8,8 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.evidence import link_samples
+from fieldkit.measure.evidence import host, link_samples
+from fieldkit.measure.evidence.host import Counters
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -60,7 +61,7 @@ class AttemptEvidence:
         found: T = self._read[key]
         return found
 
-    def known(
+    def read_or_none(
         self, parse: Callable[Concatenate[Path, P], T], name: str, *options: P.args, **none: P.kwargs
     ) -> T | None:
         """Return a piece of evidence, None when it is missing or not what it must be."""
@@ -69,7 +70,7 @@ class AttemptEvidence:
         except EvidenceError:
             return None
 
-    def once(self, find: "Callable[Concatenate[AttemptEvidence, P], T]", *options: P.args, **none: P.kwargs) -> T:
+    def cached(self, find: "Callable[Concatenate[AttemptEvidence, P], T]", *options: P.args, **none: P.kwargs) -> T:
         """Return what `find` finds in the evidence, by `options`; it looks once, whoever asks.
 
         What it raises is not kept.
@@ -86,13 +87,24 @@ class AttemptEvidence:
 
     def links(self, role: Role) -> Sequence[LinkSample]:
         """Return what a robot's radio told of its links, in the order of time: a testbed's samples, else its own."""
-        modelled = self.known(link_samples.read, link_samples.FILE) or {}
-        return modelled.get(role) or self.known(link_samples.read_own, "", role) or ()
+        modelled = self.read_or_none(link_samples.read, link_samples.FILE) or {}
+        return modelled.get(role) or self.read_or_none(link_samples.read_own, "", role) or ()
+
+    def counters(self, role: Role) -> Counters:
+        """Return how the counters of a robot's kernel moved during the attempt; None in each that is not known."""
+        before, after = (self.read_or_none(host.read, file(role)) for file in (host.before, host.after))
+        return host.difference(before or Counters(None, None), after or Counters(None, None))
+
+    def interface_bytes(self, role: Role, interface: str) -> int | None:
+        """Return how many bytes an interface received during the attempt; None if its kernel does not say."""
+        files = (file(role) for file in (host.before, host.after))
+        before, after = (self.read_or_none(host.received_bytes, file, interface) for file in files)
+        return None if before is None or after is None or after < before else after - before
 
     def whole_capture(self, name: str | None) -> Capture | None:
         """Return the capture in a file; None where it is missing or damaged, or there is to be none.
 
         Counts from a damaged one would be guesses.
         """
-        capture = None if name is None else self.known(pcap.read, name)
+        capture = None if name is None else self.read_or_none(pcap.read, name)
         return None if capture is None or capture.damage else capture

@@ -1,8 +1,7 @@
 """The offset of a robot's clock against the laptop's, with the most that it can be wrong."""
 
 from collections.abc import Sequence
-
-from fieldkit.core.lazy import dataclass
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)

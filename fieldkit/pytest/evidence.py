@@ -13,6 +13,7 @@ import pytest
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Finding, Note, PhaseStarted, RepeatEnded, Request
 from fieldkit.core.text import harmless
+from fieldkit.pytest import options
 from fieldkit.pytest.options import Keep
 
 LOG: Final = "lab.log"
@@ -151,6 +152,7 @@ def _as_lab_error(item: pytest.Item, call: pytest.CallInfo[None], report: pytest
     """Report what is wrong with the lab as an error of set-up in the words for an operator, and not as a failure."""
     if call.excinfo is None or not isinstance(call.excinfo.value, FieldkitError):
         return
+    call.excinfo.value.remedy = options.as_pytest_option(call.excinfo.value.remedy)
     if report.when == "call":
         report.when = "setup"
     if item.config.getoption("tbstyle") == "auto":

@@ -8,6 +8,7 @@ from typing import Self
 
 from fieldkit.backends.protocols import Backend, Cast, Testbed
 from fieldkit.cli import options as command_line
+from fieldkit.cli import sites
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Fault, FaultKind, Leg, Move, Placement, Scenario, Topology
 from fieldkit.core.prompts import Operator
@@ -181,7 +182,7 @@ class OpenedLab:
     def _first_topology(self) -> Topology:
         if self.options.topology is not None:
             return one_of(Topology, self.options.topology, "topology")
-        site, _ = command_line.lab_site(argparse.Namespace(site=self.options.site))
+        site, _ = sites.lab_site(argparse.Namespace(site=self.options.site))
         return next(iter(site.roles), Topology.MASTER) if site else Topology.MASTER
 
     def _bring_up(self, topology: Topology) -> None:

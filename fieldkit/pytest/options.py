@@ -1,5 +1,6 @@
 """Options of pytest: the lab that tests want."""
 
+import re
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -62,6 +63,16 @@ def output(config: pytest.Config) -> Path:
 def keep(config: pytest.Config) -> Keep:
     """Return whose evidence is kept."""
     return Keep(_text(config, "keep") or Keep.FAILED)
+
+
+_SAME: Final = re.compile(r"(?<![\w-])--(?=(?:backend|site|topology|yes)\b)")
+_COMMAND: Final = re.compile(r"(\bfieldkit [a-z][^;,\n`]*)")
+
+
+def as_pytest_option(remedy: str) -> str:
+    """Return a remedy with the options as pytest takes them: `--fieldkit-topology`; commands of fieldkit stay."""
+    parts = _COMMAND.split(remedy)
+    return "".join(part if _COMMAND.fullmatch(part) else _SAME.sub("--fieldkit-", part) for part in parts)
 
 
 def one_of(words: type[Word], text: str, what: str) -> Word:

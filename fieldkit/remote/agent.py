@@ -26,8 +26,8 @@ def content() -> bytes:
     import zipfile  # noqa: PLC0415 (10 ms, and only topics need it)
 
     parts = {"__main__.py": _START.encode(), "fieldkit/__init__.py": b""}
-    for path in sorted((_ROOT / "agent").glob("*.py")):
-        parts[f"fieldkit/agent/{path.name}"] = path.read_bytes()
+    for path in sorted((_ROOT / "agent").rglob("*.py")):
+        parts[f"fieldkit/{path.relative_to(_ROOT).as_posix()}"] = path.read_bytes()
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for name, text in parts.items():

@@ -5,10 +5,10 @@ each of them is a way for a robot to say something unforeseen.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import IO, Final
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.remote.command import printable
 
 MAX_FILES: Final = 500

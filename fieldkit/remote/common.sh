@@ -31,7 +31,15 @@
 #   job.sh unlock TOKEN                  give it back
 #   job.sh holder                        tell who holds it, if anybody: TOKEN SECONDS WHO WHAT, expiring in SECONDS
 #   job.sh abort WHO                     break the lock, say `held WHO WHAT` or `free`, end every job of any trial and list it
-#                                        as `left` does; needs no file of its own and no room
+#                                        as `left` does; needs no file of its own and no room; then list the programs that
+#                                        still bring a drone down: `lands DIR/.jobs/NAME STATE`, as `motion_states`
+#   job.sh halt_motion WHO [DIR]         stop every program of the agent that drives or flies this robot, or watches a drone,
+#                                        and what holds the robot's lock; with DIR those of DIR alone, and leave the lock;
+#                                        then list them: DIR/.jobs/NAME STATE, as `motion_states`
+#   job.sh motion_states DIR/.jobs/NAME...
+#                                        list the states: `stationary`, `landed`, `land` or `return` (coming down), `ended`,
+#                                        `silent`, or `alarm` (a drone that may be in the air)
+#   job.sh life_signs FILE               print FILE and the time since boot
 #   job.sh needs                         fail if a program is missing that this script calls
 #   job.sh stand                         say `ready`; then run each line of standard input, `NONCE [held] VERB WORD...`,
 #                                        as if it were called so: NONCE goes before what a verb prints, NONCE and its exit

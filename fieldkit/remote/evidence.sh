@@ -5,7 +5,8 @@ PIECE=4194304 # as PIECE_BYTES of evidence.py
 state() { # $1 interface
     interface=$1
     set --
-    for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg; do
+    for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg \
+        /proc/sys/net/ipv4/tcp_congestion_control; do
         [ -r "$file" ] && set -- "$@" "$file"
     done
     moment

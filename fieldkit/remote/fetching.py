@@ -4,14 +4,14 @@ import hashlib
 import re
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core import files
+from fieldkit.core import files, laptop_files
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, LinkError, RobotError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.units import format_bytes
 from fieldkit.remote import archive
 from fieldkit.remote.script import CALL, call, complaint
@@ -113,14 +113,15 @@ def fetch(
     *,
     expected_bytes: int = 0,
     progress: FetchProgress | None = None,
+    foreign: Callable[[str], str | None] = lambda _: None,
 ) -> None:
     """Let the robot note its state again, copy its files of a repeat into `into` and check each against its hash.
 
     What is small comes as one archive, what is large piece by piece: the time for each is bounded, the time for all
     grows with their size, and what was cut goes on where it was, also in another call.
 
-    The robot is not trusted: names are checked against a pattern, only plain files are taken, in one level of folders
-    at most, and their number and size are bounded.
+    The robot is not trusted: names are checked against a pattern, files that only the laptop or another robot writes
+    are refused, only plain files are taken, in one level of folders at most, and their number and size are bounded.
 
     Args:
         shell: The robot.
@@ -130,6 +131,7 @@ def fetch(
         into: Where the files go.
         expected_bytes: About how much there is; see `EXPECTED_TIMES`.
         progress: Told how far the large files are.
+        foreign: Returns why a file of this name is none of this robot's, None if it may be.
 
     Raises:
         LinkError: The robot did not answer.
@@ -139,7 +141,7 @@ def fetch(
     """
     packed = into / f".{role}.tar"
     try:
-        large, late = _fetch_small(shell, pack_command(folder, role, interface), packed, folder)
+        large, late = _fetch_small(shell, pack_command(folder, role, interface), packed, folder, foreign)
     finally:
         packed.unlink(missing_ok=True)
     if large:
@@ -153,7 +155,7 @@ def fetch(
 
 
 def _fetch_small(
-    shell: Shell, command: tuple[str, ...], packed: Path, folder: str
+    shell: Shell, command: tuple[str, ...], packed: Path, folder: str, foreign: Callable[[str], str | None]
 ) -> tuple[Mapping[str, int], RobotError | None]:
     """Fetch all small files beside their archive.
 
@@ -166,7 +168,7 @@ def _fetch_small(
     except RobotError as error:
         late = _in_its_words(error, folder)
     try:
-        return _unpack(packed, packed.parent, shell.robot), late
+        return _unpack(packed, packed.parent, shell.robot, foreign), late
     except (EvidenceError, FileNotFoundError) as error:
         if isinstance(late, LateError):
             late = RobotError(late.what, where=late.where, remedy=late.remedy)  # it did not come whole
@@ -177,7 +179,7 @@ def _in_its_words(error: RobotError, folder: str) -> RobotError:
     """Return why the robot could not pack a folder, as it says itself."""
     said = complaint(error.what.encode())
     if said.startswith(_NO_FOLDER):
-        return NoFolderError(f"it has {said} any more", where=error.where)
+        return NoFolderError(f"it no longer has {said.removeprefix('no ')}", where=error.where)
     if said.startswith(_LATE):
         return LateError(said, where=error.where, remedy=f"look into {folder} on the robot")
     return RobotError(said, where=error.where, remedy=f"look into {folder} on the robot") if said else error
@@ -255,7 +257,7 @@ class _LargeFile:
         return _parse_sums(call(self.shell, "sum", self.folder, self.name, deadline=deadline)).get(self.name)
 
 
-def _unpack(packed: Path, into: Path, robot: str) -> Mapping[str, int]:
+def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str | None]) -> Mapping[str, int]:
     """Unpack an archive of small files, check them, and return the sizes of the large ones by name."""
     sums: dict[str, str] = {}
     large: dict[str, int] = {}
@@ -266,14 +268,30 @@ def _unpack(packed: Path, into: Path, robot: str) -> Mapping[str, int]:
                 sums = _parse_sums(b"".join(islice(member.chunks, _LIST_CHUNKS)))
             elif _LARGE.match(member.name) and not large:
                 large = _parse_sizes(b"".join(islice(member.chunks, _LIST_CHUNKS)), robot)
+                for name in large:
+                    _demand_own(name, robot, foreign)
             elif not _SAFE_NAME.match(member.name):
                 raise EvidenceError(f"sent {member.name!r}, which is no plain file of a repeat", where=robot)
             else:
+                _demand_own(member.name, robot, foreign)
                 received[member.name] = _write(member, into, robot)
     wrong = sorted(name for name in sums.keys() | received.keys() if sums.get(name) != received.get(name))
     if wrong or not received:
         raise EvidenceError(f"hash differs or file missing: {', '.join(wrong) or 'all files'}", where=robot)
     return large
+
+
+def _demand_own(name: str, robot: str, foreign: Callable[[str], str | None]) -> None:
+    """Refuse a file that the laptop writes, or another robot.
+
+    Raises:
+        EvidenceError: It is one.
+    """
+    why = "only the laptop writes a file of this name" if laptop_files.reserved(name) else foreign(name)
+    if why:
+        raise EvidenceError(
+            f"sent {name}: {why}", where=robot, remedy=f"find out what writes {name} on the robot, and rename it"
+        )
 
 
 def _write(member: archive.TarMember, into: Path, robot: str) -> str:

@@ -261,7 +261,7 @@ main() {
         end) [ ! -d "$1" ] || end "$1" ;;
         halt) end "$1"/* ;;
         drop) remove "$1"; rmdir "${1%/*}" 2>/dev/null || : ;;
-        stop | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs | stand) "$verb" "$@" ;;
+        stop | halt_motion | motion_states | life_signs | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs | stand) "$verb" "$@" ;;
         *) fail "unknown verb '$verb'" ;;
     esac
 }

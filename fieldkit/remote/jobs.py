@@ -2,11 +2,11 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol
 from fieldkit.remote.command import printable
 from fieldkit.remote.script import CALL, HOME, REPLY_S, SCRIPT, SCRIPT_PATH, call, complaint, demand, install
@@ -30,9 +30,11 @@ __all__ = [
     "exit_file",
     "install",
     "left",
+    "limited_argv",
     "run",
     "serve",
     "start",
+    "stationary_file",
     "stop",
     "unhurried_file",
     "work_folder",
@@ -47,7 +49,17 @@ KILLED: Final = 137
 _HELD: Final = re.compile(rb"^held \S+ \S", re.MULTILINE)
 _JOB: Final = re.compile(rb"\S+/\S+ [0-9]{1,10} ")
 
+_LANDS: Final = re.compile(
+    rb"^lands (?P<program>[!-~]+/\.jobs/[!-~]+) (?P<state>land|return|alarm|landed|silent)$", re.MULTILINE
+)
+
 _LINE_BYTES: Final = 300
+
+# Passes at most $1 bytes of each output of the program on. The exit code is that of the program.
+_LIMITED: Final = (
+    'n=$1; shift; exec 5>&1 6>&2; exit "$( { { { "$@" 3>&- 5>&- 6>&-; echo $? >&3; } 2>&1 >&4 4>&- 5>&- 6>&- '
+    '| head -c "$n" >&6; } 4>&1 | head -c "$n" >&5; } 3>&1 )"'
+)
 
 READY_S: Final = 8
 """How long a started job may take to be up, shorter than `REPLY_S` so that the robot itself says why it is not."""
@@ -68,6 +80,7 @@ class Job:
         ready: When a started job counts as up: `log:TEXT`, or from `bound`; None at once.
         as_root: Run by `sudo -n`.
         ready_s: How long a started job may take to be up, in whole seconds.
+        output_limit_bytes: Bytes that are kept of standard output, and of standard error; 0 for no limit.
     """
 
     folder: str
@@ -80,6 +93,7 @@ class Job:
     ready: str | None = None
     as_root: bool = False
     ready_s: int = READY_S
+    output_limit_bytes: int = 0
 
 
 def work_folder(trial: str, attempt: str) -> str:
@@ -100,6 +114,11 @@ def unhurried_file(name: str) -> str:
     return f".jobs/{name}/unhurried"
 
 
+def stationary_file(name: str) -> str:
+    """Return the file, in the folder of its attempt, made by a job that drives a robot when it is stationary."""
+    return f".jobs/{name}/stationary"
+
+
 def bound(protocol: Protocol, port: int) -> str:
     """Return the `ready` condition that a socket listens on `port`."""
     return f"{protocol}:{port:04X}"
@@ -109,7 +128,14 @@ def command(verb: str, job: Job) -> tuple[str, ...]:
     """Return the remote command line that starts (`start`), runs (`run`) or does both to a job (`serve`)."""
     files = (job.stdin or "/dev/null", job.stdout or job.log, job.log)
     options = (f"{job.limit_s:.15g}", job.ready or "-", str(job.ready_s), *files)
-    return (*_script(job), verb, job.folder, job.name, *options, *job.argv)
+    return (*_script(job), verb, job.folder, job.name, *options, *limited_argv(job))
+
+
+def limited_argv(job: Job) -> tuple[str, ...]:
+    """Return the command of a job, inside one that keeps `output_limit_bytes` of each output if there is a limit."""
+    if not job.output_limit_bytes:
+        return job.argv
+    return ("sh", "-c", _LIMITED, "sh", str(job.output_limit_bytes), *job.argv)
 
 
 def start(shell: Shell, job: Job) -> None:
@@ -252,12 +278,15 @@ class Aborted:
 
     Attributes:
         locked: Whether somebody held it.
-        jobs: A line per job that was ended, as from `left`.
+        jobs: A line per job that was ended or was ordered to end, as from `left`.
+        landing: Programs that still bring a drone down, `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home, each with
+            its `motion.MotionState`.
         error: What could not be done, if anything.
     """
 
     locked: bool = False
     jobs: tuple[str, ...] = ()
+    landing: tuple[tuple[str, str], ...] = ()
     error: FieldkitError | None = None
 
 
@@ -276,7 +305,8 @@ def abort(shell: Shell, who: str, deadline: Deadline) -> Aborted:
         demand(shell, done)
     except RobotError as failed:
         error = failed
-    return Aborted(locked=_HELD.search(said) is not None, jobs=_lines(said), error=error)
+    landing = tuple((match["program"].decode(), match["state"].decode()) for match in _LANDS.finditer(said))
+    return Aborted(locked=_HELD.search(said) is not None, jobs=_lines(said), landing=landing, error=error)
 
 
 def _lines(output: bytes) -> tuple[str, ...]:

@@ -4,8 +4,9 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
+import paramiko
+
 from fieldkit.core.errors import ConfigurationError, typed
-from fieldkit.remote.ssh_library import paramiko
 
 
 def private_keys(text: str | None, *, where: str) -> Sequence[paramiko.PKey]:

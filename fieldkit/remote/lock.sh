@@ -98,7 +98,7 @@ renew() { # the lock of $1: at half its time, or where less than $2 seconds are 
             lock "$1" "$span" "$who" "$what"
             ;;
         held:*) fail "held $since $who $what" "$LOST" ;;
-        aborted:"$1") fail "aborted $since $who $what" "$LOST" ;;
+        aborted:"$1" | stopped:"$1") fail "$kind $since $who $what" "$LOST" ;;
         free:-) lock "$1" "$TTL" somebody "$1" ;; # the robot lost its files
         *) fail "gone $since $who $what" "$LOST" ;;
     esac
@@ -121,18 +121,20 @@ holder() {
 
 abort() {
     by=$1
-    broken && full= || full=1
+    broken aborted && full= || full=1
     [ "$kind" = held ] && echo "held $who $what" || echo free
     strays KILL
     end "$base"/*/*
-    [ -z "$full" ] || broken || [ "$kind" != held ] || unwritten "$base/lock"
+    landing
+    [ -z "$full" ] || broken aborted || [ "$kind" != held ] || unwritten "$base/lock"
 }
 
-broken() { # break the lock in the name of $by; false if that cannot be written; kind, who and what are those of before
+broken() { # break the lock in the name of $by, as $1 says: aborted or stopped; false if that cannot be written; kind, who and what are those of before
+    how=$1
     for try in 1 2 3 4 5 6 7 8; do
         newest
         set -- "$kind" "$who" "$what"
-        if record aborted "$holder" 0 "$by" "$what"; then
+        if record "$how" "$holder" 0 "$by" "$what"; then
             kind=$1 who=$2 what=$3
             return
         fi

@@ -6,9 +6,6 @@ import sys
 from collections.abc import Callable
 from typing import Final
 
-import keyring
-import keyring.errors
-
 from fieldkit.core.errors import ConfigurationError, typed
 
 SERVICE: Final = "fieldkit"
@@ -38,6 +35,9 @@ def in_keyring(user: str, host: str, robot: str) -> str:
     Raises:
         ConfigurationError: It has none, or there is no keyring.
     """
+    import keyring  # noqa: PLC0415 (50 ms, which `fieldkit stop` has no time for)
+    import keyring.errors  # noqa: PLC0415
+
     try:
         password = keyring.get_password(SERVICE, f"{user}@{host}")
     except keyring.errors.KeyringError as error:

@@ -18,7 +18,7 @@ HOME: Final = ".fieldkit"
 REPLY_S: Final = 10.0
 """How long the robot may take for its part of a command besides the command itself."""
 
-_PARTS: Final = ("common.sh", "leader.sh", "lock.sh", "evidence.sh", "telemetry.sh", "job.sh")
+_PARTS: Final = ("common.sh", "leader.sh", "lock.sh", "evidence.sh", "telemetry.sh", "motion.sh", "job.sh")
 _FOLDER: Final = Path(__file__).parent
 
 SCRIPT: Final = b"\n".join(_FOLDER.joinpath(name).read_bytes() for name in _PARTS)
@@ -49,9 +49,12 @@ _SAYS: Final = b"job.sh: "
 _HELD: Final = re.compile(
     r"held (?P<age>-?\d{1,11}) (?P<rest>-?\d{1,11}) (?P<since>\d{1,11}) (?P<who>\S+) (?P<what>.+)", re.ASCII
 )
-_LOST: Final = re.compile(r"(?P<kind>aborted|held|gone) (?P<since>\d{1,11}) (?P<who>\S+) (?P<what>.+)", re.ASCII)
+_LOST: Final = re.compile(
+    r"(?P<kind>aborted|stopped|held|gone) (?P<since>\d{1,11}) (?P<who>\S+) (?P<what>.+)", re.ASCII
+)
 _WHY_LOST: Final = {
     "aborted": "the trial was aborted by {who} at {at}",
+    "stopped": "{who} stopped the robots at {at} (fieldkit stop)",
     "held": "{who} took the robot at {at} for {what}, after this trial's lock had expired",
     "gone": "the lock of this trial is gone; the last to hold the robot was {who} at {at} for {what}",
 }

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.lazy import dataclass
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Charts as plain data: `figures` draws them, for the page and for papers."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -26,6 +26,10 @@ class Series:
         high: Upper ends.
         join: How the points are joined.
         behind: What the points stand for, as (x, y): drawn faintly behind them.
+        breaks: Points, by index, after which the line is interrupted.
+        notes: A short text beside each point, empty for none; empty when no point has one.
+        bounds: Whether each value is only a lower bound; empty when none is.
+        behind_bounds: Like `behind`, for what is only a lower bound.
     """
 
     label: str
@@ -36,6 +40,27 @@ class Series:
     high: Sequence[float | None] = ()
     join: Join = "line"
     behind: Sequence[tuple[float, float]] = ()
+    breaks: Collection[int] = ()
+    notes: Sequence[str] = ()
+    bounds: Sequence[bool] = ()
+    behind_bounds: Sequence[tuple[float, float]] = ()
+
+
+@dataclass(frozen=True)
+class EdgeMark:
+    """A cross at the edge of a panel where a condition has no value.
+
+    Attributes:
+        at: Its place along the axis of conditions: x, or the lane of a panel with lanes.
+        text: Why there is no value.
+        colour: Of the series that lacks it.
+        is_high: Whether it is at the upper end of the axis of values.
+    """
+
+    at: float
+    text: str
+    colour: Colour
+    is_high: bool
 
 
 @dataclass(frozen=True)
@@ -71,8 +96,12 @@ class Panel:
         right: Right end of the x axis, likewise.
         left: Left end of the x axis, where `right` is given.
         log: Whether the y axis is logarithmic; then `bottom` is above 0.
+        x_log: Whether the x axis is logarithmic; then `left` is above 0.
+        edges: Conditions without a value.
+        is_strip: Whether it is wide and low, with the same margins as others, to be stacked on a shared x axis.
         spans: Bars in lanes.
-        lanes: Names of the lanes, the lowest first; none when y is a number.
+        lanes: Names of the lanes, the lowest first; none when y is a number. With lanes, values of series and their
+            intervals are along x.
     """
 
     title: str
@@ -86,6 +115,9 @@ class Panel:
     right: float | None = None
     left: float = 0.0
     log: bool = False
+    x_log: bool = False
+    edges: Sequence[EdgeMark] = ()
+    is_strip: bool = False
     spans: Sequence[Span] = ()
     lanes: Sequence[str] = ()
 
@@ -100,6 +132,7 @@ class Chart:
         caption: How to read it, and what was left out.
         panels: At least one.
         is_dense: Whether panels are many and plain enough to stand small.
+        is_stacked: Whether panels stand below each other.
     """
 
     name: str
@@ -107,6 +140,7 @@ class Chart:
     caption: str
     panels: Sequence[Panel]
     is_dense: bool = False
+    is_stacked: bool = False
 
     def of_size(self, size: str) -> "Chart":
         """Return the chart, said to be of packets of this size; none is said where `size` is empty."""

@@ -14,9 +14,14 @@ from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities, panels
 from fieldkit.report.evidence import Evidence
+from fieldkit.report.points import needs_log
 
 MOST_DISTANCES: Final = 3
 """In panels: the nearest, the middle and the farthest."""
+_ROOM: Final = 1.03
+_LOG_ROOM: Final = 1.1
+"""Factor beyond the extreme times of an axis."""
+_LOG: Final = ", on a logarithmic axis"
 MOST_STEPS: Final = 120
 """Of a line; a longer one is drawn through as many of its quantiles."""
 
@@ -84,7 +89,10 @@ def _chart(name: str, title: str, of: str, samples: Sequence[_Sample], identitie
     scale = time_scale(min(one.times_s[-1] for one in known))
     found = []
     for condition, group in panels([one.cell for one in known]).items():
-        alike = [one for one in known if one.cell.key["protocol"] == group[0].key["protocol"]]
+        alike_s = np.concatenate(
+            [one.times_s for one in known if one.cell.key["protocol"] == group[0].key["protocol"]]
+        )
+        is_log = needs_log(alike_s)
         for place in _places(group):
             there = [one for one in known if one.cell in group and wording.distance(one.cell) == place]
             there.sort(key=lambda one: identities.of(one.cell).rank)
@@ -97,10 +105,13 @@ def _chart(name: str, title: str, of: str, samples: Sequence[_Sample], identitie
                     series=series,
                     words=_words(f"{title}, {condition}, {place}", there, identities, scale),
                     top=1.0,
-                    right=1.03 * scale.factor * max(one.times_s[-1] for one in alike),
+                    left=scale.factor * float(alike_s.min()) / _LOG_ROOM if is_log else 0.0,
+                    right=scale.factor * float(alike_s.max()) * (_LOG_ROOM if is_log else _ROOM),
+                    x_log=is_log,
                 )
             )
-    yield Chart(name, f"{title}: distribution", _caption(known, of), found, is_dense=True)
+    caption = _caption(known, of, is_log=any(panel.x_log for panel in found))
+    yield Chart(name, f"{title}: distribution", caption, found, is_dense=True)
 
 
 def _places(cells: Sequence[Cell]) -> list[str]:
@@ -133,13 +144,13 @@ def _words(title: str, samples: Sequence[_Sample], identities: Identities, scale
     return f"{title}. " + "; ".join(said) + "."
 
 
-def _caption(samples: Sequence[_Sample], of: str) -> str:
+def _caption(samples: Sequence[_Sample], of: str, *, is_log: bool) -> str:
     counts = sorted(len(one.times_s) for one in samples)
     many = str(counts[0]) if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
-    said = f"The share of {of} that took up to so long; {many} {of} a line"
+    said = f"Share of {of} that took at most this time{_LOG if is_log else ''}; {many} {of} per line"
     places = {wording.distance(one.cell) for one in samples}
     if len(places) > MOST_DISTANCES:
         said += f"; of {len(places)} distances the nearest, a middle one and the farthest"
     if counts[-1] > MOST_STEPS:
         said += f"; lines of more than {MOST_STEPS} go through as many quantiles"
-    return f"{said}. Requests without a reply are in no line: see echo loss." if of == "replies" else f"{said}."
+    return f"{said}. Requests without a reply are in no line: see ping loss." if of == "replies" else f"{said}."

@@ -1,6 +1,6 @@
 """The folders behind the rows of a table, where they are at hand: plan, raw files, what is linked."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import DEFAULT_BY, Quantity
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.core.errors import FieldkitError
@@ -51,12 +52,35 @@ class Evidence:
         """Return the rows of a cell's attempts in order of time."""
         return self._rows[tuple(cell.key[name] for name in DEFAULT_BY)]
 
+    def declared(self, cell: Cell) -> Set[str] | None:
+        """Return the columns that the steps of a cell's trials measure, None if no plan of them is at hand."""
+        key = tuple(cell.key[name] for name in DEFAULT_BY)
+        if key not in self._declared:
+            sources = dict.fromkeys(self.repeats.texts["source"][self.rows(cell)].tolist())
+            plans = [self.plans[source] for source in sources if source in self.plans]
+            steps = (placed.step for plan in plans for placed in plan.procedure.walk())
+            names = frozenset(column.name for step in steps for column in step.output_columns())
+            self._declared[key] = names if plans else None
+        return self._declared[key]
+
+    @cached_property
+    def _declared(self) -> dict[Key, Set[str] | None]:
+        return {}
+
     def valid(self, cell: Cell, name: str) -> NDArray[np.int64]:
         """Return the rows of a cell's valid repeats that have the column `name`, in order of time."""
         rows = self.rows(cell)
         is_valid = self.repeats.texts["status"][rows] == Status.VALID
         chosen: NDArray[np.int64] = rows[is_valid & np.isfinite(self.repeats.numbers[name][rows])]
         return chosen
+
+    def observed(self, cell: Cell, quantity: Quantity) -> tuple[Numbers, NDArray[np.bool_]]:
+        """Return the values of a cell's valid repeats in order of time, and which of them are only lower bounds."""
+        rows = self.rows(cell)
+        rows = rows[self.repeats.texts["status"][rows] == Status.VALID]
+        values, is_bound = (column[rows] for column in self.repeats.observed(quantity))
+        is_known = np.isfinite(values)
+        return values[is_known], is_bound[is_known]
 
     def by_payload(self, cells: Sequence[Cell], step: str = "") -> Mapping[str, list[Cell]]:
         """Return cells by the size of their echo requests in words: those of different sizes are not compared."""
@@ -93,7 +117,7 @@ class Evidence:
         """Return what ping said in a row's attempt, in a step that has a name; None where that is not at hand."""
         evidence, plan = self.attempt(row), self.plan(row)
         pinging = next((one for one in plan.pingings() if one.name == step), None) if plan else None
-        return evidence.known(ping.read, pinging.file) if evidence and pinging else None
+        return evidence.read_or_none(ping.read, pinging.file) if evidence and pinging else None
 
 
 def at_hand(repeats: Repeats) -> Evidence:

@@ -20,12 +20,14 @@ class JudgementRow:
         value: What was measured.
         interval: Its 95 % interval, empty without one.
         ruling: Whether the expectation holds.
+        why: Why it does not hold, beside the numbers; empty where they say it.
     """
 
     place: str
     value: str
     interval: str
     ruling: Ruling
+    why: str = ""
 
 
 def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence[JudgementRow]]:
@@ -43,7 +45,7 @@ def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence
 def _verdict(said: Judgement, told: Collection[str]) -> JudgementRow:
     place = wording.condition(said.cell, told=told) if said.cell else ""
     _, _, value, interval, _ = judged(said)
-    return JudgementRow(place, wording.unbroken(value), wording.unbroken(interval), said.ruling)
+    return JudgementRow(place, wording.unbroken(value), wording.unbroken(interval), said.ruling, said.why)
 
 
 def _of(cell: Cell, evidence: Evidence) -> Iterator[Expectation]:

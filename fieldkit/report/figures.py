@@ -1,4 +1,4 @@
-"""Draw charts with matplotlib, which no other module imports: the same bytes whenever and wherever."""
+"""Figures of matplotlib, for the page and for papers: the same bytes whenever and wherever."""
 
 import io
 import math
@@ -7,33 +7,28 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.markers import CARETUP
-from matplotlib.ticker import FormatStrFormatter, MaxNLocator, NullFormatter
 
 from fieldkit.core import files
 from fieldkit.core.text import harmless
 from fieldkit.lab.protocol import Overview
-from fieldkit.report.charts import Chart, Panel, Series
-from fieldkit.report.theme import FORMATS, LIGHT, METADATA, SETTINGS, Colour, Format, Style
+from fieldkit.report import drawing
+from fieldkit.report.charts import Chart, Panel
+from fieldkit.report.theme import FORMATS, LIGHT, METADATA, SETTINGS, Colour, Format
 
 _MARKER: Final = 5.0
-_POINT: Final = 3.0
-"""Size of markers that stand in a crowd."""
-_FAINT: Final = 0.3
-"""Opacity of single repeats behind what they come to."""
-_STEPS: Final = (1, 2, 5, 10)
-"""Of the ticks of an axis."""
-_TITLE: Final = 48
-_TICK: Final = 20
-"""Letters for which there is room."""
 _PANEL_INCHES: Final = (4.4, 2.75)
+_STRIP_INCHES: Final = (5.8, 1.25)
+"""Of a strip without lanes."""
+_STRIP_MARGINS_INCHES: Final = (1.45, 0.15, 0.42, 0.28)
+"""Left, right, below and above the axes of a strip: the same for all, so that their x axes stand below each other."""
+_LANE_INCHES: Final = 0.3
+_AROUND_LANES_INCHES: Final = 1.05
 # What IEEE asks for: one column of 3.5 in or both, 7.16 in, and 8 pt for what stands in figures.
 _COLUMN_INCHES: Final = 3.5
 _BOTH_COLUMNS_INCHES: Final = 7.16
@@ -56,22 +51,37 @@ _LONG_LINK: Final = 0.1
 def panel_svg(panel: Panel) -> str:
     """Return one panel as an SVG document for the page: no background, text as text, colours of the light theme."""
     with _drawing(9.0):
-        figure = Figure(figsize=_PANEL_INCHES, layout="constrained")
-        _draw(figure.add_subplot(), panel)
+        width, height = _inches(panel)
+        figure = Figure(figsize=(width, height), layout=None if panel.is_strip else "constrained")
+        drawing.draw(figure.add_subplot(), panel)
+        if panel.is_strip:
+            left, right, below, above = _STRIP_MARGINS_INCHES
+            figure.subplots_adjust(
+                left=left / width, right=1 - right / width, bottom=below / height, top=1 - above / height
+            )
         return _saved(figure, "svg", transparent=True).decode()
+
+
+def _inches(panel: Panel) -> tuple[float, float]:
+    """Return width and height of a panel of the page."""
+    lanes = _AROUND_LANES_INCHES + _LANE_INCHES * len(panel.lanes)
+    if panel.is_strip:
+        return _STRIP_INCHES[0], lanes if panel.lanes else _STRIP_INCHES[1]
+    return _PANEL_INCHES[0], lanes if panel.lanes else _PANEL_INCHES[1]
 
 
 def paper(chart: Chart, form: Format) -> bytes:
     """Return a whole chart with its legend, in the width of a paper's column, or of both for several panels."""
-    columns = min(2, len(chart.panels))
+    columns = 1 if chart.is_stacked else min(2, len(chart.panels))
     rows = -(-len(chart.panels) // columns)
-    width = _COLUMN_INCHES if columns == 1 else _BOTH_COLUMNS_INCHES
+    width = _COLUMN_INCHES if len(chart.panels) == 1 else _BOTH_COLUMNS_INCHES
+    height = _STRIP_INCHES[1] if chart.is_stacked else _PAPER_PANEL_INCHES
     with _drawing(8.0):
-        figure = Figure(figsize=(width, _PAPER_PANEL_INCHES * rows + 0.3), layout="constrained")
+        figure = Figure(figsize=(width, height * rows + 0.3), layout="constrained")
         for number, panel in enumerate(chart.panels, start=1):
-            _draw(figure.add_subplot(rows, columns, number), panel)
+            drawing.draw(figure.add_subplot(rows, columns, number), panel)
         if chart.legend:
-            handles = [_handle(label, style) for label, style in chart.legend.items()]
+            handles = [drawing.handle(label, style) for label, style in chart.legend.items()]
             figure.legend(handles=handles, loc="outside upper center", ncols=min(4, len(handles)))
         return _saved(figure, form, transparent=False)
 
@@ -177,77 +187,3 @@ def _saved(figure: Figure, form: Format, *, transparent: bool) -> bytes:
     out = io.BytesIO()
     figure.savefig(out, format=form, metadata=METADATA[form], transparent=transparent)
     return out.getvalue()
-
-
-def _draw(axes: Axes, panel: Panel) -> None:
-    axes.set_title(_fitting(panel.title, _TITLE))
-    axes.set_xlabel(_fitting(panel.x_label, _TITLE))
-    axes.set_ylabel(_fitting(panel.y_label, _TITLE))
-    for series in panel.series:
-        if len(series.x):  # matplotlib would make room for an empty one, at the corner of the figure
-            _draw_series(axes, series, math.inf if panel.top is None else panel.top)
-    for span in panel.spans:
-        axes.barh(span.lane, span.stop - span.start, left=span.start, height=0.6, color=LIGHT[span.colour])
-    if panel.lanes:
-        axes.set_yticks(range(len(panel.lanes)), [_fitting(lane, _TICK) for lane in panel.lanes])
-        axes.set_ylim(-0.6, len(panel.lanes) - 0.4)
-        axes.grid(visible=False, axis="y")
-    else:
-        axes.set_ylim(panel.bottom, panel.top)
-    if panel.log:
-        axes.set_yscale("log")
-        # Powers of ten are formulas otherwise, which text is no more.
-        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-    elif not panel.lanes:
-        axes.yaxis.set_major_locator(MaxNLocator(nbins=5, steps=_STEPS))
-    if panel.right is not None:
-        axes.set_xlim(panel.left, panel.right)
-    if panel.x_ticks:
-        axes.set_xticks([at for at, _ in panel.x_ticks], [_fitting(label, _TICK) for _, label in panel.x_ticks])
-        axes.grid(visible=False, axis="x")
-    else:
-        axes.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=_STEPS))
-
-
-def _draw_series(axes: Axes, series: Series, top: float) -> None:
-    look = _look(series.style)
-    if series.join == "steps":
-        axes.step(series.x, series.y, where="post", **look)
-        return
-    colour = look["color"]
-    if series.behind:
-        shown = [(x, y) for x, y in series.behind if y <= top]
-        faint = {"color": colour, "alpha": _FAINT, "markersize": _POINT, "markeredgewidth": 0}
-        axes.plot([x for x, _ in shown], [y for _, y in shown], "o", **faint)
-    axes.plot(series.x, series.y, clip_on=False, **(look | {"linestyle": "none"} if series.join == "none" else look))
-    for x, y, low, high in zip(series.x, series.y, series.low, series.high, strict=False):
-        if low is not None and high is not None:
-            # At nothing lost the interval only says how few repeats there are: it must not outshine what was seen.
-            axes.vlines(
-                x, low, min(high, top), color=colour, linewidth=1.1, linestyles="-" if y != 0 else (0, (1, 4))
-            )
-            if high > top:
-                axes.plot(x, top, marker=CARETUP, color=colour, markersize=_MARKER, clip_on=False)
-
-
-def _fitting(text: str, most: int) -> str:
-    said = harmless(text)
-    return said if len(said) <= most else f"{said[: most - 1]}…"
-
-
-def _handle(label: str, style: Style) -> Line2D:
-    return Line2D([], [], label=_fitting(label, _TITLE), **_look(style))
-
-
-def _look(style: Style) -> dict[str, Any]:
-    colour = LIGHT[style.colour]
-    return {
-        "color": colour,
-        "marker": style.marker or None,
-        "markerfacecolor": LIGHT["paper"] if style.is_hollow else colour,
-        "linestyle": style.line,
-        "markersize": _POINT if style.line == "none" and style.marker != "x" else _MARKER,
-        # Hollow markers hide the line behind them.
-        "zorder": 3,
-    }

@@ -1,57 +1,21 @@
-"""Beginning of a report: its headline figures, what was run, where and when, and what to beware of."""
+"""Beginning of a report: what was run, where and when, and what to know before quoting a number."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Final
 
 import numpy as np
 
-from fieldkit.analysis.cells import Cell, Estimate
+from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.comparable import mixtures
-from fieldkit.analysis.quantities import Quantity, alike
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.analysis.wording import cautions, ended, measured
+from fieldkit.analysis.wording import cautions, ended
 from fieldkit.core.columns import plain_name
 from fieldkit.core.model import Status
 from fieldkit.core.units import format_count
 from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
-
-_HEADLINES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
-_HEADLINES_OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
-"""Of trials that stream topics, beside which pings and transfers are there for clocks and load."""
-
-
-@dataclass(frozen=True)
-class Extreme:
-    """The least or the largest figure of a quantity.
-
-    Attributes:
-        which: `least`, `most`; empty where there is one condition, or all are alike.
-        value: The figure with its unit.
-        interval: Its 95 % interval, empty without one.
-        place: The condition.
-    """
-
-    which: str
-    value: str
-    interval: str
-    place: str
-
-
-@dataclass(frozen=True)
-class Headline:
-    """A quantity that matters most.
-
-    Attributes:
-        subject: What it is.
-        ends: Its least and its largest figure, or the only one.
-    """
-
-    subject: str
-    ends: Sequence[Extreme]
 
 
 @dataclass(frozen=True)
@@ -78,58 +42,6 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
         f"{format_count(len(repeats), 'attempt')}: {ended(Counter(repeats.texts['status']))}. "
         "All figures are of the valid ones."
     )
-
-
-def headlines(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Headline]:
-    """Yield the least and the largest figure of each protocol, with intervals and conditions.
-
-    Steps that are told apart by name alone share a headline: the step is part of the condition there.
-    """
-    told = wording.differing(cells)
-    for protocol, names in _HEADLINES.items():
-        mine = [one for one in cells if one.key["protocol"] == protocol]
-        has_topics = bool(alike(measured(mine), _HEADLINES_OF_TOPICS[0]))
-        for same in _of_headlines(measured(mine), _HEADLINES_OF_TOPICS if has_topics else names):
-            first = same[0]
-            label = first.label if len(same) == 1 else first.plain_label
-            found = [(cell, cell.estimates[one.name]) for one in same for cell in mine if one.name in cell.estimates]
-            found.sort(key=lambda one: one[1].value)
-            says_so = has_topics or first.plain_label.startswith(protocol.upper())
-            subject = label if says_so else f"{label} with {protocol.upper()}"
-            is_rtt = plain_name(first.name) == "rtt_median_s"
-            sizes = (size for one in same for size in evidence.payloads(mine, one.step) if is_rtt)
-            yield Headline(", ".join((subject, *dict.fromkeys(sizes))), _ends(found, told, by_step=len(same) > 1))
-
-
-def _of_headlines(found: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
-    """Return the quantities called `names`, else the first that there are, each with its like of other steps."""
-    chosen = [one for name in names if (one := _alike(found, name))]
-    others = dict.fromkeys(plain_name(one.name) for one in found)
-    return chosen or [_alike(found, name) for name in list(others)[: len(names)]]
-
-
-def _alike(found: Sequence[Quantity], name: str) -> list[Quantity]:
-    """Return the quantity of a name; of named steps where no other measures it."""
-    same = alike(found, name)
-    return same[:1] if same and not same[0].step else same
-
-
-def _ends(found: Sequence[tuple[Cell, Estimate]], told: Collection[str], *, by_step: bool) -> list[Extreme]:
-    """Return the least and the largest of figures that are sorted, or the one that all have."""
-    least, most = (
-        Extreme(
-            which,
-            wording.value(end),
-            wording.interval(end),
-            ", ".join(filter(None, (end.quantity.step if by_step else "", wording.place(cell, told=told)))),
-        )
-        for which, (cell, end) in (("least", found[0]), ("most", found[-1]))
-    )
-    if len(found) == 1:
-        return [replace(least, which="")]
-    if least.value == most.value:
-        return [replace(least, which="in all conditions", interval="", place="")]
-    return [least, most]
 
 
 def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:

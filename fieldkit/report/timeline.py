@@ -1,27 +1,23 @@
-"""The time line of one repeat: what went on when, each packet at both ends, each round trip, the robots' distance."""
+"""The time line of one repeat on one axis: bars of steps, faults and moves, then flows, pings, radios, distance."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.columns import prefixed
-from fieldkit.core.model import Protocol, Role, StationSample
-from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import bag, link, ping
-from fieldkit.measure.positions import where
-from fieldkit.measure.transfers import fates
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.evidence import ping
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.report import flows, moments
 from fieldkit.report.charts import Chart, Panel, Series, Span
 from fieldkit.report.evidence import Evidence
-from fieldkit.report.theme import Colour, Style
-from fieldkit.trial.plan import Plan
+from fieldkit.report.moments import Moments
+from fieldkit.report.theme import Style
 
 MOST_PACKETS: Final = 1500
 """Of each kind in a panel; of more, every k-th is drawn."""
@@ -36,160 +32,95 @@ _LINKS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 """Of the one that sends, and of the other."""
 _LEAST_BAR: Final = 0.004
 """Of the axis: what is shorter would not be seen."""
+_TIME: Final = "time [s]"
+_ROOM: Final = 0.01
+"""Of the axis, at its right end."""
 
 
 def charts(row: int, found: Evidence) -> Iterator[Chart]:
-    """Yield the time line of the attempt in a row whose evidence is at hand; none when nothing of it has times."""
+    """Yield the time line of the attempt in a row whose evidence is at hand, and its packets one by one.
+
+    There is none if nothing of the evidence has times.
+    """
     evidence, plan = found.attempt(row), found.plan(row)
     if evidence is None or plan is None:
         return
-    told = _read(evidence, plan, found.repeats, row)
-    spans = list(_spans(told))
-    if not spans:
+    known = moments.read(evidence, plan, found.repeats, row)
+    if not known.happenings:
         return
-    zero_ns = min(span[1] for span in spans)
-    panels = [
-        _phases(spans, zero_ns),
-        *(_packets(transfer, one, zero_ns) for transfer, one in told.transfers),
-        *(panel for one in told.pings for panel in _round_trips(*one, zero_ns + told.ahead_ns[one[1]])),
-        *_links(told, zero_ns),
-        *_distance(told, zero_ns),
+    zero_ns = known.happenings[0].start_ns
+    pings = [panel for name, role, said in known.pings for panel in _round_trips(name, role, said, known, zero_ns)]
+    ends_s = [(each.stop_ns - zero_ns) / 1e9 for each in known.happenings]
+    ends_s += [float(np.max(series.x)) for panel in pings for series in panel.series if len(series.x)]
+    strips = [
+        _bars(known, zero_ns),
+        *flows.panels(evidence, plan, known, zero_ns),
+        *pings,
+        *_links(known, zero_ns),
+        *_distance(known, zero_ns),
     ]
     reason = found.repeats.texts["reason"][row]
     ended = ": ".join(filter(None, (found.repeats.texts["status"][row], reason)))
+    name = evidence.folder.name
     yield Chart(
         name="timeline",
-        title=f"Time line of {evidence.folder.name}",
-        caption=f"Trial {plan.trial}, {ended}. {told.clocks}",
-        panels=panels,
+        title=f"Time line of {name}",
+        caption=f"Trial {plan.trial}, {ended}. {known.clocks}",
+        panels=_stacked(strips, max(ends_s)),
+        is_stacked=True,
     )
+    if known.transfers:
+        yield Chart(
+            name="packets",
+            title=f"Packets of {name}",
+            caption="Where in the payload each packet begins, at both ends: a part of the time line, drawn larger.",
+            panels=[_packets(transfer, one, zero_ns) for transfer, one in known.transfers],
+        )
 
 
-@dataclass(frozen=True, eq=False)
-class _Told:
-    """What the evidence of one attempt tells of times, all of them by the clock of the first that sends.
-
-    Attributes:
-        recorded: The bags that were sent, by file.
-        transfers: The transfers whose packets' fates are known.
-        pings: Of each ping whose output is there the name of its step, who asked, and what ping said.
-        ahead_ns: By role its clock less that of the first that sends; 0 where nobody knows.
-        clocks: How that is known, in a sentence.
-        links: What the radio of each end told of its link.
-        distances_m: How far those ends were apart, and from when on; empty where nobody knows.
-        ends: Who sends first and who receives that.
-    """
-
-    recorded: Mapping[str, bag.Bag]
-    transfers: Sequence[tuple[Transfer, Fates]]
-    pings: Sequence[tuple[str, Role, ping.Ping]]
-    ahead_ns: Mapping[Role, int]
-    clocks: str
-    links: Mapping[Role, Sequence[tuple[int, StationSample]]]
-    distances_m: Sequence[tuple[int, float | None]]
-    ends: tuple[Role, Role]
+def _stacked(strips: Sequence[Panel], end_s: float) -> list[Panel]:
+    """Return panels with one time axis, which the lowest names; what lies outside of it is left out."""
+    last, right_s = len(strips) - 1, (1 + _ROOM) * end_s or 1.0
+    return [
+        replace(
+            panel,
+            is_strip=True,
+            left=0.0,
+            right=right_s,
+            x_label=_TIME if index == last else "",
+            series=[_within(series, right_s) for series in panel.series],
+        )
+        for index, panel in enumerate(strips)
+    ]
 
 
-def _read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> _Told:
-    transfers = plan.transfers(Protocol(repeats.texts["protocol"][row]))
-    first = next(iter(transfers), None)
-    ends = (first.source, first.destination) if first else (Role.SENDER, Role.RECEIVER)
-    seen = [(transfer, one) for transfer in transfers if (one := fates.read(evidence, transfer)) is not None]
-    bags = {transfer.sent_file: evidence.known(bag.read, transfer.sent_file) for transfer in transfers}
-    said = [(one.name, one.role, evidence.known(ping.read, one.file)) for one in plan.pingings()]
-    apart_ns, clocks = _apart(transfers, seen, ends, {one.name: _offset_s(repeats, row, one) for one in transfers})
-    ahead_ns = dict.fromkeys((*plan.cast, *ends), 0) | {ends[1]: apart_ns}
-    links = {role: link.line(evidence.links(role)) for role in ends}
-    return _Told(
-        recorded={file: one for file, one in bags.items() if one},
-        transfers=[(transfer, _shifted(one, transfer, ahead_ns)) for transfer, one in seen],
-        pings=[(name, role, one) for name, role, one in said if one],
-        ahead_ns=ahead_ns,
-        clocks=clocks,
-        links={role: [(at_ns - ahead_ns[role], one) for at_ns, one in line] for role, line in links.items()},
-        ends=ends,
-        distances_m=where.distances_m(evidence, ends),
-    )
+def _within(series: Series, right_s: float) -> Series:
+    """Return the points of a series from 0 to the end of the time axis."""
+    x, y = (np.asarray(values, dtype=np.float64) for values in (series.x, series.y))
+    if series.join == "steps":  # a value holds until the next one, and from before the beginning
+        x = np.clip(x, 0.0, right_s)
+        return replace(series, x=x, y=y)
+    is_shown = (x >= 0) & (x <= right_s)
+    return replace(series, x=x[is_shown], y=y[is_shown])
 
 
-def _offset_s(repeats: Repeats, row: int, transfer: Transfer) -> float:
-    """Return how far the clock of a transfer's destination is ahead of its source's, NaN where that is not known."""
-    column = repeats.numbers.get(prefixed(transfer.name, "clock_offset_s"))
-    return math.nan if column is None else float(column[row])
-
-
-def _apart(
-    transfers: Sequence[Transfer],
-    seen: Sequence[tuple[Transfer, Fates]],
-    ends: tuple[Role, Role],
-    offsets_s: Mapping[str, float],
-) -> tuple[int, str]:
-    """Return how far the clock of the second end is ahead of the first's, by any transfer between them, and how."""
-    ways = {ends: 1, ends[::-1]: -1}
-    for one in transfers:
-        if (way := ways.get((one.source, one.destination))) and not math.isnan(offsets_s[one.name]):
-            offset_s = way * offsets_s[one.name]
-            said = f"Times of the {ends[1]} are less its clock's offset, {1e3 * offset_s:.3f} ms."
-            return round(1e9 * offset_s), said
-    apart_ns = next(
-        (
-            way * int(of.received_ns.min() - of.sent_ns.min())
-            for one, of in seen
-            if (way := ways.get((one.source, one.destination))) and len(of.received_ns)
-        ),
-        0,
-    )
-    apart = f"How far the clocks of {ends[0]} and {ends[1]} are apart is not known"
-    return apart_ns, f"{apart}: here the first packet takes no time."
-
-
-def _shifted(one: Fates, transfer: Transfer, ahead_ns: Mapping[Role, int]) -> Fates:
-    return replace(
-        one,
-        sent_ns=one.sent_ns - ahead_ns[transfer.source],
-        received_ns=one.received_ns - ahead_ns[transfer.destination],
-    )
-
-
-def _spans(told: _Told) -> Iterator[tuple[str, int, int, Colour]]:
-    """Yield what went on, from when until when, in nanoseconds since 1970 UTC."""
-    for file, one in told.recorded.items():
-        what = _called("record", Path(file).stem if len(told.recorded) > 1 else "")
-        yield what, one.started_utc_ns, one.started_utc_ns + round(one.duration_s * 1e9), "sky"
-    for transfer, packets in told.transfers:
-        sent_ns, received_ns = packets.sent_ns, packets.received_ns
-        yield _called("send", transfer.name), int(sent_ns.min()), int(sent_ns.max()), _SENT.colour
-        if len(received_ns):
-            what = _called("receive", transfer.name)
-            yield what, int(received_ns.min()), int(received_ns.max()), _RECEIVED.colour
-    for name, role, pings in told.pings:
-        stamps_ns = [reply.at_utc_ns for reply in pings.answers if reply.at_utc_ns is not None]
-        if stamps_ns:
-            first_ns, last_ns = (end - told.ahead_ns[role] for end in (min(stamps_ns), max(stamps_ns)))
-            yield _called("ping", name), first_ns, last_ns, _ROUND_TRIP.colour
-
-
-def _called(what: str, name: str) -> str:
-    """Return what is called so of a step: `send up`, `send` of one without a name."""
-    return f"{what} {name}".rstrip()
-
-
-def _phases(spans: Sequence[tuple[str, int, int, Colour]], zero_ns: int) -> Panel:
-    """Return a lane for each thing that went on, the first on top."""
-    last = len(spans) - 1
-    at_s = {name: ((start - zero_ns) / 1e9, (stop - zero_ns) / 1e9) for name, start, stop, _ in spans}
-    least_s = _LEAST_BAR * max(stop for _, stop in at_s.values())
+def _bars(known: Moments, zero_ns: int) -> Panel:
+    """Return a lane for each thing that went on, the first on top; things of one name share it."""
+    names = list(dict.fromkeys(each.name for each in known.happenings))
+    last = len(names) - 1
+    spans = [(each, (each.start_ns - zero_ns) / 1e9, (each.stop_ns - zero_ns) / 1e9) for each in known.happenings]
+    least_s = _LEAST_BAR * max(stop for *_, stop in spans)
     return Panel(
         title="what went on",
-        x_label="time [s]",
+        x_label=_TIME,
         y_label="",
         series=[],
-        words="; ".join(f"{name} from {start:.3f} to {stop:.3f} s" for name, (start, stop) in at_s.items()),
+        words="; ".join(f"{each.name} from {start:.3f} to {stop:.3f} s" for each, start, stop in spans),
         spans=[
-            Span(last - lane, at_s[name][0], max(at_s[name][1], at_s[name][0] + least_s), colour)
-            for lane, (name, _, _, colour) in enumerate(spans)
+            Span(last - names.index(each.name), start, max(stop, start + least_s), each.colour)
+            for each, start, stop in spans
         ],
-        lanes=[name for name, *_ in reversed(spans)],
+        lanes=list(reversed(names)),
     )
 
 
@@ -215,28 +146,44 @@ def _packets(transfer: Transfer, one: Fates, zero_ns: int) -> Panel:
     )
 
 
-def _round_trips(name: str, _role: Role, pings: ping.Ping, zero_ns: int) -> Iterator[Panel]:
-    """Yield the time that each round trip took, and the requests without a reply, against time by its own clock."""
+def _round_trips(name: str, role: Role, said: ping.Ping, known: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield the time that each round trip took, and the requests without a reply, against time."""
+    ahead_ns = known.ahead_ns[role]
     answered = [
-        (reply.seq, reply.at_utc_ns - zero_ns, reply.rtt_s)
-        for reply in pings.answers
+        (reply.seq, reply.at_utc_ns - ahead_ns - zero_ns, reply.rtt_s)
+        for reply in said.answers
         if reply.at_utc_ns is not None and reply.rtt_s is not None
     ]
-    if not answered:
+    lost = np.array(said.gaps)
+    seq, at_ns, rtt_s = np.array(answered).T if answered else np.empty((3, 0))
+    series = [Series("round trip", _ROUND_TRIP, at_ns / 1e9, 1e3 * rtt_s)]
+    if len(lost):
+        lost_s = left_at(lost, seq, at_ns / 1e9) if answered else _by_job(lost, name, role, known, zero_ns)
+        if lost_s is None:
+            return
+        series.append(Series("no reply", _MARK, np.maximum(lost_s, 0.0), np.zeros(len(lost))))
+    elif not answered:
         return
-    seq, at_ns, rtt_s = np.array(answered).T
-    at_s = at_ns / 1e9
-    series = [Series("round trip", _ROUND_TRIP, at_s, 1e3 * rtt_s)]
-    gaps = np.array(pings.gaps)
-    if len(gaps):
-        series.append(Series("no reply", _MARK, left_at(gaps, seq, at_s), np.zeros(len(gaps))))
+    middle = f", median {1e3 * np.median(rtt_s):.2f} ms" if answered else ""
     yield Panel(
         title=f"round trips of {name}" if name else "round trips",
-        x_label="time [s]",
-        y_label="round-trip time [ms]",
+        x_label=_TIME,
+        y_label="RTT [ms]",
         series=series,
-        words=f"{len(answered)} round trips, median {1e3 * np.median(rtt_s):.2f} ms; {len(gaps)} without a reply",
+        words=f"{len(answered)} round trips{middle}; {len(lost)} without a reply",
+        top=None if answered else 1.0,
     )
+
+
+def _by_job(
+    number: NDArray[np.int64], name: str, role: Role, known: Moments, zero_ns: int
+) -> NDArray[np.float64] | None:
+    """Return about when requests left if none was answered: evenly while the job ran; None if that is not known."""
+    if (span := known.jobs.get((role, prefixed(name, "ping")))) is None:
+        return None
+    start_s, stop_s = ((at_ns - zero_ns) / 1e9 for at_ns in span)
+    at_s: NDArray[np.float64] = start_s + (stop_s - start_s) * (number - number.min()) / len(number)
+    return at_s
 
 
 def left_at(number: NDArray[np.int64], known: NDArray[np.float64], at_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -253,15 +200,15 @@ def left_at(number: NDArray[np.int64], known: NDArray[np.float64], at_s: NDArray
     return among + step_s * beyond
 
 
-def _links(told: _Told, zero_ns: int) -> Iterator[Panel]:
-    """Yield what both radios told of their links, against time: the signal, and the rate that they sent at."""
-    signals = {role: [(at_ns, one.signal_dbm) for at_ns, one in link_] for role, link_ in told.links.items()}
+def _links(known: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield what both radios said of their links, against time: the signal, and the rate that they sent at."""
+    signals = {role: [(at_ns, one.signal_dbm) for at_ns, one in link_] for role, link_ in known.links.items()}
     rates = {
         role: [(at_ns, one.tx_rate_bit_s and one.tx_rate_bit_s / 1e6) for at_ns, one in link_]
-        for role, link_ in told.links.items()
+        for role, link_ in known.links.items()
     }
-    yield from _of_radios("signal", "signal [dBm]", signals, zero_ns, bottom=None)
-    yield from _of_radios("rate", "rate sent at [Mbit/s]", rates, zero_ns, bottom=0.0)
+    yield from _of_radios("signal", "[dBm]", signals, zero_ns, bottom=None)
+    yield from _of_radios("PHY rate", "[Mbit/s]", rates, zero_ns, bottom=0.0)
 
 
 def _of_radios(
@@ -272,36 +219,36 @@ def _of_radios(
     *,
     bottom: float | None,
 ) -> Iterator[Panel]:
-    """Yield what each radio told of one thing, against time, if any did; the one that sends comes first."""
+    """Yield what each radio said of one thing, against time, if any did; the one that sends comes first."""
     series, words = [], []
-    for (role, told), style in zip(values.items(), _LINKS, strict=True):
-        known = [((at_ns - zero_ns) / 1e9, value) for at_ns, value in told if value is not None]
-        if known:
-            at_s, heights = zip(*known, strict=True)
+    for (role, samples), style in zip(values.items(), _LINKS, strict=True):
+        points = [((at_ns - zero_ns) / 1e9, value) for at_ns, value in samples if value is not None]
+        if points:
+            at_s, heights = zip(*points, strict=True)
             series.append(Series(role, style, at_s, heights))
             words.append(f"{role} {min(heights):g} to {max(heights):g}")
     if series:
         yield Panel(
             title=f"{what} of the radios",
-            x_label="time [s]",
+            x_label=_TIME,
             y_label=y_label,
             series=series,
-            words=f"{y_label}: {', '.join(words)}",
+            words=f"{what} {y_label}: {', '.join(words)}",
             bottom=bottom,
         )
 
 
-def _distance(told: _Told, zero_ns: int) -> Iterator[Panel]:
+def _distance(known: Moments, zero_ns: int) -> Iterator[Panel]:
     """Yield how far sender and receiver were apart, against time, if that changed."""
-    changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in told.distances_m]
+    changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in known.distances_m]
     known_m = [metres for _, metres in changes if metres is not None]
     if len(set(known_m)) < 2:
         return
     at_s, distance_m = zip(*((at, math.nan if metres is None else metres) for at, metres in changes), strict=True)
     yield Panel(
         title="distance between sender and receiver",
-        x_label="time [s]",
-        y_label="distance [m]",
+        x_label=_TIME,
+        y_label="[m]",
         series=[Series("distance", _DISTANCE, at_s, distance_m, join="steps")],
         words=f"{min(known_m):.1f} to {max(known_m):.1f} m",
     )

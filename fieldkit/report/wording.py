@@ -3,20 +3,19 @@
 from collections.abc import Collection, Sequence
 
 from fieldkit.analysis.cells import Cell, Estimate
-from fieldkit.analysis.wording import Scale, scale_of
+from fieldkit.analysis.wording import Scale, amount, incomplete, scale_of
 from fieldkit.analysis.wording import interval as interval_of
-from fieldkit.core.model import Distance
-from fieldkit.core.units import format_distance
 
 
 def value(found: Estimate) -> str:
     """Return the figure to quote, unbroken: `3.21 %`."""
-    return unbroken(_scale(found).amount(found.value))
+    return unbroken(amount(_scale(found), found))
 
 
 def interval(found: Estimate) -> str:
-    """Return its interval, unbroken: `[1.10, 6.70]`; empty where there is none."""
-    return unbroken(interval_of(_scale(found), found))
+    """Return its interval, unbroken, and of how many repeats it is if not of all: `[1.10, 6.70] (7 of 10)`."""
+    of = incomplete(found)
+    return unbroken(" ".join(filter(None, (interval_of(_scale(found), found), f"({of})" if of else ""))))
 
 
 def estimate(found: Estimate) -> str:
@@ -45,12 +44,10 @@ def metres(cell: Cell) -> float:
 
 
 def distance(cell: Cell) -> str:
-    """Return a cell's distance as its operator wrote it, with metres, unbroken."""
-    label = text(cell, "distance")
-    if cell.key["distance_m"] is None:
-        return label or "distance unknown"
-    said = format_distance(Distance(metres(cell), label)) if label else f"{metres(cell):.2f} m"
-    return unbroken(said)
+    """Return a cell's distance as its operator wrote it, `30ft`; in metres if only these are known."""
+    if label := text(cell, "distance"):
+        return label
+    return "distance unknown" if cell.key["distance_m"] is None else unbroken(f"{metres(cell):.2f} m")
 
 
 def scenario(cell: Cell) -> str:
@@ -65,7 +62,7 @@ def procedure(cell: Cell) -> str:
 
 
 def place(cell: Cell, *, told: Collection[str]) -> str:
-    """Return what tells a cell from others: `LOS, master, 30 ft (9.14 m), field`.
+    """Return what distinguishes a cell from others: `LOS, master, 30ft, field`.
 
     Args:
         cell: Which.
@@ -82,7 +79,7 @@ def place(cell: Cell, *, told: Collection[str]) -> str:
 
 
 def condition(cell: Cell, *, told: Collection[str]) -> str:
-    """Return the same with the protocol before it: `UDP, 30 ft (9.14 m)`."""
+    """Return the same with the protocol before it: `UDP, 30ft`."""
     return ", ".join(filter(None, (text(cell, "protocol").upper(), place(cell, told=told))))
 
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from rosbags.serde import SerdeError
@@ -19,7 +20,8 @@ from rosbags.serde import SerdeError
 from fieldkit.agent import middleware
 from fieldkit.agent.middleware import Middleware, MiddlewareError, Network, Publisher, Topic
 from fieldkit.core.errors import ConfigurationError, LinkError
-from fieldkit.ros import topics
+from fieldkit.ros import counterparts, topics
+from fieldkit.ros.counterparts import Counterparts
 from fieldkit.ros.crossings import Crossed, Crossing, CrossingTally
 from fieldkit.ros.types import MessageTypes
 
@@ -154,15 +156,15 @@ def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTy
     for one in crossings:
         if ways.count((one.topic, one.back)) > 1:
             raise ConfigurationError(f"{one.topic} is named twice for the same way", remedy="name it once")
-        found = types.get(one.type_name)
-        if not found.rihs01 or (_is_ros1(near, far) and (not found.md5 or not types.translatable(found.name))):
+        same = counterparts.of_type(types, one.type_name) if _is_ros1(near, far) else types.get(one.type_name).rihs01
+        if not same:
             raise ConfigurationError(
                 f"{one.topic}: {one.type_name} is not the same in ROS 1 and ROS 2, or there in one of them alone",
                 remedy="carry a topic of another type",
             )
 
 
-def _is_ros1(*sides: Side) -> bool:
+def _is_ros1(*sides: "Side | _End") -> bool:
     return any(side.over == "ros1" for side in sides)
 
 
@@ -182,32 +184,38 @@ def _started(side: Side) -> Iterator[_End]:
 
 
 def _carrier(crossing: Crossing, source: _End, target: _End, types: MessageTypes, number: int) -> Carrier:
+    ends = (source, target)
+    pair = counterparts.of_type(types, crossing.type_name) if _is_ros1(*ends) else None
     described = [
         Topic.from_json(
             topics.describe(
                 types,
                 crossing.topic,
-                crossing.type_name,
+                _type_at(end, crossing, pair),
                 crossing.qos,
                 domain=end.network.domain,
                 node=end.network.node,
                 number=number,
             )
         )
-        for end in (source, target)
+        for end in ends
     ]
-    for end, topic in zip((source, target), described, strict=True):
+    for end, topic in zip(ends, described, strict=True):
         # Where ends are found by and by, it is not known yet.
         for sentence in end.other_types(topic):
             raise ConfigurationError(sentence, remedy="name the topic with its own type")
-    convert = _conversion(source.over, target.over, described[0].type, types)
+    convert = _conversion(_is_ros1(source), pair, types)
     return Carrier(crossing, source, target, (described[0], described[1]), convert)
 
 
-def _conversion(source: str, target: str, type_name: str, types: MessageTypes) -> Convert:
-    # Both of the store of ROS 2: that of ROS 1 raises SerdeError.
-    if source == "ros1":
-        return lambda data: bytes(types.ros2.ros1_to_cdr(data, type_name))
-    if target == "ros1":
-        return lambda data: bytes(types.ros2.cdr_to_ros1(data, type_name))
-    return lambda data: data
+def _type_at(end: _End, crossing: Crossing, pair: Counterparts | None) -> str:
+    """Return the name that the type of a crossing has at one of its ends."""
+    if pair is None:
+        return crossing.type_name
+    return pair.ros1 if _is_ros1(end) else pair.ros2
+
+
+def _conversion(from_ros1: bool, pair: Counterparts | None, types: MessageTypes) -> Convert:
+    if pair is None:
+        return lambda data: data
+    return partial(pair.to_ros2 if from_ros1 else pair.to_ros1, types)

@@ -5,9 +5,8 @@ usual ones, so that fieldkit's routers, masters and nodes run beside a robot's o
 that several run on one robot; only Zenoh's scouting has its own.
 """
 
+from dataclasses import dataclass
 from typing import Final
-
-from fieldkit.core.lazy import dataclass
 
 _ZENOH_SCOUTING: Final = 7446
 _ZENOH_FIRST: Final = 7500

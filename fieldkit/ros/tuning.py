@@ -1,7 +1,7 @@
 """Settings of middlewares for a lossy radio, as those who make them, or ROS 2, advise; the first thing to try.
 
 Each stands beside its default and its source. Settings of the kernel (`net.core.rmem_max`, `net.ipv4.ipfrag_time`)
-are the machine's, need root and outlive a trial, so they are not among them; docs/middleware.md says what for.
+are the machine's, need root and outlive a trial, so they are not among them; see docs/studies/middleware.md.
 """
 
 import json
@@ -17,7 +17,7 @@ _DDS: Final = {
     "General/FragmentSize": "1300 B",
 }
 """A reader that asks sooner for what is missing (Internal/NackDelay, 100 ms) and a writer that waits later
-(Internal/Watermarks/WhcHigh, 500 kB) were tried, too: see docs/middleware.md."""
+(Internal/Watermarks/WhcHigh, 500 kB) were tried, too: see docs/studies/middleware.md."""
 
 _ZENOH: Final = {
     # `drop`: a sample whose fragments find no place in the queue for 50 ms is given up, which is every large one on a
@@ -46,7 +46,7 @@ _FAST_DDS: Final = {
     # Use-cases, "Large Data mode": large samples over lossy networks).
     "FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA",
 }
-"""Datagrams of one packet (`UDPv4?max_msg_size=1400B`) and later answers were tried, too: see docs/middleware.md."""
+"""Datagrams of one packet (`UDPv4?max_msg_size=1400B`) and later answers were tried: docs/studies/middleware.md."""
 
 _TUNED: Final[Mapping[tuple[str, str], Mapping[str, str]]] = MappingProxyType(
     {

@@ -156,6 +156,13 @@ class MessageTypes:
             for name in self.fields(type_name)
         )
 
+    def adds_at_end(self, type_name: str, names: tuple[str, ...]) -> bool:
+        """Return whether a type of ROS 2 has the members of ROS 1's, and after them just those of these names."""
+        full = full_name(type_name)
+        of_ros1 = _char_as_uint8(self.ros1.fielddefs[full][1])
+        common, added = self.ros2.fielddefs[full][1][: -len(names)], self.ros2.fielddefs[full][1][-len(names) :]
+        return common == of_ros1 and tuple(name for name, _ in added) == names
+
     def _unknown(self, name: str) -> ConfigurationError:
         known = self.ros1.fielddefs.keys() | self.ros2.fielddefs.keys()
         last = {full.rpartition("/")[2]: full for full in known}

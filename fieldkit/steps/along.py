@@ -4,10 +4,13 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Field
-from fieldkit.steps.base import Nest, Step
+from fieldkit.steps.base import Step
+from fieldkit.steps.nest import Nest
 
 
 class AlongStep(Step):
@@ -15,7 +18,8 @@ class AlongStep(Step):
 
     Attributes:
         lasts_by: The key that says otherwise how long it lasts.
-        along: Whether it lasts as long as the way of the step around it.
+        along: Whether the step lasts as long as the motion of the `move` or `fly` around it, in place of its own
+            duration or count.
     """
 
     lasts_by: ClassVar[str] = "duration"
@@ -38,14 +42,14 @@ class AlongStep(Step):
     def lasting(self, seconds: float) -> Self:
         """Return this step with its own key saying that it lasts so long."""
 
-    def fitted(self, cast: Cast, way_s: float | None = None) -> Self:  # noqa: ARG002 (see the base)
-        """See `Step.fitted`."""
+    @override
+    def resolved(self, cast: Cast, way_s: float | None = None) -> Self:
         if not self.along or way_s is None:
             return self
         return self.lasting(way_s).model_copy(update={"along": False})
 
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
-        """See `Step.misplaced`."""
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         if self.along and not any(nest.leads for nest in within):
             return (
                 f"nothing moves around it, so it lasts along no way; say its {self.lasts_by}, or put it into a move"

@@ -1,27 +1,29 @@
 """The contract of a step: data from a procedure that owns all that its kind needs, does and leaves."""
 
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache, partial
 from inspect import isabstract
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import CoreSchema, Field, Strict
 from fieldkit.core import plugins
 from fieldkit.core.columns import Column, Measured, Value, prefixed
-from fieldkit.core.errors import ConfigurationError, RobotError
-from fieldkit.core.lazy import dataclass
+from fieldkit.core.crosschecks import CrossCheck
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.steps import kinds
 from fieldkit.steps.scene import Announce, Flow, ListeningPort, Need, Pinging, Planned, RecordedFile, Refusal, Scene
+from fieldkit.steps.view import View
+
+if TYPE_CHECKING:
+    from fieldkit.steps.nest import Nest
 
 StepName = Annotated[
     str,
@@ -33,54 +35,33 @@ FileName = Annotated[
 """What a step, and a bag, may be called."""
 
 
-@dataclass(frozen=True)
-class View:
-    """One attempt as its measures see it.
-
-    Attributes:
-        scene: The attempt.
-        evidence: What it left.
-        within: The steps that the one that is measured ran inside, the outermost first.
-    """
-
-    scene: Scene
-    evidence: AttemptEvidence
-    within: Sequence["Nest"] = ()
-
-    def capture(self, role: Role) -> Capture | None:
-        """Return what a robot captured while the step ran; None where it did not, or its capture is not whole."""
-        return self.evidence.whole_capture(capture_around(self.within, role))
-
-    def captured(self, *roles: Role) -> bool:
-        """Return whether all of these robots captured while the step ran."""
-        return all(capture_around(self.within, role) is not None for role in roles)
-
-
-def capture_around(within: Sequence["Nest"], role: Role) -> str | None:
-    """Return the file of the innermost capture of a robot around a step; None where it does not capture.
-
-    Args:
-        within: The steps that the one that is asked about stands inside, the outermost first.
-        role: Whose capture.
-    """
-    files = (nest.captures().get(role) for nest in reversed(within))
-    return next((file for file in files if file is not None), None)
-
-
 class Step(Strict, ABC):
-    """One action of a procedure. Its kind owns all that there is to know of it.
+    """One action of a procedure.
 
-    Its fields are its YAML. What plans, preflight, gates, rows and reports must know they ask here, and know no kind
-    by name. `commands` is pure: `--dry-run` prints it, tests compare it with golden lines, and `run` uses the same
-    jobs. To add a kind, write its module and name its class in `fieldkit.steps.kinds`, or in an entry point of the
-    group `fieldkit.steps`.
+    Its fields are its YAML keys. Plans, preflight, gates, rows and reports call the methods below and contain no name
+    of a kind. A kind usually defines `jobs`, `check` and `measure`; every method has a default. A kind that runs one
+    program is a `fieldkit.steps.program.ProgramStep`, which needs two methods.
+
+    `jobs` is pure: `--dry-run` prints it, tests compare it with golden lines, and `run` starts the same jobs. To add
+    a kind, write its module and name its class in `fieldkit.steps.kinds`, or in an entry point of the group
+    `fieldkit.steps`.
 
     Attributes:
         columns: What steps of its kind measure.
-        name: Tells it from others of its kind in one procedure; its jobs, files and columns begin with it.
+        cross_checks: Sources of these columns, and the checks between them.
+        kept_bytes: Bytes of each frame that a capture must keep for the step; 0 if headers are enough.
+        capture_buffer_kib: Kernel buffer that a capture needs for the step's packets; 0 if the usual one is enough.
+        needs_complete_capture: Whether packets that a capture dropped make the step's figures wrong. If not, the step
+            withholds the columns that depend on captures.
+        name: Letters, digits and `_`, a lower-case letter first; distinguishes the step from others of its kind.
+            Names of its jobs, files and columns begin with it.
     """
 
     columns: ClassVar[tuple[Column, ...]] = ()
+    cross_checks: ClassVar[tuple[CrossCheck, ...]] = ()
+    kept_bytes: ClassVar[int] = 0
+    capture_buffer_kib: ClassVar[int] = 0
+    needs_complete_capture: ClassVar[bool] = True
 
     name: StepName = Field(default="", exclude_if=schema.is_empty)
 
@@ -93,98 +74,109 @@ class Step(Strict, ABC):
         """Return what a job or a file of the step is called: `up.recv.bag`; `recv.bag` of a step without a name."""
         return prefixed(self.prefix, what)
 
+    @classmethod
+    def kind_name(cls) -> str:
+        """Return the name of the class in lower case, without `Step`: part of the names of jobs and files."""
+        return cls.__name__.removesuffix("Step").lower()
+
     # What it does.
 
-    @abstractmethod
-    def commands(self, scene: Scene) -> Iterator[Planned]:
+    def jobs(self, scene: Scene) -> Iterator[Planned]:  # noqa: ARG002 (some steps need no robot)
         """Yield every job in the order in which it starts."""
+        return iter(())
 
-    @abstractmethod
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """Carry the step out.
+        """Carry the step out. By default each job starts when the one before has ended with exit code 0.
 
         Raises:
             LinkError: A robot did not answer.
             RobotError: A robot could not do it.
         """
+        for planned in self.jobs(scene):
+            announce(planned.job.name, None)
+            shell = testbed.shells[planned.role]
+            with shell.silence(planned.job.limit_s):
+                code = jobs.run(shell, planned.job)
+            if code != 0:
+                raise scene.failure(planned, f"{planned.program} ended with exit code {code}")
 
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        """Bring up what must be up before the step begins, and return what carries it out.
+        """Start what must be ready before the step begins, as a listener, and return the function that runs the step.
 
-        Who runs the step at once may do so beside work of its own, in a thread. Errors as `run`, of both.
+        A capture calls it in a thread while tcpdump starts. Errors as `run`, of both.
         """
         return partial(self.run, scene, testbed)
 
-    def own(self, scene: Scene) -> Iterator[Planned]:
-        """Yield the jobs of the step itself, without those of steps inside."""
-        return self.commands(scene)
+    def own_jobs(self, scene: Scene) -> Iterator[Planned]:
+        """Yield the jobs of the step itself, without those of the steps inside it."""
+        return self.jobs(scene)
 
-    def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
-        """Yield what the testbed does beside the commands, in words: `--dry-run` prints it."""
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
+        """Yield a line for each action that is not a command on a robot; `--dry-run` prints them."""
         return iter(())
 
-    def cut_short(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most leave robots where they are)
-        """Yield in words what robots do that move where somebody stops the attempt at once."""
+    def abort_notes(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most leave robots where they are)
+        """Yield a sentence about each moving robot: what it does if the attempt is stopped immediately."""
         return iter(())
 
-    @abstractmethod
     def roles(self) -> frozenset[Role]:
-        """Return the roles that the step needs."""
+        """Return the roles that the step needs. By default these are the roles among the values of its fields."""
+        return frozenset(role for name in type(self).model_fields for role in _roles_in(getattr(self, name)))
 
-    @abstractmethod
-    def expected_s(self, protocol: Protocol) -> float:
+    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """Return about how many seconds the step takes on a good link."""
+        return 0.0
 
     def with_record(self, duration_s: float) -> Self:  # noqa: ARG002 (most steps record nothing)
         """Return this step with every recording in it `duration_s` long."""
         return self
 
-    def fitted(self, cast: Cast, way_s: float | None = None) -> Self:  # noqa: ARG002 (most ask nothing of robots)
-        """Return this step with what it leaves to its robots filled in; a plan has such steps alone.
+    def resolved(self, cast: Cast, way_s: float | None = None) -> Self:  # noqa: ARG002 (most ask nothing of robots)
+        """Return this step with each setting that depends on the robots filled in. A plan has resolved steps only.
 
         Args:
-            cast: Who plays which role.
-            way_s: How long the way takes along which a robot moves meanwhile; None where none does.
+            cast: The robot in each role.
+            way_s: Duration of the path of the robot that moves meanwhile; None if no robot moves.
         """
         return self
 
-    def shortened(self, cast: Cast) -> Iterator[str]:  # noqa: ARG002 (most do what they say, or not at all)
-        """Yield in words of what `fitted` makes less than the step says."""
+    def adjustments(self, cast: Cast) -> Iterator[str]:  # noqa: ARG002 (most do what they say, or not at all)
+        """Yield a sentence for each setting that `resolved` reduces."""
         return iter(())
 
     # What it needs.
 
     def listens(self) -> tuple[ListeningPort, ...]:
-        """Return where robots listen for the step, by which its packets are told from others in a capture."""
+        """Return the ports on which robots listen for the step. They identify its packets in a capture."""
         return ()
 
     def restarts(self) -> frozenset[Role]:
-        """Return whose robots the step restarts; where nobody is to, a restart spoils an attempt."""
+        """Return the roles whose robots the step restarts. Any other restart makes an attempt void."""
         return frozenset()
 
     def moves(self) -> frozenset[Role]:
-        """Return whose robots the step itself moves from their places."""
+        """Return the roles whose robots the step moves from their places."""
         return frozenset()
 
-    def misplaced(self, earlier: Sequence["Step"], within: Sequence["Nest"]) -> str | None:  # noqa: ARG002 (most fit)
-        """Return why a procedure cannot have the step where it stands, None where it can.
+    def placement_error(self, earlier: Sequence["Step"], within: Sequence["Nest"]) -> str | None:  # noqa: ARG002 (most fit)
+        """Return why a procedure cannot have the step at its position; None if it can.
 
         Args:
             earlier: The steps that begin before it.
-            within: The steps that it stands inside, the outermost first.
+            within: The steps around it, the outermost first.
         """
         return None
 
     def asks(self) -> bool:
-        """Return whether a person may be asked to do something for it, so that no other step runs beside it."""
+        """Return whether the step may ask the operator to do something, so that no other step may run beside it."""
         return False
 
     def refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (most tools can do what they are for)
-        """Yield what cannot work with the tools of the scene."""
+        """Yield what cannot work with the tools that the robots have."""
         return iter(())
 
     def needs(self, scene: Scene) -> Iterator[Need]:  # noqa: ARG002 (most need programs alone)
-        """Yield what the step needs of robots beside the programs of its `commands`."""
+        """Yield what the step needs of robots beside the programs of its `jobs`."""
         return iter(())
 
     def live_topics(self, role: Role) -> tuple[str, ...]:  # noqa: ARG002 (most hear none)
@@ -192,77 +184,99 @@ class Step(Strict, ABC):
         return ()
 
     def bytes_left(self, scene: Scene, role: Role) -> float:  # noqa: ARG002 (a few lines of text are counted for all)
-        """Return about how many bytes the step leaves on the robot in `role`, texts apart."""
+        """Return about how many bytes the step leaves on the robot in `role`, without text files."""
         return 0.0
 
     def reserve_bytes(self, scene: Scene, role: Role) -> int:  # noqa: ARG002 (most write until the disk is full)
-        """Return how many bytes its programs want to find free on the robot in `role`, beside what they write."""
+        """Return the free bytes that its programs demand on the robot in `role`, beside what they write."""
         return 0
 
     # What it sends and leaves.
 
-    @abstractmethod
-    def claims(self) -> tuple[str, ...]:
-        """Return what the step has for itself in a repeat, in words: no other step of its name may have the same."""
+    def exclusive_resources(self) -> tuple[str, ...]:
+        """Return what no other step with the same `name` may use in a repeat, for messages: `a ping`."""
+        kind = self.kind_name()
+        return (f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}",)
 
-    @abstractmethod
     def files(self) -> tuple[str, ...]:
         """Return the names of all files that the step leaves in an attempt's folder, logs too.
 
-        A bag is named by its stem, which may be a folder, and by its stem and `.bag`: how it is really called is for
-        the robot's profile to say.
+        A bag is listed with and without the suffix `.bag`: the robot's profile determines its actual name, which may
+        be that of a folder.
         """
+        return ()
+
+    def laptop_files(self) -> tuple[str, ...]:
+        """Return which of `files` the laptop writes; `fieldkit.core.laptop_files` has their names."""
+        return ()
 
     def recorded(self, cast: Cast) -> Iterator[RecordedFile]:  # noqa: ARG002 (most make none)
-        """Yield the files that the step makes for others to send."""
+        """Yield the files that the step makes and that other steps may send."""
         return iter(())
 
     def records_on(self) -> frozenset[Role]:
-        """Return the roles of `recorded`, for whom the cast is not known yet."""
+        """Return the roles of `recorded`, which do not depend on the cast."""
         return frozenset()
 
     def flows(self, scene: Scene) -> Iterator[Flow]:  # noqa: ARG002 (most send nothing over the radio)
         """Yield what the step sends over the radio."""
         return iter(())
 
-    # What that tells.
+    # What its evidence shows.
 
-    def problems(self, view: View) -> Iterator[str]:  # noqa: ARG002 (what it declares is asked for anyway)
-        """Yield the reasons for which the step's evidence is not whole, a sentence each without a full stop."""
+    def check(self, view: View) -> Iterator[str]:  # noqa: ARG002 (what it declares is asked for anyway)
+        """Yield each reason why the evidence is incomplete or contradictory: a sentence without a full stop."""
         return iter(())
 
-    def declared(self) -> tuple[Column, ...]:
-        """Return which of its kind's columns the step measures."""
+    def output_columns(self) -> tuple[Column, ...]:
+        """Return the columns that the step measures."""
         return self.columns
 
     def measure(self, view: View) -> Measured:  # noqa: ARG002 (most of those that measure nothing)
-        """Return the columns that the step declares: a value for each, or why there is none."""
+        """Return a value for each of `output_columns`, or the reason why it is missing."""
         return Measured()
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:  # noqa: ARG002 (not all is worth a word)
-        """Yield the most important of the step's figures for people: `IP loss 3.2 %`."""
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:  # noqa: ARG002 (not all is worth a word)
+        """Yield the most important figures for the line of a repeat: `IP loss 3.2 %`.
+
+        Parts with the word `loss` come first in that line.
+        """
         return iter(())
 
     def transfer(self, scene: Scene, within: Sequence["Nest"]) -> Transfer | None:  # noqa: ARG002 (most send no file)
-        """Return what tells the packets of the file that the step sends; None where it sends none.
+        """Return the file transfer of the step and what identifies its packets; None if it sends no file.
 
         Args:
             scene: The attempt.
-            within: The steps that it stands inside, the outermost first.
+            within: The steps around it, the outermost first.
         """
         return None
 
     def pinging(self) -> Pinging | None:
-        """Return who prints the round-trip times that the step measures, and where; None where it measures none."""
+        """Return the role and file that contain the step's round-trip times; None if it measures none."""
         return None
 
 
+def _roles_in(value: object) -> Iterator[Role]:
+    """Yield the roles in the value of a field; steps inside a step are left out."""
+    if isinstance(value, Role):
+        yield value
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _roles_in(key)
+            yield from _roles_in(item)
+    elif isinstance(value, tuple | list | set | frozenset):
+        for item in value:
+            yield from _roles_in(item)
+
+
 @cache
-def known() -> Mapping[str, type[Step]]:
-    """Return every kind of step by name, fieldkit's own first.
+def step_types() -> Mapping[str, type[Step]]:
+    """Return the class of every kind of step by name, fieldkit's own first.
 
     Raises:
-        ConfigurationError: As `kinds.load`, or what stands for a kind is no `Step`, or lacks methods of it.
+        ConfigurationError: As `kinds.load`, or an entry point names an object that is not a complete subclass of
+            `Step`.
     """
     found: dict[str, type[Step]] = {}
     for point, loaded in kinds.load():
@@ -290,90 +304,4 @@ class StepEntry:
 
     @classmethod
     def __get_pydantic_core_schema__(cls, *_: Any) -> CoreSchema:  # noqa: ANN401 (of pydantic)
-        return schema.by_kind(known, cls, lambda entry: (entry.kind, entry.step), "step")
-
-
-class Nest(Step, ABC):
-    """A step that others run inside.
-
-    Attributes:
-        during: The steps inside.
-        disturbs: Whether the steps inside may fail because of it, so that their evidence need not be whole.
-        parallel: Whether the steps inside run at the same time.
-        leads: Whether it has a way along which steps inside can last.
-    """
-
-    disturbs: ClassVar[bool] = False
-    parallel: ClassVar[bool] = False
-    leads: ClassVar[bool] = False
-
-    during: tuple[StepEntry, ...]
-
-    def captures(self) -> Mapping[Role, str]:
-        """Return the files of what is captured while the steps inside run, by whose packets these are."""
-        return {}
-
-    def inside(self, scene: Scene) -> Iterator[Planned]:
-        """Yield every job of the steps inside, in the order in which it starts."""
-        for entry in self.during:
-            yield from entry.step.commands(scene)
-
-    def own(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.own`."""
-        others = {(planned.role, planned.job.name) for planned in self.inside(scene)}
-        return (planned for planned in self.commands(scene) if (planned.role, planned.job.name) not in others)
-
-    def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """See `Step.refusals`."""
-        for entry in self.during:
-            yield from entry.step.refusals(scene)
-
-    def beside(self, scene: Scene) -> Iterator[str]:
-        """See `Step.beside`."""
-        for entry in self.during:
-            yield from entry.step.beside(scene)
-
-    def cut_short(self, scene: Scene) -> Iterator[str]:
-        """See `Step.cut_short`."""
-        for entry in self.during:
-            yield from entry.step.cut_short(scene)
-
-    def with_record(self, duration_s: float) -> Self:
-        """See `Step.with_record`."""
-        during = tuple(StepEntry(entry.kind, entry.step.with_record(duration_s)) for entry in self.during)
-        return self.model_copy(update={"during": during})
-
-    def fitted(self, cast: Cast, way_s: float | None = None) -> Self:
-        """See `Step.fitted`."""
-        during = tuple(StepEntry(entry.kind, entry.step.fitted(cast, way_s)) for entry in self.during)
-        return self.model_copy(update={"during": during})
-
-    def shortened(self, cast: Cast) -> Iterator[str]:
-        """See `Step.shortened`."""
-        for entry in self.during:
-            yield from entry.step.shortened(cast)
-
-    def flows_inside(self, scene: Scene) -> Iterator[Flow]:
-        """Yield what the steps inside send over the radio, at any depth."""
-        for entry in self.during:
-            yield from entry.step.flows(scene)
-            if isinstance(entry.step, Nest):
-                yield from entry.step.flows_inside(scene)
-
-    def end_inside(self, scene: Scene, testbed: Testbed) -> None:
-        """End every job of the steps inside that runs.
-
-        Raises:
-            LinkError: A robot did not answer.
-        """
-        for planned in self.inside(scene):
-            with suppress(RobotError):  # it was never started
-                jobs.stop(testbed.shells[planned.role], planned.job)
-
-    def roles_inside(self) -> frozenset[Role]:
-        """Return the roles that the steps inside need."""
-        return frozenset().union(*(entry.step.roles() for entry in self.during))
-
-    def inside_s(self, protocol: Protocol) -> float:
-        """Return about how many seconds the steps inside take on a good link."""
-        return sum(entry.step.expected_s(protocol) for entry in self.during)
+        return schema.by_kind(step_types, cls, lambda entry: (entry.kind, entry.step), "step")

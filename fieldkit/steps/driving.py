@@ -1,10 +1,13 @@
 """Drive a robot by its own velocity topic while other steps run: its agent steers, this laptop holds the lease."""
 
 import json
+import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from types import MappingProxyType
 from typing import Any, Final
+
+from typing_extensions import override
 
 from fieldkit.agent import drive_plan
 from fieldkit.agent.drive_plan import DriveTask
@@ -13,10 +16,10 @@ from fieldkit.backends.protocols import Robot, Testbed
 from fieldkit.config.profiles import Drive
 from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import FieldkitError, LinkError, RobotError
-from fieldkit.core.model import Move
+from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError
+from fieldkit.core.model import MotionOrigin, Move
 from fieldkit.core.text import JSON_ERRORS, brief
-from fieldkit.measure.evidence import drive_log
+from fieldkit.measure.motion import drive_log
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
@@ -24,6 +27,8 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps import lease, streams
 from fieldkit.steps.lease import HeldLease, orders_file
 from fieldkit.steps.middlewares import Over
+from fieldkit.steps.motions import Mover
+from fieldkit.steps.origins import RobotMotion
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
 
 ODOMETRY_S: Final = 0.5
@@ -87,7 +92,7 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
         robot.profile.tools.python,
         agent.path_from_job(),
         "drive",
-        _told(robot, move, name),
+        _told(scene, move, name),
         name.format(drive_log.FILE),
     )
     setup = streams.setup(robot)
@@ -137,6 +142,17 @@ def _drive(robot: Robot) -> Drive:
     return robot.profile.drive
 
 
+def _origin(scene: Scene, move: Move) -> dict[str, Any]:
+    """Return what of a task depends on the place of the robot in this trial."""
+    origin, last = scene.origins.get(move.role), scene.origins.last(move.role)
+    if origin is None or not scene.origins.kept:
+        return {}
+    places = {"origin": (origin.x_m, origin.y_m, origin.heading_rad)}
+    if last is not None:
+        places["last"] = (last.x_m, last.y_m, last.heading_rad)
+    return {**places, "frame_id": origin.frame_id, "may_return": scene.origins.may_return}
+
+
 def _task(robot: Robot, move: Move) -> dict[str, Any]:
     """Return what a robot is to drive, as `fieldkit.agent.steering.DriveTask` has it."""
     drive = _drive(robot)
@@ -152,11 +168,12 @@ def _task(robot: Robot, move: Move) -> dict[str, Any]:
     }
 
 
-def _told(robot: Robot, move: Move, name: str) -> str:
-    """Return what the driver is told, as JSON."""
+def _told(scene: Scene, move: Move, name: str) -> str:
+    """Return the argument of the driver, as JSON."""
     from fieldkit.ros import topics, types  # noqa: PLC0415 (50 ms, and only a robot that drives needs it)
     from fieldkit.ros.qos import PROFILES  # noqa: PLC0415
 
+    robot = scene.robot(move.role)
     drive = _drive(robot)
     way, ros = over(robot), robot.profile.ros
     known = types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.shipped()
@@ -174,9 +191,10 @@ def _told(robot: Robot, move: Move, name: str) -> str:
         "cdr": way is not Over.ROS1,
         "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default", 1),
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
-        "task": _task(robot, move),
+        "task": {**_task(robot, move), **_origin(scene, move)},
         "orders": orders_file(name.format("drive")),
         "status": name.format(_STATUS),
+        "stationary": jobs.stationary_file(name.format("drive")),
     }
     return streams.compact(told)
 
@@ -197,7 +215,7 @@ def _network(robot: Robot, way: Over) -> dict[str, Any]:
 
 
 class DriveLease(HeldLease):
-    """Holds the program that drives a robot, which goes its way at first.
+    """Holds the program that drives a robot, which waits at first.
 
     Args:
         shell: The robot.
@@ -208,13 +226,36 @@ class DriveLease(HeldLease):
 
     def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
         super().__init__(
-            shell, job, says=name.format(_STATUS), order=drive_plan.OUT, lease_s=lease_s, renewals=_RENEWALS
+            shell, job, says=name.format(_STATUS), order=drive_plan.WAIT, lease_s=lease_s, renewals=_RENEWALS
         )
 
     def turn_back(self) -> None:
         """Want the robot at its place again; where it does not hear of it now, it does with a renewal, or stops."""
         with suppress(LinkError, RobotError):
             self.order(drive_plan.BACK)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the robot is stationary, and where it must be to start."""
+        return self.status.get("ready") is True
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the robot did not start because it is not where it must be."""
+        return self.status.get("refused") is True
+
+    @property
+    def pose(self) -> MotionOrigin | None:
+        """Where the robot was when it reported last, in the frame of its odometry; None if it did not report that."""
+        status = self.status
+        try:
+            x_m, y_m, yaw_rad = map(float, status["pose"])
+            frame_id = status["frame_id"]
+        except (KeyError, TypeError, ValueError):
+            return None
+        if not isinstance(frame_id, str) or not all(map(math.isfinite, (x_m, y_m, yaw_rad))):
+            return None
+        return MotionOrigin("odometry", brief(frame_id), x_m, y_m, yaw_rad)
 
     @property
     def status(self) -> dict[str, Any]:
@@ -235,8 +276,8 @@ class DriveLease(HeldLease):
         return super().over
 
     @property
+    @override
     def over(self) -> str:
-        """See `HeldLease.over`."""
         return "" if self.why in {"", drive_log.HOME} else f"it stopped on its way: {self.why}"
 
     def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
@@ -267,34 +308,84 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
     Raises:
         LinkError: The robot did not answer.
         RobotError: It could not be driven, or stopped by itself before the body had ended.
+        MotionHeldError: It is not where it must be to start, or robots may not move before a person confirms it.
+        OSError: The journal of motions cannot be written; the robot does not start.
     """
     shell, robot = testbed.shells[move.role], scene.robot(move.role)
     lease_s = robot.profile.drive.lease if robot.profile.drive else 0.0
-    lease.start(shell, plan.job)
-    with DriveLease(shell, plan.job, name, lease_s) as held:
+    mover = Mover(robot.name, shell, scene.folder, f"it stops by itself within {lease_s:g} s")
+    held = DriveLease(shell, plan.job, name, lease_s)
+    with scene.motions.moving(mover), lease.started(shell, plan.job), held, ExitStack() as stack:
         try:
-            held.wait(lambda: held.status or held.why, Deadline.after(_START_S))
-            held.demand()
-            yield held
-        except Exception:
-            _bring_back(testbed, shell, plan.job, held, move)
-            raise
+            _commit(scene, held, move)
+            motion = stack.enter_context(scene.origins.moving(move.role))
         except BaseException:
             _end(shell, plan.job)
             raise
-        early = held.over
-        came = _bring_back(testbed, shell, plan.job, held, move)
-        if early or came != drive_log.HOME:
-            raise held.failure(early or held.over or "it stopped on its way: it is not back in time")
+        yield from _moving(scene, testbed, shell, plan.job, held, move, motion)
 
 
-def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move: Move) -> str:
-    """Let a robot drive back, or be brought; return `DriveLease.why`."""
+def _commit(scene: Scene, held: DriveLease, move: Move) -> None:
+    """Wait until a robot is stationary at its place, and record its origin before its first start there."""
+    held.wait(lambda: held.is_ready or held.why, Deadline.after(_START_S))
+    if held.is_refused:
+        scene.origins.refuse(move.role, held.why)
+        raise MotionHeldError(
+            f"it does not start: {held.why}",
+            where=scene.robot(move.role).name,
+            remedy="put it at its place, facing as in the beginning, then resume without --yes and confirm it",
+        )
+    held.demand()
+    if not held.is_ready:
+        raise held.failure(f"it was not stationary for {_START_S:g} s")
+    if scene.origins.kept and scene.origins.get(move.role) is None:
+        pose = held.pose
+        if pose is None:
+            raise held.failure("its driver does not report where it is")
+        scene.origins.record(move.role, pose)
+
+
+def _moving(  # noqa: PLR0917 (the parts of one motion)
+    scene: Scene, testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move: Move, motion: RobotMotion
+) -> Iterator[DriveLease]:
+    """Let a robot drive while the body runs, and back; see `driven`."""
+
+    def bring_back() -> str:
+        came = _bring_back(testbed, shell, job, held, move, by_hand=not scene.origins.kept)
+        if came == drive_log.HOME:
+            motion.ended(held.pose)
+        elif held.status.get("ended"):
+            motion.at = held.pose
+        return came
+
+    try:
+        with suppress(LinkError, RobotError):  # it is given again with each renewal
+            held.order(drive_plan.OUT)
+        yield held
+    except Exception:
+        bring_back()
+        raise
+    except BaseException:
+        _end(shell, job)
+        raise
+    early = held.over
+    came = bring_back()
+    if early or came != drive_log.HOME:
+        raise held.failure(early or held.over or "it stopped on its way: it is not back in time")
+
+
+def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move: Move, *, by_hand: bool) -> str:
+    """Let a robot drive back, or be brought; return `DriveLease.why`.
+
+    With `by_hand` false a robot that did not come back stays where it is: before robots move again a person is asked
+    to put it at its place (`fieldkit.trial.running.motion_leave`).
+    """
     held.turn_back()
     held.wait(lambda: held.why, Deadline.after(_START_S + limit_s(move)))
     why = held.why
     _end(shell, job)
-    testbed.bring_back(move.role, by_itself=why == drive_log.HOME)
+    if by_hand or why == drive_log.HOME:
+        testbed.bring_back(move.role, by_itself=why == drive_log.HOME)
     return why
 
 

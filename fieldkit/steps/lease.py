@@ -1,7 +1,7 @@
 """A lease on what a robot does: a program on it follows an order for only as long as this laptop renews it.
 
-Who kills this process, or cuts the control link for longer than the lease, lets the order lapse; what the robot does
-then is for its program to know (`fieldkit.agent.orders`).
+If this process is killed, or the control link is cut for longer than the lease, the order lapses; the program defines
+what the robot does then (`fieldkit.agent.orders`). While one runs, its robot counts as moving (`steps.motions`).
 """
 
 import threading
@@ -18,7 +18,7 @@ from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.base import Nest
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Scene
 
 _LOOKS_S: Final = 0.25
@@ -35,10 +35,12 @@ def orders_file(name: str) -> str:
     return f"{name}.orders"
 
 
-def start(shell: Shell, job: Job) -> None:
-    """Bring the agent to a robot and start a program of it; errors as `jobs.start`."""
+@contextmanager
+def started(shell: Shell, job: Job) -> Iterator[None]:
+    """Bring the agent to a robot and start a program of it, which the body ends; errors as `jobs.start`."""
     agent.install(shell)
     jobs.start(shell, job)
+    yield
 
 
 class HeldLease:

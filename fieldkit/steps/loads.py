@@ -8,6 +8,8 @@ from typing import Annotated, Final
 from fieldkit.config import schema
 from fieldkit.config.schema import Bits, Field, Int, Strict
 from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.transfers.deliveries import FlowSchedule
+from fieldkit.measure.transfers.load_streams import COOKIE_BYTES, LoadStreams
 from fieldkit.steps.scene import GOOD_BIT_S, Flow, Scene, frames
 
 PROGRAM: Final = "iperf3"
@@ -23,11 +25,12 @@ class LoadOptions(Strict):
     """A load from one robot to another.
 
     Attributes:
-        sender: Who runs the client (`from`), and sends.
-        receiver: Who runs the server (`to`), and receives.
-        protocol: Transport protocol; None for the repeat's.
-        rate: What each stream sends per second at most; None for 1 Mbit/s of UDP, and as much as goes of TCP.
-        streams: How many at once.
+        sender: Role that runs the client, and sends.
+        receiver: Role that runs the server, and receives.
+        protocol: `tcp` or `udp`; without it, that of the repeat.
+        rate: Maximum rate of each stream, `5Mbit/s`; without it, UDP sends 1 Mbit/s and TCP as much as the link
+            carries.
+        streams: Number of parallel streams.
         payload_bytes: UDP payload of a datagram.
         port: Port that the server listens on.
     """
@@ -65,6 +68,51 @@ class LoadOptions(Strict):
             *(("-b", str(round(rate))) if rate else ()),
             *(("-P", str(self.streams)) if self.streams > 1 else ()),
             *options,
+        )
+
+    def interval_s(self, protocol: Protocol) -> float:
+        """Return the time between two blocks or datagrams of a stream; 0 where it sends as much as goes."""
+        udp = self.carried_by(protocol) is Protocol.UDP
+        if self.rate is None and not udp:
+            return 0.0
+        return 8 * (self.payload_bytes if udp else _BLOCK_BYTES) / (self.rate or DEFAULT_UDP_BIT_S)
+
+    def data_streams(
+        self,
+        scene: Scene,
+        *,
+        reverse: bool = False,
+        ports: tuple[tuple[int, int], ...] = (),
+        lasts_s: float | None = None,
+        until_ns: int | None = None,
+    ) -> LoadStreams:
+        """Return what tells the load's data in captures.
+
+        Args:
+            scene: The attempt.
+            reverse: Whether the server sends.
+            ports: As `LoadStreams.ports`.
+            lasts_s: As `FlowSchedule.lasts_s`.
+            until_ns: As `FlowSchedule.until_ns`.
+        """
+        ends = [scene.robot(role).address for role in (self.sender, self.receiver)]
+        source, destination = reversed(ends) if reverse else ends
+        carrier = self.carried_by(scene.protocol)
+        return LoadStreams(
+            protocol=carrier,
+            source_address=source,
+            destination_address=destination,
+            port=self.port,
+            source_listens=reverse,
+            count=self.streams,
+            payload_bytes=self.payload_bytes,
+            ports=ports,
+            expected=FlowSchedule(
+                interval_s=self.interval_s(scene.protocol),
+                head_bytes=0 if reverse or carrier is Protocol.UDP else COOKIE_BYTES,
+                lasts_s=lasts_s,
+                until_ns=until_ns,
+            ),
         )
 
     def expected_bit_s(self, protocol: Protocol) -> float:

@@ -1,11 +1,11 @@
 """Middlewares that a topic can go over: how their ends find each other, and what a robot must have for them."""
 
 import re
+from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Verdict
 from fieldkit.steps.scene import Said
 

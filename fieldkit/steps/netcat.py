@@ -12,6 +12,7 @@ busybox 1.35.0). Three things decide:
   traditional one counts too, the others wait for the job's limit.
 """
 
+import re
 from collections.abc import Mapping
 from typing import Final
 
@@ -21,7 +22,13 @@ from fieldkit.steps.variants import Netcat
 DATAGRAM_BYTES: Final[Mapping[Netcat, int]] = {Netcat.TRADITIONAL: 8192, Netcat.OPENBSD: 16384, Netcat.NCAT: 8192}
 """Payload of the datagrams that each sends, the file's last one apart; busybox (as Debian builds it) has no UDP."""
 
-_READ_BYTES: Final = {Netcat.TRADITIONAL: 8192, Netcat.OPENBSD: 16384, Netcat.NCAT: 131072}
+_READ_BYTES: Final = {Netcat.TRADITIONAL: 8192, Netcat.OPENBSD: 16384, Netcat.NCAT: 8192}
+_OLD_NCAT_READ_BYTES: Final = 131072
+_NCAT_CHANGED: Final = (7, 94)
+"""From this version on (Debian 13 has 7.95) a listening ncat reads UDP into its buffer for TCP, of 8192 bytes (nmap's
+commit 4e6c8feb1). The rest of a longer datagram is lost.
+"""
+_NCAT_VERSION: Final = re.compile(r"Ncat\D*(\d+)\.(\d\d)")
 
 # Opened for reading and writing, a FIFO neither blocks nor ends.
 _ENDLESS_INPUT: Final = ("sh", "-c", 'mkfifo .endless && exec <>.endless && rm .endless && exec "$@"', "sh")
@@ -67,7 +74,21 @@ def listener_cut(code: int | None, log: str | None) -> bool:
     return code in {1, 2} and log is not None and (not log.strip() or "write" in log)
 
 
-def cut_short(sender: Netcat, receiver: Netcat) -> bool:
-    """Return whether the receiver reads less of a datagram than the sender puts into one, and drops the rest."""
+def cut_short(sender: Netcat, receiver: Netcat, receiver_version: str = "") -> bool:
+    """Return whether the receiver reads less of a datagram than the sender puts into one, and drops the rest.
+
+    Args:
+        sender: The sender's netcat.
+        receiver: The receiver's.
+        receiver_version: What the receiver's prints of its version; empty where it is not known.
+    """
     both_know_udp = sender in DATAGRAM_BYTES and receiver in _READ_BYTES
-    return both_know_udp and DATAGRAM_BYTES[sender] > _READ_BYTES[receiver]
+    return both_know_udp and DATAGRAM_BYTES[sender] > _read_bytes(receiver, receiver_version)
+
+
+def _read_bytes(netcat: Netcat, version: str) -> int:
+    """Return how much of a datagram a listener reads."""
+    numbers = _NCAT_VERSION.search(version)
+    if netcat is Netcat.NCAT and numbers and (int(numbers[1]), int(numbers[2])) < _NCAT_CHANGED:
+        return _OLD_NCAT_READ_BYTES
+    return _READ_BYTES[netcat]

@@ -35,4 +35,4 @@ def judged(answer: Said) -> tuple[Verdict, str, str]:
     if answer.ok and found:
         return Verdict.OK, ", ".join(found), ""
     lack = "nothing on it finds ways over others: no babeld or the like runs, no batman-adv, no 802.11s"
-    return Verdict.FAIL, lack, "start one on each robot: docs/mesh.md says how"
+    return Verdict.FAIL, lack, "start one on each robot, see: fieldkit docs mesh"

@@ -2,21 +2,23 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import ClassVar, Final
 
 from fieldkit.backends.protocols import Cast, Robot
+from fieldkit.config.programs import LabProgram
 from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import OnAbort, Placement, Protocol, Role, Vector, Verdict
 from fieldkit.core.threads import Halt
 from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
+from fieldkit.steps.motions import Motions
+from fieldkit.steps.origins import MemoryOrigins, Origins
 from fieldkit.steps.variants import Tool, Variants
 
 Shells = Mapping[Role, Shell]
@@ -68,9 +70,12 @@ class Scene:
         variants: Which tools the robots have, where that was looked up.
         here: The attempt's folder on this machine, for what no robot can know; None where no attempt is made.
         placement: Where the robots were placed; None where nobody placed them.
+        repeat: Number of the repeat of its protocol, from 1; None where it holds for all repeats.
         flows: What all steps of the procedure send over the radio.
         on_abort: What becomes of a drone where the attempt is cut short; those that are not there land.
         halt: Ends what waits, where the steps are not to go on.
+        motions: The robots that move by themselves, which the operator may stop.
+        origins: Origins of the robots that move by themselves, and the record of each motion.
     """
 
     protocol: Protocol
@@ -80,9 +85,12 @@ class Scene:
     variants: Mapping[Role, Variants] = field(default_factory=lambda: MappingProxyType({}))
     here: Path | None = None
     placement: Placement | None = None
+    repeat: int | None = None
     flows: "tuple[Flow, ...]" = ()
     on_abort: Mapping[Role, OnAbort] = field(default_factory=lambda: MappingProxyType({}))
     halt: Halt = field(default_factory=Halt, compare=False, repr=False)
+    motions: Motions = field(default_factory=Motions, compare=False, repr=False)
+    origins: Origins = field(default_factory=MemoryOrigins, compare=False, repr=False)
 
     def robot(self, role: Role) -> Robot:
         """Return the robot in `role`."""
@@ -108,6 +116,21 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class PutProgram:
+    """A program of the lab that is copied to a robot before the first step of an attempt.
+
+    Attributes:
+        role: To whose robot.
+        program: The program.
+        at: Its path there, below the attempt's folder.
+    """
+
+    role: Role
+    program: LabProgram
+    at: str
+
+
+@dataclass(frozen=True)
 class Planned:
     """A job that a step will run.
 
@@ -120,6 +143,7 @@ class Planned:
         ends: Who may end it; ended by anybody else its evidence is not whole.
         least_s: How long it runs at least where it ends by itself and nothing cuts it short, in seconds.
         remedy: What to do where the program is missing; empty where the profile or a package is to blame.
+        put: Program of the lab that the job needs on the robot; None where it needs none.
     """
 
     role: Role
@@ -130,6 +154,7 @@ class Planned:
     ends: frozenset[Cause] = BY_ITSELF
     least_s: float = 0.0
     remedy: str = ""
+    put: PutProgram | None = None
 
 
 @dataclass(frozen=True)

@@ -39,12 +39,13 @@ class StreamQos(Strict):
     """A quality of service: a profile of ROS 2, and what differs from it.
 
     Attributes:
-        profile: Its name.
+        profile: `default`, `sensor_data`, `services_default`, `parameters`, `parameter_events` or `system_default`,
+            with ROS 2's values. The other keys override it.
         reliability: `reliable` or `best_effort`.
         history: `keep_last` or `keep_all`.
         depth: How many samples are kept, with `keep_last`.
         durability: `volatile` or `transient_local`.
-        deadline: A sample is expected at least so often.
+        deadline: Maximum expected time between two samples.
     """
 
     profile: Annotated[str, AfterValidator(_is_profile)] = "default"
@@ -81,21 +82,29 @@ class StreamOptions(Strict):
     """A stream of samples from one robot to another.
 
     Attributes:
-        sender: Who publishes (`from`).
-        receiver: Who subscribes (`to`).
-        over: The middleware.
-        topic: Its topic.
+        sender: Role that publishes.
+        receiver: Role that subscribes.
+        over: `dds` (CycloneDDS), `zenoh`, `ros1`, or `ros2`: the robot's own ROS 2 with [its own
+            RMW](topics.md#your-own-ros-2).
+        topic: Name of the topic.
         rate: Samples per second.
-        bytes: Data of a sample.
-        qos: Its quality of service.
-        discovery: How the ends find each other; None for the middleware's usual way.
-        server: Who runs the router, or ROS's master.
+        bytes: Size of a sample's data, 24 B to 16 MB.
+        qos: Quality of service.
+        discovery: `multicast` or `peers` for `dds`; `multicast`, `peers` or `router` for `zenoh`; `master` for
+            `ros1`; `environment` (that of the robot), `multicast` or `peers` for `ros2`. The first of these is the
+            default.
+        server: Role that runs the router or the master.
         duration: How long it streams.
-        patience: How long the publisher waits for a subscription.
-        domain: ROS domain, another than robots use by themselves.
-        transport: What carries Zenoh.
-        settings: The middleware's own settings by their path, of ROS 2 variables of its environment; `default` for
-            none, `tuned` for those of `fieldkit.ros.tuning`.
+        patience: How long the publisher waits for a subscription; if it finds none, it sends nothing, which is a
+            valid measurement.
+        domain: ROS domain, 0 to 101; it must differ from the robots' own. Each domain has its own ports, also for
+            Zenoh and ROS 1: simultaneous streams on one robot need different domains.
+        transport: Transport of `zenoh`: `tcp` or `udp`.
+        settings: `default`; `tuned`, for a lossy radio: [the tuned
+            settings](studies/middleware.md#the-tuned-settings); or the middleware's own settings by their path:
+            `Discovery/SPDPInterval: 500 ms` of CycloneDDS, `Internal/SocketReceiveBufferSize@min: 10 MB` for an
+            attribute, `transport/link/tx/batch_size: "1400"` of Zenoh, `tcp_nodelay: "1"` of ROS 1, and for `ros2`
+            environment variables: `RMW_IMPLEMENTATION: rmw_cyclonedds_cpp`.
     """
 
     sender: Role = Field(alias="from")
@@ -126,7 +135,7 @@ class StreamOptions(Strict):
             raise schema.complaint("ROS 1 sends by TCP, which is reliable; leave it out", "qos")
         if self.rate * self.duration < 1:
             raise schema.complaint("it is over before its second sample", "duration")
-        for name in self._set if self.over is Over.ROS2 else ():
+        for name in self.own_settings if self.over is Over.ROS2 else ():
             if why := no_setting(name):
                 raise schema.complaint(why, "settings")
         return self
@@ -162,7 +171,7 @@ class StreamOptions(Strict):
         return ports.zenoh_listener(self.domain) if self.over is Over.ZENOH else ports.ros1_master(self.domain)
 
     @property
-    def _set(self) -> Mapping[str, str]:
+    def own_settings(self) -> Mapping[str, str]:
         """The middleware's own settings by their path."""
         if isinstance(self.settings, dict):
             return self.settings
@@ -172,7 +181,7 @@ class StreamOptions(Strict):
         """Return how a robot takes part, as `fieldkit.agent.middleware.Network` has it."""
         other = self.receiver if role == self.sender else self.sender
         of_node = ports.ros1_node(self.domain) if self.over is Over.ROS1 else {}
-        settings = {**{name: str(port) for name, port in of_node.items()}, **self._set}
+        settings = {**{name: str(port) for name, port in of_node.items()}, **self.own_settings}
         return {
             "address": scene.robot(role).address,
             "discovery": self.way.value,
@@ -187,7 +196,7 @@ class StreamOptions(Strict):
 
     def environment(self, robot: Robot) -> dict[str, str]:
         """Return the variables that the agent runs with: of ROS 2 the robot's own, and the settings."""
-        return {**robot.ros_environment, **self._set} if self.over is Over.ROS2 else {}
+        return {**robot.ros_environment, **self.own_settings} if self.over is Over.ROS2 else {}
 
     def need(self, role: Role, robot: Robot) -> Need:
         """Return what says whether a robot's Python has the middleware."""

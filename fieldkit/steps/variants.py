@@ -1,13 +1,12 @@
 """Variants of a robot's tools, which share names and differ in options, output and abilities."""
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import PurePosixPath
 from types import MappingProxyType
 
 from fieldkit.config.profiles import RobotProfile
-from fieldkit.core.lazy import dataclass
 
 
 class Tool(StrEnum):

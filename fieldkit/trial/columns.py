@@ -9,7 +9,7 @@ from fieldkit.core.columns import Column, Value, named
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.measure.evidence import lateness, link
 from fieldkit.steps import kinds
-from fieldkit.steps.base import Step, known
+from fieldkit.steps.base import Step, step_types
 
 IDENTITY: Final = columns.columns(
     0,
@@ -55,7 +55,7 @@ Row = Mapping[str, Value]
 def measures() -> tuple[Column, ...]:
     """Return every column that evidence fills in every trial: the testbed's own, and fieldkit's own kinds'."""
     own = kinds.own()
-    of_kinds = (column for kind, step in known().items() if kind in own for column in step.columns)
+    of_kinds = (column for kind, step in step_types().items() if kind in own for column in step.columns)
     filled = dict.fromkeys((*ALWAYS, *of_kinds))
     return tuple(sorted(filled, key=lambda column: column.rank))
 
@@ -77,7 +77,7 @@ def _everywhere() -> Mapping[str, Column]:
 
 def of_step(step: Step) -> tuple[Column, ...]:
     """Return the columns that a step fills, as a row has them."""
-    return tuple(named(step.prefix, column) for column in step.declared())
+    return tuple(named(step.prefix, column) for column in step.output_columns())
 
 
 def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
@@ -116,10 +116,10 @@ def installed() -> tuple[Column, ...]:
     """Return the columns of every trial, and those that other packages' kinds of step declare.
 
     Raises:
-        ConfigurationError: As `known`, or a kind declares a column that cannot be, or whose name stands for another.
+        ConfigurationError: As `step_types`, or a kind declares an invalid column, or one whose name is taken.
     """
     found = dict(_everywhere())
-    for kind, step in known().items():
+    for kind, step in step_types().items():
         for column in step.columns:
             flaw = column.flaw()
             if flaw or found.setdefault(column.name, column) != column:

@@ -25,6 +25,8 @@ class FrozenFigure(Strict):
     arrived: str | None = None
     sent: str | None = None
     rank: Int
+    at_least: str | None = Field(default=None, exclude_if=schema.is_empty)
+    of_sent: str | None = Field(default=None, exclude_if=schema.is_empty)
 
 
 class FrozenColumn(Strict):

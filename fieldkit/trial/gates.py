@@ -10,8 +10,8 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import lateness, link, link_samples, track
-from fieldkit.steps.base import View
-from fieldkit.trial import hosts
+from fieldkit.steps.view import View
+from fieldkit.trial import hosts, placements
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
 
@@ -42,25 +42,28 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
     scene = plan.scene(repeat, "")
     # What happened to a robot comes first: it is the cause of much of the rest.
     problems = list(hosts.problems(plan.procedure, scene, evidence))
-    measured = lateness.measure(evidence.known(lateness.read, lateness.FILE))
+    measured = lateness.measure(evidence.read_or_none(lateness.read, lateness.FILE))
     for role in link.ROLES:
         measured |= link.measure(role, evidence.links(role))
+    misplaced = placements.contradiction(scene, evidence)
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
         try:
             found = placed.step.measure(view)
             impossible = dict(_impossible(placed, found))
             if not placed.disturbed:
-                problems += (_of_step(placed, why) for why in placed.step.problems(view))
+                problems += (_of_step(placed, why) for why in placed.step.check(view))
                 problems += _unexplained(placed, found)
                 problems += impossible.values()
             found = found.without(impossible)
+            if misplaced:
+                found = found.without({name: misplaced for name in found.values if placements.is_dependent(name)})
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see above)
             why = f"what {placed.called} left cannot be measured: {type(error).__name__}: {error}"
             problems.append(why)
-            found = Measured.nothing(placed.step.declared(), why)
+            found = Measured.nothing(placed.step.output_columns(), why)
         measured |= found.named(placed.step.prefix)
     problems += _of_the_testbed(evidence)
     return Judged(tuple(problems), measured)
@@ -72,14 +75,14 @@ def _of_step(placed: PlacedStep, why: str) -> str:
 
 
 def _unexplained(placed: PlacedStep, found: Measured) -> Iterator[str]:
-    for column in placed.step.declared():
+    for column in placed.step.output_columns():
         if column.name not in found.values and column.name not in found.missing:
             yield f"{placed.called} does not say why it has no {column.name}"
 
 
 def _impossible(placed: PlacedStep, found: Measured) -> Iterator[tuple[str, str]]:
     """Yield what no such column can hold, with the reason: no table that has it would be read again."""
-    for column in placed.step.declared():
+    for column in placed.step.output_columns():
         text = "" if column.type is str else cell(found.values.get(column.name))
         if text and (problem := "not a number" if text == "nan" else column.problem(text)):
             yield column.name, f"the evidence gives {prefixed(placed.step.prefix, column.name)} as {text}, {problem}"

@@ -10,25 +10,32 @@ from fieldkit.measure.evidence.host import HostState
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure
 
+_LOST: Final = "its state before the attempt and that after it do not both have the section {}"
 REBOOTED: Final = "the robot rebooted during the repeat"
 
 
 def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
-    """Yield what happened to a robot that spoils the attempt; notes that are not there say nothing.
+    """Yield what happened to a robot that spoils the attempt, and what is missing of its notes.
 
-    A robot that a step restarts is judged by its jobs alone: its clock begins anew.
+    Notes that a robot cannot provide are missing before and after; those of one moment alone were lost. A robot that
+    a step restarts is judged by its jobs alone: its clock begins anew.
     """
     on_purpose = restarted(procedure)
     for role in sorted(procedure.roles()):
         name = scene.robot(role).name
-        before, after = (evidence.known(host.state, file(role)) for file in (host.before, host.after))
+        before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
+        for file, state in ((host.before(role), before), (host.after(role), after)):
+            if state is None:
+                yield f"{name}: {file} is missing, or cannot be read"
+        if before is not None and after is not None:
+            yield from (f"{name}: {_LOST.format(section)}" for section in host.lacking(before, after))
         if before is not None and after is not None and role not in on_purpose:
             if rebooted(before.boot, after.boot):
                 yield f"{name}: {REBOOTED}"
                 continue  # so its jobs were cut, and its clock begins anew
             yield from (f"{name}: {why}" for why in _of_the_clock(before, after))
         if after is not None and after.endings is not None:
-            yield from (f"{name}: {why}" for why in _of_the_jobs(procedure, scene, role, after))
+            yield from (f"{name}: {why}" for why in _of_the_jobs(procedure, scene, role, after, evidence))
 
 
 def restarted(procedure: Procedure) -> frozenset[Role]:
@@ -53,10 +60,20 @@ def _of_the_clock(before: HostState, after: HostState) -> Iterator[str]:
         yield why
 
 
-def _of_the_jobs(procedure: Procedure, scene: Scene, role: Role, after: HostState) -> Iterator[str]:
+def _of_the_jobs(
+    procedure: Procedure, scene: Scene, role: Role, after: HostState, evidence: AttemptEvidence
+) -> Iterator[str]:
     """Yield which jobs of steps that no fault disturbs did not end as they are to."""
     for placed in procedure.walk():
-        for planned in () if placed.disturbed else placed.step.own(scene):
+        for planned in () if placed.disturbed else placed.step.own_jobs(scene):
+            if planned.role is not role:
+                continue
             ending = (after.endings or {}).get(planned.job.name)
-            if planned.role is role and ending and (why := endings.problem(ending, planned.ends, planned.least_s)):
+            if (
+                ending is None
+                and role not in restarted(procedure)
+                and any(evidence.has(file) for file in (planned.job.log, planned.job.stdout) if file)
+            ):
+                yield f"its job {planned.job.name} ran, and nothing says how it ended"
+            if ending and (why := endings.problem(ending, planned.ends, planned.least_s)):
                 yield f"its job {planned.job.name} {why}"

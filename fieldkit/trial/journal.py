@@ -1,19 +1,20 @@
 """The journal: append-only, on disk before anything goes on, the truth about each repeat."""
 
+import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
 from fieldkit.config.schema import Codec, Field
-from fieldkit.core import jsonl
+from fieldkit.core import jsonl, laptop_files
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
 from fieldkit.remote import jobs
 from fieldkit.trial.plan import Plan
 
-JOURNAL_FILE: Final = "journal.jsonl"
+JOURNAL_FILE: Final = laptop_files.JOURNAL
 
 _OPEN: Final = frozenset({Status.PLANNED, Status.RUNNING, Status.MEASURED})
 
@@ -59,7 +60,9 @@ class Attempt:
         started_utc_ns: When it began.
         status: How it ended.
         reason: Why it is not valid.
-        excused: Whether it was cut short from outside, so that it is none of the attempts that the procedure allows.
+        excused: Whether it was cut short from outside, or its repeat was reopened later, so that it is none of the
+            attempts that the procedure allows.
+        reopened: Whether it failed, and its repeat was reopened later: it is void since then.
     """
 
     repeat: RepeatId
@@ -68,6 +71,7 @@ class Attempt:
     status: Status
     reason: str = ""
     excused: bool = False
+    reopened: bool = False
 
     @property
     def folder(self) -> str:
@@ -92,6 +96,22 @@ def claimed(folder: Path) -> AbstractContextManager[None]:
 def append(folder: Path, *entries: JournalEntry) -> None:
     """Add entries to the journal of a trial; raises as `jsonl.append`."""
     jsonl.append(folder / JOURNAL_FILE, *map(_CODEC.dump, entries))
+
+
+def reopen_failed(folder: Path, plan: Plan) -> int:
+    """Plan every failed repeat of a claimed trial once more; return how many they are.
+
+    What failed is void from then on: `ended` says so.
+
+    Raises:
+        EvidenceError: As `history`.
+        OSError: The disk is full or gone.
+    """
+    mend(folder)
+    now = time.time_ns()
+    failed = [attempt.repeat for attempt in ended(history(folder, plan)) if attempt.status is Status.FAILED]
+    append(folder, *(JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in failed))
+    return len(failed)
 
 
 def mend(folder: Path) -> None:
@@ -124,13 +144,14 @@ def _impossible(entries: list[JournalEntry], plan: Plan) -> Iterator[tuple[int, 
     """Yield line and reason of each entry that contradicts the plan or an entry before it."""
     begun: set[tuple[RepeatId, int]] = set()
     ended_before: set[tuple[RepeatId, int]] = set()
-    over: set[RepeatId] = set()
+    over: dict[RepeatId, Status] = {}
     for line, entry in enumerate(entries, start=1):
         repeat, attempt = entry.repeat, (entry.repeat, entry.attempt)
         if repeat.protocol not in plan.protocols or repeat.number > plan.repeats:
             yield line, f"the plan has no repeat {repeat}"
         elif entry.status is Status.PLANNED:
-            continue
+            if over.pop(repeat, Status.FAILED) is not Status.FAILED:
+                yield line, f"{repeat} is planned again, though it was valid"
         elif entry.status is Status.RUNNING:
             if attempt in begun or repeat in over or not entry.attempt:
                 yield line, f"attempt {entry.attempt} at {repeat} begins, though it or its repeat was over"
@@ -139,22 +160,29 @@ def _impossible(entries: list[JournalEntry], plan: Plan) -> Iterator[tuple[int, 
             yield line, f"attempt {entry.attempt} at {repeat} is {entry.status}, though it does not run"
         elif entry.status in ENDED:
             ended_before.add(attempt)
-            over |= {repeat} if entry.status is not Status.VOID else set()
+            over |= {repeat: entry.status} if entry.status is not Status.VOID else {}
 
 
 def ended(entries: list[JournalEntry]) -> list[Attempt]:
-    """Return the attempts that ended, in the order in which they ended."""
+    """Return the attempts that ended, in the order in which they ended; of a reopened repeat none is failed."""
     started = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING}
-    return [
-        Attempt(
+    planned_at = {entry.repeat: line for line, entry in enumerate(entries) if entry.status is Status.PLANNED}
+
+    def attempt(entry: JournalEntry, *, earlier: bool) -> Attempt:
+        reopened = earlier and entry.status is Status.FAILED
+        return Attempt(
             repeat=entry.repeat,
             number=entry.attempt,
             started_utc_ns=started[entry.repeat, entry.attempt],
-            status=entry.status,
+            status=Status.VOID if reopened else entry.status,
             reason=entry.reason,
-            excused=entry.excused,
+            excused=entry.excused or earlier,
+            reopened=reopened,
         )
-        for entry in entries
+
+    return [
+        attempt(entry, earlier=line < planned_at.get(entry.repeat, -1))
+        for line, entry in enumerate(entries)
         if entry.status not in _OPEN
     ]
 

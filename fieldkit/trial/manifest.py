@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core import files
+from fieldkit.core import files, laptop_files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.text import harmless
 from fieldkit.measure.positions import accounts
@@ -60,6 +60,14 @@ class Manifest:
     def add(self, attempt: Path) -> None:
         """Take in the evidence of an attempt that was kept; nothing writes it twice, so it is summed once."""
         self._lines[attempt.name] = _lines(_sums(self._folder, attempt))
+
+    def rename(self, attempt: str, name: str) -> None:
+        """Keep the sums of an attempt whose folder has another name now, which are not made again."""
+        if attempt in self._lines:
+            before, after = (f"{store.REPEATS}/{one}/" for one in (attempt, name))
+            lines = self._lines.pop(attempt).splitlines(keepends=True)
+            self._lines[name] = b"".join(line.replace(before.encode(), after.encode(), 1) for line in lines)
+            self._save()
 
     def write(self) -> None:
         """Write the manifest: the evidence taken in, and the trial's own files as they stand now.
@@ -154,11 +162,10 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[
 
 
 def _own_differences(folder: Path, sums: Sums) -> dict[str, str]:
-    """Return how plan and journal differ; the journal may have grown since it was summed."""
-    changed = {
-        PLAN_FILE: PLAN_FILE in sums and _sha256(folder / PLAN_FILE) != sums[PLAN_FILE],
-        JOURNAL_FILE: JOURNAL_FILE in sums and _whole_lines(folder / JOURNAL_FILE, sums[JOURNAL_FILE]) is None,
-    }
+    """Return how the plan and the journals differ; journals may have grown since they were summed."""
+    changed = {PLAN_FILE: PLAN_FILE in sums and _sha256(folder / PLAN_FILE) != sums[PLAN_FILE]}
+    for name in (JOURNAL_FILE, laptop_files.MOTION):
+        changed[name] = name in sums and _whole_lines(folder / name, sums[name]) is None
     for name in filter(is_positions, sums.keys() | {path.name for path in folder.iterdir()}):
         changed[name] = not (folder / name).is_file() or _sha256(folder / name) != sums.get(name)
     return {name: "changed" for name, has in changed.items() if has}

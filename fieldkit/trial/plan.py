@@ -6,19 +6,23 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, Final
 
+from fieldkit.analysis import claims
 from fieldkit.backends.protocols import Robot
+from fieldkit.config import schema
 from fieldkit.config.schema import Field, Int, Number, Strict
+from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
 from fieldkit.measure.transfers.transfer import Transfer
-from fieldkit.steps.base import Nest
-from fieldkit.steps.scene import Pinging, Planned, Refusal, Scene
+from fieldkit.steps.nest import Nest
+from fieldkit.steps.scene import Pinging, Planned, PutProgram, Refusal, Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial.columns import of_steps, trial_columns
 from fieldkit.trial.frozen import Columns
 from fieldkit.trial.procedure import Procedure, Repeats
+from fieldkit.trial.step_packages import StepPackage
 
-PLAN_FILE: Final = "trial.yaml"
+PLAN_FILE: Final = laptop_files.PLAN
 
 
 class Plan(Strict):
@@ -43,6 +47,7 @@ class Plan(Strict):
         cast: Who plays which role.
         procedure: What is done.
         lab_bytes: How many bytes the lab itself adds to an attempt at most.
+        step_packages: The package of each kind of step that does not ship with fieldkit.
         columns: What its steps measure beside the columns of every trial; None where they measure nothing else, or
             an earlier fieldkit planned it.
     """
@@ -65,6 +70,7 @@ class Plan(Strict):
     cast: dict[Role, Robot]
     procedure: Procedure
     lab_bytes: Int = 0
+    step_packages: dict[str, StepPackage] = Field(default_factory=dict, exclude_if=schema.is_empty)
     columns: Columns | None = None
 
     @cached_property
@@ -90,16 +96,22 @@ class Plan(Strict):
 
     def scene(self, repeat: RepeatId, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})) -> Scene:
         """Return what the command lines of one attempt depend on; `variants` as preflight found them."""
-        return replace(self.procedure.scene(repeat.protocol, self.cast, folder, variants), placement=self.placement)
+        scene = self.procedure.scene(repeat.protocol, self.cast, folder, variants)
+        return replace(scene, placement=self.placement, repeat=repeat.number)
 
     def scenes(self, variants: Mapping[Role, Variants] = MappingProxyType({})) -> tuple[Scene, ...]:
         """Return a scene per protocol, for what holds for all of its repeats."""
         return tuple(self.procedure.scene(protocol, self.cast, "check", variants) for protocol in self.protocols)
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         """Yield every job of one attempt in the order in which it starts."""
         for entry in self.procedure.steps:
-            yield from entry.step.commands(scene)
+            yield from entry.step.jobs(scene)
+
+    def puts(self) -> tuple[PutProgram, ...]:
+        """Return the programs of the lab that every attempt copies to robots."""
+        planned = (job for scene in self.scenes() for job in self.jobs(scene))
+        return tuple(dict.fromkeys(job.put for job in planned if job.put is not None))
 
     def refusals(self, variants: Mapping[Role, Variants]) -> tuple[Refusal, ...]:
         """Return what of the procedure cannot work with the tools that the robots have, each once."""
@@ -114,17 +126,21 @@ class Plan(Strict):
                 why = "on_abort is to bring it down, and its profile has no mavlink"
                 yield Refusal(role, why, f"leave {role} out of on_abort, or take a drone")
 
-    def beside(self, scene: Scene) -> tuple[str, ...]:
+    def shortfalls(self) -> Iterator[str]:
+        """Yield what its expectations need and it does not have, in words."""
+        return claims.shortfalls(self.procedure.expectations, self.procedure.figures, self.repeats)
+
+    def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
         """Return what the testbed does beside the commands of one repeat, in words."""
         on_abort = self.procedure.on_abort.items()
         drones = (f"where it is cut short: {self.cast[role].name} is told to {how}" for role, how in on_abort)
-        return (*drones, *(line for entry in self.procedure.steps for line in entry.step.beside(scene)))
+        return (*drones, *(line for entry in self.procedure.steps for line in entry.step.dry_run_notes(scene)))
 
-    def cut_short(self, scene: Scene) -> str:
-        """Return in words what robots do that move where somebody stops a repeat at once; empty where none moves."""
+    def abort_notes(self, scene: Scene) -> tuple[str, ...]:
+        """Return in words what each robot does that moves by itself where a repeat is stopped at once."""
         watched = (role for role in self.procedure.on_abort if role not in self.procedure.moved())
         told = (f"{self.cast[role].name} is told to {self.procedure.on_abort[role]}" for role in watched)
-        return "; ".join((*told, *(one for entry in self.procedure.steps for one in entry.step.cut_short(scene))))
+        return (*told, *(line for entry in self.procedure.steps for line in entry.step.abort_notes(scene)))
 
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
         """Return what tells the packets of each transfer, in the order in which they begin."""
@@ -147,7 +163,3 @@ class Plan(Strict):
         """Return the first file that is recorded on each robot, by its name below an attempt's folder."""
         scene = self.procedure.scene(self.protocols[0], self.cast, "")
         return {role: made[0].name for role, made in scene.recorded.items()}
-
-    def expected_s(self) -> float:
-        """Return about how many seconds the repeats take on a good link."""
-        return self.repeats * sum(self.procedure.expected_s(protocol) for protocol in self.protocols)

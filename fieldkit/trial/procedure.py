@@ -1,11 +1,13 @@
 """Procedures (`procedures/*.yaml`) -> frozen objects: the scripted steps of a trial, spoken of in roles."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Final
+from typing import Annotated
+
+from typing_extensions import override
 
 from fieldkit.analysis import expectations
 from fieldkit.analysis.expectations import Expectation
@@ -13,22 +15,16 @@ from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, loops, schema
 from fieldkit.config.schema import Bool, Field, Int
+from fieldkit.core import laptop_files
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, OnAbort, Post, Protocol, Role, Scenario, Topology, in_order
-from fieldkit.measure.evidence import host, lateness, link_samples, track
-from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.measure.evidence import host, link_samples
+from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.kinds.move import PathLeg
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import columns
-
-AIR_LOG: Final = ("air.pcap", "air.csv")
-"""What a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
-
-_RESERVED: Final = frozenset({lateness.FILE, track.FILE, link_samples.FILE, *AIR_LOG})
-"""Files that may be in every attempt's folder, whatever its steps are, beside those of each robot."""
-
 
 Repeats = Annotated[Int, Field(gt=0, le=MOST_REPEATS)]
 """How often each protocol is measured."""
@@ -38,7 +34,8 @@ class Place(PathLeg):
     """Place of a robot in a role of the procedure's own; its directions are those of a piece of a way.
 
     Attributes:
-        near: The robot under test that it is told from.
+        near: The robot under test that the position is relative to: `sender`, `receiver` or `relay`. At least one of
+            the four directions is required.
     """
 
     near: Role
@@ -51,19 +48,32 @@ class Place(PathLeg):
 
 
 class Procedure(catalog.Named):
-    """A scripted trial: one YAML file in `procedures/`.
+    """The steps of a repeat, by role: one YAML file in `procedures/`.
+
+    Roles are `sender`, `receiver`, `relay`, and others that the procedure places. How to write one: [add a
+    procedure](add-a-procedure.md). Steps of a kind are distinguished by their `name`: without one, a procedure has at
+    most one `transfer` and one `ping`, one `record`, one `capture` and one `move` per robot, and one `fault` of a
+    kind. Files must have different names; simultaneous steps need different ports or different listening robots;
+    steps in one capture must differ in port, sender or receiver. A procedure that cannot be measured is refused when
+    it is loaded, with its line.
+
+    In `master` the distance is between each station and the relay, with the stations on opposite sides; in
+    `masterless` it is between sender and receiver. Protocols alternate from repeat to repeat, so that slow changes of
+    the channel affect both equally.
 
     Attributes:
-        scenario: Whether an obstacle stands between the robots.
-        topology: Used when the command line names none.
-        protocols: Used when the command line names none.
-        repeats: Per protocol, used when the command line names none.
-        attempts: How often a repeat is tried while its evidence is not whole.
-        needs_ros_master: Whether it is about one ROS master that robots share, which the site file must give them.
-        places: Where robots in roles of its own stand, beside those under test.
-        on_abort: What becomes of drones where a repeat is cut short: `land` where they are, or `return`.
-        expect: What is demanded of its figures: `udp ip_loss < 2 %`.
-        steps: What is done in each repeat.
+        scenario: `los`, or `nlos`: the sender is behind a wall.
+        topology: `master` or `masterless`; the command line may override it.
+        protocols: List of `tcp`, `udp`; the command line may override it.
+        repeats: Repeats per protocol; the command line may override it.
+        attempts: Maximum number of attempts at a repeat whose evidence is not whole.
+        needs_ros_master: Whether it needs one ROS master for all robots; a site file without `ros_master` is then
+            refused.
+        places: Positions of robots in additional roles, by role.
+        on_abort: What a drone does when a repeat is aborted, by role: `land` where it is, or `return`; see
+            [MAVLink](mavlink.md#where-a-trial-is-cut-short).
+        expect: List of [expectations](values.md#expectations).
+        steps: The steps of a repeat, in order; each entry has one key, the kind of step.
     """
 
     scenario: Scenario
@@ -78,8 +88,9 @@ class Procedure(catalog.Named):
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @classmethod
+    @override
     def written_out(cls, document: schema.Document) -> schema.Document:
-        """See `Strict.written_out`: every `for:`."""
+        """Every `for:`."""
         return loops.written_out(document, "steps")
 
     @schema.model_validator(mode="after")
@@ -104,21 +115,20 @@ class Procedure(catalog.Named):
     def _can_be_measured(self) -> "Procedure":
         """Refuse what would be measured wrongly, or not at all."""
         of_robots = (name(role) for role in self.roles() for name in (host.before, host.after, link_samples.file))
-        claimed, files, earlier = set[tuple[str, str]](), {*_RESERVED, *of_robots}, list[PlacedStep]()
+        claimed, files, earlier = set[tuple[str, str]](), set(of_robots), list[PlacedStep]()
         filled = set[str]()
         for placed in self.walk():
             step = placed.step
             before = [one.step for one in earlier if not placed.is_beside(one)]
-            if why := step.misplaced(before, placed.within):
+            if why := step.placement_error(before, placed.within):
                 raise schema.complaint(why, *placed.at)
-            for claim in step.claims():
+            for claim in step.exclusive_resources():
                 if (step.prefix, claim) in claimed:
                     raise schema.complaint(_twice(step, claim), *placed.at)
                 claimed.add((step.prefix, claim))
             for name in step.files():
-                if name in files:
-                    what = f"a file {name} is there already; give it, or its step, another name"
-                    raise schema.complaint(what, *placed.at)
+                if why := _taken(step, name, files):
+                    raise schema.complaint(why, *placed.at)
                 files.add(name)
             if why := next(filter(None, map(placed.taken_for, earlier)), None):
                 raise schema.complaint(why, *placed.at, "port")
@@ -195,14 +205,14 @@ class Procedure(catalog.Named):
         steps = tuple(StepEntry(entry.kind, entry.step.with_record(duration_s)) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
-    def fitted(self, cast: Cast) -> "Procedure":
+    def resolved(self, cast: Cast) -> "Procedure":
         """Return this procedure with what its steps leave to their robots filled in."""
-        steps = tuple(StepEntry(entry.kind, entry.step.fitted(cast)) for entry in self.steps)
+        steps = tuple(StepEntry(entry.kind, entry.step.resolved(cast)) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
-    def shortened(self, cast: Cast) -> Iterator[str]:
+    def adjustments(self, cast: Cast) -> Iterator[str]:
         """Yield in words of what `fitted` makes less than the steps say."""
-        return (line for entry in self.steps for line in entry.step.shortened(cast))
+        return (line for entry in self.steps for line in entry.step.adjustments(cast))
 
 
 @dataclass(frozen=True)
@@ -252,6 +262,13 @@ class PlacedStep:
         ways = zip((*self.within, self.step), (*other.within, other.step), strict=False)
         parts = next((index for index, (mine, theirs) in enumerate(ways) if mine is not theirs), 0)
         return parts > 0 and self.within[parts - 1].parallel
+
+
+def _taken(step: Step, name: str, files: Set[str]) -> str | None:
+    """Return why a step cannot have a file of this name, None if it can."""
+    if laptop_files.reserved(name) and name not in step.laptop_files():
+        return f"only the laptop writes a file {name}; give it another name"
+    return f"a file {name} is there already; give it, or its step, another name" if name in files else None
 
 
 def _twice(step: Step, claim: str) -> str:

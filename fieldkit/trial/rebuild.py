@@ -20,11 +20,13 @@ class Rebuilt:
     Attributes:
         cells: The summary.
         changed: Files whose bytes differ from what stood there before; files that were missing count.
+        expected: Names of the quantities with an expectation.
         is_summed: Whether there is a manifest, which says that the evidence is as it was.
     """
 
     cells: tuple[Cell, ...]
     changed: tuple[str, ...]
+    expected: frozenset[str]
     is_summed: bool
 
 
@@ -48,12 +50,14 @@ def rebuild(folder: Path) -> Rebuilt:
     entries = journal.history(folder, plan)
     with journal.claimed(folder):  # a trial that runs would lose the rows that it has written meanwhile
         table = rows.to_csv(_measured(folder, plan, entries), plan.table)
+        rows.summary(folder, plan, table)  # nothing is written if it cannot be made
         rows.write_table(folder, table)
         cells = rows.write_summary(folder, plan, table)
         if is_summed := (folder / store.MANIFEST_FILE).exists():
             manifest.Manifest(folder).renew(names)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
-    return Rebuilt(cells=cells, changed=changed, is_summed=is_summed)
+    expected = frozenset(expectation.quantity for expectation in plan.procedure.expectations)
+    return Rebuilt(cells=cells, changed=changed, expected=expected, is_summed=is_summed)
 
 
 def measured(folder: Path, plan: Plan) -> list[Row]:

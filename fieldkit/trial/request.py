@@ -1,6 +1,7 @@
 """The operator's request for a trial, and the plan that it is frozen into."""
 
 import platform
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from fieldkit import __version__
@@ -8,8 +9,8 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.core import plugins
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import FIXED_ROLES, Distance, Protocol, Role, Topology
+from fieldkit.trial import step_packages
 from fieldkit.trial.columns import OTHERS, of_steps
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.hashes import code_hash, data_hash
@@ -75,7 +76,7 @@ def make_plan(
     _demand_ros_master(procedure, topology, cast)
     if request.record_s is not None:
         procedure = procedure.with_record(request.record_s)
-    procedure = procedure.fitted(cast)
+    procedure = procedure.resolved(cast)
     stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     trial = f"{stamp}_{procedure.name}_{request.distance.label}_{topology}"
     others = (OTHERS,) if procedure.places else ()
@@ -107,6 +108,7 @@ def make_plan(
         cast={role: robot for role, robot in cast.items() if role in FIXED_ROLES or role in procedure.roles()},
         procedure=procedure,
         lab_bytes=lab_bytes,
+        step_packages=step_packages.of_kinds(placed.kind for placed in procedure.walk()),
         columns=freeze((*others, *of_steps(placed.step for placed in procedure.walk()))) or None,
     )
 

@@ -1,20 +1,38 @@
 """Rows of trial.csv and summary.csv, the same whether a repeat has just ended or is read from disk years later."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import filterfalse
 from pathlib import Path
+from typing import Final
 
 from fieldkit.analysis import repeats, tables
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.core import columns, files
 from fieldkit.core.columns import Column, Measured, Value, prefixed
+from fieldkit.core.events import NOTHING_ARRIVED
 from fieldkit.core.model import FIXED_ROLES, Role, in_order
 from fieldkit.core.text import encodable
-from fieldkit.steps.base import Nest, Step
+from fieldkit.steps.base import Step
+from fieldkit.steps.nest import Nest
 from fieldkit.trial import store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
+
+LOSSES: Final = frozenset(
+    (
+        "file_loss",
+        "ip_loss",
+        "datagram_loss",
+        "tcp_byte_loss",
+        "rtt_loss",
+        "topic_loss",
+        "iperf3_loss",
+        "mavlink_loss",
+    )
+)
+"""Columns that are 1 where nothing arrived; of a transfer without any packet some are missing."""
 
 
 def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
@@ -48,26 +66,41 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
 
 
 def in_words(plan: Plan, row: Row) -> str:
-    """Return the most important numbers of a row for people: `IP loss 3.2 %, RTT 12.1 ms`.
+    """Return the most important numbers of a row for people, losses first: `IP loss 3.2 %, RTT 12.1 ms`.
 
-    For how long a fault took a robot away comes behind what it did to others: where a line is too short for all, no
-    other gap than that of a ping is left of it.
+    How long a fault took a robot away comes after what it did to others.
     """
     steps = sorted(
         (placed.step for placed in plan.procedure.walk()), key=lambda step: isinstance(step, Nest) and step.disturbs
     )
-    return ", ".join(part for step in steps for part in _of_step(step, row))
+    said = [(step.prefix, list(_of_step(step, row))) for step in steps]
+    losses = [text for name, parts in said for text in _named(name, filter(_is_loss, parts))]
+    others = [text for name, parts in said for text in _named(name, filterfalse(_is_loss, parts))]
+    return ", ".join([*([NOTHING_ARRIVED] if _lost_all(row) else []), *losses, *others])
 
 
 def _of_step(step: Step, row: Row) -> Iterator[str]:
-    """Yield the most important numbers of a step, with its name before the first, if it has one."""
-    if not (name := step.prefix):
-        yield from step.in_words(row)
-        return
-    begin = prefixed(name, "")
-    own = {column.removeprefix(begin): value for column, value in row.items() if column.startswith(begin)}
-    for index, part in enumerate(step.in_words(own)):
-        yield part if index else f"{name}: {part}"
+    """Return the most important numbers of a step, whose columns have its name before theirs, if it has one."""
+    begin = prefixed(step.prefix, "")
+    return iter(
+        step.summary({column.removeprefix(begin): value for column, value in row.items() if column.startswith(begin)})
+    )
+
+
+def _named(name: str, parts: Iterable[str]) -> Iterator[str]:
+    """Yield parts with the name of their step before the first."""
+    for index, part in enumerate(parts):
+        yield f"{name}: {part}" if name and not index else part
+
+
+def _is_loss(part: str) -> bool:
+    return "loss" in part.split()
+
+
+def _lost_all(row: Row) -> bool:
+    """Return whether everything that a repeat sent was lost, as far as its steps count losses."""
+    losses = [value for name, value in row.items() if columns.plain_name(name) in LOSSES]
+    return bool(losses) and all(isinstance(loss, float | int) and loss >= 1 for loss in losses)
 
 
 def to_csv(rows: Iterable[Row], table: Sequence[Column]) -> str:
@@ -90,8 +123,17 @@ def write_table(folder: Path, table: str) -> None:
     files.write(folder / store.TRIAL_CSV, table.encode())
 
 
+def summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
+    """Return the summary of a trial with this table.
+
+    Raises:
+        EvidenceError: A value is not what its column is declared to hold.
+    """
+    return aggregate(repeats.parse(table.encode(), plan.table, str(folder / store.TRIAL_CSV)))
+
+
 def write_summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
-    """Write summary.csv of a trial with this table and return what stands in it."""
-    cells = aggregate(repeats.parse(table.encode(), plan.table))
+    """Write summary.csv of a trial with this table and return what it holds; errors as `summary`."""
+    cells = summary(folder, plan, table)
     files.write(folder / store.SUMMARY_CSV, tables.to_csv(DEFAULT_BY, cells).encode())
     return cells

@@ -2,10 +2,12 @@
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
 from fieldkit.analysis import expectations, repeats
+from fieldkit.analysis.duplicates import deduplicated
 from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import SOURCE, Repeats
@@ -13,7 +15,6 @@ from fieldkit.analysis.words import worded
 from fieldkit.core import files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
-from fieldkit.core.lazy import dataclass
 from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
 
@@ -134,7 +135,7 @@ class Sources:
         if columns is None:
             columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
         content = partial(_measured, note=self.note) if self.rebuild else Path.read_bytes
-        found, notes = repeats.deduplicated(repeats.read(self.tables, self.columns, columns, content))
+        found, notes = deduplicated(repeats.read(self.tables, self.columns, columns, content))
         for note in notes:
             self.note(note)
         if not len(found):

@@ -8,17 +8,18 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.config import schema
-from fieldkit.core import files
+from fieldkit.core import files, laptop_files
 from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
 from fieldkit.core.model import RepeatId
 from fieldkit.measure.positions import accounts
+from fieldkit.trial import step_packages
 from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
-MANIFEST_FILE: Final = "MANIFEST.sha256"
-TRIAL_CSV: Final = "trial.csv"
-SUMMARY_CSV: Final = "summary.csv"
-PREFLIGHT_FILE: Final = "preflight.txt"
+MANIFEST_FILE: Final = laptop_files.MANIFEST
+TRIAL_CSV: Final = laptop_files.TRIAL_CSV
+SUMMARY_CSV: Final = laptop_files.SUMMARY_CSV
+PREFLIGHT_FILE: Final = laptop_files.PREFLIGHT
 REPEATS: Final = "repeats"
 POSITIONS: Final = "positions-"
 """What the names of files begin with that tell where robots were, given after the trial."""
@@ -27,7 +28,17 @@ DEPTH: Final = 3
 """How deep evidence lies below `repeats/` at most: in a folder of an attempt's folder."""
 
 _OWN: Final = frozenset(
-    {PLAN_FILE, JOURNAL_FILE, PREFLIGHT_FILE, TRIAL_CSV, SUMMARY_CSV, MANIFEST_FILE, REPEATS, accounts.FILE}
+    {
+        PLAN_FILE,
+        JOURNAL_FILE,
+        laptop_files.MOTION,
+        PREFLIGHT_FILE,
+        TRIAL_CSV,
+        SUMMARY_CSV,
+        MANIFEST_FILE,
+        REPEATS,
+        accounts.FILE,
+    }
 )
 """What fieldkit reads and writes in a trial's folder; what else lies there is its owner's business."""
 
@@ -77,7 +88,14 @@ def read_plan(folder: Path) -> Plan:
         raise ConfigurationError(
             f"there is no {PLAN_FILE}", where=str(folder), remedy="name the folder of a trial, trials/<stamp>_..."
         )
-    return schema.load(folder / PLAN_FILE, Plan)
+    document = schema.read(folder / PLAN_FILE)
+    if absent := step_packages.missing(document.data):
+        raise ConfigurationError(
+            absent,
+            where=str(folder / PLAN_FILE),
+            remedy="install that package with pip: rebuild needs any version of it, resume the same one",
+        )
+    return schema.validate(document, Plan)
 
 
 def demand_plain(folder: Path) -> None:

@@ -1,12 +1,11 @@
 """The agents of a co-simulation: bodies that the physics moves, and programs on them."""
 
 import heapq
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+from sim_backends.cosim.federate_errors import FederateError, failed, seconds
 from sim_backends.cosim.federates import PhysicsFederate, Program, next_send_ns
-from sim_backends.cosim.watchdog import DeadlinePassed, FederateError, failed, seconds
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 
@@ -43,13 +42,13 @@ class Agents:
     Attributes:
         physics: As given.
         programs: As given, by name.
-        asked_s: When physics or programs were asked last, by `time.perf_counter`.
+        new: Agents that the physics moves since `with_new` was called last, and did not before.
     """
 
     def __init__(self, physics: PhysicsFederate, programs: Mapping[str, Program]) -> None:
         self.physics = physics
         self.programs = dict(sorted(programs.items()))
-        self.asked_s = time.perf_counter()
+        self.new: frozenset[str] = frozenset()
         self._names = frozenset(programs)
         self._at_ns = 0
         self._mail: dict[str, list[Received]] = {}
@@ -70,11 +69,16 @@ class Agents:
             self._commands = {}
         try:
             states = self.physics.advance(now_ns, commands)
-        except (Exception, DeadlinePassed) as error:
+        except Exception as error:
             asked = f"advance from {seconds(self._at_ns)} to {seconds(now_ns)}"
             raise failed(error, "physics", asked) from error
-        if states.keys() != self._names:
-            self._meet(states, now_ns)
+        try:
+            if states.keys() != self._names:
+                self._meet(states, now_ns)
+        except AttributeError:
+            raise FederateError(
+                f"physics, asked to advance to {seconds(now_ns)}, returned {states!r}, which is no mapping of states"
+            ) from None
         self._at_ns = now_ns
         return states
 
@@ -83,7 +87,15 @@ class Agents:
         if lost := self._names - states.keys():
             names = ", ".join(sorted(lost))
             raise FederateError(f"physics, asked to advance to {seconds(now_ns)}, has no state of {names}")
+        self.new |= states.keys() - self._names
         self._names = frozenset(states)
+
+    def with_new(self, begin: Mapping[str, State], states: Mapping[str, State]) -> Mapping[str, State]:
+        """Return the states at a window's begin; with those at its end of agents that appeared in it, if any did."""
+        if not self.new:
+            return begin
+        new, self.new = self.new, frozenset()
+        return {**{name: states[name] for name in new}, **begin}
 
     def next_wake_ns(self) -> int | None:
         """Return when a program wakes next by itself, None for never."""
@@ -99,7 +111,7 @@ class Agents:
         for name, program in self.programs.items():
             try:
                 at_ns = next_send_ns(program)
-            except (Exception, DeadlinePassed) as error:
+            except Exception as error:
                 asked = f"say when it sends next after {seconds(self._at_ns)}"
                 raise failed(error, f"the program of {name}", asked) from error
             if at_ns is not None and (found is None or at_ns < found):
@@ -111,7 +123,7 @@ class Agents:
         for name in names:
             try:
                 wake_ns = self.programs[name].next_wake_ns()
-            except (Exception, DeadlinePassed) as error:
+            except Exception as error:
                 asked = f"say when it wakes next after {seconds(self._at_ns)}"
                 raise failed(error, f"the program of {name}", asked) from error
             if wake_ns is None:
@@ -174,14 +186,12 @@ class Agents:
         states = self.states(now_ns)
         sent: list[Sent] = []
         for name in sorted(mail):
-            self.asked_s = time.perf_counter()
             try:
                 action = self.programs[name].wake(now_ns, states[name], mail[name])
-            except (Exception, DeadlinePassed) as error:
+            except Exception as error:
                 raise failed(error, f"the program of {name}", f"act at {seconds(now_ns)}") from error
             sent += [Sent(now_ns, name, datagram, states) for datagram in action.datagrams]
             if action.command is not None:
                 self._commands[name] = action.command
         self._plan(mail)
-        self.asked_s = time.perf_counter()
         return sent

@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.cosim.run import Fate, Run
+from sim_backends.cosim.geometry import displaced_m
+from sim_backends.cosim.run import Run
 from sim_backends.radio.random_streams import PacketIdentity
 
 Floats = NDArray[np.float64]
@@ -35,8 +36,9 @@ class Errors:
     Attributes:
         packets: Packets whose fate is known in both runs.
         delivery_error_s: Magnitude of the difference of delivery times, over packets that arrived in both.
-        position_error_m: How far off the network took the sender to be from the receiver, beside where it was in the
-            same run when it sent; the distance between the two is off by no more.
+        position_error_m: By how much the network was wrong, when a packet was sent, about where two of the agents
+            that transmit, forward or interfere were to each other in the same run, the largest; of the continuous
+            trajectories, so that states which are held for a step h count with v h / 2.
         path_error_m: How far off agents are, over time; above 0 only where their programs steer by what they receive.
         fate_disagreement: Share of packets that arrived in one run and not in the other.
         first_disagreement: The packet that was sent first of these; None for none.
@@ -82,11 +84,6 @@ def errors(reference: Run, run: Run, apart_m: Floats | None = None) -> Errors:
         if one.counted_ns is not None and other.counted_ns is not None
     ]
     late_ns = [fate.late_ns for fate in run.fates.values() if fate.arrived_ns is not None]
-    added_ns = [
-        fate.packet.enters_ns - fate.packet.sent_ns + fate.counted_ns - fate.arrived_ns
-        for fate in run.fates.values()
-        if fate.arrived_ns is not None and fate.counted_ns is not None
-    ]
     simulated_s = run.windows_ns[-1] / 1e9 if run.windows_ns else math.nan
     first = min(differing, key=lambda packet: packet.sent_ns, default=None)
     return Errors(
@@ -99,7 +96,7 @@ def errors(reference: Run, run: Run, apart_m: Floats | None = None) -> Errors:
         first_disagreement_s=math.nan if first is None else first.sent_ns / 1e9,
         causality_violations=sum(one > 0 for one in late_ns),
         late_s=_spread([one / 1e9 for one in late_ns]),
-        delay_added_s=float(np.mean(added_ns)) / 1e9 if added_ns else math.nan,
+        delay_added_s=delay_added_s(run),
         exchanges_per_s=len(run.windows_ns) / simulated_s,
         wall_s=dict(run.wall_s),
         real_time_factor=simulated_s / (sum(run.wall_s.values()) or math.nan),
@@ -144,13 +141,14 @@ def mean_errors(several: Sequence[Errors]) -> Errors:
     )
 
 
-def displaced_m(fate: Fate) -> float:
-    """Return how far off the network took the sender to be from the receiver, beside where it was when it sent."""
-    known, true = (
-        tuple(one - other for one, other in zip(ends[0].position_m, ends[1].position_m, strict=True))
-        for ends in (fate.known, fate.true)
-    )
-    return math.dist(known, true)
+def delay_added_s(run: Run) -> float:
+    """Return what the policy added to a delay, before the network got a packet and behind it, mean; nan for none."""
+    added_ns = [
+        fate.packet.enters_ns - fate.packet.sent_ns + fate.counted_ns - fate.arrived_ns
+        for fate in run.fates.values()
+        if fate.arrived_ns is not None and fate.counted_ns is not None
+    ]
+    return float(np.mean(added_ns)) / 1e9 if added_ns else math.nan
 
 
 def lost_share(run: Run) -> float:

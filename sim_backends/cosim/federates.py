@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
 from sim_backends.world.motion import State
 
@@ -34,8 +35,47 @@ class PhysicsFederate(Protocol):
         ...
 
 
+def check_physics(physics: object) -> None:
+    """Refuse what is no physics federate, before anything is asked of it.
+
+    Raises:
+        ConfigurationError: It lacks something; says what.
+    """
+    step_ns = getattr(physics, "step_ns", None)
+    lacks = ""
+    if not isinstance(step_ns, int) or isinstance(step_ns, bool) or step_ns <= 0:
+        lacks = f"no step_ns, an integer above 0 (it is {step_ns!r})"
+    elif not isinstance(getattr(physics, "limits_m_s2", None), Mapping):
+        lacks = "no limits_m_s2, a mapping from each agent to a number"
+    elif not callable(getattr(physics, "advance", None)):
+        lacks = "no method advance(to_ns, commands)"
+    if lacks:
+        raise ConfigurationError(
+            f"the physics {type(physics).__name__} has {lacks}",
+            remedy="see what a physics class needs: fieldkit docs cosim-api",
+        )
+
+
+def check_states(states: Mapping[str, object]) -> None:
+    """Refuse what a physics gives at time 0 if it is no mapping of states.
+
+    Raises:
+        ConfigurationError: There is something else in it; says what.
+    """
+    for name, state in states.items():
+        if not isinstance(state, State):
+            raise ConfigurationError(
+                f"the physics gave {state!r} for {name}, which is no State",
+                remedy="see what a physics class needs: fieldkit docs cosim-api",
+            )
+
+
 class NetworkFederate(Protocol):
-    """Carries packets."""
+    """Carries packets.
+
+    One in which agents forward or interfere names them by an attribute `transmitters`, and the places of what
+    interferes without being an agent by `fixed_emitters_m`: `error_bounded` and the errors of places include them.
+    """
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 Point = tuple[float, float]
 """In points of the figure, from its lower left corner."""
@@ -115,3 +116,20 @@ def _cost(box: LabelBox, point: Point, room: LabelBox, taken: Sequence[LabelBox]
     outside = 1 - box.overlap(room) / box.area
     touched = (covered > 0) + (outside > _ROUNDING)
     return _TOUCHED * touched + 30 * (covered + 3 * outside) + box.gap(point) / box.height
+
+
+def along_all(curves: Sequence[Sequence[Point]], half: float) -> Iterator[LabelBox]:
+    """Yield what labels must not cover: markers that are `half` as wide from their middle, and lines between them."""
+    for points in curves:
+        for x, y in _along(points, half):
+            yield LabelBox(x - half, y - half, 2 * half, 2 * half)
+
+
+def _along(points: Sequence[Point], step: float) -> Iterator[Point]:
+    """Yield the points of a line, and others between them, a step apart."""
+    yield points[0]
+    for one, other in pairwise(points):
+        pieces = max(math.ceil(math.dist(one, other) / step), 1)
+        for piece in range(1, pieces + 1):
+            share = piece / pieces
+            yield one[0] + (other[0] - one[0]) * share, one[1] + (other[1] - one[1]) * share

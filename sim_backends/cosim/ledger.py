@@ -1,14 +1,15 @@
 """The ledger of a run: which packets there are, what each carries, and what became of it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sim_backends.cosim.agents import Sent
+from sim_backends.cosim.federate_errors import FederateError, seconds
+from sim_backends.cosim.geometry import largest_m
 from sim_backends.cosim.run import Fate
-from sim_backends.cosim.watchdog import FederateError, seconds
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.radio.random_streams import PacketIdentity
-from sim_backends.world.dead_reckoning import DeadReckoned
+from sim_backends.world.dead_reckoning import DeadReckoned, moved_on
 from sim_backends.world.motion import State
 
 
@@ -17,10 +18,23 @@ class PacketLedger:
 
     Args:
         fates: Takes the fate of every packet that entered the network, by flow and number.
+        step_ns: Own step of the physics.
+        measured: Agents whose places count for every packet, beside those of its sender and its receiver.
+        anchored: Whether the place of something that never moves counts, too.
     """
 
-    def __init__(self, fates: dict[PacketIdentity, Fate]) -> None:
+    def __init__(
+        self,
+        fates: dict[PacketIdentity, Fate],
+        step_ns: int,
+        measured: Iterable[str] = (),
+        *,
+        anchored: bool = False,
+    ) -> None:
         self._fates = fates
+        self._step_ns = step_ns
+        self._measured = frozenset(measured)
+        self._anchored = anchored
         self._under_way: dict[int, tuple[Fate, Any]] = {}
         self._packets = 0
 
@@ -50,7 +64,15 @@ class PacketLedger:
         packet = Packet(
             self._packets, source, destination, datagram.size_bytes, identity, at_ns, enters_ns, datagram.protocol
         )
-        fate = Fate(packet, (known[source], known[destination]), (true[source], true[destination]))
+        held_s = at_ns % self._step_ns / 1e9
+        ends = true[source], true[destination]
+        if held_s:
+            ends = moved_on(ends[0], held_s), moved_on(ends[1], held_s)
+        fate = Fate(packet, (known[source], known[destination]), ends)
+        if self._measured or self._anchored:
+            names = self._measured | {source, destination}
+            states = [moved_on(true[name], held_s) for name in names]
+            fate.displaced_m = largest_m(known, states, names, anchored=self._anchored)
         self._fates[identity] = fate
         self._under_way[self._packets] = fate, datagram.payload
         return fate

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import groupby
 from typing import Any, Final
 
 import matplotlib as mpl
@@ -16,11 +16,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from fieldkit.core.text import harmless
 from fieldkit.report.theme import CYCLE, LIGHT, METADATA, SETTINGS, Colour, Format, Marker
-from sim_backends.cosim.label_placement import LabelBox, Point, placed, stacked
+from sim_backends.cosim.from_above import ObstacleOutline, last_heading
+from sim_backends.cosim.label_placement import LabelBox, Point, along_all, placed, stacked
 
 _POINTS: Final = 8.0
 """Size of letters, as IEEE asks for."""
@@ -138,7 +140,11 @@ class FlowTrace:
 
 
 def run_figure(
-    title: str, ways_m: Mapping[str, Sequence[tuple[float, float]]], flows: Sequence[FlowTrace], form: Format
+    title: str,
+    ways_m: Mapping[str, Sequence[tuple[float, float]]],
+    flows: Sequence[FlowTrace],
+    form: Format,
+    outlines: Sequence[ObstacleOutline] = (),
 ) -> bytes:
     """Return a run in the width of both columns of a paper: the ways from above, and delay and distance over time.
 
@@ -147,6 +153,7 @@ def run_figure(
         ways_m: Metres east and north of each agent over time, at least one each.
         flows: Its flows.
         form: Of the file.
+        outlines: What stands around them.
     """
     with _drawing():
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _RUN_INCHES), layout="constrained")
@@ -154,6 +161,10 @@ def run_figure(
         above = figure.add_subplot(grid[:, 0])
         above.set_title(harmless(title))
         _draw_ways(above, ways_m)
+        for outline in outlines:
+            # An artist of no data, so that what is far away does not change what is shown.
+            shade, alpha = LIGHT["muted"], 0.2 if outline.is_light else 0.6
+            above.add_artist(Polygon(outline.corners_m, facecolor=shade, alpha=alpha, linewidth=0, zorder=1))
         delay, distance = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
         _draw_delays(delay, flows)
         distance.set(xlabel="sent at (s)", ylabel="distance (m)")
@@ -232,6 +243,9 @@ def _draw_ways(axes: Axes, ways_m: Mapping[str, Sequence[tuple[float, float]]]) 
     for number, way_m in enumerate(ways_m.values()):
         marker = CYCLE[number % len(CYCLE)][1]
         axes.plot(*way_m[0], marker=marker, color=LIGHT["ink"], markersize=_MARKER, zorder=3)
+        if (heading := last_heading(way_m)) is not None:
+            arrow = {"arrowstyle": "-|>", "color": LIGHT["ink"], "linewidth": 0.6, "shrinkA": 0, "shrinkB": 0}
+            axes.annotate("", heading[1], heading[0], arrowprops=arrow, zorder=3)
     axes.margins(0.15)
     axes.set_adjustable("datalim")
 
@@ -303,7 +317,7 @@ def _label(
         places = list(zip(last, stacked(last, sizes, left, room), strict=True))
     else:
         covered = [*groups, *(_points(axes, line) for line in around)]
-        places = placed(list(groups), sizes, room, list(_covered(covered)))
+        places = placed(list(groups), sizes, room, list(along_all(covered, _MARKER / 2 + 1)))
     for (point, box), text, group in zip(places, texts, groups.values(), strict=True):
         _annotate(axes, text, point, box, str(drawn[group[0]].get_color()), at_left=aside)
 
@@ -339,24 +353,6 @@ def _annotate(axes: Axes, text: str, point: Point, box: LabelBox, colour: str, *
         bbox=_BACKED,
         arrowprops={**line, **end} if box.gap(point) > _FAR else None,
     )
-
-
-def _covered(curves: Sequence[Sequence[Point]]) -> Iterator[LabelBox]:
-    """Yield what labels must not cover: markers, and the lines between them."""
-    half = _MARKER / 2 + 1
-    for points in curves:
-        for x, y in _along(points, half):
-            yield LabelBox(x - half, y - half, 2 * half, 2 * half)
-
-
-def _along(points: Sequence[Point], step: float) -> Iterator[Point]:
-    """Yield the points of a line, and others between them, a step apart."""
-    yield points[0]
-    for one, other in pairwise(points):
-        pieces = max(math.ceil(math.dist(one, other) / step), 1)
-        for piece in range(1, pieces + 1):
-            share = piece / pieces
-            yield one[0] + (other[0] - one[0]) * share, one[1] + (other[1] - one[1]) * share
 
 
 def _colour(number: int) -> str:

@@ -14,11 +14,14 @@ class Fate:
     Attributes:
         packet: The packet, with when it was sent and when the network got it.
         known: Where the network took source and destination to be when it got the packet.
-        true: Where they were when it was sent.
+        true: Where they were when it was sent: at the physics' last own step, moved on at their velocity of then, so
+            that it is right to a h^2 / 2 at an acceleration a and a step h.
         arrived_ns: When it arrived by the network's clock; None if it did not.
         counted_ns: When it arrived by the policy: its window's end, or `arrived_ns`.
         late_ns: By how much its receiver had passed that time already.
         reason: Why it never arrived; empty if it did, or is under way.
+        displaced_m: By how much the network was wrong about the distance vector of two of the agents whose places
+            count for it, the largest; None if these are source and destination alone (`geometry.displaced_m`).
     """
 
     packet: Packet
@@ -28,6 +31,7 @@ class Fate:
     counted_ns: int | None = None
     late_ns: int = 0
     reason: str = ""
+    displaced_m: float | None = field(default=None, compare=False)
 
     @property
     def is_known(self) -> bool:

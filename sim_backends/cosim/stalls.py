@@ -1,40 +1,56 @@
-"""`stalled_federate` as a fault: a party that answers late, in wall time, once, at a simulated time."""
+"""Fault `stalled-federate`: a party that answers late, in wall time, once, at a simulated time."""
 
 import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final, TypeVar, cast
 
+from sim_backends.cosim.federate_errors import AnswerTimeoutError
 from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate, Program
 from sim_backends.cosim.wall_time import Waits
+
+DEADLINE_S: Final = 30.0
+"""Default deadline of an answer, in seconds of wall time."""
 
 Party = TypeVar("Party", bound=PhysicsFederate | NetworkFederate | Program)
 
 
 class Stall:
-    """Keeps whoever asks waiting, once.
+    """Delays one answer.
 
     Args:
-        at_ns: From which simulated time on: the first question about it, or about later, waits.
-        wall_s: For how long, in seconds of wall time.
+        at_ns: Simulated time from which on it waits: the first question about this time or a later one waits.
+        wall_s: Duration, in seconds of wall time.
+        limit_s: Deadline of an answer, in seconds of wall time; None for no deadline.
 
     Attributes:
-        waited_s: For how long somebody has waited.
+        waited_s: Total time that it has waited, in seconds of wall time.
     """
 
-    def __init__(self, at_ns: int, wall_s: float) -> None:
+    def __init__(self, at_ns: int, wall_s: float, limit_s: float | None = None) -> None:
         self._at_ns = at_ns
         self._wall_s = wall_s
+        self._limit_s = limit_s
         self._over = False
         self.waited_s = 0.0
 
     def wait(self, now_ns: int) -> None:
-        """Wait, if it is time for it."""
+        """Wait if this is the first question about `at_ns` or later.
+
+        Raises:
+            AnswerTimeoutError: The wait is longer than the deadline, and the deadline has passed.
+        """
         if self._over or now_ns < self._at_ns:
             return
         self._over = True
+        if self._limit_s is not None and self._wall_s > self._limit_s:
+            self._sleep(self._limit_s)
+            raise AnswerTimeoutError(self._limit_s)
+        self._sleep(self._wall_s)
+
+    def _sleep(self, wall_s: float) -> None:
         begun_s = time.perf_counter()
-        time.sleep(self._wall_s)
+        time.sleep(wall_s)
         self.waited_s += time.perf_counter() - begun_s
 
 

@@ -1,52 +1,67 @@
-"""The split of wall time: what agents, network and exchange took, and in what time a federate itself only waited."""
+"""Wall time of a run by part: agents, network, exchange, and wait."""
 
-from collections.abc import Iterable
-from typing import Protocol, runtime_checkable
+import time
+from collections.abc import Iterable, Sequence
+from typing import Literal, Protocol, runtime_checkable
 
 
 @runtime_checkable
 class Waits(Protocol):
-    """A federate or program that waits itself: for another process, a machine, a fault.
+    """A federate or program that waits in wall time: for another process, a machine, or a fault.
+
+    It raises `AnswerTimeoutError` if it waits for longer than its deadline.
 
     Attributes:
-        waited_s: For how long it has, in seconds of wall time.
+        waited_s: Total time that it has waited, in seconds of wall time.
     """
 
     waited_s: float
 
 
 class WallTime:
-    """Splits wall time by part, and takes out of each in what time a federate of it only waited.
+    """Stopwatch that adds each lap to one part of the wall time.
+
+    The time in which a federate of the part only waited is added to `wait` instead.
 
     Args:
-        total_s: Takes the sums, in seconds by part, as `no_wall_s` has them.
+        total_s: Receives the sums, in seconds by part, whenever `window` is called.
         agents: Physics and programs.
         network: The network.
     """
 
     def __init__(self, total_s: dict[str, float], *, agents: Iterable[object], network: Iterable[object]) -> None:
         self._total_s = total_s
-        parts = {"agents": agents, "network": network}
-        self._waiting = [(part, one) for part, ones in parts.items() for one in ones if isinstance(one, Waits)]
-        self._added_s = [one.waited_s for _, one in self._waiting]
-        self._split_s = list(self._added_s)
+        self._waiting: dict[str, Sequence[Waits]] = {
+            "agents": [federate for federate in agents if isinstance(federate, Waits)],
+            "network": [federate for federate in network if isinstance(federate, Waits)],
+            "exchange": (),
+        }
+        self._waited_s = {part: self._sum_s(part) for part in self._waiting}
+        self._spent_s = dict.fromkeys(total_s, 0.0)
+        self._lap_s = time.perf_counter()
 
-    def add(self, agents_s: float, network_s: float, whole_s: float) -> None:
-        """Add many windows to the sums, from what their calls took and what they took as a whole."""
-        self._total_s["agents"] += agents_s
-        self._total_s["network"] += network_s
-        self._total_s["exchange"] += whole_s - agents_s - network_s
-        self._take_waits(self._total_s, self._added_s)
+    def start(self) -> None:
+        """Begin a lap; the time since the last lap counts for no part."""
+        self._lap_s = time.perf_counter()
 
-    def split(self, agents_s: float, network_s: float, whole_s: float) -> dict[str, float]:
-        """Return the wall time of one window by part, from what its calls took and what it took as a whole."""
-        parts = {"agents": agents_s, "network": network_s, "exchange": whole_s - agents_s - network_s, "wait": 0.0}
-        self._take_waits(parts, self._split_s)
-        return parts
+    def lap(self, part: Literal["agents", "network", "exchange"]) -> None:
+        """Add the time since the last lap to a part."""
+        now_s = time.perf_counter()
+        self._spent_s[part] += now_s - self._lap_s
+        self._lap_s = now_s
+        if self._waiting[part]:
+            waited_s = self._sum_s(part)
+            new_s = waited_s - self._waited_s[part]
+            self._waited_s[part] = waited_s
+            self._spent_s[part] -= new_s
+            self._spent_s["wait"] += new_s
 
-    def _take_waits(self, wall_s: dict[str, float], taken_s: list[float]) -> None:
-        for number, (part, one) in enumerate(self._waiting):
-            waited_s = one.waited_s - taken_s[number]
-            taken_s[number] = one.waited_s
-            wall_s[part] -= waited_s
-            wall_s["wait"] += waited_s
+    def window(self) -> dict[str, float]:
+        """Return the wall time by part since the last call, and add it to the sums."""
+        spent_s, self._spent_s = self._spent_s, dict.fromkeys(self._spent_s, 0.0)
+        for part, part_s in spent_s.items():
+            self._total_s[part] += part_s
+        return spent_s
+
+    def _sum_s(self, part: str) -> float:
+        return sum(federate.waited_s for federate in self._waiting[part])

@@ -51,6 +51,7 @@ class EmulatedLab:
         # A robot that steers itself is followed in a thread of its own.
         self._turn = threading.RLock()
         up.medium.place(self._places_m)
+        up.places.write(self._places_m)
         for name in members:
             self._put(name)
         self.members = members
@@ -75,6 +76,7 @@ class EmulatedLab:
             place_m = placement.moved_m(self._places_m[name], to, self._world)
             places_m = self._places_m | {name: place_m}
             self._up.medium.place(places_m)
+            self._up.places.write(places_m)
             self._places_m = places_m
             self._put(name)
             return place_m
@@ -104,6 +106,7 @@ class EmulatedLab:
                 self._places_m = self._places_m | {name: state.position_m for name, state in states.items()}
                 velocities_m_s = {name: state.velocity_m_s for name, state in states.items()}
                 self._up.medium.place(self._places_m, velocities_m_s=velocities_m_s)
+                self._up.places.write(self._places_m)
         return WATCH_S
 
     def overview(self) -> Overview:

@@ -11,7 +11,7 @@ from typing import Final, Self
 from fieldkit.backends.protocols import Cast
 from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
-from fieldkit.core.model import Move, Placement, Role, Whereabouts
+from fieldkit.core.model import Move, Placement, Role, Vector, Whereabouts
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
@@ -98,6 +98,7 @@ class Mobility:
         world: What they stand in.
         laptop: Stands among them; None where it is not on the air.
         robots: Told how they move, for their sensors; those that steer themselves say where they are.
+        show: Takes where each robot is, metres east, north, up, for the lasers of the others.
     """
 
     def __init__(
@@ -107,7 +108,10 @@ class Mobility:
         world: World,
         laptop: Laptop | None,
         robots: Mapping[Role, EmulatedRobot] = MappingProxyType({}),
+        *,
+        show: Callable[[Mapping[str, Vector]], None] = lambda positions_m: None,  # noqa: ARG005
     ) -> None:
+        self._show = show
         self._robots = robots
         self._cast = cast
         self._medium = medium
@@ -241,8 +245,9 @@ class Mobility:
             relay = places.relay(self._cast, placement)
             if self._laptop is not None:
                 states[self._laptop.name] = State(places.laptop_m(self._cast, placement, self._world))
-            if self._away is not None:
-                gone = self._cast[self._away].name
+            gone = None if self._away is None else self._cast[self._away].name
+            self._show({name: state.position_m for name, state in states.items() if name != gone})
+            if gone is not None:
                 states = {} if gone == relay else {name: state for name, state in states.items() if name != gone}
             self._medium.place(
                 {name: state.position_m for name, state in states.items()},

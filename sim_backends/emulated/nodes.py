@@ -5,8 +5,10 @@ import socket
 from dataclasses import asdict
 from typing import Final, Self
 
+from typing_extensions import override
+
 from fieldkit.config.profiles import Radio
-from fieldkit.core.errors import LinkError, RobotError
+from fieldkit.core.errors import LinkError, RobotError, TestbedLostError
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import REPLY_S, Worker
 from sim_backends.emulated.provisioning import LAPTOP_NAME
@@ -84,11 +86,14 @@ class Node:
         """Return a TCP connection from inside its network namespace.
 
         Raises:
-            OSError: There was none in time, or the node does not answer.
+            OSError: There was none in time, or the node is busy.
+            TestbedLostError: The node ended.
         """
         try:
             # Made there, connected here: whoever does not answer keeps this thread waiting, and not the node.
             _, (fd,) = self._worker.ask({"do": "socket"})
+        except TestbedLostError:
+            raise
         except (LinkError, RobotError) as error:
             raise ConnectionError(error.what) from error
         stream = socket.socket(fileno=fd)
@@ -99,6 +104,10 @@ class Node:
             stream.close()
             raise
         return stream
+
+    def demand_up(self) -> None:
+        """Return if the node runs; raises as `Worker.demand_up`."""
+        self._worker.demand_up()
 
     def hang_up(self) -> None:
         """Let the node end, without waiting for it; requests under way fail at once."""
@@ -117,19 +126,23 @@ class EmulatedRobot(Node):
 
     Args:
         spec: What it is told about itself.
+        places_fd: Descriptor of the memory with the places of all robots (`neighbours.PlacesWriter`), open until it
+            is built; None for a robot that is alone.
 
     Raises:
         ConfigurationError: As `Node`.
     """
 
-    def __init__(self, spec: RobotSpec) -> None:
+    def __init__(self, spec: RobotSpec, places_fd: int | None = None) -> None:
         super().__init__(spec.name, interface=spec.interface, address=spec.address)
         self.spec = spec
+        self._places_fd = places_fd
         self._record: SteeredRecord | None = None
 
     def build(self) -> None:
         """Give the robot its name and its own file system. Errors as `open_radio`."""
-        _, (fd,) = self._worker.ask({"do": "build", "robot": asdict(self.spec)})
+        shared = () if self._places_fd is None else (self._places_fd,)
+        _, (fd,) = self._worker.ask({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
         self._record = SteeredRecord(fd)
 
     def steered(self) -> Steered | None:
@@ -164,8 +177,8 @@ class EmulatedRobot(Node):
         """Start it after `halt`: interface up, programs starting. Errors as `open_radio`."""
         self._worker.ask({"do": "boot", "interface": self.spec.interface, "robot": asdict(self.spec)})
 
+    @override
     def close(self) -> None:
-        """See `Node.close`."""
         super().close()
         if self._record is not None:
             self._record.close()

@@ -37,11 +37,13 @@ class RobotOptions(Strict):
     """Which variant of each tool one robot has; what is not said is as on this machine.
 
     Attributes:
-        ssh: Its SSH server.
+        ssh: Its SSH server: `openssh` or `dropbear`.
         sftp: Whether that server offers SFTP.
-        userland: `busybox`: `sh`, `tar`, `ip` and their like are busybox's, and what busybox lacks is missing.
-        netcat: Its only netcat, as `nc` and by its own name.
-        ping: Its `ping`.
+        userland: `gnu` or `busybox`. With `busybox`, `sh`, `tar`, `ip` and similar programs are busybox's, and
+            programs that busybox lacks are missing.
+        netcat: `traditional`, `openbsd`, `ncat` or `busybox`: its only netcat, installed as `nc` and under its own
+            name.
+        ping: `iputils` or `busybox`.
     """
 
     ssh: SshServer = "openssh"
@@ -66,8 +68,7 @@ class MeshOptions(Strict):
 
     Attributes:
         daemon: `babeld`, which speaks Babel (RFC 8966).
-        hello: How often it says hello to its neighbours, in seconds; 4 s is its own default. A way that is lost is
-            replaced within a multiple of it.
+        hello: Hello interval; 4 s is the daemon's own default. A lost route is replaced within a multiple of it.
     """
 
     daemon: Literal["babeld"]
@@ -78,8 +79,8 @@ class Ros2Options(Strict):
     """How the nodes of robots with ROS 2 find each other over the radio.
 
     Attributes:
-        discovery: `multicast`: by multicast (DDS), by scouting (Zenoh); `peers`: each is told the addresses of all
-            others; `router`: by a router, which Zenoh alone has.
+        discovery: `multicast`: by multicast (DDS) or scouting (Zenoh). `peers`: each robot has a list of the
+            addresses of all others. `router`: by a router, which only Zenoh has.
         router: The robot that runs the router.
     """
 
@@ -97,17 +98,23 @@ class EmulatedOptions(Strict):
     """Options of the emulated backend.
 
     Attributes:
-        ros: `debian`, ROS's own master and rosbag from Debian's packages; `builtin`, fieldkit's own sensors and
-            `rosbag` command; `auto`, Debian's where they are installed. Robots with ROS 2 speak over the radio unless
-            it is `builtin`.
-        ros2: How those find each other.
-        robots: Tool variants of the robots that have others than this machine, by name.
-        world: What they stand in: a file of the lab's own folder `worlds/`, or one that ships with fieldkit.
-        radio: The radio between the robots.
-        late_bound: A repeat is void if the medium handed a packet over so much later than its model says, in seconds.
-        record_air: Whether every transmission attempt is written to the evidence; fixed links make none.
-        boot: How long a robot that lost its power stays dark, in seconds; its programs start after that.
-        mesh: How the robots forward for each other; None if they do not.
+        ros: `debian`: ROS's own master and rosbag from Debian. `builtin`: fieldkit's own
+            ([cheaper](add-a-robot.md#built-in-or-debians-ros)). `auto`: Debian's where installed. Robots with ROS 2
+            always use fieldkit's own, and [speak over the radio](add-a-robot.md#ros-2-over-the-radio) unless this is
+            `builtin`.
+        ros2: How robots with ROS 2 discover each other.
+        robots: Variants of tools, by robot; the default is what this machine has. See [add a
+            robot](add-a-robot.md#tools-of-another-kind).
+        world: The world around the robots: a file in the folder `worlds/` of the lab, or a shipped one (`lawn`,
+            `baylands`, `open`). See [world file](world-file.md).
+        radio: The radio between the robots: Wi-Fi in that world, unless one of `loss`, `delay`, `rate` and `jitter`
+            fixes the links.
+        late_bound: A repeat is void if a packet was delayed by the emulator itself by more than this in total, before
+            and after the radio model.
+        record_air: Whether every transmission attempt and ACK is written to `air.pcap` and `air.csv` of each repeat;
+            fixed links have none.
+        boot: How long a robot that reboots stays off before its programs start.
+        mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
     """
 
     ros: RosChoice = RosChoice.AUTO

@@ -130,7 +130,8 @@ def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
         raise ConfigurationError(
             f"{end_m[0]:g} m east, {end_m[1]:g} m north is outside of the world {world.name}, which is "
             f"{width_m:g} m by {depth_m:g} m",
-            remedy="choose a place in it, or a larger one by emulated.world in the site file; see docs/reference.md",
+            remedy="choose a place in it, or a larger one by emulated.world in the site file; see: fieldkit docs "
+            "world-file",
         )
     ground_m = world.ground_m(end_m)
     if to.relative:

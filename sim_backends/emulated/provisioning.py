@@ -4,7 +4,7 @@ Keys are made per lab and never lie on the host's disk. The only user of `crypto
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
 from ipaddress import IPv4Network
@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING, Final, Self, TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.lazy import dataclass
 from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice, uses_debian_ros
-from sim_backends.emulated.robot.spec import LOOPBACK, Base, RobotSpec, Ros2Spec
-from sim_backends.emulated.ros.messages import GENERATORS, Definition, Sensor
+from sim_backends.emulated.robot.spec import ANTENNA_M, LOOPBACK, Base, RobotSpec, Ros2Spec
+from sim_backends.emulated.ros import static_frames
+from sim_backends.emulated.ros.laser import LaserTarget
+from sim_backends.emulated.ros.messages import GENERATORS, LASER_SCAN, Definition, Sensor
+from sim_backends.emulated.ros.neighbours import Neighbour
+from sim_backends.world.shapes import Cylinder, Shape
 from sim_backends.world.world import World
 
 if TYPE_CHECKING:
@@ -77,6 +80,14 @@ def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
     return tuple(_sensor(topic) for topic in _topics(robot))
 
 
+def _definitions(robot: "Robot | LabRobot") -> dict[str, Definition]:
+    """Return the definitions of the types that a robot publishes; errors as `template_of`."""
+    definitions = {topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)}
+    if static_frames.links(sensors_of(robot)):
+        definitions[static_frames.TYPE] = definition(static_frames.TYPE)
+    return definitions
+
+
 def _topics(robot: "Robot | LabRobot") -> tuple[PublishedTopic, ...]:
     return robot.profile.ros.topics if robot.profile.ros else ()
 
@@ -88,6 +99,38 @@ def _sensor(topic: PublishedTopic) -> Sensor:
     from sim_backends.emulated.ros import templates  # noqa: PLC0415 (as above)
 
     return replace(own, template=templates.template_of(topic))
+
+
+def laser_targets(world: World) -> tuple[LaserTarget, ...]:
+    """Return what a laser sees of a world."""
+    return tuple(_laser_target(part.shape) for part in world.parts)
+
+
+def _laser_target(shape: Shape) -> LaserTarget:
+    base_m, top_m = shape.centre_m[2] - (shape.top_m - shape.centre_m[2]), shape.top_m
+    if isinstance(shape, Cylinder):
+        return LaserTarget((shape.centre_m[:2],), shape.radius_m, base_m, top_m)
+    return LaserTarget(shape.corners_m(), 0.0, base_m, top_m)
+
+
+def _neighbours(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[Neighbour, ...]:
+    """Return the bodies of the other robots, with their positions among `robots`."""
+    return tuple(
+        neighbour(number, robot.profile) for number, (other, robot) in enumerate(robots.items()) if other != key
+    )
+
+
+def neighbour(number: int, profile: RobotProfile) -> Neighbour:
+    """Return the body of a robot from the ground under it up to its antenna, or to its top where that is higher.
+
+    A profile without a known body has that of the paper's robot of its kind.
+    """
+    from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER  # noqa: PLC0415 (numpy takes 60 ms)
+    from sim_backends.physics.known import BODIES, quadrotor  # noqa: PLC0415
+
+    like = quadrotor(profile.name) if profile.kind == "uav" else TURTLEBOT3_BURGER
+    body = BODIES.get(profile.name, like)
+    return Neighbour(number, body.radius_m, ANTENNA_M, max(body.height_m - ANTENNA_M, 0.0))
 
 
 def ros_master_of(robot: "Robot | LabRobot") -> str:
@@ -191,7 +234,7 @@ def robot_spec(
     options: EmulatedOptions = _DEFAULTS,
     world: World | None = None,
 ) -> RobotSpec:
-    """Return what a robot is told about itself; one that flies needs to know its world."""
+    """Return what a robot is told about itself; one that flies, or has a laser, needs to know its world."""
     robot = robots[key]
     tools = options.robots.get(robot.name, AS_THIS_MACHINE)
     own = robot.profile.ros
@@ -199,6 +242,7 @@ def robot_spec(
     speaks_ros2 = _ros2_spec(robots, robot, options)
     hears_ros1 = ros is RosChoice.DEBIAN and own is not None and not ros2
     mavlink, limits = robot.profile.mavlink, robot.profile.limits
+    has_laser = any(topic.type == LASER_SCAN for topic in _topics(robot))
     return RobotSpec(
         name=robot.name,
         interface=robot.profile.radio.interface,
@@ -214,14 +258,18 @@ def robot_spec(
         ros_master=ros_master_of(robot),
         sensors=sensors_of(robot),
         registered=_registered(robots, key),
-        definitions={topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)},
+        definitions=_definitions(robot),
         mavlink_port=mavlink.port if mavlink else None,
         max_speed_m_s=limits.max_speed_m_s,
         max_height_m=limits.max_height_m,
         fence_m=limits.fence_m,
         profile=robot.profile.name,
         world=world.model_dump_json() if world is not None and mavlink else "",
+        laser_targets=laser_targets(world) if world is not None and has_laser else (),
+        neighbours=_neighbours(robots, key) if has_laser else (),
         autopilot=mavlink.autopilot if mavlink else "px4",
+        system=mavlink.system if mavlink else 1,
+        boot_s=float(mavlink.boot_s) if mavlink else 0.0,
         base=_base(robot.profile) if hears_ros1 or speaks_ros2 is not None else None,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
         ros2=speaks_ros2,

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from typing import Final, Generic
 
@@ -14,6 +14,7 @@ from sim_backends.emulated.medium.framing import ETHERNET, IP
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.provisioning import KeyPair, RobotKey, robot_spec
+from sim_backends.emulated.ros.neighbours import PlacesWriter
 from sim_backends.radio.modes import fixed_mode, standard_of
 from sim_backends.world.world import World
 
@@ -28,12 +29,14 @@ class RunningRobots(Generic[RobotKey]):
     Attributes:
         robots: The robots.
         medium: Carries their packets.
+        places: Takes where each of them is, for the lasers of the others.
         host_keys: Public host key of each.
         private_key: Logs in on all of them, OpenSSH PEM.
     """
 
     robots: Mapping[RobotKey, EmulatedRobot]
     medium: MediumClient
+    places: PlacesWriter
     host_keys: Mapping[RobotKey, str]
     private_key: str = field(repr=False)
 
@@ -60,6 +63,7 @@ def running_robots(
     with ExitStack() as stack:
         framing = IP if options.mesh is None else ETHERNET
         medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
+        places = stack.enter_context(closing(PlacesWriter([robot.name for robot in robots.values()])))
         # Entered before the robots and left after them: a robot that ends ends the request that waits for it.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _AT_ONCE)))
         up: dict[RobotKey, EmulatedRobot] = {}
@@ -67,7 +71,7 @@ def running_robots(
             spec = robot_spec(
                 robots, key, ros=ros, login=login, host_key=host_keys[key], options=options, world=world
             )
-            up[key] = stack.enter_context(EmulatedRobot(spec))
+            up[key] = stack.enter_context(EmulatedRobot(spec, places.fd))
         list(pool.map(_build, up.values()))
         # Who waits for a master of others waits for one that is being started.
         started = pool.map(EmulatedRobot.start, sorted(up.values(), key=lambda one: not one.spec.runs_master))
@@ -76,7 +80,7 @@ def running_robots(
         if any(robot.spec.waits_for_another for robot in up.values()):
             medium.place(placement.together_m(robot.name for robot in up.values()))
         list(started)
-        yield RunningRobots(up, medium, {key: pair.public for key, pair in host_keys.items()}, login.private)
+        yield RunningRobots(up, medium, places, {key: pair.public for key, pair in host_keys.items()}, login.private)
         for one in up.values():
             one.hang_up()
 

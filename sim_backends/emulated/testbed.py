@@ -28,7 +28,7 @@ from fieldkit.remote.ssh import PATIENCE_S, SshShell
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.mobility import Mobility
-from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop
+from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node
 from sim_backends.emulated.options import EmulatedOptions, MeshOptions, RosChoice
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey
 from sim_backends.emulated.robot.spec import USER
@@ -107,9 +107,10 @@ class EmulatedTestbed:
         self.operator = operator
         self.robots = up.robots
         self.medium = up.medium
+        self._laptop = laptop
         self._shells = shells
         self._boot_s = options.boot
-        self._mobility = Mobility(cast, up.medium, world, laptop, up.robots)
+        self._mobility = Mobility(cast, up.medium, world, laptop, up.robots, show=up.places.write)
         names = {role: robot.name for role, robot in up.robots.items()}
         self._oracle = EmulatedOracle(names, up.medium, self._mobility, options)
 
@@ -122,6 +123,13 @@ class EmulatedTestbed:
     def oracle(self) -> EmulatedOracle:
         """See `Testbed.oracle`."""
         return self._oracle
+
+    def demand_up(self) -> None:
+        """See `Transient.demand_up`."""
+        self.medium.demand_up()
+        nodes: list[Node] = [*self.robots.values()]
+        for node in nodes if self._laptop is None else [*nodes, self._laptop]:
+            node.demand_up()
 
     def place(self, placement: Placement) -> Answer:
         """See `Testbed.place`; robots arrive at once."""
@@ -227,9 +235,17 @@ def _shell(
 ) -> SshShell:
     """Return the control connection of a robot, over the radio where there is a laptop on it."""
     robot = up.robots[role]
+
+    def connect(timeout_s: float) -> socket.socket:
+        if laptop is None:
+            return robot.connect(timeout_s)
+        up.medium.demand_up()  # nobody waits for an answer that nothing carries
+        robot.demand_up()
+        return laptop.reach(robot.spec.ip, timeout_s)
+
     return SshShell(
         robot.name,
-        connect=robot.connect if laptop is None else partial(laptop.reach, robot.spec.ip),
+        connect=connect,
         user=USER,
         host_key=up.host_keys[role],
         private_key=up.private_key,

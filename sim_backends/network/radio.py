@@ -52,6 +52,8 @@ class RadioNetwork:
     Attributes:
         now_ns: See `Wire`.
         extrapolates: See `NetworkFederate.advance`.
+        transmitters: Stations that forward or interfere, whatever is sent: the relay, and who carries a jammer.
+        fixed_emitters_m: Places of jammers that nobody carries.
 
     Raises:
         ConfigurationError: A disturbance or the relay names a station that there is not.
@@ -73,6 +75,9 @@ class RadioNetwork:
         self._relay = relay
         self._disturbances = tuple(disturbances)
         self._check_names()
+        jammers = [one for one in disturbances if isinstance(one, Jammer)]
+        self.transmitters = frozenset({relay or "", *(one.agent for one in jammers)} - {""})
+        self.fixed_emitters_m = tuple(one.place_m for one in jammers if one.place_m is not None)
         self._changes_ns = changes_ns(disturbances)[::-1]
         self._off: set[str] = set()
         self._jammers: dict[str, Jammer] = {}

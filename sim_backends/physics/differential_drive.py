@@ -25,6 +25,9 @@ _LEVEL: Final = (0.0, 0.0)
 _SAME: Final = 1e-12
 """What is nearer to its target, in m/s or rad/s, has reached it: rounding alone is that large."""
 
+_NO_GRIP_M_S2: Final = 1e-9
+"""With less its speed cannot be changed on a slope: what is left of friction there is rounding."""
+
 
 @dataclass(frozen=True)
 class DriveLimits:
@@ -206,11 +209,14 @@ class DifferentialDrive:
         speed_m_s = _within(twist.forward_m_s, limits.speed_m_s)
         turn_rad_s = _within(twist.turn_rad_s, limits.turn_rad_s)
         most_m_s2 = self._acceleration_m_s2(pose, faster=speed_m_s > pose.speed_m_s)
+        slips = most_m_s2 <= _NO_GRIP_M_S2 and speed_m_s != pose.speed_m_s
+        if slips:  # the slope takes all of the friction
+            speed_m_s = pose.speed_m_s
         a_m_s2, speeding = _towards(pose.speed_m_s, speed_m_s, most_m_s2, step_s)
         a_rad_s2, turning = _towards(pose.turn_rad_s, turn_rad_s, limits.turn_acceleration_rad_s2, step_s)
         steps = min((some for some in (speeding, turning) if some), default=None)
         turns = bool(turning or turn_rad_s)
-        if (turning or (turns and pose.grade != _LEVEL)) and (speeding or speed_m_s):
+        if (turning or (turns and pose.grade != _LEVEL)) and (speeding or speed_m_s or slips):
             steps = 1  # see the top of this module
         return Arc(
             pose,

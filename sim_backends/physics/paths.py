@@ -1,9 +1,10 @@
 """Physics of agents whose motion is known in advance: way-points and velocity profiles."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from sim_backends.world.motion import Motion, State
+from sim_backends.world.motion import Motion, State, WayPoints
 
 STEP_NS: Final = 1_000_000
 """Gazebo's and ns-3 co-simulations' usual step, 1 ms."""
@@ -15,18 +16,19 @@ class Paths:
     Args:
         motions: The motions; no two move the same agent.
         step_ns: Own step: states are those at whole steps.
-        limits_m_s2: The most that each agent's velocity changes per second; 0 for those left out, which is true of
-            who goes straight at one speed.
+        limits_m_s2: The most that each agent's velocity changes per second. For agents that are left out it follows
+            from the corners of `WayPoints`; of any other motion nothing is known, so that it is infinite.
     """
 
     def __init__(
         self, motions: Sequence[Motion], *, step_ns: int = STEP_NS, limits_m_s2: Mapping[str, float] | None = None
     ) -> None:
         self._motions = tuple(motions)
+        self._ways = {motion.name: motion for motion in motions if isinstance(motion, WayPoints)}
         self.step_ns = step_ns
         self._at_ns = 0
         self._states = self._at(0)
-        self.limits_m_s2: Mapping[str, float] = dict.fromkeys(self._states, 0.0) | dict(limits_m_s2 or {})
+        self.limits_m_s2: Mapping[str, float] = PathLimits(self, dict(limits_m_s2 or {}))
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:  # noqa: ARG002 (see PhysicsFederate)
         """See `PhysicsFederate.advance`."""
@@ -35,5 +37,33 @@ class Paths:
             self._at_ns, self._states = at_ns, self._at(at_ns)
         return self._states
 
+    def limit_m_s2(self, name: str) -> float:
+        """Return the limit of an agent without a given one, from the states on that were asked for last."""
+        way = self._ways.get(name)
+        return math.inf if way is None else way.limit_m_s2(self._at_ns)
+
+    @property
+    def names(self) -> frozenset[str]:
+        """The agents that it moves now."""
+        return frozenset(self._states)
+
     def _at(self, time_ns: int) -> Mapping[str, State]:
         return {name: state for motion in self._motions for name, state in motion.at(time_ns).items()}
+
+
+class PathLimits(Mapping[str, float]):
+    """The most that the velocity of each agent of `Paths` changes per second."""
+
+    def __init__(self, paths: Paths, given: Mapping[str, float]) -> None:
+        self._paths = paths
+        self._given = given
+
+    def __getitem__(self, name: str) -> float:
+        given = self._given.get(name)
+        return self._paths.limit_m_s2(name) if given is None else given
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._paths.names)
+
+    def __len__(self) -> int:
+        return len(self._paths.names)

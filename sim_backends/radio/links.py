@@ -1,6 +1,6 @@
 """Parameters and counters of directed links; importable without the models that use them."""
 
-from fieldkit.core.lazy import dataclass
+from dataclasses import dataclass
 
 Pair = tuple[str, str]
 """Transmitter and receiver."""

@@ -4,13 +4,13 @@ Clauses are of IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache
 from typing import Final, Literal
 
 from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.lazy import dataclass
 
 Standard = Literal["802.11g", "802.11n"]
 Modulation = Literal["BPSK", "QPSK", "16-QAM", "64-QAM"]

@@ -53,27 +53,32 @@ class RadioOptions(Strict):
 
     Attributes:
         propagation: Mean path loss in the open: `log-distance`, `free-space`, or `two-ray` over flat ground.
-        exponent: Of the log-distance law. 3.0 is the distance power-loss coefficient N = 30 that ITU-R P.1238 gives
-            for 2.4 GHz in offices; free space has 2.
-        shadowing_db: Standard deviation of shadowing; 0 for none.
+        exponent: Exponent of the log-distance law. 3.0 is the distance power-loss coefficient N = 30 that ITU-R
+            P.1238 gives for 2.4 GHz in offices; free space has 2.
+        shadowing_db: Standard deviation of shadowing, in dB; 0 for none.
         decorrelation: Distance over which shadowing decorrelates to 1/e.
-        fading: Whether echoes fade: Rician with line of sight, Rayleigh without.
-        k_db: Power of the steady wave over that of the echoes, with line of sight. 6 dB is that of model F, large
-            spaces indoors and outdoors, of IEEE 802.11-03/940r4 (TGn channel models).
-        stir_m_s: Speed of what moves around the robots (leaves, people): two that stand fade as if one went at it.
-            The TGn models have 1.2 km/h (0.33 m/s), those of TGac (IEEE 802.11-09/0308r12) 0.089 km/h (0.025 m/s);
-            0.1 m/s lies between, and lets a gain last about 0.5 s.
-        noise_floor_dbm: Noise and interference at a receiver. -95 dBm is thermal noise in 20 MHz (-101 dBm) and a
-            noise figure of 6 dB.
-        mode: Name of the mode to send in always, `g54` or `n7`; left out, stations choose by what arrives.
-        queue_packets: Packets that wait per station, or per fixed link, beside the one on the air; 1000 is Linux's
-            default queue length.
-        loss: Fixed: share of packets lost per link, whatever their length; 0 % if left out.
-        delay: Fixed: delay of a link beside waiting and serialization, in seconds; 0.2 ms if left out, which is about
+        fading: Whether multipath components fade: Rician with line of sight, Rayleigh without. `false` gives a link
+            without randomness within its range.
+        k_db: Rician K factor in dB: power of the constant component over that of the scattered ones, with line of
+            sight. 6 dB is that of model F, large spaces indoors and outdoors, of IEEE 802.11-03/940r4 (TGn channel
+            models).
+        stir_m_s: Speed of moving objects around the robots (leaves, people), in m/s: a link between two robots at
+            rest fades as if one moved at this speed. The TGn models have 1.2 km/h (0.33 m/s), those of TGac (IEEE
+            802.11-09/0308r12) 0.089 km/h (0.025 m/s); 0.1 m/s lies between, and gives a coherence time of about 0.5
+            s.
+        noise_floor_dbm: Noise and interference at a receiver, in dBm. -95 dBm is thermal noise in 20 MHz (-101 dBm)
+            and a noise figure of 6 dB.
+        mode: Fixed transmission mode: `g6` to `g54` (Mbit/s) or `n0` to `n7` (MCS). Without it, stations adapt the
+            rate to acknowledgements.
+        queue_packets: Queue length per station, or per fixed link, in packets, without the packet on the air; 1000 is
+            Linux's default.
+        loss: Fixed links: share of packets lost per link, whatever their length; 0 % if only others of these four are
+            given.
+        delay: Fixed links: delay of a link in addition to queueing and serialization. The default is 0.2 ms, about
             DIFS, mean first backoff, preamble, SIFS and ACK of 802.11g (28 + 68 + 20 + 10 + 30 us) and the host's
             interrupt.
-        rate: Fixed: bit rate of every link, or `unlimited`; 54 Mbit/s if left out.
-        jitter: Fixed: width of the uniform extra delay of a link, in seconds, on top of its delay.
+        rate: Fixed links: bit rate of every link, `20Mbit/s`, or `unlimited`; 54 Mbit/s if left out.
+        jitter: Fixed links: width of the uniformly distributed extra delay of a link.
     """
 
     propagation: Literal["log-distance", "free-space", "two-ray"] = "log-distance"

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from fieldkit.config.profiles import Radio
 from fieldkit.core.model import Vector
@@ -311,8 +312,8 @@ class WorldChannel(RadioChannel):
         """Return the mean signal-to-noise ratio of a link."""
         return decibel(float(self._row(transmitter).mean_mw[receiver]) / self.noise_mw[receiver])
 
+    @override
     def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
-        """See `RadioChannel.powers_mw`."""
         row = self._row(transmitter)
         if not self._options.fading:
             return row.powers_mw
@@ -322,8 +323,9 @@ class WorldChannel(RadioChannel):
             row.slot = slot
         return row.powers_mw
 
+    @override
     def linked(self, transmitter: int, receiver: int) -> bool:
-        """See `RadioChannel.linked`; by mean powers, so that a deep fade breaks no association."""
+        """By mean powers, so that a deep fade breaks no association."""
         row = self._row(transmitter)
         if row.linked is None:
             back_mw = _milliwatts(self._sent_dbm - self._loss_db[transmitter])
@@ -331,13 +333,13 @@ class WorldChannel(RadioChannel):
             row.linked = ((row.mean_mw >= self.sensitivity_mw) & (back_mw >= hears_mw)).tolist()
         return row.linked[receiver]
 
+    @override
     def delay_ns(self, transmitter: int, receiver: int) -> int:
-        """See `RadioChannel.delay_ns`."""
         one, other = self._places[transmitter], self._places[receiver]
         return round(math.dist(one or STILL, other or STILL) / SPEED_OF_LIGHT_M_S * 1e9)
 
+    @override
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
-        """See `RadioChannel.rate_control`."""
         if self._fixed_mode is not None:
             return FixedRate(self._fixed_mode)
         names = self.names[transmitter], self.names[receiver]

@@ -34,7 +34,7 @@ class DeadReckoned(Mapping[str, State]):
     Args:
         states: The states.
         since_ns: Their time.
-        step_ns: They move on by whole steps, as those of the physics do.
+        step_ns: They move on by whole steps of this length, counted from `since_ns`.
     """
 
     def __init__(self, states: Mapping[str, State], since_ns: int, step_ns: int) -> None:
@@ -46,7 +46,7 @@ class DeadReckoned(Mapping[str, State]):
 
     def at(self, now_ns: int) -> Mapping[str, State]:
         """Return the states at a time not before theirs; the same object for a whole step."""
-        steps = now_ns // self._step_ns - self._since_ns // self._step_ns
+        steps = (now_ns - self._since_ns) // self._step_ns
         if steps != self._steps:
             self._steps = steps
             self._now = _MovedOn(self._states, steps * self._step_ns / 1e9) if steps else self._states

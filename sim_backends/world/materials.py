@@ -3,10 +3,9 @@
 import cmath
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
-
-from fieldkit.core.lazy import dataclass
 
 SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
 _DB_PER_NEPER: Final = 20 / math.log(10)

@@ -56,7 +56,8 @@ class WayPoints:
     def __init__(self, name: str, points_m: Sequence[Vector], speed_m_s: float) -> None:
         if not points_m or not speed_m_s > 0:
             raise ValueError(f"no way: {len(points_m)} points at {speed_m_s} m/s")
-        self._name = name
+        self.name = name
+        self._speed_m_s = speed_m_s
         self._points_m = tuple(points_m)
         so_far_m = accumulate((math.dist(*leg) for leg in pairwise(points_m)), initial=0.0)
         self._times_ns = tuple(round(metres / speed_m_s * 1e9) for metres in so_far_m)
@@ -72,7 +73,18 @@ class WayPoints:
 
     def at(self, time_ns: int) -> Mapping[str, State]:
         """See `Motion.at`."""
-        return {self._name: self._state(time_ns)}
+        return {self.name: self._state(time_ns)}
+
+    def limit_m_s2(self, time_ns: int) -> float:
+        """Return an acceleration a such that who moves on at the velocity of now is off by at most a t^2 / 2.
+
+        Up to the next corner, c from now, there is no error; behind it two velocities of speed v differ by at most
+        2 v. So the error is at most 2 v (t - c), which is never more than (v / c) t^2 / 2.
+        """
+        passed = bisect_right(self._times_ns, time_ns)
+        if passed == len(self._times_ns):
+            return 0.0
+        return self._speed_m_s * 1e9 / (self._times_ns[passed] - time_ns)
 
     def _state(self, time_ns: int) -> State:
         if time_ns < 0:

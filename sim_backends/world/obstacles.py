@@ -3,12 +3,14 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Annotated, Final, Literal
+
+from typing_extensions import override
 
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Field, Int, Length, Number, Strict
 from fieldkit.core.errors import nearest
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Vector
 from sim_backends.world.materials import MATERIALS
 from sim_backends.world.shapes import Box, Cylinder, Shape
@@ -99,8 +101,8 @@ class BoxObstacle(_Rectangular):
     base: Length = 0.0
     material: MaterialName
 
+    @override
     def parts(self) -> Iterator[Part]:
-        """See `_Obstacle.parts`."""
         yield Part(self.name, self.material, self._box(self.size_m, base_m=self.base))
 
 
@@ -123,8 +125,8 @@ class Wall(_Obstacle):
     thickness: Dimension
     material: MaterialName
 
+    @override
     def parts(self) -> Iterator[Part]:
-        """See `_Obstacle.parts`."""
         east_m, north_m = self.to_m[0] - self.from_m[0], self.to_m[1] - self.from_m[1]
         centre = ((self.from_m[0] + self.to_m[0]) / 2, (self.from_m[1] + self.to_m[1]) / 2, self.height / 2)
         size = (math.hypot(east_m, north_m), self.thickness, self.height)
@@ -144,8 +146,8 @@ class Building(_Rectangular):
     thickness: Dimension
     material: MaterialName
 
+    @override
     def parts(self) -> Iterator[Part]:
-        """See `_Obstacle.parts`."""
         long_m, wide_m, high_m = self.size_m
         off = self.thickness
         under_m = high_m - off
@@ -176,8 +178,8 @@ class Tree(_Obstacle):
     crown_radius: Dimension
     trunk_radius: Dimension
 
+    @override
     def parts(self) -> Iterator[Part]:
-        """See `_Obstacle.parts`."""
         crown_m = self.height - self.crown_base
         crown = Cylinder((*self.at_m, self.crown_base + crown_m / 2), self.crown_radius, crown_m)
         yield Part(self.name, "foliage", crown)
@@ -220,17 +222,17 @@ class Raised(_HigherGround):
     kind: Literal["raised"]
 
     @property
+    @override
     def grade(self) -> tuple[float, float]:
-        """See `_HigherGround.grade`."""
         return 0.0, 0.0
 
     @property
+    @override
     def middle_m(self) -> float:
-        """See `_HigherGround.middle_m`."""
         return self.size_m[2]
 
+    @override
     def parts(self) -> Iterator[Part]:
-        """See `_Obstacle.parts`."""
         yield Part(self.name, "ground", self._box(self.size_m))
 
 
@@ -244,18 +246,19 @@ class Ramp(_HigherGround):
     kind: Literal["ramp"]
 
     @property
+    @override
     def grade(self) -> tuple[float, float]:
-        """See `_HigherGround.grade`."""
         yaw, rise = math.radians(self.yaw_deg), self.size_m[2] / self.size_m[0]
         return rise * math.cos(yaw), rise * math.sin(yaw)
 
     @property
+    @override
     def middle_m(self) -> float:
-        """See `_HigherGround.middle_m`."""
         return self.size_m[2] / 2
 
+    @override
     def parts(self) -> Iterator[Part]:
-        """See `_Obstacle.parts`; a flight of steps, each as high as the ramp is in its middle."""
+        """A flight of steps, each as high as the ramp is in its middle."""
         long_m, wide_m, high_m = self.size_m
         for number in range(_STEPS):
             share = (number + 0.5) / _STEPS

@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Vector
 
 Floats = NDArray[np.float64]

@@ -1,6 +1,7 @@
 """World files: obstacles, ground and lines to stand along; and the loss of radio paths through them."""
 
 import math
+from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -11,7 +12,6 @@ from fieldkit.config import schema
 from fieldkit.config.catalog import Named
 from fieldkit.config.schema import Field, Strict
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Scenario
 from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
 from sim_backends.world.obstacles import Obstacle, Part, Place, Raised, Ramp, Real

@@ -13,6 +13,8 @@ from fieldkit.agent import dialect, mavlink_frames
 from fieldkit.agent.arming import ArmingCheck
 from fieldkit.agent.autopilot import AutopilotState
 from fieldkit.agent.flight_plan import FlightNeeds, FlightPlan, along
+from fieldkit.agent.flying.origin import FlightOrigin
+from fieldkit.agent.links.client import MessageRate
 
 PX4 = d.MAV_AUTOPILOT_PX4
 ARMED = d.MAV_MODE_FLAG_SAFETY_ARMED
@@ -26,6 +28,7 @@ class MemoryLink:
     def __init__(self) -> None:
         self.sent: list[bytes] = []
         self.coming: list[bytes] = []
+        self.messages: dict[int, MessageRate] = {}
 
     def fileno(self) -> int:
         raise AssertionError("nobody waits for it")
@@ -67,7 +70,9 @@ def test_what_an_autopilot_says_is_known() -> None:
     assert state.speed_m_s == pytest.approx(0.5)
     assert state.yaw_rad == pytest.approx(1.5)
     assert state.answers == {400: 4}
-    assert state.said == "Arming denied: it falls"
+    assert state.said == "mode OFFBOARD, its last text: Arming denied: it falls"
+    assert state.texts.new() == ["Arming denied: it falls"]
+    assert state.texts.new() == []
 
 
 def test_a_stranger_and_a_damaged_frame_count_for_nothing() -> None:
@@ -107,8 +112,8 @@ def test_what_it_says_is_what_pymavlink_reads() -> None:
     state.command(*state.dialect.guide())
     state.command(dialect.ARM, 1)
     state.command(*state.dialect.bring_down("land"))
-    state.lead((1.5, -2.5, -3.0))
-    state.ask_for(mavlink_frames.ATTITUDE, 10.0)
+    state.lead((1.5, -2.5, -3.0), -2.0)
+    state.request_stream(mavlink_frames.ATTITUDE, 10.0)
     reader = d.MAVLink(None)
     said = [message for frame in link.sent for message in reader.parse_buffer(frame)]
     beat, mode, arm, land, lead, ask = said
@@ -120,9 +125,13 @@ def test_what_it_says_is_what_pymavlink_reads() -> None:
     assert state.dialect.bring_down("return") == (d.MAV_CMD_NAV_RETURN_TO_LAUNCH,)
     assert (lead.x, lead.y, lead.z) == (1.5, -2.5, -3.0)
     assert lead.coordinate_frame == d.MAV_FRAME_LOCAL_NED
-    ignored = lead.type_mask
-    assert ignored & 0b111 == 0
-    assert ignored & 0b111111000 == 0b111111000
+    assert lead.yaw == -2.0
+    mask, flags = lead.type_mask, d.enums["POSITION_TARGET_TYPEMASK"]
+    ignored = {
+        flag.name.removeprefix("POSITION_TARGET_TYPEMASK_") for bit, flag in flags.items() if mask & bit == bit
+    }
+    rates = {f"{what}{axis}_IGNORE" for axis in "XYZ" for what in "VA"}
+    assert ignored == {*rates, "YAW_RATE_IGNORE"}
     assert (ask.param1, ask.param2) == (d.MAVLINK_MSG_ID_ATTITUDE, 100_000)
 
 
@@ -130,12 +139,27 @@ def plan(way: list[tuple[float, float, float]]) -> FlightPlan:
     return FlightPlan("udpout:127.0.0.1:1", "orders", "land", 5.0, height_m=3.0, legs=way)
 
 
+def test_an_answer_to_another_station_and_one_that_is_not_final_are_ignored() -> None:
+    ours, other = (245, 191), (255, 190)
+    state, _ = talk(
+        d.MAVLink_command_ack_message(400, d.MAV_RESULT_DENIED, 0, 0, *other),
+        d.MAVLink_command_ack_message(22, d.MAV_RESULT_IN_PROGRESS, 40, 0, *ours),
+        d.MAVLink_command_ack_message(176, d.MAV_RESULT_ACCEPTED, 0, 0, *ours),
+        d.MAVLink_command_ack_message(21, d.MAV_RESULT_FAILED),
+        d.MAVLink_statustext_message(d.MAV_SEVERITY_NOTICE, b"Fence Breached"),
+        d.MAVLink_statustext_message(d.MAV_SEVERITY_INFO, b"Arming motors"),
+    )
+    assert state.answers == {176: d.MAV_RESULT_ACCEPTED, 21: d.MAV_RESULT_FAILED}
+    assert state.texts.new() == ["Fence Breached"]
+    assert state.texts.warnings == []
+
+
 @given(legs, st.floats(-math.pi, math.pi), st.tuples(metres, metres, metres))
 def test_its_way_is_as_long_as_its_legs_wherever_its_nose_points(
     way: list[tuple[float, float, float]], yaw_rad: float, begin_m: tuple[float, float, float]
 ) -> None:
-    corners_m = plan(way).corners_m(begin_m, yaw_rad)
-    assert corners_m[0] == (begin_m[0], begin_m[1], begin_m[2] - 3.0)
+    corners_m = plan(way).corners_m(FlightOrigin("local", "", begin_m[0], begin_m[1], yaw_rad), begin_m[2])
+    assert corners_m[0] == pytest.approx((begin_m[0], begin_m[1], begin_m[2] - 3.0))
     assert [math.dist(a, b) for a, b in pairwise(corners_m)] == pytest.approx(
         [math.hypot(*leg) for leg in way], abs=1e-6
     )
@@ -143,7 +167,9 @@ def test_its_way_is_as_long_as_its_legs_wherever_its_nose_points(
 
 
 def test_ahead_is_where_its_nose_points_and_left_is_left_of_that() -> None:
-    _, ahead, left = plan([(4.0, 0.0, 0.0), (0.0, 2.0, 1.0)]).corners_m((0.0, 0.0, 0.0), math.pi / 2)
+    _, ahead, left = plan([(4.0, 0.0, 0.0), (0.0, 2.0, 1.0)]).corners_m(
+        FlightOrigin("local", "", 0.0, 0.0, math.pi / 2), 0.0
+    )
     assert ahead == pytest.approx((0.0, 4.0, -3.0)), "east"
     assert left == pytest.approx((2.0, 4.0, -4.0)), "north of it, and up"
 
@@ -152,6 +178,6 @@ def test_ahead_is_where_its_nose_points_and_left_is_left_of_that() -> None:
 def test_along_it_nobody_goes_faster_than_the_way(
     way: list[tuple[float, float, float]], one_m: float, other_m: float
 ) -> None:
-    corners_m = plan(way).corners_m((0.0, 0.0, 0.0), 0.0)
+    corners_m = plan(way).corners_m(FlightOrigin("local", "", 0.0, 0.0, 0.0), 0.0)
     assert math.dist(along(corners_m, one_m), along(corners_m, other_m)) <= abs(one_m - other_m) + 1e-6
     assert along(corners_m, 1e6) == corners_m[-1]

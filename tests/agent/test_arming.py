@@ -18,6 +18,7 @@ from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.px4 import PX4
 from tests.agent.test_agent_flight import MemoryLink
 from tests.helpers import drones
+from tests.helpers.sshd import free_port
 
 NEEDS = FlightNeeds(highest_m=3.0, farthest_m=20.0, ceiling_m=10.0, least_charge=0.2, returns=True)
 ALL = d.MAV_SYS_STATUS_SENSOR_GPS | d.MAV_SYS_STATUS_PREARM_CHECK
@@ -119,5 +120,5 @@ def test_an_emulated_autopilot_is_asked(firmware: Firmware, capsys: pytest.Captu
 
 def test_where_nobody_answers_it_says_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arming, "_HEARTBEAT_S", 0.3)
-    assert arming.look("udpin:127.0.0.1:0", NEEDS, threading.Event()) == 1
+    assert arming.look(f"udpin:127.0.0.1:{free_port()}", NEEDS, threading.Event()) == 1
     assert "no heartbeat" in capsys.readouterr().err

@@ -53,6 +53,27 @@ def test_modes_of_px4_are_those_of_its_table() -> None:
     assert guided == ["OFFBOARD"]
 
 
+def test_names_of_modes_are_those_of_the_tables_of_pymavlink() -> None:
+    px4 = {name: PX4.mode_name(main << 16 | sub << 24) for name, (_, main, sub) in mavutil.px4_map.items()}
+    del px4["RTGS"], px4["FOLLOWME"]  # not in px4_custom_mode.h any more; FOLLOW_TARGET there
+    assert {name: given.rpartition(".")[2] for name, given in px4.items()} == {name: name for name in px4}
+    assert PX4.mode_name(4 << 16 | 6 << 24) == "AUTO.LAND"
+    obsolete = {"POSITION", "OF_LOITER", "RATE_ACRO"}
+    named = {name: COPTER.mode_name(number) for name, number in ACM.items() if name not in obsolete}
+    assert named == {name: name for name in named}
+    assert (COPTER.mode_name(99), PX4.mode_name(99 << 16)) == ("99", str(99 << 16))
+
+
+def test_a_guard_knows_the_modes_of_programs_and_those_in_which_a_drone_comes_down() -> None:
+    assert {name for name, number in ACM.items() if COPTER.is_led(number)} == {"AUTO", "GUIDED"}
+    assert {name for name, number in ACM.items() if COPTER.comes_down(number)} == {
+        *("RTL", "LAND", "SMART_RTL", "AUTO_RTL")
+    }
+    px4 = {name: main << 16 | sub << 24 for name, (_, main, sub) in mavutil.px4_map.items()}
+    assert {name for name in px4 if PX4.is_led(px4[name])} == {"OFFBOARD", "TAKEOFF", "LOITER", "MISSION"}
+    assert {name for name in px4 if PX4.comes_down(px4[name])} == {"RTL", "LAND"}
+
+
 def test_who_speaks_which() -> None:
     flown = {kind for kind in range(64) if COPTER.speaks(d.MAV_AUTOPILOT_ARDUPILOTMEGA, kind)}
     named = {kind for kind in range(64) if mavutil.mode_mapping_byname(kind) == ACM}

@@ -6,13 +6,15 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 
 from fieldkit.agent import flight, landing
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
+from fieldkit.agent.flying import loop
+from fieldkit.agent.mavlink_frames import LOCAL_POSITION_NED, head
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.autopilot import Autopilot
@@ -24,7 +26,7 @@ HEIGHT_M = 0.6
 
 def plan(folder: Path, port: int) -> FlightPlan:
     where, orders = f"udpout:127.0.0.1:{port}", str(folder / "orders")
-    return FlightPlan(where, orders, "land", 60.0, height_m=HEIGHT_M, ceiling_m=10.0)
+    return FlightPlan(where, orders, "land", 60.0, height_m=HEIGHT_M, ceiling_m=10.0, fence_m=20.0)
 
 
 def order(folder: Path, number: int, what: str) -> None:
@@ -66,12 +68,40 @@ def test_who_cannot_write_its_log_lands(tmp_path: Path) -> None:
         assert process.wait(60) == 0
 
 
-def test_an_autopilot_that_is_silent_is_told_to_land(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_does_not_end_a_flight(tmp_path: Path) -> None:
+    """The log of positions ends; the flight does not."""
+    order(tmp_path, 1, CLIMB)
+    with (
+        drones.autopilot_at_udp() as (port, autopilot),
+        agent(replace(plan(tmp_path, port), log="/dev/full")) as process,
+    ):
+        wait_until_up(autopilot)
+        order(tmp_path, 2, GO)
+        order(tmp_path, 3, HOME)
+        wait_until_down(autopilot)
+        assert process.wait(60) == 0
+
+
+@pytest.mark.parametrize(
+    ("lost", "reason"),
+    [
+        (None, "no heartbeat of the autopilot for 2 s"),
+        (LOCAL_POSITION_NED, "it has not reported its position for 2 s"),
+    ],
+    ids=["everything", "positions"],
+)
+def test_an_autopilot_that_does_not_report_is_told_to_land(
+    lost: int | None, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """It may hear what it cannot answer."""
-    monkeypatch.setattr(flight, "_SILENT_S", 2.0)
+    monkeypatch.setattr(loop, "_BLIND_S" if lost else "_SILENT_S", 2.0)
     silent, codes = threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
-    with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame]) as (port, autopilot):
+
+    def damage(frame: bytes) -> list[bytes]:
+        return [] if silent.is_set() and lost in {None, head(frame).kind} else [frame]
+
+    with drones.autopilot_at_udp(damage) as (port, autopilot):
         told, over = plan(tmp_path, port), threading.Event()
         pilot = threading.Thread(target=lambda: codes.append(flight.fly(told, over)))
         pilot.start()
@@ -80,10 +110,40 @@ def test_an_autopilot_that_is_silent_is_told_to_land(tmp_path: Path, monkeypatch
             silent.set()
             wait_until_down(autopilot)
             silent.clear()
+            pilot.join(60)
         finally:
             over.set()
             pilot.join(60)
     assert codes == [landing.REFUSED]
+    assert reason in capfd.readouterr().err
+
+
+def test_an_autopilot_that_stays_silent_ends_the_flight_with_an_alarm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As behind a router that has ended: the alarm comes first, and the program ends some time later."""
+    monkeypatch.setattr(loop, "_SILENT_S", 5.0)
+    monkeypatch.setattr(landing, "UNHEARD_S", 1.0)
+    silent, over, codes = threading.Event(), threading.Event(), list[int]()
+    order(tmp_path, 1, CLIMB)
+    with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame]) as (port, autopilot):
+        told = plan(tmp_path, port)
+        pilot = threading.Thread(target=lambda: codes.append(flight.fly(told, over)))
+        pilot.start()
+        try:
+            wait_until_up(autopilot)
+            silent.set()
+            pilot.join(60)
+        finally:
+            over.set()
+            pilot.join(60)
+    assert codes == [landing.REFUSED]
+    said = capfd.readouterr().err.splitlines()
+    texts = [line.partition(" ")[2] for line in said]
+    alarms = [number for number, text in enumerate(texts) if text.startswith("ALARM: THE DRONE MAY STILL BE")]
+    assert texts[alarms[0] - 1] == "land: no heartbeat of the autopilot for 5 s"
+    assert all(text.endswith(landing.MANUAL_ACTION) for text in (texts[number] for number in alarms))
+    assert texts[-1] == "error: no heartbeat of the autopilot for 1 s"
 
 
 def test_a_drone_whose_motors_stop_is_not_led_any_more(tmp_path: Path) -> None:
@@ -94,4 +154,4 @@ def test_a_drone_whose_motors_stop_is_not_led_any_more(tmp_path: Path) -> None:
         autopilot.vehicle.disarm(force=True)
         assert process.wait(60) == landing.TAKEN
         assert process.stderr is not None
-        assert b"its motors stand" in process.stderr.read()
+        assert b"its motors have stopped" in process.stderr.read()

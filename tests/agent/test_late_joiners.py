@@ -45,12 +45,14 @@ def test_who_comes_late_gets_the_last_samples(over: str, tmp_path: Path) -> None
     said = [bytes(store.serialize_cdr(store.types[TYPE](text), TYPE)).hex() for text in ("one", "two", "three")]
     file = tmp_path / "samples"
     file.write_text("\n".join(said), encoding="ascii")
-    with cabled() as (near, far), end(near, "say", over, file):
+    with cabled() as (near, far), end(near, "say", over, file) as publisher:
         with end(far, "hear", over, file) as ears:
             assert ears.stdout is not None
             for line in ears.stdout:
                 if line.strip() == said[-1]:
                     break
+            assert publisher.stdout is not None
+            assert publisher.stdout.readline() == "matched\n"
         # All has been said by now.
         with end(far, "hear", over, file) as late:
             assert late.stdout is not None

@@ -139,6 +139,7 @@ print(json.dumps([policies, made.deadline.nanoseconds, made.lifespan.nanoseconds
 """
 
 
+@pytest.mark.emulated
 def test_what_is_asked_is_told_to_rclpy_in_its_own_words(program: Path) -> None:
     done = subprocess.run((ROS2, "-c", SHOWN, str(program)), capture_output=True, check=False, timeout=LONG_S)
     assert done.returncode == 0, done.stderr

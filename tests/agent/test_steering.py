@@ -92,7 +92,7 @@ def test_it_gets_there_and_back_and_faces_as_before(
     ahead, left = map(sum, zip(*legs, strict=True))
     goal = start.x_m + cos * ahead - sin * left, start.y_m + sin * ahead + cos * left
     assert math.dist(robot.pose[:2], goal) < 0.05 + 5 * noise_m + 3 * noise_m * len(legs)
-    back = list(run(driver, robot, now_s=500.0, order=BACK))
+    back = list(run(driver, robot, now_s=len(out) * TICK_S, order=BACK))
     assert (driver.phase, driver.stopped) == ("home", "")
     assert math.dist(robot.pose[:2], start[:2]) < 0.05 + 10 * noise_m
     assert abs(math.remainder(robot.pose.yaw_rad - start.yaw_rad, math.tau)) < 0.1 + 5 * noise_m
@@ -169,7 +169,7 @@ def test_silent_odometry_stops_it() -> None:
 def test_it_stops_at_its_fence_and_after_its_time() -> None:
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], fence_m=2.0))
     stopped_after_s(driver, since_s, robot, renews=True, hears=True)
-    assert driver.stopped == "beyond the fence, 2 m from where it began"
+    assert driver.stopped == "beyond the fence, 2 m from its place"
     assert math.dist(robot.pose[:2], (7.0, 8.0)) < 2.0 + 2 * TASK.speed_m_s * TICK_S
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], limit_s=3.0))
     assert stopped_after_s(driver, since_s, robot, renews=True, hears=True) <= 3.0
@@ -184,7 +184,7 @@ def test_odometry_that_jumps_and_an_order_to_end_stop_it() -> None:
     assert driver.stopped.startswith("odometry jumped by 1")
     driver, _, since_s = moving()
     driver.renewed(since_s, END)
-    assert (driver.tick(since_s), driver.stopped) == (STAND, "asked to")
+    assert (driver.tick(since_s), driver.stopped) == (STAND, "ordered to stop")
 
 
 def test_it_waits_for_its_laptop_and_turns_back_where_it_is() -> None:
@@ -225,10 +225,57 @@ def test_odometry_that_says_the_same_for_ever_stops_it(told: tuple[float, float]
     way_m = 0.0
     for number in range(1, 1200):
         at_s = number * TICK_S
-        driver.odometry(at_s, pose)
+        driver.odometry(at_s, pose if driver.phase != "waits" else OdometryPose(0.0, 0.0, 0.0))
         driver.renewed(at_s, OUT)
         way_m += driver.tick(at_s).forward_m_s * TICK_S
         if driver.stopped:
             break
     assert driver.stopped.startswith("told to drive 1.3 m, it came 0.0 m")
     assert way_m < 1.5, "of 5 m to its fence"
+
+
+@pytest.mark.parametrize(
+    ("start", "last", "why"),
+    [
+        ((6.0, 0.0, 0.0), None, "it is 6.00 m from its place, outside its fence of 5 m"),
+        ((0.5, 0.0, 0.0), None, "it is 0.50 m and 0.00 rad from its place"),
+        ((0.0, 0.0, 0.6), None, "it is 0.00 m and 0.60 rad from its place"),
+        ((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), "its odometry is 2.00 m and 0.00 rad from where its last motion ended"),
+    ],
+)
+def test_a_robot_that_is_not_at_its_place_does_not_start(
+    start: tuple[float, float, float], last: tuple[float, float, float] | None, why: str
+) -> None:
+    driver = Driver(replace(TASK, origin=(0.0, 0.0, 0.0), last=last), 0.0)
+    assert set(run(driver, Robot(OdometryPose(*start)))) == {STAND}
+    assert (driver.stopped, driver.refused) == (why, True)
+
+
+def test_later_repeats_take_the_direction_of_the_origin() -> None:
+    driver = Driver(replace(TASK, legs=[(2.0, 0.0)], origin=(0.0, 0.0, 0.0)), 0.0)
+    robot = Robot(OdometryPose(0.1, -0.1, 0.25))
+    list(run(driver, robot))
+    assert robot.pose[:2] == pytest.approx((2.0, 0.0), abs=0.05)
+
+
+def test_a_gap_between_two_turns_of_the_loop_stops_it_for_good() -> None:
+    driver, robot, since_s = moving()
+    driver.renewed(since_s + 6.0, OUT)
+    driver.odometry(since_s + 6.0, robot.odometry())
+    assert driver.tick(since_s + 6.0) == STAND
+    assert driver.stopped == "its program was suspended for 6.0 s"
+
+
+def test_with_leave_it_first_returns_along_its_path() -> None:
+    task = replace(TASK, legs=[(2.0, 0.0), (0.0, 1.5)], origin=(0.0, 0.0, 0.0), may_return=True)
+    driver, robot = Driver(task, 0.0), Robot(OdometryPose(2.0, 1.0, 1.5))
+    off_m = 0.0
+    for _ in run(driver, robot):
+        x_m, y_m, _ = robot.pose
+        off_m = max(off_m, min(abs(y_m), abs(x_m - 2.0)))
+    assert (driver.phase, driver.stopped) == ("there", "")
+    assert off_m < 0.2, "round the corner"
+    assert driver.driven_m == pytest.approx(3.5, abs=0.3), "the way back is not of the drive"
+    driver = Driver(task, 0.0)
+    assert set(run(driver, Robot(OdometryPose(0.5, 2.0, 0.0)))) == {STAND}
+    assert driver.stopped.endswith("more than 1 m off its path")

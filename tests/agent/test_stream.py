@@ -89,8 +89,13 @@ class Remembering:
 
 
 def logged(path: Path) -> list[tuple[int, int, int, int]]:
-    """Return kind, size, sequence and time sent of each record."""
-    return [(kind, size, sequence, sent_ns) for kind, _, size, sequence, sent_ns, _ in topic_logs.rows(path)]
+    """Return kind, size, sequence and time sent of each record; of the end, the checksum and its mark left out."""
+    *rows, end = topic_logs.rows(path)
+    assert (end[0], end[4]) == (records.END, records.CHECKED)
+    return [
+        *((kind, size, sequence, sent_ns) for kind, _, size, sequence, sent_ns, _ in rows),
+        (end[0], 0, end[3], 0),
+    ]
 
 
 def published(tmp_path: Path, middleware: Remembering, what: Stream | None = None) -> list[tuple[int, int, int, int]]:

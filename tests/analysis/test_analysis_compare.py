@@ -148,6 +148,13 @@ def test_runs_that_are_not_comparable_say_why(changes: dict[str, Any], said: str
     assert [str(one) for one in found.refusals] == [said]
 
 
+def test_runs_with_other_congestion_controls_do_not_compare() -> None:
+    cubic, bbr = (moved(UDP, tcp_congestion_control=name) for name in ("cubic", "bbr"))
+    (refusal,) = compared(cubic, bbr).refusals
+    assert str(refusal) == "tcp_congestion_control: A has cubic, B has bbr (los, master, 9.144 m, udp)"
+    assert not compared(cubic, UDP).refusals, "of trials of an earlier version it is unknown"
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -90,8 +90,8 @@ def test_a_trend_is_told_beside_the_table_and_in_json(tmp_path: Path, capsys: py
     assert main([*words, "table"]) == 0
     said = capsys.readouterr().out
     assert "]!" in said
-    assert "! repeats that hang together in time" in said
-    assert "shuffle the order" in said
+    assert "! repeats are not independent in time" in said
+    assert "Randomize the order" in said
     assert main([*words, "json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert "transfer time" in found["cautions"][0]
@@ -112,4 +112,7 @@ def test_a_median_of_few_repeats_says_what_it_holds(tmp_path: Path, capsys: pyte
     assert main(["aggregate", str(path), "--quantity", "transfer_s"]) == 0
     said = capsys.readouterr().out
     assert "]*" in said
-    assert "in 88 % of 4 repeats; run 6 at least" in said
+    assert (
+        "* 95 % interval assuming a normal distribution; without that assumption 4 repeats give 88 %. "
+        "Use 6 or more repeats"
+    ) in said

@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldkit.analysis import repeats as repeats_module
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.repeats import Repeats, deduplicated, parse, read
+from fieldkit.analysis.duplicates import deduplicated
+from fieldkit.analysis.repeats import Repeats, parse, read
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.trial.columns import trial_columns
@@ -193,3 +195,33 @@ def test_only_the_columns_asked_for_are_read(tmp_path: Path) -> None:
 
 def test_no_table_gives_no_row() -> None:
     assert len(read([], trial_columns())) == 0
+
+
+def test_a_large_table_is_read_block_by_block_to_the_same_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = write(tmp_path, [replace(ROW, repeat=1 + n, sender=f"robot {n}") for n in range(50)])
+    whole = read([table], trial_columns())
+    monkeypatch.setattr(repeats_module, "_BATCH_BYTES", 1000)
+    blocks = read([table], trial_columns())
+    assert same(blocks, whole)
+    assert (blocks.texts["source"] == whole.texts["source"]).all()
+
+
+def test_a_damaged_line_of_a_large_table_has_its_number_in_the_whole_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = write(tmp_path, [replace(ROW, repeat=1 + n) for n in range(50)])
+    lines = table.read_text(encoding="utf-8").splitlines()
+    lines[40] = lines[40].replace(",valid,", ",vali,")
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    monkeypatch.setattr(repeats_module, "_BATCH_BYTES", 1000)
+    with pytest.raises(EvidenceError, match=r"trial\.csv:41"):
+        read([table], trial_columns())
+
+
+@given(st.lists(st.tuples(st.sampled_from("ab"), st.sampled_from([1.0, 2.0, None])), min_size=1))
+def test_rows_have_the_same_code_exactly_where_columns_hold_the_same(keys: list[tuple[str, float | None]]) -> None:
+    table = [replace(ROW, repeat=1 + n, sender=text, distance_m=metres) for n, (text, metres) in enumerate(keys)]
+    codes = parse(to_csv(table, trial_columns()).encode(), trial_columns()).codes(("sender", "distance_m")).tolist()
+    assert [[a == b for b in codes] for a in codes] == [[a == b for b in keys] for a in keys]

@@ -1,4 +1,4 @@
-"""How often the 95 % intervals hold the truth, by simulation; docs/method.md has the tables that come out."""
+"""Coverage of the 95 % intervals by simulation, compared with the tables of docs/method-intervals.md."""
 
 import re
 from collections.abc import Callable
@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilsons
+from tests.helpers.nightly import others_at_night
 from tests.helpers.paths import ROOT
 
 CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
@@ -22,7 +23,7 @@ RATES: Final = (0.01, 0.05, 0.35)
 # Seven losses are expected in a whole cell, or two bursts at most: losing nothing is no surprise, so an interval can
 # only miss on one side.
 RARE: Final = {(36, 0.01)}
-METHOD: Final = ROOT / "docs" / "method.md"
+METHOD: Final = ROOT / "docs" / "method-intervals.md"
 
 Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, tuple[int, int]], Floats]
@@ -52,14 +53,14 @@ def covered(found: Intervals, truth: float) -> float:
 
 
 def in_method(*key: str) -> list[float]:
-    """Return the numbers of the row of docs/method.md that begins with these cells."""
+    """Return the numbers of the row of docs/method-intervals.md that begins with these cells."""
     begin = re.escape("| " + " | ".join(key) + " |")
     (row,) = re.findall(rf"^{begin}(.*)\|$", METHOD.read_text(encoding="utf-8"), re.MULTILINE)
     return [float(number) for number in row.split("|")]
 
 
-@pytest.mark.parametrize("rate", RATES)
-@pytest.mark.parametrize("packets", [36, 215])
+@pytest.mark.parametrize("rate", others_at_night(RATES))
+@pytest.mark.parametrize("packets", others_at_night([36, 215]))
 def test_shares_cover_whatever_the_bursts(
     packets: int, rate: float, record_property: Callable[[str, object], None]
 ) -> None:
@@ -81,7 +82,7 @@ def test_shares_cover_whatever_the_bursts(
     )
 
 
-@pytest.mark.parametrize("n", [2, 3, 5, 10])
+@pytest.mark.parametrize("n", others_at_night([2, 3, 5, 10]))
 def test_shares_of_few_repeats_cover_at_least_nearly_as_often(
     n: int, record_property: Callable[[str, object], None]
 ) -> None:
@@ -98,7 +99,7 @@ def test_shares_of_few_repeats_cover_at_least_nearly_as_often(
     assert min(found) > 92
 
 
-@pytest.mark.parametrize("burst", BURSTS)
+@pytest.mark.parametrize("burst", others_at_night(BURSTS, in_ci=[5]))
 def test_shares_cover_where_repeats_send_unequally(
     burst: int, record_property: Callable[[str, object], None]
 ) -> None:
@@ -110,8 +111,8 @@ def test_shares_cover_where_repeats_send_unequally(
     assert BAND[0] <= found <= BAND[1]
 
 
-@pytest.mark.parametrize("rate", [0.05, 0.35])
-@pytest.mark.parametrize("largest", [36, 540])
+@pytest.mark.parametrize("rate", others_at_night([0.05, 0.35]))
+@pytest.mark.parametrize("largest", others_at_night([36, 540]))
 def test_shares_cover_less_where_repeats_differ_by_far(
     rate: float, largest: int, record_property: Callable[[str, object], None]
 ) -> None:
@@ -148,7 +149,7 @@ def percentile_bootstrap(random: np.random.Generator, values: Floats) -> Interva
     return Intervals(values.mean(axis=1), low, high)
 
 
-@pytest.mark.parametrize("name", TIMES)
+@pytest.mark.parametrize("name", others_at_night(TIMES, in_ci=["lognormal, sigma 1"]))
 def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(14)
     draw, mean, middle = TIMES[name]
@@ -164,7 +165,7 @@ def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Call
     assert in_method(name) == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
 
 
-@pytest.mark.parametrize("burst", [5, 20])
+@pytest.mark.parametrize("burst", others_at_night([5, 20]))
 def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(15)
     packets, rate = 215, 0.35
@@ -200,7 +201,7 @@ SHAPES: Final[dict[str, tuple[Draw, float]]] = {
 FEW_AND_MANY: Final = (2, 3, 4, 5, 6, 7, 10, 20, 30)
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", others_at_night(SHAPES, in_ci=["two humps, 60:40"]))
 def test_medians_hold_what_is_assured_whatever_the_shape(
     name: str, record_property: Callable[[str, object], None]
 ) -> None:

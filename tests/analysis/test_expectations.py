@@ -7,16 +7,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.analysis import expectations, judgements, wording
-from fieldkit.analysis.cells import Cell, Estimate
+from fieldkit.analysis.cells import Cell, Estimate, aggregate
+from fieldkit.analysis.expectations import Scope
 from fieldkit.analysis.judgements import Ruling
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.core.columns import Kind
 from fieldkit.core.errors import ConfigurationError
+from tests.helpers.tables import ROW, parsed, replace
 
-LOSS = Quantity("up.file_loss", "up: file bytes lost", Kind.MEAN, "share")
+LOSS = Quantity("up.file_loss", "up: file loss", Kind.MEAN, "share")
 RTT = Quantity("rtt_median_s", "RTT", Kind.MEDIAN, "s")
 SIGNAL = Quantity("signal_dbm", "signal", Kind.MEDIAN, "dBm")
-KNOWN = (LOSS, RTT, SIGNAL)
+PACKETS = Quantity("ip_loss", "IP packet loss", Kind.COUNTED, "share", "ip_packets_received", "ip_packets_sent")
+KNOWN = (LOSS, RTT, SIGNAL, PACKETS)
 
 
 def estimate(quantity: Quantity, value: float, low: float | None, high: float | None) -> Estimate:
@@ -48,12 +51,26 @@ def test_what_can_be_demanded(text: str, name: str, is_below: bool, bound: float
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "is no expectation"),
-        ("up.file_loss", "is no expectation"),
-        ("up.file_loss = 2 %", "is no expectation"),
-        ("up.file_loss <= 2 %", "is no expectation"),
-        ("up.file_loss < 2 % < 3 %", "is no expectation"),
-        ("icmp up.file_loss < 2 %", "is no expectation"),
+        ("", "is not an expectation"),
+        ("up.file_loss", "is not an expectation"),
+        ("up.file_loss = 2 %", "is not an expectation"),
+        ("up.file_loss == 2 %", "is not an expectation"),
+        ("up.file_loss =< 2 %", "is not an expectation"),
+        ("up.file_loss < 2 % < 3 %", "is not an expectation"),
+        ("icmp up.file_loss < 2 %", "is not an expectation"),
+        ("median up.file_loss < 2 %", "is not an expectation"),
+        ("90 of up.file_loss < 2 %", "is not an expectation"),
+        ("max up.file_loss > 2 %", "about one repeat alone"),
+        ("min rtt_median_s <= 2 ms", "about one repeat alone"),
+        ("100 % of rtt_median_s < 2 ms", "not a share that repeats can show"),
+        ("0 % of rtt_median_s < 2 ms", "not a share that repeats can show"),
+        ("120 % of rtt_median_s < 2 ms", "not a share that repeats can show"),
+        ("ip_loss <= 0 % of all packets", "no number of packets shows a loss below 0 %"),
+        ("ip_loss < -2 % of all packets", "no number of packets shows a loss below -2 %"),
+        ("up.file_loss < 2 % of all packets", "a loss that is counted is over all packets"),
+        ("ip_loss > 2 % of all packets", "a loss that is counted is over all packets"),
+        ("every ip_loss < 2 % of all packets", "a loss that is counted is over all packets"),
+        ("90 % of ip_loss < 2 % of all packets", "a loss that is counted is over all packets"),
         ("file_loss < 2 %", "there is no figure 'file_loss'"),
         ("up.file_loss < 2", "has no unit"),
         ("up.file_loss < 2 ms", "unknown unit 'ms'"),
@@ -93,6 +110,100 @@ def test_nothing_both_holds_and_fails(one: float, other: float, bound: float) ->
     assert (above is Ruling.HOLDS) == (low > float(f"{bound:.6f}"))
 
 
+@pytest.mark.parametrize(
+    ("text", "scope", "is_inclusive", "share"),
+    [
+        ("ip_loss < 2 %", Scope.FIGURE, False, None),
+        ("ip_loss <= 2 %", Scope.FIGURE, True, None),
+        ("udp every ip_loss <= 2 %", Scope.EVERY, True, None),
+        ("max rtt_median_s < 5 ms", Scope.EVERY, False, None),
+        ("min signal_dbm >= -70 dBm", Scope.EVERY, True, None),
+        ("udp 90 % of ip_loss < 2 %", Scope.SHARE, False, 0.9),
+        ("99.5% of rtt_median_s < 5ms", Scope.SHARE, False, 0.995),
+        ("udp ip_loss < 2 % of all packets", Scope.PACKETS, False, None),
+        ("ip_loss <= 2% of  all packets", Scope.PACKETS, True, None),
+    ],
+)
+def test_what_an_expectation_is_about(text: str, scope: Scope, is_inclusive: bool, share: float | None) -> None:
+    found = expectations.parse(text, KNOWN)
+    assert (found.scope, found.is_inclusive, found.share) == (scope, is_inclusive, share)
+
+
+def losses(*lost: int, sent: int = 1250) -> Cell:
+    """The cell of UDP repeats that lost so many of `sent` packets each."""
+    rows = [
+        replace(ROW, repeat=number, ip_packets_sent=sent, ip_packets_received=sent - one, ip_loss=one / sent)
+        for number, one in enumerate(lost, 1)
+    ]
+    (made,) = aggregate(parsed(rows), ("protocol",), quantities=[PACKETS])
+    return made
+
+
+def ruling(text: str, found: Cell) -> Ruling:
+    (said,) = judgements.judge([expectations.parse(text, KNOWN)], [found])
+    return said.ruling
+
+
+def test_a_perfect_link_passes_a_gate_over_all_packets() -> None:
+    """Issue 21: 0 of 7,500 datagrams lost in 6 repeats of 3 s was undecided, while 0.5 % of loss passed."""
+    gate = "ip_loss < 2 % of all packets"
+    assert ruling(gate, losses(0, 0, 0, 0, 0, 0)) is Ruling.HOLDS
+    assert ruling(gate, losses(6, 6, 6, 6, 6, 7)) is Ruling.HOLDS
+    assert ruling(gate, losses(0, 0, 37, 0, 0, 0)) is Ruling.OPEN, "0.5 % in one burst"
+    assert ruling(gate, losses(25, 25, 25, 25, 25, 25)) is Ruling.FAILS
+    assert ruling("ip_loss <= 2 % of all packets", losses(25, 25, 25, 25, 25, 25)) is Ruling.OPEN
+    assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "a statement on other repeats"
+    (few,) = judgements.judge([expectations.parse(gate, KNOWN)], [losses(0, 0, sent=100)])
+    assert wording.judged(few)[2:] == (
+        "0.00 %", "14.98 % or less", "undecided: 200 of 1498 packets that it needs at least",
+    )  # fmt: skip
+
+
+ORDER = (Ruling.FAILS, Ruling.OPEN, Ruling.HOLDS)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 150), st.integers(0, 150)), min_size=2, max_size=8),
+    st.sampled_from(["ip_loss < 2 % of all packets", "every ip_loss < 2 %", "50 % of ip_loss < 2 %"]),
+)
+def test_fewer_losses_never_make_a_ruling_worse(pairs: list[tuple[int, int]], text: str) -> None:
+    fewer, more = (losses(*(pick(pair) for pair in pairs)) for pick in (min, max))
+    assert ORDER.index(ruling(text, fewer)) >= ORDER.index(ruling(text, more))
+
+
+@pytest.mark.parametrize(
+    ("lost", "every", "most"),
+    [
+        ([0] * 29, Ruling.HOLDS, Ruling.HOLDS),
+        ([0] * 28, Ruling.HOLDS, Ruling.OPEN),
+        ([0] * 28 + [100], Ruling.FAILS, Ruling.OPEN),
+        ([0] * 60 + [100], Ruling.FAILS, Ruling.HOLDS),
+        ([0] * 10 + [100] * 10, Ruling.FAILS, Ruling.FAILS),
+        ([25] * 29, Ruling.FAILS, Ruling.FAILS),
+    ],
+)
+def test_every_repeat_and_a_share_of_them(lost: list[int], every: Ruling, most: Ruling) -> None:
+    assert ruling("every ip_loss < 2 %", losses(*lost)) is every
+    assert ruling("90 % of ip_loss < 2 %", losses(*lost)) is most
+
+
+def test_what_was_measured_is_shown_for_each_form() -> None:
+    cells = losses(0, 0, 0, 50)
+    shown = {
+        text: wording.judged(judgements.judge([expectations.parse(text, KNOWN)], [cells])[0])[2:]
+        for text in ("max ip_loss < 5 %", "90 % of ip_loss < 5 %", "ip_loss < 5 % of all packets")
+    }
+    assert shown == {
+        "max ip_loss < 5 %": ("4.00 %", "", "holds"),
+        "90 % of ip_loss < 5 %": (
+            "4 of 4 repeats",
+            "47.29 % or more",
+            "undecided: 29 repeats are needed, if all meet it",
+        ),
+        "ip_loss < 5 % of all packets": ("1.00 %", "4.74 % or less", "holds"),
+    }
+
+
 def test_a_protocol_alone_is_judged_and_what_is_not_there_cannot_be_told() -> None:
     cells = [cell("tcp", estimate(RTT, 0.002, 0.001, 0.003)), cell("udp")]
     (alone,) = judgements.judge([expectations.parse("tcp rtt_median_s < 5 ms", KNOWN)], cells)
@@ -101,7 +212,7 @@ def test_a_protocol_alone_is_judged_and_what_is_not_there_cannot_be_told() -> No
     assert [one.ruling for one in both] == [Ruling.HOLDS, Ruling.OPEN]
     assert [wording.judged(one)[1:] for one in both] == [
         ("TCP", "2.00 ms", "[1.00, 3.00]", "holds"),
-        ("UDP", "nothing", "", "cannot be told"),
+        ("UDP", "nothing", "", "undecided: 0 of 5 repeats have a value"),
     ]
     (nobody,) = judgements.judge([expectations.parse("udp rtt_median_s < 5 ms", KNOWN)], cells[:1])
     assert nobody.ruling is Ruling.OPEN

@@ -24,7 +24,7 @@ from fieldkit.bags import contents
 from fieldkit.bags.formats import BagFormat
 from fieldkit.bags.worker import types_of
 from fieldkit.cli import main
-from fieldkit.cli.arguments import bag
+from fieldkit.cli.commands import bag
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence.bag import METADATA
 from tests.helpers.paths import DATA

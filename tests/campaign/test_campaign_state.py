@@ -200,3 +200,28 @@ def test_a_disk_that_cannot_hold_the_evidence_is_noticed_before_anybody_walks(la
         campaign.run(Nobody(), Stop())
     assert [type(event) for event in told] == [CampaignEnded], "no robot was started"
     assert journal.folder.is_dir(), "and the order is kept"
+
+
+def test_trials_with_failed_repeats_are_left_where_these_are_redone(lawn: Path) -> None:
+    asked, journal = begin(lawn)
+    backend = load_backend("emulated", None, None)
+    whole, failed, *_ = asked.trials()
+    with journal.kept(asked):
+        for trial, count in ((whole, 0), (failed, 2)):
+            journal.add(trial, TrialProgress.STARTED, trial=str(count))
+            journal.add(trial, TrialProgress.ENDED, trial=str(count), failed=count)
+    assert str(failed) not in planned(asked, journal, backend).trials
+    told: list[Event] = []
+    campaign = CampaignRun(asked, journal, backend, told.append, failed=True)
+    campaign.announce()
+    (event,) = told
+    assert isinstance(event, CampaignPlanned)
+    assert str(failed) in event.trials
+    assert str(whole) not in event.trials
+    with journal.kept(asked):
+        campaign._reopen()
+    (journal.folder / "2").mkdir()
+    (journal.folder / "2" / "trial.yaml").touch()
+    for kept in (journal, CampaignJournal(journal.folder)):
+        assert set(kept.ended()) == {str(whole)}
+        assert kept.interrupted(failed) == journal.folder / "2"

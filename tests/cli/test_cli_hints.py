@@ -66,6 +66,11 @@ def test_every_command_that_is_named_is_one_and_takes_its_options() -> None:
             "fieldkit check los --topology master",
             "fieldkit check --site 'my lab.yaml' --backend field --repeats 3 --record 2s los --topology master",
         ),
+        (
+            "trial los 30ft --allow-motion",
+            "fieldkit resume t; or fieldkit abort",
+            "fieldkit resume --site 'my lab.yaml' --backend field --allow-motion t; or fieldkit abort {given}",
+        ),
         ("resume t", "wait, or end it: fieldkit abort; or not", "wait, or end it: fieldkit abort {given}; or not"),
         ("check los", "fieldkit columns lists them", "fieldkit columns lists them"),
         ("check los", "fieldkit init, then fill it in", "fieldkit init, then fill it in"),
@@ -78,7 +83,7 @@ def test_a_hint_carries_what_was_given(typed_before: str, hint: str, whole: str)
         known.take(top.parse_args((*typed_before.split(), *GIVEN)))
         completed = hints.completed(hint)
     assert completed == whole.format(given=shlex.join(GIVEN))
-    if completed.split()[0] == "fieldkit" and " lists" not in completed and "," not in completed:
+    if completed.split()[0] == "fieldkit" and not any(mark in completed for mark in (" lists", ",", ";")):
         again = top.parse_args(shlex.split(completed)[1:])
         assert getattr(again, "site", None) is None or str(again.site) == "my lab.yaml"
 

@@ -49,7 +49,7 @@ def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
         (40, "━─────  7/40  udp-08 transfer  12 s left"),
         (24, "7/40  udp-08 transfer"),
         (16, "udp-08 transfer"),
-        (5, "udp-0"),
+        (5, "ud..."),
     ],
 )
 def test_the_line_fits_and_keeps_what_is_done_now(width: int, shown: str) -> None:
@@ -80,13 +80,13 @@ def test_nothing_is_drawn_over_a_question_nor_after_the_end() -> None:
     assert not progress.is_needed
 
 
-def test_a_valid_repeat_is_one_line_of_a_terminal_and_whole_in_a_file() -> None:
+def test_a_valid_repeat_is_whole_and_is_folded_where_a_terminal_is_narrow() -> None:
     def repeat(width: int | None) -> str:
         return "".join(text for text, _ in words_of(VALID, width))
 
     assert repeat(None) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms  (3 min 20 s left)"
     assert repeat(80) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms"
-    assert repeat(40) == "  7/40  udp-07  valid  IP loss 3.2 %"
+    assert repeat(40) == "  7/40  udp-07  valid  IP loss 3.2 %,\n        file loss 18 %, RTT 1.3 ms"
 
 
 def test_why_a_repeat_is_void_is_folded_below_it_and_never_cut() -> None:

@@ -5,6 +5,7 @@ import pkgutil
 import subprocess
 import sys
 from collections.abc import Mapping
+from inspect import isfunction
 from pathlib import Path
 from types import ModuleType
 
@@ -13,8 +14,8 @@ import pytest
 from fieldkit import __version__
 from fieldkit.analysis.compare import PAIRED_BY
 from fieldkit.analysis.quantities import DEFAULT_BY
-from fieldkit.cli import arguments, commands, main, parser
-from fieldkit.cli.arguments import compare, shared
+from fieldkit.cli import commands, main, parser, shared_arguments
+from fieldkit.cli.commands import compare
 from fieldkit.config import documents
 from tests.helpers.paths import DATA, ROOT
 from tests.helpers.runs import fieldkit
@@ -51,17 +52,24 @@ def imported(lab: Path, words: str, asked: Mapping[str, str] | None = None) -> s
     return rooms | {name.partition(".")[0] for name in names} & LIBRARIES
 
 
-@pytest.mark.parametrize("words", ["--version", "--help", "trial --help", "lab --help", "report --help"])
-def test_help_imports_no_library(tmp_path: Path, words: str) -> None:
+@pytest.mark.parametrize("words", ["--version", "--help"])
+def test_the_list_of_commands_imports_no_library(tmp_path: Path, words: str) -> None:
     assert imported(tmp_path, words) == set()
+
+
+# An operator waits for `stop`, so it imports at its top.
+@pytest.mark.parametrize("name", [name for name in commands.COMMANDS if name != "stop"])
+def test_help_imports_no_slow_library(tmp_path: Path, name: str) -> None:
+    """Of `rosbags` the names of types, which take 10 ms."""
+    assert imported(tmp_path, f"{name} --help") & LIBRARIES <= {"rich", "rosbags"}
 
 
 @pytest.mark.parametrize(
     "line", ["fieldkit tr", "fieldkit trial ", "fieldkit trial los 30ft --to", "fieldkit resume "]
 )
-def test_completion_imports_no_library(tmp_path: Path, line: str) -> None:
+def test_completion_imports_no_library_but_rich(tmp_path: Path, line: str) -> None:
     asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
-    assert imported(tmp_path, "", asked | {"_ARGCOMPLETE_STDOUT_FILENAME": os.devnull}) == set()
+    assert imported(tmp_path, "", asked | {"_ARGCOMPLETE_STDOUT_FILENAME": os.devnull}) & LIBRARIES <= {"rich"}
 
 
 def test_a_mistyped_word_imports_what_shows_errors_alone(tmp_path: Path) -> None:
@@ -85,6 +93,13 @@ def test_a_command_imports_no_library_that_it_does_not_need(tmp_path: Path, word
     assert not imported(tmp_path, words) & unneeded
 
 
+def test_stop_imports_only_what_reaches_robots(tmp_path: Path) -> None:
+    access = "profile: box, host: 127.0.0.1, port: 1, user: u, host_key: ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIA=="
+    (tmp_path / "fieldkit.yaml").write_text(f"robots: {{a: {{{access}}}}}\nroles: {{}}\n", encoding="utf-8")
+    needed = {"cryptography", "paramiko", "yaml"}
+    assert imported(tmp_path, "stop --all") == needed | {"lab", "remote"}
+
+
 def test_a_command_that_calculates_has_one_thread(tmp_path: Path) -> None:
     """Of numpy's OpenBLAS there would be one more per core, which spins while it has nothing to do."""
     script = "import os; from fieldkit.cli import main; main(['columns']); print(*os.listdir('/proc/self/task'))"
@@ -101,7 +116,7 @@ def test_a_command_that_calculates_has_one_thread(tmp_path: Path) -> None:
 
 
 def test_the_help_names_the_columns_by_which_repeats_are_told_apart() -> None:
-    assert tuple(shared.CONDITION.split(",")) == DEFAULT_BY
+    assert tuple(shared_arguments.CONDITION.split(",")) == DEFAULT_BY
     assert tuple(compare.PAIRED_BY.split(",")) == PAIRED_BY
 
 
@@ -109,21 +124,17 @@ def test_the_help_names_the_installed_backends() -> None:
     assert "one of: emulated, field (default:" in " ".join(fieldkit(Path.cwd(), "abort", "--help").out.split())
 
 
-def test_every_command_says_what_it_takes_and_names_a_function_that_runs_it() -> None:
-    top, named = parser(), set[str]()
+def test_every_command_has_a_module_of_its_name_with_a_function_that_runs_it() -> None:
+    top = parser()
     for name in commands.COMMANDS:
         own = top.command(name)
         assert own is not None
         for inner in map(own.command, own.subcommands()) if own.subcommands() else (own,):
             assert inner is not None
-            run = inner.get_default("run") or own.get_default("run")  # `show` of a listing is run as its listing
-            assert callable(commands.load(run)), f"{inner.prog}: {run}"
-            named.add(run.partition(":")[0])
-    assert named == modules(commands), "modules that no command runs"
-
-
-def test_every_module_of_arguments_is_a_commands() -> None:
-    assert modules(arguments) - {"shared"} == set(commands.COMMANDS)
+            run = inner.get_default("run") or own.get_default("run")  # `show` of a listing runs as its listing
+            assert isfunction(run), inner.prog
+            assert run.__module__ == f"fieldkit.cli.commands.{name}"
+    assert modules(commands) == set(commands.COMMANDS)
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ def test_a_width_in_any_unit_says_how_many_more_repeats(trials: Path, capsys: py
 def test_two_runs_are_compared_in_any_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, level_dbm in (("a", -40.0), ("b", -46.0)):
         plan = varied.plan(name, distance="30ft", metres=9.144, columns=varied.VENDOR)
-        varied.write(tmp_path, plan, varied.measured(plan, seed=3, level_dbm=level_dbm))
+        varied.write(tmp_path, plan, varied.measured(plan, repeats=20, seed=3, level_dbm=level_dbm))
     words = ("compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force")
     text = said(capsys, *words, "--format", "csv")
     level = next(line for line in records(text) if line["quantity"] == "probe.level")
@@ -138,7 +138,11 @@ def test_a_report_draws_every_step_beside_the_others(
     monkeypatch.chdir(trials)
     said(capsys, "report", ".", "-o", "page.html", "--quantity", "up.jitter_s")
     page = (trials / "page.html").read_text(encoding="utf-8")
-    for title in ("IP packet loss against distance, by step", "probe: level against distance", "Jitter against"):
+    for title in (
+        "IP packet loss against distance, by step",
+        "probe: level against distance",
+        "Last jitter value (RFC 3550) against distance",
+    ):
         assert title in page
     for caption in ("UDP, up", "UDP, down", "UDP, p502", "UDP, probe, further figures"):
         assert f"<caption>{caption}</caption>" in page
@@ -154,13 +158,32 @@ def test_a_report_of_very_many_figures_says_which_it_does_not_draw(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     many = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
-    plan = varied.plan("one", distance="30ft", metres=9.144, columns=many)
-    varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
+    for distance, metres in DISTANCES.items():
+        plan = varied.plan(distance, distance=distance, metres=metres, columns=many)
+        varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
     said(capsys, "report", ".", "-o", "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "a: m11 against distance" in page
     assert "a: m12 against distance" not in page
     assert "Not drawn: a.m12, a.m13, a.m14. To draw one: --quantity a.m12." in page
+
+
+def test_figures_of_one_distance_leave_room_for_the_curves_of_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    many = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
+    last = Column("b.level", "V", "Voltage.", figure=Figure("b: level", Kind.MEDIAN))
+    for (distance, metres), columns in zip(DISTANCES.items(), ((*many, last), (last,)), strict=True):
+        plan = varied.plan(distance, distance=distance, metres=metres, columns=columns)
+        varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
+    said(capsys, "report", ".", "-o", "page.html")
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "b: level against distance" in page
+    assert "a: m0 against distance" not in page
+    assert "Not drawn" not in page
+    (dots,) = re.findall(r'<figure id="quantities".*?</figure>', page, re.DOTALL)
+    assert all(f"a: m{n}: " in dots for n in range(15))
 
 
 HOSTILE = ("<script>alert(1)</script>", r"\input{/etc/passwd}", "[x](javascript:alert)", "$2^{10}$ & #%_~", "`a`|b")

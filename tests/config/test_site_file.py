@@ -28,6 +28,7 @@ LAYOUTS = {
     "empty": "robots:\n  a:\n    host_key:   # not yet\n    profile: x\n  b: {profile: y}\n",
     "pinned": f"robots:\n  a:\n    host_key: {OTHER}  # of May\n    profile: x\n  b: {{profile: y}}\n",
     "pinned in quotes": f'robots: {{a: {{host_key: "{OTHER}", profile: x}}, b: {{profile: y}}}}\n',
+    "nested": "robots:\n  a:\n    profile: x\n    link:\n      - host: h\n\n  # of b\n  b: {profile: y}\n",
     "deep": "---\nrobots:\n        a:\n                profile: x\n        b: {profile: y}\n...\n",
 }
 

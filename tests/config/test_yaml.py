@@ -4,12 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldkit.campaign.plan import CampaignFile
-from fieldkit.config import documents, schema
+from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
@@ -228,31 +227,3 @@ def test_no_damage_to_a_file_gives_anything_but_our_own_error(file: tuple[str, t
 def test_no_text_gives_anything_but_our_own_error(text: str) -> None:
     validated(text, Site)
     validated(f"robots: {text}", Site)
-
-
-def read(text: str) -> tuple[object, ...]:
-    try:
-        document = documents.parse(text, source="x")
-    except ConfigurationError as error:
-        return error.what, error.where, error.remedy
-    return repr(document.data), document.lines
-
-
-def read_by_pyyaml_alone(text: str) -> tuple[object, ...]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(yaml, "__with_libyaml__", False)
-        return read(text)
-
-
-@given(TEXTS.map("a: {}".format) | TEXTS | damaged().map(lambda file: file[0]))
-@example("a: 1\t# one")
-@example("a: [1?2]")
-@example("a: |# one")
-@example("a: 1\nb: \ufeff")
-def test_libyaml_reads_what_pyyaml_reads(text: str) -> None:
-    assert read(text) == read_by_pyyaml_alone(text)
-
-
-@pytest.mark.parametrize("text", [text for text, _ in FILES])
-def test_what_ships_is_read_alike_with_and_without_libyaml(text: str) -> None:
-    assert read(text) == read_by_pyyaml_alone(text)

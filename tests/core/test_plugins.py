@@ -1,28 +1,21 @@
-"""What installed packages say of themselves, beside what Python's own reader of it finds."""
+"""Entry points and versions of installed packages."""
 
-from importlib import metadata
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
+from fieldkit import __version__
 from fieldkit.core import plugins
+from fieldkit.core.errors import ConfigurationError
 from tests.helpers.outside_packages import write_package
 
 
-@pytest.mark.parametrize("group", [plugins.BACKENDS, plugins.COMMANDS, "console_scripts", "pytest11"])
-def test_entry_points_are_those_that_python_itself_finds(group: str) -> None:
-    found = {(point.name, point.value) for point in plugins.points(group)}
-    assert found == {(point.name, point.value) for point in metadata.entry_points(group=group)}
-    assert found
-
-
-@pytest.mark.parametrize("package", ["fieldkit", "numpy", "PyYAML", "ruamel-yaml", "typing_extensions"])
-def test_a_version_is_what_python_itself_finds(package: str) -> None:
-    assert plugins.version(package) == metadata.version(package)
-
-
-def test_a_package_that_is_not_there_has_no_known_version() -> None:
-    assert plugins.version("no-such-package") == "unknown"
+def test_entry_points_are_sorted_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_package(tmp_path, "first", "[bench]\nlast = a.b:c\nmiddle = a.b:d [extra]\n")
+    write_package(tmp_path, "second", "[bench]\nearly = e.f:g\n[other]\nelse = h:i\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert [point.name for point in plugins.points("bench")] == ["early", "last", "middle"]
 
 
 def test_of_two_versions_of_a_package_the_first_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,22 +23,29 @@ def test_of_two_versions_of_a_package_the_first_counts(tmp_path: Path, monkeypat
         write_package(tmp_path / version, "bench-tools", f"[bench]\nbench = bench.v{version[0]}:run\n", version)
         monkeypatch.syspath_prepend(tmp_path / version)
     assert [point.value for point in plugins.points("bench")] == ["bench.v2:run"]
-    assert [point.value for point in metadata.entry_points(group="bench")] == ["bench.v2:run"]
-    assert plugins.version("Bench.Tools") == metadata.version("Bench.Tools") == "2.0"
+    assert plugins.version("Bench.Tools") == "2.0"
 
 
-def test_files_that_are_not_as_they_should_be_say_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_package(tmp_path, "first", "; a comment\n# bench = of:it\nno group\n[bench]\nlast = a.b:c.d [extra]\n")
-    (tmp_path / "second-1.0.dist-info").write_bytes(b"no folder")
-    (tmp_path / "third-1.0.dist-info").mkdir()
-    (tmp_path / "third-1.0.dist-info" / "entry_points.txt").write_bytes(b"\xff\xfe")
+def test_versions_are_of_packages_that_add_backends_or_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_package(tmp_path, "more-steps", f"[{plugins.STEPS}]\nload = more_steps:Load\n", "1.5")
+    write_package(tmp_path, "more-commands", f"[{plugins.COMMANDS}]\nplay = more_commands:play\n", "3.0")
     monkeypatch.syspath_prepend(tmp_path)
-    assert [point.name for point in plugins.points("bench")] == ["last"]
-    assert plugins.version("third") == "unknown"
+    assert plugins.versions() == {"fieldkit": __version__, "more-steps": "1.5"}
 
 
-def test_an_entry_point_may_stand_for_a_module_or_for_what_is_deep_in_one() -> None:
-    module = plugins.EntryPoint("a", "fieldkit.core.plugins", "bench")
-    deep = plugins.EntryPoint("b", "fieldkit.core.plugins : EntryPoint.count [extra]", "bench")
+def test_a_package_that_is_not_installed_has_an_unknown_version() -> None:
+    assert plugins.version("no-such-package") == "unknown"
+
+
+@pytest.mark.parametrize("value", ["fieldkit.core.no_such_module:x", "fieldkit.core.plugins:x", "not a module"])
+def test_an_entry_point_that_cannot_be_loaded_is_named(value: str) -> None:
+    with pytest.raises(ConfigurationError, match="it cannot be loaded") as caught:
+        plugins.load(EntryPoint("broken", value, "bench"))
+    assert caught.value.where == f"entry point broken = {value}"
+
+
+def test_an_entry_point_names_a_module_or_an_attribute_in_one() -> None:
+    module = EntryPoint("a", "fieldkit.core.plugins", "bench")
+    attribute = EntryPoint("b", "fieldkit.core.errors:ConfigurationError.exit_code [extra]", "bench")
     assert plugins.load(module) is plugins
-    assert plugins.load(deep) is plugins.EntryPoint.count
+    assert plugins.load(attribute) == ConfigurationError.exit_code

@@ -1,6 +1,12 @@
-import pytest
+"""Text of unknown origin in every form in which it is shown."""
 
-from fieldkit.core.text import harmless
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.text import guarded, harmless, json_text, one_line, unguarded
 
 
 @pytest.mark.parametrize(
@@ -15,3 +21,65 @@ from fieldkit.core.text import harmless
 )
 def test_nothing_is_left_that_a_terminal_obeys(text: str, shown: str) -> None:
     assert harmless(text) == shown
+
+
+def is_shown(text: str) -> bool:
+    return all(char.isprintable() or char in "\n\N{NO-BREAK SPACE}" for char in text)
+
+
+@given(st.text())
+def test_any_text_is_printable_in_every_form(text: str) -> None:
+    assert is_shown(harmless(text))
+    assert is_shown(json_text({"a": text}))
+    assert is_shown(one_line(text))
+    assert "\n" not in one_line(text)
+    assert harmless(harmless(text)) == harmless(text)
+
+
+@given(st.text().filter(str.isprintable))
+def test_a_printable_text_stays_as_it_is(text: str) -> None:
+    assert harmless(text) == one_line(text) == text
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(JSON, st.sampled_from([None, 1]))
+def test_json_says_the_same_with_escapes(value: object, indent: int | None) -> None:
+    assert json.loads(json_text(value, indent=indent)) == value
+
+
+def test_json_escapes_beyond_sixteen_bits_and_what_json_itself_leaves() -> None:
+    assert json_text("\x7f\x9b\u202e\U000e0001\xa0é") == '"\\u007f\\u009b\\u202e\\udb40\\udc01\xa0é"'
+
+
+CELLS = st.text() | st.from_regex(r"'{0,2}[=+@-][0-9a-z|!'\"]{0,5}", fullmatch=True)
+
+
+@given(CELLS)
+def test_a_cell_is_no_formula_and_is_read_back(text: str) -> None:
+    cell = guarded(text)
+    assert unguarded(cell) == text
+    if cell[:1] in {"=", "+", "-", "@"} and len(cell) > 1:
+        float(cell)  # a number
+
+
+@pytest.mark.parametrize(
+    ("text", "cell"),
+    [
+        ("=cmd|'/c calc'!A0", "'=cmd|'/c calc'!A0"),
+        ("@SUM(1)", "'@SUM(1)"),
+        ("-52.7", "-52.7"),
+        ("-52.7 dBm", "'-52.7 dBm"),
+        ("+1e3", "+1e3"),
+        ("'=x", "''=x"),
+        ("-", "-"),
+        ("it's", "it's"),
+    ],
+)
+def test_what_a_spreadsheet_takes_for_a_formula_is_marked_as_text(text: str, cell: str) -> None:
+    assert guarded(text) == cell

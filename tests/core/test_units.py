@@ -5,7 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.units import format_bytes, format_distance, format_duration, parse_distance, parse_duration_s
+from fieldkit.core.units import (
+    format_bytes,
+    format_distance,
+    format_duration,
+    parse_distance,
+    parse_duration_s,
+    parse_offset_m,
+)
 
 
 @pytest.mark.parametrize(
@@ -24,7 +31,7 @@ def test_distances_are_metres_and_keep_their_label(text: str, metres: float, lab
         ("30", "no unit"),
         ("30feet", "unknown unit 'feet'"),
         ("thirty", "not a distance"),
-        ("-3m", "not a distance"),
+        ("-3m", "below zero"),
         ("0m", "not above zero"),
         ("", "not a distance"),
         ("nanm", "not a distance"),
@@ -77,3 +84,8 @@ def test_a_distance_reads_in_the_operators_own_unit(label: str, text: str) -> No
 )
 def test_sizes_read_well(size_bytes: float, text: str) -> None:
     assert format_bytes(size_bytes) == text
+
+
+def test_a_length_may_be_in_millimetres() -> None:
+    assert parse_distance("5mm").metres == pytest.approx(0.005)
+    assert parse_offset_m("-30 mm") == pytest.approx(-0.03)

@@ -162,7 +162,7 @@ def test_replay_and_plot_tell_what_is_no_recording(lab: Path) -> None:
         (("run", "pas"), "there is no scenario 'pas'", "baylands"),
         (("run", "none.yaml"), "none.yaml: cannot be read: No such file", "ls -l none.yaml"),
         (("run", "pass.yaml", "--policy", "sliding"), "there is no sync policy 'sliding'", "sliding_window"),
-        (("run", "pass.yaml", "--seed", "-1"), "'-1' is no whole number", "--help"),
+        (("run", "pass.yaml", "--seed", "-1"), "'-1' is not a whole number from 0", "--help"),
         (("run", "pass.yaml", "--seeds", "0"), "must be at least 1", "--help"),
         (("run", "pass.yaml", "--seed", "1", "--seeds", "2"), "not allowed with", "--help"),
         (("run", "pass.yaml", "--set", "duration"), "--set: 'duration' does not say", "--set policy.window=5ms"),
@@ -328,7 +328,7 @@ def of_loss(row: dict[str, str]) -> bool:
 
 
 def test_a_reader_that_goes_away_ends_it_in_silence(lab: Path) -> None:
-    command = f"set -o pipefail; '{sys.executable}' -m fieldkit cosim run pass.yaml | true"
+    command = f"set -o pipefail; '{sys.executable}' -m fieldkit cosim run pass.yaml --window 11ms | true"
     done = subprocess.run(
         ("bash", "-c", command), cwd=lab, capture_output=True, text=True, check=False, timeout=LIMIT_S
     )
@@ -336,6 +336,6 @@ def test_a_reader_that_goes_away_ends_it_in_silence(lab: Path) -> None:
 
 
 def test_without_a_terminal_nothing_is_coloured_and_nothing_redraws(lab: Path) -> None:
-    done = cosim(lab, "run", "pass.yaml")
+    done = cosim(lab, "run", "pass.yaml", "--window", "11ms")
     assert "\x1b" not in done.out
     assert not done.err

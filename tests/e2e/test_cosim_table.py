@@ -33,7 +33,7 @@ def test_people_get_printed_digits_and_a_count(tmp_path: Path) -> None:
     assert "54.309" in done.out
     assert max(map(len, done.out.splitlines())) <= 80
     assert "of 8 cells agree" in done.out
-    assert "docs/paper.md" in " ".join(done.out.split())
+    assert "fieldkit docs paper" in " ".join(done.out.split())
 
 
 @pytest.mark.parametrize(

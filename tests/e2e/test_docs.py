@@ -1,6 +1,6 @@
 """What the documentation says is so: its commands run, its keys, options, codes and links exist."""
 
-import argparse
+import ast
 import inspect
 import os
 import re
@@ -10,32 +10,22 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, cast, get_args, get_origin
+from typing import Any
 
 import pytest
-from pydantic import TypeAdapter
-from pydantic.fields import FieldInfo
 
+from docs.generator import pages as reference
+from docs.generator.commands import GUIDES
 from fieldkit import cli
-from fieldkit.campaign.plan import CampaignFile
-from fieldkit.cli.parser import Parser
-from fieldkit.config import schema
-from fieldkit.config.profiles import RobotProfile
-from fieldkit.config.schema import Strict
-from fieldkit.config.site import Site
-from fieldkit.core import errors
-from fieldkit.steps.base import Step, known
-from fieldkit.trial.procedure import Procedure
-from sim_backends.cosim.scenario.faults import Fault
-from sim_backends.cosim.scenario.motions import MotionPlan
-from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.scenario.traffic import Traffic
-from sim_backends.emulated.options import EmulatedOptions
+from fieldkit.config import documentation
+from fieldkit.steps.base import Step
 from tests.helpers.paths import ROOT
 
-PAGES = sorted([*(ROOT / "docs").glob("*.md"), *ROOT.glob("*.md")])
-REFERENCE = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
+PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 COMMAND_S = 600.0
+
+TOPIC = re.compile(r"fieldkit docs ([a-z][a-z0-9_-]*)")
+MARKDOWN_FILE = re.compile(r"[\w/-]+\.md\b")
 
 MEASURES_NOTHING = re.compile(r"^ls |--dry-run| show | verify ")
 """Commands whose output has the same lines each time, numbers apart."""
@@ -94,63 +84,6 @@ def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 
 
-def rows(section: str) -> dict[str, str]:
-    """Return the first column (bare) and the second of every table row in a section of the reference."""
-    found = re.search(rf"^##+ {re.escape(section)}$(.*?)(?=^## |^### |\Z)", REFERENCE, re.MULTILINE | re.DOTALL)
-    assert found, f"docs/reference.md has no section {section!r}"
-    cells = (line.split(" | ") for line in found[1].splitlines() if line.startswith("| `"))
-    return {first.removeprefix("| `").partition("`")[0]: second for first, second, *_ in cells}
-
-
-def models_in(annotation: object) -> Iterator[tuple[str, type[Strict]]]:
-    """Yield the models in an annotation, each with what stands between its name and that of its field."""
-    if inspect.isclass(annotation) and issubclass(annotation, Strict):
-        yield "", annotation
-        return
-    if any(isinstance(part, FieldInfo) and part.discriminator for part in get_args(annotation)):
-        return  # kinds have tables of their own
-    origin = get_origin(annotation)
-    mark = "[]" if origin is tuple else ".*" if origin is dict else ""
-    for part in get_args(annotation):
-        yield from ((mark + inner, model) for inner, model in models_in(part))
-
-
-def keys(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Yield every key that a file of `model` may have, as the reference writes it; steps have tables of their own."""
-    for name, field in model.model_fields.items():
-        key = prefix + (field.alias or name)
-        yield key, field
-        if field.discriminator:
-            continue
-        for mark, inner in models_in(field.annotation):
-            yield from keys(inner, f"{key}{mark}.")
-
-
-SITE = [(key, field) for key, field in keys(Site)] + list(keys(EmulatedOptions, "emulated."))
-FILES = {
-    "Robot profile": list(keys(RobotProfile)),
-    "Procedure": list(keys(Procedure)),
-    "Campaign": list(keys(CampaignFile)),
-    "Site file": SITE,
-}
-SCENARIO = {"Scenario file": [one for one in keys(CosimScenario) if not one[0].startswith("radio.")]}
-KINDS = {
-    f"{what} {model.model_fields['kind'].annotation.__args__[0]}": list(keys(model))
-    for what, union in {"Motion": MotionPlan, "Traffic": Traffic, "Fault": Fault}.items()
-    for model in get_args(get_args(union)[0])
-}
-EVERY_STEP = dict(keys(Step))
-STEPS = {"Every step": list(EVERY_STEP.items())} | {
-    f"Step {kind}": [
-        (key, field)
-        for key, field in keys(model)
-        if key not in EVERY_STEP or field.default != EVERY_STEP[key].default
-    ]
-    for kind, model in known().items()
-}
-TABLES = FILES | STEPS | SCENARIO | KINDS
-
-
 @pytest.mark.emulated
 @pytest.mark.parametrize("page", [page for page in PAGES if any(commands(page))], ids=page_id)
 def test_every_command_of_a_page_runs(page: Path, tmp_path: Path) -> None:
@@ -200,61 +133,51 @@ def test_python_examples_import_and_are_complete(page: Path, monkeypatch: pytest
     for source in blocks(page, "python"):
         names: dict[str, Any] = {"__name__": "example"}
         exec(compile(source, page.name, "exec"), names)
-        steps = [one for one in names.values() if inspect.isclass(one) and issubclass(one, Step) and one is not Step]
-        assert not [step for step in steps if inspect.isabstract(step)]
+        own = [value for value in names.values() if inspect.isclass(value) and value.__module__ == "example"]
+        assert not [kind for kind in own if issubclass(kind, Step) and inspect.isabstract(kind)]
 
 
-@pytest.mark.parametrize("section", TABLES)
-def test_the_reference_names_every_key_and_no_other(section: str) -> None:
-    assert sorted(rows(section)) == sorted(key for key, _ in TABLES[section])
+def test_the_reference_is_what_the_code_says() -> None:
+    written = reference.pages()
+    assert {path.name for path in reference.FOLDER.glob("*.md")} == set(written)
+    differing = [name for name, text in written.items() if (reference.FOLDER / name).read_text("utf-8") != text]
+    assert not differing, "write them again: .venv/bin/python -m docs.generator"
 
 
-@pytest.mark.parametrize(
-    ("section", "key", "field"),
-    [(section, key, field) for section, table in TABLES.items() for key, field in table],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_the_reference_gives_the_default(section: str, key: str, field: FieldInfo) -> None:
-    said = rows(section)[key]
-    if field.is_required():
-        assert said == "required"
-        return
-    default = field.get_default(call_default_factory=True)
-    if default is None or field is EVERY_STEP["name"]:
-        assert said in {"none", "all defaults", "its `host`"}
-    elif isinstance(default, Strict):
-        assert default == type(default)(), "the default of a section is all its defaults"
-        assert said in {"all defaults", "as below"}
-    else:
-        written = schema.parse(said.strip("`"), source="docs/reference.md").data
-        # Without its alias, which has no meaning outside of its model.
-        bare = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
-        wanted: TypeAdapter[Any] = TypeAdapter(cast("Any", bare))
-        assert wanted.validate_python(written) == default
+def test_every_row_of_the_reference_has_a_meaning() -> None:
+    for name, text in reference.pages().items():
+        empty = [line for line in text.splitlines() if line.startswith("| ") and line.endswith("|  |")]
+        assert not empty, name
 
 
-def subcommands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    actions = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
-    return {name: parser for action in actions for name, parser in action.choices.items()}
+def test_every_page_has_a_place_in_the_sidebar() -> None:
+    navigation = (ROOT / ".ci" / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:\n")[2]
+    listed = re.findall(r"([\w/-]+\.md)$", navigation, re.MULTILINE)
+    pages = [str(page.relative_to(ROOT / "docs")) for page in PAGES if page.is_relative_to(ROOT / "docs")]
+    assert sorted(listed) == sorted(pages)
 
 
-def test_the_reference_names_every_command_with_its_options() -> None:
-    command_line = REFERENCE.partition("## Command line")[2].partition("## Exit codes")[0]
-    for name, parser in subcommands(cli.parser()).items():
-        if isinstance(parser, Parser):
-            parser.complete()
-        heading = re.search(rf"^### .*fieldkit {name}\b.*$", command_line, re.MULTILINE)
-        assert heading, f"docs/reference.md has no section on fieldkit {name}"
-        section = command_line[heading.end() :].partition("\n### ")[0]
-        for inner in subcommands(parser):
-            assert f"fieldkit {name} {inner}" in section
-        for action in chain(*(one._actions for one in (parser, *subcommands(parser).values()))):
-            for option in action.option_strings:
-                assert option in {"-h", "--help"} or f"`{option}`" in section, f"{option} of fieldkit {name}"
+def test_every_guide_that_a_command_names_exists() -> None:
+    assert not [guide for guide in GUIDES.values() if not (ROOT / "docs" / guide).is_file()]
+    assert not set(GUIDES) - set(cli.parser().subcommands())
 
 
-def test_the_reference_names_every_exit_code() -> None:
-    section = REFERENCE.partition("## Exit codes")[2].partition("\n## ")[0]
-    families: list[type[errors.FieldkitError]] = [errors.FieldkitError, *errors.FieldkitError.__subclasses__()]
-    codes = {0, cli.INTERRUPTED} | {family.exit_code for family in families}
-    assert {int(code) for code in re.findall(r"^\| (\d+) \|", section, re.MULTILINE)} == codes
+def texts() -> Iterator[tuple[str, str]]:
+    """Yield every text that a user can read, and its place: strings in code, and shipped YAML with its comments."""
+    for path in chain((ROOT / "fieldkit").rglob("*.py"), (ROOT / "sim_backends").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+                yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value
+    for folder in ("fieldkit", "sim_backends", "robots", "procedures"):
+        for path in (ROOT / folder).rglob("*.yaml"):
+            yield str(path.relative_to(ROOT)), path.read_text(encoding="utf-8")
+
+
+def test_messages_refer_to_installed_pages_alone() -> None:
+    named = [(place, topic) for place, text in texts() for topic in TOPIC.findall(text)]
+    assert len(named) > 10
+    wrong = [(place, topic) for place, topic in named if topic not in documentation.topics()]
+    files = [(place, name) for place, text in texts() for name in MARKDOWN_FILE.findall(text)]
+    assert (wrong, files) == ([], [])

@@ -2,25 +2,35 @@
 
 import json
 import math
+import os
+import pty
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
 from bisect import bisect_left
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import chdir, closing, contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
 from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.model import Role, Topology, Vector, Whereabouts
+from fieldkit.core.model import Placement, Role, Scenario, Topology, Vector, Whereabouts
+from fieldkit.core.units import parse_distance
 from fieldkit.lab.protocol import Destination
+from fieldkit.remote import jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.ros.steered import Steered
-from tests.helpers.host import wait_for_end
+from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.outside import Outside, robots_outside
-from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, only_trial, rows, start
+from tests.helpers.rovers import rover_profile
+from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_during, wait_for_line
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
@@ -41,6 +51,7 @@ robots: {robot-1: {profile: turtlebot3_burger}}
 roles: {}
 emulated: {ros: debian}
 """
+PLACEMENT = Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m"))
 SPEED_M_S = 0.6
 LEASE_S = 2.0
 SETUP = ("/opt/ros/noetic/setup.bash",)
@@ -81,32 +92,39 @@ BOTH = (
                     - ping: {from: sender, to: receiver, count: 13, interval: 200ms, payload_bytes: 500}
 """
 )
+SHORT = DRIVE.replace("away: 20m", "away: 1.5m").replace("count: 150", "count: 13")
 RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
 
 
-@pytest.fixture
-def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Outside]:
-    """Robots that outlive fieldkit, one of them quick, so that nobody waits for it."""
-    monkeypatch.chdir(tmp_path)
-    profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
-    for old, new in (
-        ("name: turtlebot3_burger", "name: rover"),
-        ("max_speed_m_s: 0.22", "max_speed_m_s: 1.0"),
-        ("turn_rad_s: 1.0, acceleration_m_s2: 0.5", "turn_rad_s: 3.0, acceleration_m_s2: 2.0"),
-    ):
-        assert old in profile
-        profile = profile.replace(old, new)
-    for folder in ("robots", "procedures"):
-        (tmp_path / folder).mkdir()
-    (tmp_path / "robots" / "rover.yaml").write_text(profile, encoding="utf-8")
+@pytest.fixture(scope="module")
+def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+    """Robots that outlive fieldkit, one of them quick, so that the tests take less time."""
+    folder = tmp_path_factory.mktemp("rovers")
+    profile = rover_profile(fence_m=30.0)
+    for name in ("robots", "procedures"):
+        (folder / name).mkdir()
+    (folder / "robots" / "rover.yaml").write_text(profile, encoding="utf-8")
     ros2 = profile.replace("name: rover", "name: rover_two").replace("variant: ros1", "variant: ros2")
-    (tmp_path / "robots" / "rover_two.yaml").write_text(ros2, encoding="utf-8")
+    (folder / "robots" / "rover_two.yaml").write_text(ros2, encoding="utf-8")
     zenoh = ros2.replace("name: rover_two", "name: rover_three").replace("distribution: foxy", "distribution: jazzy")
     zenoh = zenoh.replace("\nlimits:", "\n  environment: {RMW_IMPLEMENTATION: rmw_zenoh_cpp}\nlimits:")
-    (tmp_path / "robots" / "rover_three.yaml").write_text(zenoh, encoding="utf-8")
-    (tmp_path / "lab.yaml").write_text(SITE, encoding="utf-8")
-    with robots_outside(tmp_path, site=tmp_path / "lab.yaml", topology=Topology.MASTER) as robots:
+    (folder / "robots" / "rover_three.yaml").write_text(zenoh, encoding="utf-8")
+    (folder / "lab.yaml").write_text(SITE, encoding="utf-8")
+    with chdir(folder), robots_outside(folder, site=folder / "lab.yaml", topology=Topology.MASTER) as robots:
         yield robots
+
+
+@pytest.fixture
+def outside(rovers: Outside, monkeypatch: pytest.MonkeyPatch) -> Outside:
+    """The same robots at their places, reachable, without what an earlier trial left on them."""
+    monkeypatch.chdir(rovers.folder)
+    for role, shell in rovers.testbed.shells.items():
+        rovers.links.restore(role)
+        jobs.abort(shell, "test", Deadline.after(60))  # a fieldkit that was killed leaves its jobs to their limits
+        shell.run(("sh", "-c", "rm -rf ~/.fieldkit/*"), deadline=Deadline.after(30))
+    shutil.rmtree(rovers.folder / "trials", ignore_errors=True)
+    rovers.testbed.place(PLACEMENT)
+    return rovers
 
 
 def track_of(outside: Outside, role: Role) -> list[Whereabouts]:
@@ -198,9 +216,7 @@ def test_a_fieldkit_that_is_killed_stops_it(outside: Outside) -> None:
     (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
     process = start(outside.folder, *RUN)
     try:
-        wait_until(
-            lambda: (now := said(outside)) is not None and now.velocity_m_s[0] > SPEED_M_S / 2, Deadline.after(90)
-        )
+        wait_during(process, lambda: drives(outside))
     finally:
         process.kill()
         process.communicate(timeout=60)
@@ -214,3 +230,316 @@ def test_a_fieldkit_that_is_killed_stops_it(outside: Outside) -> None:
     status = json.loads(shell.run(text, deadline=Deadline.after(30)).stdout)
     assert status["ended"] == f"the laptop was silent for {LEASE_S:g} s"
     assert status["x_m"] < 19.0, "long before its end"
+
+
+@contextmanager
+def driving(outside: Outside, procedure: str = DRIVE) -> "Iterator[subprocess.Popen[str]]":
+    """Run a trial until its robot drives; killed at the end where it still runs."""
+    (outside.folder / "procedures" / "drive.yaml").write_text(procedure, encoding="utf-8")
+    process = start(outside.folder, *RUN)
+    try:
+        wait_during(process, lambda: drives(outside))
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate(timeout=60)
+        wait_for_end({process.pid}, within_s=60.0)
+
+
+def standstill_s(outside: Outside, since_ns: int) -> float:
+    """Return how long after a time the world saw the receiver stop, and that it did not move afterwards."""
+    wait_until(lambda: (now := said(outside)) is not None and not now.moves, Deadline.after(60))
+    moments = [one for one in track_of(outside, Role.RECEIVER) if one.utc_ns >= since_ns]
+    moving = [one.utc_ns for one in moments if math.hypot(*one.velocity_m_s) > 0]
+    return (max(moving, default=since_ns) - since_ns) / 1e9
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_stops_it_at_once(outside: Outside, number: signal.Signals) -> None:
+    with driving(outside) as process:
+        sent_ns = time.time_ns()
+        process.send_signal(number)
+        took_s = standstill_s(outside, sent_ns)
+        run = finish(process)
+    assert took_s < LEASE_S, "by the order, not by its lease"
+    assert "stopping: rover-1 stops where it is" in run.err
+    assert "rover-1: stopped (standing)" in run.err
+    assert run.code == 130
+    assert run.err.index("stopping: rover-1") < run.err.index("rover-1: stopped")
+    assert_held(outside, "stopped by the operator")
+
+
+def assert_held(outside: Outside, reason: str) -> None:
+    """Assert that the stopped motion is held, and that its repeat is void, with the same reason."""
+    trial = only_trial(outside.folder)
+    assert motions(trial) == ["origin", "begun", "held"]
+    held = json.loads((trial / "motion.jsonl").read_text(encoding="utf-8").splitlines()[-1])
+    assert reason in held["reason"]
+    assert [(row["status"], row["reason"]) for row in rows(trial)] == [("void", reason)]
+    stopped_m = place_m(outside)
+    again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
+    assert again.code == 5, again.err
+    assert f"rover-1: {held['reason']}" in again.err
+    assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
+
+
+def test_ctrl_c_at_a_terminal_stops_it_at_once(outside: Outside) -> None:
+    (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
+    master, terminal = pty.openpty()
+    words = ("setsid", "--ctty", sys.executable, "-m", "fieldkit", *RUN)
+    process = subprocess.Popen(words, cwd=outside.folder, stdin=terminal, stdout=terminal, stderr=terminal)
+    os.close(terminal)
+    shown: list[bytes] = []
+
+    def read() -> None:
+        with suppress(OSError):  # the end of a terminal
+            while data := os.read(master, 1 << 16):
+                shown.append(data)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    try:
+        wait_until(lambda: drives(outside), Deadline.after(90))
+        sent_ns = time.time_ns()
+        os.write(master, b"\x03")
+        took_s = standstill_s(outside, sent_ns)
+        assert process.wait(timeout=180) == 130
+    finally:
+        process.kill()
+        process.wait()
+        reader.join()
+        os.close(master)
+    assert took_s < LEASE_S, "by the order, not by its lease"
+    text = b"".join(shown).decode()
+    assert text.index("stopping: rover-1") < text.index("rover-1: stopped (standing)")
+
+
+def test_ctrl_c_while_it_drives_back_stops_it_on_its_way(outside: Outside) -> None:
+    (outside.folder / "procedures" / "drive.yaml").write_text(SHORT, encoding="utf-8")
+    home_m = place_m(outside)
+    process = start(outside.folder, *RUN)
+    try:
+        wait_during(process, lambda: drives(outside))
+        wait_during(process, lambda: (now := said(outside)) is not None and now.velocity_m_s[0] < -0.3)
+        sent_ns = time.time_ns()
+        process.send_signal(signal.SIGINT)
+        took_s = standstill_s(outside, sent_ns)
+        run = finish(process)
+    finally:
+        process.kill()
+        wait_for_end({process.pid}, within_s=60.0)
+    assert took_s < LEASE_S, "by the order, not by its lease"
+    assert run.code == 130
+    assert math.dist(place_m(outside), home_m) > 0.3, "on its way"
+    assert_held(outside, "stopped by the operator")
+
+
+def test_a_robot_outside_its_fence_does_not_start(outside: Outside) -> None:
+    fence_m = 2.0
+    profile = outside.folder / "robots" / "rover.yaml"
+    text = profile.read_text(encoding="utf-8")
+    assert "fence_m: 30" in text
+    profile.write_text(text.replace("fence_m: 30", f"fence_m: {fence_m:g}"), encoding="utf-8")
+    try:
+        with driving(outside, SHORT) as process:
+            process.send_signal(signal.SIGINT)
+            assert finish(process).code == 130
+        home_m = place_m(outside)
+        topic = ("rostopic", "pub", "-r", "10", "/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 1.0}}")
+        words = ("sh", "-c", '"$@" & cat >/dev/null; kill $!', "sh", *with_environment(topic, setup=SETUP))
+        session = outside.testbed.shells[Role.RECEIVER].begin(words, deadline=Deadline.after(30))
+        wait_until(lambda: math.dist(place_m(outside), home_m) > fence_m + 0.2, Deadline.after(60))
+        session.end(deadline=Deadline.after(60), check=False)
+        wait_until(lambda: stationary(outside), Deadline.after(60))
+        moved_m = place_m(outside)
+        trial = only_trial(outside.folder)
+        run = fieldkit(outside.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
+        assert run.code == 5, run.err
+        assert f"outside its fence of {fence_m:g} m" in run.err
+        assert place_m(outside) == pytest.approx(moved_m, abs=0.01)
+        assert motions(trial) == ["origin", "begun", "held", "allowed", "held"]
+    finally:
+        profile.write_text(text, encoding="utf-8")
+
+
+def test_stop_from_another_terminal_also_while_fieldkit_is_suspended(outside: Outside) -> None:
+    with driving(outside) as process:
+        process.send_signal(signal.SIGSTOP)
+        sent_ns = time.time_ns()
+        run = fieldkit(outside.folder, "stop", "--all")
+        took_s = standstill_s(outside, sent_ns)
+        assert run.code == 0, run.err + run.out
+        assert sorted(run.out.splitlines()) == [
+            "rover-1: stopped (standing)",
+            "rover-2: nothing of fieldkit moves it; nothing was sent to it",
+            "rover-3: nothing of fieldkit moves it; nothing was sent to it",
+        ]
+        process.send_signal(signal.SIGCONT)
+        ended = finish(process)
+    assert ended.code == 3, ended.err
+    assert "stopped the robots at" in ended.err
+    assert standstill_s(outside, sent_ns + int(1e9 * took_s) + 1) == 0.0, "nothing moved again"
+    again = fieldkit(outside.folder, "stop", "rover-1")
+    assert (again.code, again.out) == (0, "rover-1: nothing of fieldkit moves it; nothing was sent to it\n")
+    outside.links.cut(Role.SENDER)
+    partly = fieldkit(outside.folder, "stop", "--all")
+    assert partly.code == 3
+    assert "rover-2: NOT REACHED: stop it by hand" in partly.out
+    assert "rover-1: nothing of fieldkit moves it" in partly.out
+
+
+def test_ctrl_c_while_its_program_starts_lets_no_robot_move(outside: Outside) -> None:
+    (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
+    began_ns = time.time_ns()
+    process = start(outside.folder, *RUN, "--json")
+    wait_for_line(process, '"move rover-1"')
+    process.send_signal(signal.SIGINT)
+    run = finish(process)
+    assert run.code == 130
+    assert "stopping: " in run.err
+    speeds = [math.hypot(*one.velocity_m_s) for one in track_of(outside, Role.RECEIVER) if one.utc_ns > began_ns]
+    assert max(speeds, default=0.0) == 0.0
+    assert not [name for name in only_trial(outside.folder).rglob("drive.jsonl") if name.read_text(encoding="ascii")]
+
+
+def test_ctrl_c_of_a_robot_out_of_reach_says_that_its_lease_stops_it(outside: Outside) -> None:
+    with driving(outside) as process:
+        outside.links.cut(Role.RECEIVER)
+        process.send_signal(signal.SIGINT)
+        wait_until(lambda: (now := said(outside)) is not None and not now.moves, Deadline.after(60))
+        run = finish(process)
+    assert run.code == 130
+    assert f"no answer from rover-1: it stops by itself within {LEASE_S:g} s" in run.err
+
+
+def test_stop_of_a_suspended_agent_lets_it_send_no_other_velocity(outside: Outside) -> None:
+    with driving(outside) as process:
+        (agent,) = [pid for pid in descendants(os.getpid()) if b"drive" in command_line(pid)]
+        os.kill(agent, signal.SIGSTOP)
+        wait_until(lambda: (now := said(outside)) is not None and not now.moves, Deadline.after(60))
+        stands_ns = time.time_ns()
+        stopped = fieldkit(outside.folder, "stop", "rover-1")
+        assert (stopped.code, stopped.out) == (0, "rover-1: stopped (standing)\n")
+        wait_for_end({agent}, within_s=60.0)
+        assert standstill_s(outside, stands_ns) == 0.0
+        assert finish(process).code == 3
+    assert standstill_s(outside, stands_ns) == 0.0
+    trial = only_trial(outside.folder)
+    assert motions(trial) == ["origin", "begun", "held"]
+    again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
+    assert again.code == 5, again.err
+    assert "nothing moves again before a person has confirmed it: rover-1" in again.err
+    assert standstill_s(outside, stands_ns) == 0.0
+
+
+def command_line(pid: int) -> list[bytes]:
+    """Return the words of an agent's process; none where it is another process, or has ended."""
+    with suppress(OSError):
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        return words if b"python" in words[0] and any(b"/agent-" in word for word in words) else []
+    return []
+
+
+FAR_M = 3.0
+AFTER = DRIVE.replace("repeats: 1\nattempts: 1", "repeats: 2\nattempts: 2").replace("away: 20m", f"away: {FAR_M:g}m")
+RESUME = ("--yes", "--allow-motion")
+
+
+def place_m(outside: Outside) -> Vector:
+    place = track_of(outside, Role.RECEIVER)[-1].position_m
+    assert place is not None
+    return place
+
+
+def drives(outside: Outside) -> bool:
+    return (now := said(outside)) is not None and now.velocity_m_s[0] > SPEED_M_S / 2
+
+
+def stationary(outside: Outside) -> bool:
+    return (now := said(outside)) is not None and not now.moves
+
+
+def motions(trial: Path) -> list[str]:
+    lines = (trial / "motion.jsonl").read_text(encoding="utf-8").splitlines()
+    return [json.loads(line)["event"] for line in lines]
+
+
+def test_after_a_fault_nothing_moves_before_it_is_confirmed(outside: Outside) -> None:
+    (outside.folder / "procedures" / "drive.yaml").write_text(AFTER, encoding="utf-8")
+    home_m = place_m(outside)
+    process = start(outside.folder, *RUN)
+    try:
+        wait_during(process, lambda: drives(outside))
+        outside.links.cut(Role.RECEIVER)
+        wait_until(lambda: stationary(outside), Deadline.after(60))
+        stopped_m = place_m(outside)
+        outside.links.restore(Role.RECEIVER)
+        _, err = process.communicate(timeout=180)
+    finally:
+        process.kill()
+    assert process.returncode == 5, err
+    assert 0.1 < math.dist(stopped_m, home_m) < FAR_M
+    trial = only_trial(outside.folder)
+    assert motions(trial) == ["origin", "begun", "held"]
+    # --yes is no confirmation, in no run.
+    again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
+    assert again.code == 5, again.err
+    assert "the laptop was silent for 2 s" in again.err
+    assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
+    # A person who only presses Enter does not confirm either: the default is to stop.
+    answers = outside.folder / "answers"
+    answers.write_text("\n\n", encoding="utf-8")
+    enter = fieldkit(outside.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    assert enter.code == 5, enter.err
+    assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
+    # The option: it drives back along its path first, and then as in the beginning.
+    begun_ns = track_of(outside, Role.RECEIVER)[-1].utc_ns
+    option = fieldkit(outside.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
+    assert option.code == 0, option.err
+    track = [one for one in track_of(outside, Role.RECEIVER) if one.utc_ns > begun_ns and one.position_m]
+    off_m = [math.dist(one.position_m or home_m, home_m) for one in track]
+    assert max(off_m) == pytest.approx(FAR_M, abs=0.3), "not as far again from where it stopped"
+    assert place_m(outside) == pytest.approx(home_m, abs=0.3)
+    assert motions(trial)[3:] == ["allowed", *("begun", "ended") * 2]
+
+
+SUSPEND = r"""
+for folder in /proc/[0-9]*; do
+  case "$(readlink "$folder/cwd")" in *"$1"*) ;; *) continue ;; esac
+  words=$(tr '\0' ' ' <"$folder/cmdline")
+  case $words in *python*agent-*.pyz\ drive\ *) kill "-$2" "${folder#/proc/}" ;; esac
+done
+"""
+
+
+def test_a_suspended_driver_does_not_go_on_and_a_person_lets_it_move_again(outside: Outside) -> None:
+    (outside.folder / "procedures" / "drive.yaml").write_text(AFTER, encoding="utf-8")
+    shell = outside.testbed.shells[Role.RECEIVER]
+
+    def send(name: str) -> None:
+        words = ("sh", "-c", SUSPEND, "sh", only_trial(outside.folder).name, name)
+        shell.run(words, deadline=Deadline.after(30), check=False)
+
+    process = start(outside.folder, *RUN)
+    try:
+        wait_during(process, lambda: drives(outside))
+        send("STOP")
+        wait_until(lambda: stationary(outside), Deadline.after(60))  # by the base's own time limit
+        stopped_m, since_s = place_m(outside), time.monotonic()
+        wait_until(lambda: time.monotonic() > since_s + 1.0, Deadline.after(60))
+        send("CONT")
+        _, err = process.communicate(timeout=180)
+    finally:
+        send("CONT")
+        process.kill()
+    assert process.returncode == 5, err
+    assert "its program was suspended for" in err
+    assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
+    trial = only_trial(outside.folder)
+    answers = outside.folder / "answers"
+    answers.write_text("\nconfirm\n", encoding="utf-8")
+    outside.testbed.place(PLACEMENT)
+    confirmed = fieldkit(outside.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    assert confirmed.code == 0, confirmed.err
+    assert motions(trial)[2:6] == ["held", "confirmed", "origin", "begun"]

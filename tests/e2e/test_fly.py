@@ -89,12 +89,12 @@ def test_a_drone_flies_away_and_the_row_says_so(tmp_path: Path) -> None:
     assert flown_m[-1][0] - flown_m[0][0] > 8.0, "where it was"
     log = (trial / "repeats/tcp-01/fly.log").read_text(encoding="utf-8").split("\n")
     said = [line.partition(" ")[2] for line in log if line]
-    assert said[1:6] == ["ready", "standing", "climbing", "up", "flying"]
-    assert said[-2:] == ["coming down", "landed"]
+    phases = "ready", "standing", "climbing", "up", "flying", "coming down", "landed"
+    assert [text for text in said if text in phases] == list(phases)
     assert float(row["fly_height_median_m"]) == pytest.approx(1.0, abs=0.3)
     assert float(row["fly_farthest_m"]) == pytest.approx(flown_m[-1][0] - flown_m[0][0], abs=0.5)
     assert 1.0 < float(row["fly_speed_median_m_s"]) < 4.0
-    assert "height flown, median" in run.out
+    assert "flight height, median" in run.out
     assert "flew " in run.out
 
 
@@ -164,20 +164,25 @@ def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
         yield outside
 
 
-def test_ctrl_c_lets_an_arducopter_return_and_says_so(outside: Outside) -> None:
+def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(outside: Outside) -> None:
     set_parameter(outside, Role.SENDER, "RTL_ALT", 100)
     set_parameter(outside, Role.SENDER, "WPNAV_RADIUS", 10)
     process = flying(outside, Role.SENDER, how="return", lease="60s")
     wait_until(lambda: far_m(outside, Role.SENDER) > 1.5, Deadline.after(60))
     process.send_signal(signal.SIGINT)
-    assert process.stderr is not None
-    first = next(line for line in process.stderr if "Ctrl-C again" in line)
-    process.send_signal(signal.SIGINT)
     stopped = finish(process)
     assert stopped.code == 130
-    for said in (first, stopped.err):
-        assert "copter-1 returns by itself, if it is in the air: for up to about " in said
-    landed(outside, Role.SENDER, "return: the job was told to end")
+    stops, comes, ground = map(
+        stopped.err.index,
+        (
+            "stopping: copter-1 returns by itself, if it is in the air: for up to about ",
+            "copter-1: coming down (return)",
+            "copter-1: stopped (on the ground)",
+        ),
+    )
+    assert stops < comes < ground
+    assert height_m(outside, Role.SENDER) < 1e-3, "confirmed when it is there"
+    landed(outside, Role.SENDER, "return: the job was ended")
     assert far_m(outside, Role.SENDER) < NEAR_M
     wait_until(lambda: not agents(), Deadline.after(60))
 
@@ -193,7 +198,34 @@ def test_a_drone_flies_on_without_its_laptop_until_somebody_says_abort(outside: 
     aborted = fieldkit(outside.folder, "abort", "--yes")
     assert aborted.code == 0
     assert "/fly " in aborted.out, aborted.err
-    landed(outside, Role.RECEIVER, "land: the job was told to end")
+    landed(outside, Role.RECEIVER, "land: the job was ended")
+    wait_until(lambda: not agents(), Deadline.after(60))
+
+
+def test_a_second_ctrl_c_does_not_wait_for_the_landing(outside: Outside) -> None:
+    process = flying(outside, Role.RECEIVER, how="land", lease="60s")
+    assert process.stderr is not None
+    process.send_signal(signal.SIGINT)
+    assert any("duckiedrone-1: coming down (land)" in line for line in process.stderr)
+    process.send_signal(signal.SIGINT)
+    stopped = finish(process)
+    assert stopped.code == 130
+    assert "the order to stop remains" in stopped.err
+    landed(outside, Role.RECEIVER, "land: the job was ended")
+    wait_until(lambda: not agents(), Deadline.after(60))
+
+
+def test_stop_brings_a_drone_down_whose_fieldkit_is_dead(outside: Outside) -> None:
+    process = flying(outside, Role.RECEIVER, how="land", lease="60s")
+    process.kill()
+    process.communicate(timeout=60)
+    stopped = fieldkit(outside.folder, "stop", "--all")
+    assert stopped.code == 0, stopped.err
+    assert stopped.out.splitlines() == [
+        "copter-1: nothing of fieldkit moves it; nothing was sent to it",
+        "duckiedrone-1: coming down (land)",
+    ]
+    landed(outside, Role.RECEIVER, "land: the job was ended")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 

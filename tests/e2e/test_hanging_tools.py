@@ -79,7 +79,7 @@ def test_a_tool_that_hangs_at_work_ends_at_its_limit(
     assert run.code in {0, 4}, run.err
     (row,) = rows(only_trial(lab))
     if tool == "netcat":  # a transfer that does not come to its end is a measurement
-        assert (row["status"], row["received_bytes"]) == ("valid", "0")
+        assert (row["status"], row["received_bytes"]) == ("valid", "0"), row["reason"]
     else:
         assert row["status"] == "failed"
         assert said in row["reason"]

@@ -16,20 +16,23 @@ FOUR_SIGMA = 0.99994
 FRAGMENTS = 6  # of a datagram of 8,192 bytes in packets of 1,500
 
 
-@pytest.fixture(scope="module")
-def lossy_udp(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str, str]]]:
+@pytest.fixture(scope="module", params=REPEATS)
+def lossy_udp(
+    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> dict[str, list[dict[str, str]]]:
     base = tmp_path_factory.mktemp("udp")
     # 200 messages a second make a bag of some 80 kB: 60 packets a repeat.
     labs = [make_lab(base / str(loss), f"{{loss: {loss}%, rate: 50Mbit/s}}", topic="/imu") for loss in LOSSES_PERCENT]
-    return run_all(labs, "--protocol", "udp", "--repeats", str(REPEATS))
+    tables = run_all(labs, "--protocol", "udp", "--repeats", str(request.param))
+    assert {name: len(table) for name, table in tables.items()} == {lab.name: request.param for lab in labs}
+    return tables
 
 
 @pytest.mark.parametrize("percent", LOSSES_PERCENT)
 def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str, str]]], percent: int) -> None:
     table = lossy_udp[str(percent)]
-    assert len(table) == REPEATS
     sent, received = total(table, "ip_packets_sent"), total(table, "ip_packets_received")
-    assert sent > REPEATS * 20
+    assert sent > len(table) * 20
     interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
     assert interval.low <= percent / 100 <= interval.high, (sent, received)
 
@@ -42,7 +45,7 @@ def test_losses_that_do_not_know_of_each_other_come_in_runs_as_in_closed_form(
     table, loss = lossy_udp[str(percent)], percent / 100
     sent, bursts = total(table, "ip_packets_sent"), total(table, "ip_loss_bursts")
     start = loss * (1 - loss)
-    expected = sent * start + REPEATS * loss**2
+    expected = sent * start + len(table) * loss**2
     assert abs(bursts - expected) <= 4 * math.sqrt(sent * start * (1 - 3 * start)), (bursts, expected)
     longest = max(int(row["ip_loss_longest_burst"]) for row in table)
     assert (longest > 0) == (bursts > 0)
@@ -64,11 +67,11 @@ def test_datagram_loss_is_larger_as_six_fragments_predict(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
     table = lossy_udp[str(percent)]
-    loss = percent / 100
+    loss, repeats = percent / 100, len(table)
     sent, received = total(table, "datagrams_sent"), total(table, "datagrams_received")
     # Every repeat's last datagram is the rest of the file; it has fragments of its own number.
-    fragments_of_last = total(table, "ip_packets_sent") - FRAGMENTS * (sent - REPEATS)
-    delivered = (sent - REPEATS) * (1 - loss) ** FRAGMENTS + REPEATS * (1 - loss) ** (fragments_of_last / REPEATS)
+    fragments_of_last = total(table, "ip_packets_sent") - FRAGMENTS * (sent - repeats)
+    delivered = (sent - repeats) * (1 - loss) ** FRAGMENTS + repeats * (1 - loss) ** (fragments_of_last / repeats)
     interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
     assert interval.low <= 1 - delivered / sent <= interval.high, (sent, received)
     if percent >= 10:
@@ -84,7 +87,7 @@ def test_the_delay_on_the_air_is_of_the_packets_that_arrived(
     # Now and then a packet of ROS, sent again because it was lost, comes between them.
     others = [int(row["delay_packets"]) - int(row["ip_packets_received"]) for row in table]
     assert min(others) >= 0
-    assert others.count(0) > REPEATS // 2
+    assert others.count(0) > len(table) // 2
 
 
 def test_the_parts_of_the_delay_are_those_of_a_link_of_50_mbit_s(lossy_udp: dict[str, list[dict[str, str]]]) -> None:

@@ -1,6 +1,8 @@
 """`fieldkit lab` as people use it: robots stay up, plain ssh and scp reach them, and nothing is left of them."""
 
 import contextlib
+import json
+import math
 import os
 import pty
 import socket
@@ -9,12 +11,18 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from statistics import median
+from typing import Any, Final
 
 import pytest
+from rosbags.rosbag1 import Reader
 
-from fieldkit.cli import main
+from fieldkit.cli import lab_shells, main
+from fieldkit.core.deadline import Deadline
 from fieldkit.lab import client, folder
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.ros.types import shipped
 from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.runs import fieldkit, start
 
@@ -73,6 +81,19 @@ def test_ps_tells_robots_roles_addresses_places_and_what_runs(lab: Path) -> None
     assert ground == "ground-1 turtlebot3_burger sender (masterless) 10.42.0.1 197.5, 197.5, 0.2 sshd, sensors"
     assert air == "air-1 duckiedrone receiver (masterless) 10.42.0.2 202.5, 197.5, 0.2 sshd, sensors, autopilot"
     assert lines[-1].startswith("up for ")
+    told = json.loads(fieldkit(lab, "lab", "ps", "--json").out)
+    assert told["pid"] == process_of(lab)
+    assert told["up_s"] > 0
+    ground_1, air_1 = told["robots"]
+    assert ground_1 == {
+        "name": "ground-1",
+        "profile": "turtlebot3_burger",
+        "roles": ["sender (masterless)"],
+        "address": "10.42.0.1",
+        "place_m": pytest.approx([197.5, 197.5, 0.2]),
+        "programs": ["sshd", "sensors"],
+    }
+    assert (air_1["name"], air_1["place_m"]) == ("air-1", pytest.approx([202.5, 197.5, 0.2]))
 
 
 def test_plain_ssh_scp_and_sftp_reach_the_robots(lab: Path) -> None:
@@ -83,6 +104,30 @@ def test_plain_ssh_scp_and_sftp_reach_the_robots(lab: Path) -> None:
     (lab / "batch").write_text("get there back\n", encoding="utf-8")
     plain(lab, "sftp", "-F", "ssh.conf", "-b", "batch", "ground-1")
     assert (lab / "back").read_bytes() == (lab / "there").read_bytes()
+
+
+STANDS: Final = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
+
+
+def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
+    """A program with the command line of the driver: `fieldkit stop` recognizes it by that, whoever started it."""
+    attempt = jobs.work_folder("trial-a", "tcp-01-1")
+    argv = ("sh", "-c", STANDS, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
+    driver = Job(attempt, "drive", argv, WITHIN_S, "drive.log", ready="log:up")
+    with lab_shells.opened(folder.of_directory(lab)) as shells:
+        jobs.install(shells["ground-1"], Deadline.after(WITHIN_S))
+        evidence.begin(shells["ground-1"], attempt, "sender", "lo")
+        jobs.start(shells["ground-1"], driver)
+        stopped = fieldkit(lab, "stop", "--all", "--backend", "emulated")
+        assert (stopped.code, sorted(stopped.out.splitlines())) == (
+            0,
+            ["air-1: nothing of fieldkit moves it; nothing was sent to it", "ground-1: stopped (standing)"],
+        )
+        assert not jobs.left(shells["ground-1"], Deadline.after(WITHIN_S))
+    again = fieldkit(lab, "stop", "ground-1", "--backend", "emulated")
+    assert (again.code, again.out) == (0, "ground-1: nothing of fieldkit moves it; nothing was sent to it\n")
+    unknown = fieldkit(lab, "stop", "ground-2", "--backend", "emulated")
+    assert (unknown.code, "did you mean 'ground-1'?" in unknown.err) == (2, True)
 
 
 def test_rsync_reaches_the_robots(lab: Path) -> None:
@@ -124,6 +169,28 @@ def test_a_robot_that_is_moved_away_is_heard_no_more_until_it_is_back(lab: Path)
     assert fieldkit(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
     assert client.state(here).robots[1].place_m == (207.5, 197.5, 0.2)
     assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "1", "-w", "30", "-i", "0.2", "air-1").code == 0
+
+
+def ahead_m(lab: Path) -> float:
+    """Return the median range of the beam ahead of ground-1, in 2 s of its laser."""
+    record = "source /opt/ros/noetic/setup.bash && rosbag record --duration=2 -O scan /scan"
+    plain(lab, "ssh", "-F", "ssh.conf", "ground-1", record)
+    plain(lab, "scp", "-F", "ssh.conf", "ground-1:scan.bag", ".")
+    with Reader(lab / "scan.bag") as bag:
+        scans: list[Any] = [
+            shipped().ros1.deserialize_ros1(data, "sensor_msgs/msg/LaserScan") for *_, data in bag.messages()
+        ]
+    return median(float(scan.ranges[0]) for scan in scans)
+
+
+def test_another_robot_reflects_the_laser_and_the_range_follows_it(lab: Path) -> None:
+    """The cylinder of a Duckiedrone has a radius of 0.2 m; beam 0 points east, as the robot does."""
+    for east_m in (199.5, 200.5):
+        assert fieldkit(lab, "lab", "move", "air-1", "--to", f"{east_m}m", "197.5m").code == 0
+        # Of the median of 8 scans or more with noise of 0.015 m.
+        assert ahead_m(lab) == pytest.approx(east_m - 197.5 - 0.2, abs=0.05)
+    assert fieldkit(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
+    assert ahead_m(lab) == math.inf
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,10 @@ from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
 
+# The drone is lost as late as in the shipped ones: on a busy machine a recorder takes 2 s to reach the master.
 SHORTER = (
     *("duration: 5s, name: before", "duration: 2s, name: before"),
-    *("after: 3s", "after: 1s"),
-    *("duration: 10s, name: through", "duration: 4s, name: through"),
+    *("duration: 10s, name: through", "duration: 6s, name: through"),
     *("duration: 5s, name: after", "duration: 2s, name: after"),
 )
 
@@ -80,7 +80,7 @@ def test_the_drone_is_lost_with_the_master_and_nobody_discovers_anything_any_mor
     assert int(row["through.bag_messages"]) == len(came_ns)
     gap_s = max(later - sooner for sooner, later in pairwise(came_ns)) / 1e9
     assert float(row["through.bag_gap_s"]) >= gap_s - 1e-6
-    assert len(came_ns) >= 10, "4 s at 5 Hz, the drone lost after 1 s: who has its publisher needs no master"
+    assert len(came_ns) >= 10, "6 s at 5 Hz, the drone lost after 3 s: who has its publisher needs no master"
     assert "the same bytes as before" in fieldkit(tmp_path, "rebuild", str(only_trial(tmp_path))).out
 
 

@@ -1,5 +1,6 @@
 """A kind of step from another package: the one of docs/add-a-procedure.md, found by its entry point."""
 
+import json
 import os
 import re
 import subprocess
@@ -16,14 +17,14 @@ from tests.helpers.runs import only_trial, rows
 PAGE = ROOT / "docs" / "add-a-procedure.md"
 PROCEDURE = """\
 name: busy
-summary: How busy is the receiver
+summary: The interface by which the receiver answers
 scenario: los
 topology: masterless
 protocols: [tcp]
 repeats: 1
 
 steps:
-  - load: {robot: receiver}
+  - route: {robot: receiver, to: sender}
   - ping: {from: sender, to: receiver, count: 2}
 """
 
@@ -38,9 +39,9 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
     (entry,) = re.findall(r'^    \[project\.entry-points\."(.*)"\]\n    (\w+) = "(.*)"$', page, re.MULTILINE)
     group, kind, target = entry
     installed = tmp_path / "installed"
-    about = installed / "load_step-1.0.dist-info"
+    about = installed / "route_step-1.0.dist-info"
     about.mkdir(parents=True)
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: load-step\nVersion: 1.0\n", encoding="utf-8")
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: route-step\nVersion: 1.0\n", encoding="utf-8")
     (about / "entry_points.txt").write_text(f"[{group}]\n{kind} = {target}\n", encoding="utf-8")
     (installed / f"{target.partition(':')[0]}.py").write_text(source, encoding="utf-8")
     (tmp_path / "procedures").mkdir()
@@ -57,19 +58,19 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
 
 
 def test_its_columns_and_commands_are_known(fieldkit: Fieldkit) -> None:
-    shown = fieldkit("columns", "show", "load_1min")
-    assert "Processes that ran or waited on the robot" in shown.stdout, shown.stderr
+    shown = fieldkit("columns", "show", "route_device")
+    assert "Interface to the other robot" in shown.stdout, shown.stderr
     planned = fieldkit("trial", "busy", "5m", "--dry-run")
-    assert "load: cat /proc/loadavg > load.txt 2> receiver-load.log" in planned.stdout, planned.stderr
+    assert "route: ip -json route get 10.42.0.1 > route.txt 2> receiver-route.log" in planned.stdout, planned.stderr
 
 
 def test_a_kind_that_is_not_there_is_refused_with_those_that_are(fieldkit: Fieldkit, tmp_path: Path) -> None:
     path = tmp_path / "procedures" / "busy.yaml"
-    path.write_text(PROCEDURE.replace("load:", "lode:"), encoding="utf-8")
+    path.write_text(PROCEDURE.replace("route:", "rout:"), encoding="utf-8")
     refused = fieldkit("trial", "busy", "5m", "--dry-run")
     assert refused.returncode == 2
     assert "procedures/busy.yaml:9" in refused.stderr
-    assert "did you mean 'load'?" in refused.stderr
+    assert "did you mean 'route'?" in refused.stderr
 
 
 @pytest.mark.emulated
@@ -79,12 +80,45 @@ def test_it_runs_is_judged_measured_and_told(fieldkit: Fieldkit, tmp_path: Path)
     assert done.returncode == 0, done.stderr
     folder = only_trial(tmp_path)
     (row,) = rows(folder)
-    said = (folder / "repeats" / "tcp-01" / "load.txt").read_text(encoding="ascii")
-    assert (row["status"], float(row["load_1min"])) == ("valid", float(said.split()[0]))
-    assert f"load {row['load_1min']}" in done.stdout
+    (route,) = json.loads((folder / "repeats" / "tcp-01" / "route.txt").read_text(encoding="ascii"))
+    assert (row["status"], row["route_device"]) == ("valid", route["dev"])
     assert fieldkit("rebuild", str(folder)).stdout.endswith("the same bytes as before\n")
-    (folder / "repeats" / "tcp-01" / "load.txt").write_text("no load\n", encoding="ascii")
+    (folder / "repeats" / "tcp-01" / "route.txt").write_text("[]\n", encoding="ascii")
     assert fieldkit("rebuild", str(folder)).returncode == 4, "it is not what was summed"
     (folder / "MANIFEST.sha256").unlink()
     assert fieldkit("rebuild", str(folder)).returncode == 0
-    assert rows(folder)[0]["load_1min"] == "", "a figure that is not there is empty, and never guessed"
+    assert rows(folder)[0]["route_device"] == "", "a figure that is not there is empty, and never guessed"
+
+
+@pytest.mark.emulated
+def test_a_step_that_raises_fails_its_attempt_with_one_line(fieldkit: Fieldkit, tmp_path: Path) -> None:
+    built_in_ros(tmp_path)
+    with (tmp_path / "installed" / "route_step.py").open("a", encoding="utf-8") as module:
+        module.write("\n    def run(self, *_: object) -> None:\n        raise KeyError('wlan0')\n")
+    done = fieldkit("trial", "busy", "5m")
+    assert (done.returncode, "Traceback" in done.stdout + done.stderr) == (4, False)
+    assert "the step route raised KeyError: 'wlan0'" in done.stdout
+    assert "report it to the author of the step, with step-error.log of this repeat" in done.stdout
+    folder = only_trial(tmp_path)
+    assert [row["status"] for row in rows(folder)] == ["void", "void", "failed"]
+    logs = list(folder.glob("**/step-error.log"))
+    assert len(logs) == 3
+    assert all("route_step.py" in log.read_text(encoding="utf-8") for log in logs)
+    assert fieldkit("rebuild", str(folder)).stdout.endswith("the same bytes as before\n")
+
+
+@pytest.mark.emulated
+def test_the_package_of_a_step_is_part_of_the_trial(fieldkit: Fieldkit, tmp_path: Path) -> None:
+    built_in_ros(tmp_path)
+    assert fieldkit("trial", "busy", "5m").returncode == 0
+    folder = only_trial(tmp_path)
+    installed = tmp_path / "installed"
+    with (installed / "route_step.py").open("a", encoding="utf-8") as module:
+        module.write("\nCHANGED = True\n")
+    changed = fieldkit("resume", str(folder))
+    assert "the code of the step route (route-step 1.0) has changed since the trial began" in changed.stdout
+    installed.rename(tmp_path / "elsewhere")
+    refused = fieldkit("rebuild", str(folder))
+    assert (refused.returncode, "mend" in refused.stderr) == (2, False)
+    assert "step kind `route` from route-step 1.0 is not installed" in refused.stderr
+    assert "install that package with pip" in refused.stderr

@@ -66,6 +66,10 @@ steps:
         - {name: queue, unit: packets, json: "[0].txqlen", label: queue of the radio}
         - {name: up, unit: bool, json: "contains([0].flags, 'UP')", label: radio up}
         - {name: driver, unit: text, json: "[0].linkinfo.info_kind"}
+  - run:
+      {name: probe, robot: receiver, put: tools/probe.sh, output: printed.txt,
+      command: "{put} {distance} 'no {repeat}' {{repeat}} ${distance}",
+      columns: [{name: words, unit: text, regex: "words=(.*)"}, {name: copies, unit: count, regex: "copies=(.*)"}]}
 """,
     "walk": """\
 steps:
@@ -78,6 +82,13 @@ steps:
   - ping: {from: sender, to: receiver, count: 5, interval: 100ms}
 """,
 }
+PROBE = """\
+#!/bin/sh
+printf 'words='
+printf '<%s>' "$@"
+printf '\\ncopies=%s\\n' "$(find ../.. -name probe.sh | wc -l)"
+"""
+"""What a lab copies to a robot: it prints its arguments, and how many copies of itself are there."""
 DISTANCES = {"asymmetric": ["10m"], "vendor": ["10m", "20m"], "walk": ["5m", "15m"]}
 ANSWERS = "wet\n3.5\n2\n4\n0\ndry\n1\n-\n2 m/s\n1\n"
 
@@ -106,6 +117,9 @@ def worked(folder: Path, name: str) -> Stranger:
     (folder / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     (folder / "answers.txt").write_text(ANSWERS, encoding="utf-8")
+    (folder / "tools").mkdir()
+    (folder / "tools" / "probe.sh").write_text(PROBE, encoding="utf-8")
+    (folder / "tools" / "probe.sh").chmod(0o755)
     own_procedure(folder, HEAD.replace("NAME", name) + PROCEDURES[name])
 
     def says(command: str, *words: str) -> str:
@@ -120,6 +134,7 @@ def worked(folder: Path, name: str) -> Stranger:
     said["aggregate"] = says("aggregate", "trials", "--format", "csv")
     said["compare"] = says("compare", *ends, "--by", "protocol")
     said["table"] = says("aggregate", "trials")
+    said["all"] = says("aggregate", "trials", "--all")
     says("report", "trials")
     says("export", ends[0], "--format", "mcap", "-o", "time.mcap")
     page = (folder / "report.html").read_text(encoding="utf-8")
@@ -158,6 +173,14 @@ def test_a_vendor_s_tool_fills_columns(strangers: Mapping[str, Stranger]) -> Non
         assert (row["queue"], row["up"], row["driver"]) == (str(printed["txqlen"]), "true", "tun")
 
 
+def test_a_program_of_the_lab_gets_the_distance_and_the_repeat(strangers: Mapping[str, Stranger]) -> None:
+    one = strangers["vendor"]
+    found = [(row["probe.words"], row["probe.copies"]) for row in one.rows()]
+    wanted = [f"<{at}><no {number}><{{repeat}}><${{distance}}>" for at in ("10m", "20m") for number in (1, 2)]
+    assert found == [(words, "1") for words in wanted], "the copy of each attempt is deleted with it"
+    assert not [path for trial in one.trials for path in trial.rglob("probe.sh")]
+
+
 def test_what_the_operator_says_is_kept(strangers: Mapping[str, Stranger]) -> None:
     said = [(row["distance"], row["grass"], row["wind"], row["people"]) for row in strangers["walk"].rows()]
     assert said == [
@@ -170,22 +193,29 @@ def test_what_the_operator_says_is_kept(strangers: Mapping[str, Stranger]) -> No
 
 LABELS = {
     "asymmetric": {
-        "up.transfer_s": ("s", "up: transfer time", "ms"),
-        "down.transfer_s": ("s", "down: transfer time", "ms"),
-        "up.goodput_bit_s": ("bit/s", "up: goodput", "Mbit/s"),
-        "down.tcp_byte_loss": ("share", "down: TCP bytes lost and repaired", "%"),
+        "up.transfer_s": ("s", "up: transfer time", "", "ms"),
+        "down.transfer_s": ("s", "down: transfer time", "down: transfer time", "ms"),
+        "up.goodput_bit_s": ("bit/s", "up: goodput", "up: goodput", "Mbit/s"),
+        "down.tcp_byte_loss": ("share", "down: TCP byte loss before retransmission", "down: radio loss", "%"),
     },
-    "vendor": {"queue": ("packets", "queue of the radio", "packets"), "up": ("share", "radio up", "%")},
-    "walk": {"wind": ("m/s", "wind", "m/s"), "people": ("number", "people", ""), "rtt_median_s": ("s", "RTT", "ms")},
+    "vendor": {
+        "queue": ("packets", "queue of the radio", "queue of the radio", "packets"),
+        "up": ("share", "radio up", "radio up", "%"),
+    },
+    "walk": {
+        "wind": ("m/s", "wind", "wind", "m/s"),
+        "people": ("number", "people", "people", ""),
+        "rtt_median_s": ("s", "RTT", "RTT, 502-byte ping", "ms"),
+    },
 }
-"""Figures by column: unit in files, label, unit for people."""
+"""Figures by column: unit in files, label, label in the trial's own table (empty where only --all shows it), unit."""
 
 
 @pytest.mark.parametrize("name", PROCEDURES)
 def test_nothing_is_lost_on_the_way_to_the_aggregate(strangers: Mapping[str, Stranger], name: str) -> None:
     one = strangers[name]
     cells = list(csv.DictReader(io.StringIO(one.said["aggregate"])))
-    wanted = {quantity: unit for quantity, (unit, _, _) in LABELS[name].items()}
+    wanted = {quantity: unit for quantity, (unit, *_) in LABELS[name].items()}
     assert {cell["quantity"]: cell["unit"] for cell in cells}.items() >= wanted.items()
     for cell in cells:
         column, _, _ = cell["quantity"].partition("=")  # a text has a line per word
@@ -196,11 +226,15 @@ def test_nothing_is_lost_on_the_way_to_the_aggregate(strangers: Mapping[str, Str
 @pytest.mark.parametrize("name", PROCEDURES)
 def test_people_read_labels_and_units(strangers: Mapping[str, Stranger], name: str) -> None:
     one = strangers[name]
-    for _, label, unit in LABELS[name].values():
-        for table in (one.said["trial"], one.said["compare"]):
-            lines = [line for line in table.splitlines() if re.match(rf" {label}(, median)?  ", line)]
-            assert lines, label
+    for _, label, of_operator, unit in LABELS[name].values():
+        for table, row in (("trial", of_operator), ("compare", label)):
+            lines = [
+                line for line in one.said[table].splitlines() if re.match(rf" {row or label}(, median)?  ", line)
+            ]
+            assert bool(lines) is bool(row), (table, label)
             assert all(unit in line for line in lines)
+        head = rf"^{of_operator if label == 'RTT' else label}{re.escape(f' ({unit})') if unit else ''}$"
+        assert re.search(head, one.said["all"], re.MULTILINE), head
         # The page gives each named step a table.
         assert re.search(rf"{label.rpartition(': ')[2]}\b.*? [0-9.]+ ?{unit}", one.page)
 
@@ -214,14 +248,18 @@ def test_words_of_the_operator_are_counted_everywhere(strangers: Mapping[str, St
     assert re.search(r"^ grass +wet 2$", one.said["trial"], re.MULTILINE)
     assert re.search(r"^ 15m +2  dry 2$", one.said["table"].partition("\ngrass\n")[2], re.MULTILINE)
     assert re.search(r"^ grass +wet 2 +dry 2 +words are counted, not judged$", one.said["compare"], re.MULTILINE)
-    assert re.search(r"TCP, words condition repeats grass 5 m 2 valid wet 2 15 m 2 valid dry 2", one.page)
+    assert re.search(
+        r"TCP, expected and own figures condition repeats wind, median people, median grass 5m 2 valid "
+        r"3\.75 m/s \[[^]]+\]\* 1\.00 \[[^]]+\]\* wet 2 15m 2 valid 1\.50 m/s \[[^]]+\]\* 1\.00 \(1 of 2\) dry 2 ",
+        one.page,
+    )
 
 
 def test_what_was_expected_and_its_verdict_are_in_the_report(strangers: Mapping[str, Stranger]) -> None:
     page = strangers["asymmetric"].page
     assert "Expectations 2 of 3 hold." in page
-    assert re.search(r"up\.file_loss < 90 % TCP, 10 m holds 0\.00 % \[0\.00, [0-9.]+\]", page)
-    assert re.search(r"down\.transfer_s > 60min TCP, 10 m does not hold [0-9.]+ m?s \[", page)
+    assert re.search(r"up\.file_loss < 90 % TCP, 10m holds 0\.00 % \[0\.00, [0-9.]+\]", page)
+    assert re.search(r"down\.transfer_s > 60min TCP, 10m does not hold [0-9.]+ m?s \[", page)
     assert "Expectations" not in strangers["walk"].page
 
 
@@ -229,8 +267,11 @@ def test_each_transfer_has_a_time_line_of_its_own(strangers: Mapping[str, Strang
     one = strangers["asymmetric"]
     folder = one.trials[0].parents[1]
     page = (folder / "report.html").read_text(encoding="utf-8")
-    lanes = re.search(r"send up from [0-9.]+ to [0-9.]+ s; receive up from .*; send down from .*; receive down", page)
-    assert lanes
+    spans = re.findall(r"((?:send|receive) \w+) from ([0-9.]+) to ([0-9.]+) s", page)
+    # By when they began, which of two that run together may be either.
+    assert sorted(lane for lane, _, _ in spans) == ["receive down", "receive up", "send down", "send up"]
+    assert all(float(start_s) < float(stop_s) for _, start_s, stop_s in spans)
+    assert [float(start_s) for _, start_s, _ in spans] == sorted(float(start_s) for _, start_s, _ in spans)
     assert "up, TCP, masterless Marked: segments sent again" in one.page
     assert "down, TCP, masterless Marked: segments sent again" in one.page
     found: dict[str, list[str]] = {}

@@ -39,7 +39,7 @@ def test_the_trial_ends_valid_and_prints_its_table(finished: tuple[Path, Run]) -
     _, run = finished
     assert "using emulated robots" in run.out
     assert "4/4" in run.out
-    for label in ("2 valid", "IP packet loss", "RTT, median", "transfer time, median"):
+    for label in ("2 valid", "radio loss", "RTT, 8192-byte ping, median", "goodput, median", "next: fieldkit report"):
         assert label in run.out
     assert "\x1b" not in run.out, "no terminal codes off a terminal"
 

@@ -77,11 +77,15 @@ def test_the_second_ctrl_c_stops_the_repeat_at_once(tmp_path: Path, untouched: U
     process.wait(LIMIT_S)
     stopped = finish(process)
     assert stopped.code == 130
-    assert [note["text"] for note in stopped.events("note")][-1] == "not begun: 6m, 7m"
+    notes = [note["text"] for note in stopped.events("note")]
+    assert notes[-1] == "not begun: 6m, 7m"
+    assert not any("stays" in note or "delete" in note for note in notes), "nothing stays on robots that have ended"
     wait_for_end(family, within_s=60.0)
     untouched()
     (row,) = rows(only_trial(tmp_path))
     assert (row["status"], row["reason"]) == ("void", "interrupted")
+    (unfetched,) = only_trial(tmp_path).glob("repeats/*/sender-unfetched.txt")
+    assert "its files ended with it" in unfetched.read_text(encoding="utf-8")
 
 
 def test_kill_9_in_mid_repeat_then_resume(tmp_path: Path) -> None:

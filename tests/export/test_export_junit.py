@@ -1,5 +1,6 @@
 """JUnit XML of trials: what a CI server would show of them."""
 
+import csv
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -74,6 +75,44 @@ def test_an_expectation_is_a_case_that_fails_unless_it_holds(trial: Path) -> Non
     protocols = [str(one).upper() for one in store.read_plan(trial).protocols]
     assert failed == [f"rtt_median_s < 1 us ({protocol})" for protocol in protocols]
     assert found.get("tests") == str(len(found))
+
+
+def expecting(trial: Path, *expect: str) -> None:
+    text = ", ".join(expect)
+    edited(trial / PLAN_FILE, lambda plan: plan.replace("  steps:\n", f"  expect: [{text}]\n  steps:\n", 1))
+
+
+def with_column(trial: Path, name: str, values: Callable[[int], str]) -> None:
+    """Give the trial's table a column, or other values in one that it has."""
+    path = trial / store.TRIAL_CSV
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = [row | {name: values(number)} for number, row in enumerate(csv.DictReader(file))]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def test_an_expectation_on_repeats_without_a_value_is_a_failure_that_counts_them(trial: Path) -> None:
+    expecting(trial, "udp rtt_median_s < 10 s")
+    with_column(trial, "rtt_median_sent_s", lambda number: "0.01")
+    assert not cases(suite(trial), "failure")
+    with_column(trial, "rtt_median_s", lambda number: "" if number % 4 == 1 else "0.01")
+    (failure,) = suite(trial).iter("failure")
+    assert failure.get("message") == (
+        "undecided: 1 of 2 repeats have no value; a single repeat has no interval: 10.00 ms (1 of 2)"
+    )
+
+
+def test_a_trial_without_its_table_passes_no_expectation(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    expecting(trial, "rtt_loss < 100 %")
+    assert not cases(suite(trial), "failure")
+    (trial / store.TRIAL_CSV).unlink()
+    out = trial.parent / "results.xml"
+    assert main(["export", str(trial.parent), "--format", "junit", "-o", str(out)]) == 0
+    (found,) = ET.parse(out).getroot()
+    assert cases(found, "failure") == ["rtt_loss < 100 %"]
+    assert "no repeat has ended" in capsys.readouterr().err + out.read_text(encoding="utf-8")
 
 
 def test_the_command_writes_what_a_parser_reads(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,8 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.core.prompts import Question
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import drive_log, ping, reception
+from fieldkit.measure.evidence import ping, reception
+from fieldkit.measure.motion import drive_log
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions import accounts, recorded, where
 from fieldkit.measure.positions.accounts import Account, Accounts
@@ -32,8 +33,8 @@ from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
 from tests.helpers.casts import CAST, los_plan
-from tests.measure.evidence.test_drive_log import drive
 from tests.measure.evidence.test_reception import ROS2, log, write
+from tests.measure.motion.test_drive_log import drive
 from tests.measure.positions.test_recorded import BEGAN_NS, S, fix, odometry, transform, written
 
 _ENDS: Final = (Role.SENDER, Role.RECEIVER)

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.agent import records
-from fieldkit.analysis import repeats
+from fieldkit.analysis import duplicates, repeats
 from fieldkit.campaign.plan import load_campaign
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.site import load_site
+from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
@@ -24,6 +25,9 @@ from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
 from fieldkit.measure import offsets
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
+from fieldkit.measure.checks import topic_captures, topic_checks
+from fieldkit.measure.checks.topic_captures import Captured
+from fieldkit.measure.checks.topic_checks import TopicPlan
 from fieldkit.measure.evidence import (
     bag,
     clock,
@@ -36,18 +40,18 @@ from fieldkit.measure.evidence import (
     printed,
     recovery,
     tcpdump_log,
-    tlog,
     track,
 )
 from fieldkit.measure.evidence.confined import ConfinedAnswerError
+from fieldkit.measure.motion import tlog
 from fieldkit.measure.positions import recorded
 from fieldkit.measure.positions.accounts import Account
 from fieldkit.measure.transfers import topic_log, topics
 from fieldkit.measure.transfers.topics import TopicTraffic
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
-from fieldkit.steps.base import View
 from fieldkit.steps.scene import Said
+from fieldkit.steps.view import View
 from fieldkit.trial import columns, journal, manifest, plan, rebuild, store
 from fieldkit.trial.check import probe, radio, software, system, tools
 from fieldkit.trial.check.report import Report
@@ -181,9 +185,8 @@ def _tar(data: bytes, place: Path) -> None:
 
 def _tars() -> tuple[bytes, ...]:
     folder = LOS / "repeats" / "udp-01"
-    files = [
-        (path.name.encode(), path.read_bytes()) for path in sorted(folder.iterdir()) if path.stat().st_size < 9000
-    ]
+    small = (path for path in sorted(folder.iterdir()) if path.stat().st_size < 9000)
+    files = [(path.name.encode(), path.read_bytes()) for path in small if not laptop_files.reserved(path.name)]
     members = [entry(b"scan/scan.db3", b"x"), *(entry(name, content) for name, content in files)]
     whole = b"".join(members) + bytes(1024)
     names = [one.name for one in archive.members(io.BytesIO(whole), "robot")]
@@ -229,7 +232,7 @@ def _measured(name: str, data: bytes, place: Path) -> None:
         for placed in the_plan.procedure.walk():
             view = View(scene, found, placed.within)
             placed.step.measure(view)
-            list(placed.step.problems(view))
+            list(placed.step.check(view))
         for error in found._failed.values():
             if error.__cause__ is not None and not isinstance(error.__cause__, OSError | ConfinedAnswerError):
                 raise error.__cause__
@@ -251,7 +254,7 @@ def _trial(name: str, data: bytes, place: Path) -> None:
 
 def _csv(data: bytes, place: Path) -> None:
     (place / "trial.csv").write_bytes(data)
-    repeats.deduplicated(repeats.read([place / "trial.csv"], columns.trial_columns()))
+    duplicates.deduplicated(repeats.read([place / "trial.csv"], columns.trial_columns()))
 
 
 def _manifest(path: Path) -> None:
@@ -324,7 +327,9 @@ def _tlog(path: Path) -> None:
 def _topic_log(path: Path) -> None:
     found = topic_log.read(path)
     flow = TopicTraffic("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
-    topics.contradiction(found, found)
+    plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, on_ports=True)
+    list(topic_checks.of_logs(plan, found, found))
+    list(topic_captures.of_captures(plan, found, found, Captured(None, None, complete=False)))
     topics.measure(flow, found, found, None, None)
 
 

@@ -11,14 +11,16 @@ from fieldkit.core.errors import EvidenceError
 from tests.fuzz import harness, targets
 from tests.fuzz.harness import Defect, Target
 from tests.fuzz.mutate import MOST_BYTES, mutated
+from tests.helpers.nightly import others_at_night
 
 KEPT = Path(__file__).parent / "kept"
 
 
-def test_a_short_hunt_finds_nothing(tmp_path: Path) -> None:
-    *defects, tried = harness.hunted("", 10, 300, tmp_path)
+@pytest.mark.parametrize("inputs", others_at_night([100, 3000]))
+def test_a_short_hunt_finds_nothing(inputs: int, tmp_path: Path) -> None:
+    *defects, tried = harness.hunted("", 10, inputs, tmp_path)
     assert defects == []
-    assert tried == 300
+    assert tried == inputs
 
 
 @pytest.mark.parametrize("path", sorted(KEPT.glob("*.*")), ids=lambda path: path.name)

@@ -9,7 +9,7 @@ import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -191,23 +191,32 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
         witness = Witness(out)
         witness.look()
         witness.told = dict.fromkeys(witness.versions, 0)  # what a cut has left is on disk, and must stay there
-        cuts: list[Future[Cut]] = []
+        moments: list[tuple[dict[str, int], bool]] = []
+        asked = threading.Event()
+
+        def image() -> Cut:
+            asked.wait()
+            ((told, is_over),) = moments
+            return Cut(disk.image(mounted, file), told, is_over, f"cut after {after_calls} calls and returns")
 
         def cut() -> None:
-            told, is_over = dict(witness.told), witness.is_over
-            at = f"cut after {after_calls} calls and returns"
-            cuts.append(pool.submit(lambda: Cut(disk.image(mounted, file), told, is_over, at)))
+            # The trial may be in any call, also in one that holds a lock of thread pools: start no thread here.
+            moments.append((dict(witness.told), witness.is_over))
+            asked.set()
 
         def look(_place: str) -> bool:
             witness.look()
             return True
 
-        with at_every_sync(look), at_call(after_calls, cut):
-            run(out, witness)
-        witness.look()
-        if not cuts:
-            cut()
-        return cuts[0].result(), witness
+        made = pool.submit(image)
+        try:
+            with at_every_sync(look), at_call(after_calls, cut):
+                run(out, witness)
+            witness.look()
+        finally:
+            if not moments:
+                cut()
+        return made.result(), witness
 
 
 def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, *, calls: int, most: int) -> int:

@@ -82,4 +82,5 @@ def _row(frame: Packet, addresses: Sequence[int], part: Row, upper: Packet) -> R
         left - tcp.dataofs * 4 if tcp else 0,
         udp.len if udp else 0,
         icmp.id + 65_536 * (icmp.type == 0) if icmp else -1,
+        icmp.seq if icmp else -1,
     )

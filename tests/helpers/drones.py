@@ -2,6 +2,7 @@
 
 import os
 import random
+import select
 import selectors
 import socket
 import struct
@@ -9,10 +10,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as d
 
+from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.autopilot import Autopilot
 from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.px4 import PX4
@@ -76,7 +79,11 @@ def flight(seconds: float = 10.0, speed_m_s: float = 1.0, lost: Callable[[int], 
 
 @contextmanager
 def flying(
-    descriptor: int, send: Callable[[bytes], object], receive: Callable[[int], bytes], firmware: Firmware = PX4
+    descriptor: int,
+    send: Callable[[bytes], object],
+    receive: Callable[[int], bytes],
+    firmware: Firmware = PX4,
+    boot_s: float = 0.0,
 ) -> Iterator[Autopilot]:
     """Let an autopilot answer at a descriptor while the body runs."""
     over = threading.Event()
@@ -87,6 +94,7 @@ def flying(
         can=DUCKIEDRONE,
         around=Ground(None, None).around,
         now_ns=time.monotonic_ns(),
+        boot_s=boot_s,
     )
 
     def fly() -> None:
@@ -117,23 +125,25 @@ def at_udp(damage: Damage = lambda frame: [frame], firmware: Firmware = PX4) -> 
 
 @contextmanager
 def autopilot_at_udp(
-    damage: Damage = lambda frame: [frame], firmware: Firmware = PX4
+    damage: Damage = lambda frame: [frame], firmware: Firmware = PX4, boot_s: float = 0.0
 ) -> Iterator[tuple[int, Autopilot]]:
-    """Do the same for one client, and let the test see the autopilot itself."""
+    """Do the same, and let the test see the autopilot itself; all clients get all frames, as from a router."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind(("127.0.0.1", 0))
         peers: list[tuple[str, int]] = []
 
         def receive(most: int) -> bytes:
             data, sender = endpoint.recvfrom(most)
-            peers[:] = [sender]
+            if sender not in peers:
+                peers.append(sender)
             return data
 
         def send(frame: bytes) -> None:
             for one in damage(frame):
-                endpoint.sendto(one, peers[0])
+                for peer in peers:
+                    endpoint.sendto(one, peer)
 
-        with flying(endpoint.fileno(), send, receive, firmware) as autopilot:
+        with flying(endpoint.fileno(), send, receive, firmware, boot_s) as autopilot:
             yield endpoint.getsockname()[1], autopilot
 
 
@@ -153,6 +163,72 @@ def at_terminal(damage: Damage = lambda frame: [frame]) -> Iterator[str]:
     finally:
         os.close(ours)
         os.close(theirs)
+
+
+class UsbSerial:
+    """A serial line at a USB port: its device disappears when it is pulled out, and comes back.
+
+    Args:
+        path: Of the device.
+        drone: Socket to the autopilot at its other end.
+    """
+
+    def __init__(self, path: Path, drone: socket.socket) -> None:
+        self.path = path
+        self._drone = drone
+        self._ours, self._theirs = -1, -1
+        self._changing = threading.Lock()
+
+    def plug_in(self) -> None:
+        """Let the device appear."""
+        with self._changing:
+            self._ours, self._theirs = os.openpty()
+            os.set_blocking(self._ours, False)
+            self.path.symlink_to(os.ttyname(self._theirs))
+
+    def pull_out(self) -> None:
+        """Let the device disappear: a program that has opened it gets an error."""
+        with self._changing:
+            if self._ours >= 0:
+                self.path.unlink()
+                os.close(self._theirs)
+                os.close(self._ours)
+            self._ours = self._theirs = -1
+
+    def forward(self) -> None:
+        """Forward what has arrived, in both directions; without a device it is lost."""
+        drone = self._drone.fileno()
+        ready, _, _ = select.select([drone, *([self._ours] if self._ours >= 0 else [])], [], [], 0.01)
+        with self._changing, suppress(OSError):  # full, closed, or pulled out meanwhile
+            if drone in ready:
+                data = self._drone.recv(65_536)
+                if self._ours >= 0:
+                    os.write(self._ours, data)
+            if self._ours >= 0 and self._ours in ready:
+                self._drone.sendall(os.read(self._ours, 65_536))
+
+
+@contextmanager
+def autopilot_at_usb(path: Path, firmware: Firmware = ARDUCOPTER) -> Iterator[tuple[UsbSerial, Autopilot]]:
+    """Let a drone be at a serial device that can be pulled out."""
+    near, far = socket.socketpair()
+    usb, over = UsbSerial(path, near), threading.Event()
+
+    def forward() -> None:
+        while not over.is_set():
+            with suppress(OSError):  # pulled out while it waited
+                usb.forward()
+
+    thread = threading.Thread(target=forward)
+    with near, far, flying(far.fileno(), far.sendall, far.recv, firmware) as autopilot:
+        usb.plug_in()
+        thread.start()
+        try:
+            yield usb, autopilot
+        finally:
+            over.set()
+            thread.join()
+            usb.pull_out()
 
 
 def hostile(seed: int) -> Damage:

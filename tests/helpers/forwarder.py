@@ -5,6 +5,8 @@ import select
 import socket
 import struct
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Generic, Self, TypeVar
@@ -14,6 +16,8 @@ Connect = Callable[[float], socket.socket]
 
 _CHUNK: Final = 1 << 16
 _CONNECT_S: Final = 5.0
+_MOST_PIECES: Final = 1000
+"""That a delayed direction of a stream holds."""
 
 # asm-generic/socket.h; a classic BPF program of one instruction, `ret #0`, drops every packet.
 _SO_ATTACH_FILTER: Final = 26
@@ -24,22 +28,44 @@ _DROP_ALL_PROGRAM: Final = struct.pack("HxxxxxxP", 1, ctypes.addressof(_DROP_ALL
 
 @dataclass(eq=False)
 class _Flow:
-    """One direction of a stream."""
+    """One direction of a stream.
+
+    Attributes:
+        source: Where bytes come from.
+        sink: Where they go.
+        queue: Pieces that have come, each with the time from which it may go on; an empty one is the end.
+        finished: Whether the end has come from the source.
+        ended: Whether it was passed on.
+    """
 
     source: socket.socket
     sink: socket.socket
-    pending: bytes = b""
+    queue: deque[tuple[float, bytes]] = field(default_factory=deque)
+    finished: bool = False
     ended: bool = False
 
-    def carry(self) -> None:
-        """Move what can be moved without waiting; pass the end on."""
-        if self.pending:
-            self.pending = self.pending[self.sink.send(self.pending) :]
-        else:
-            self.pending = self.source.recv(_CHUNK)
-            if not self.pending:
-                self.ended = True
-                self.sink.shutdown(socket.SHUT_WR)
+    def due_s(self) -> float | None:
+        """Return in how many seconds a piece may go on, 0 for now; None where there is none."""
+        return max(self.queue[0][0] - time.monotonic(), 0.0) if self.queue else None
+
+    def reads(self, delay_s: float) -> bool:
+        """Whether it takes more: without a delay, not before the last piece has gone on."""
+        return not self.finished and (not self.queue or (delay_s > 0 and len(self.queue) < _MOST_PIECES))
+
+    def take(self, delay_s: float) -> None:
+        """Take what has come."""
+        piece = self.source.recv(_CHUNK)
+        self.finished = not piece
+        self.queue.append((time.monotonic() + delay_s, piece))
+
+    def give(self) -> None:
+        """Pass on what may go on and can without waiting; the end, too."""
+        due_s, piece = self.queue.popleft()
+        if not piece:
+            self.ended = True
+            self.sink.shutdown(socket.SHUT_WR)
+        elif left := piece[self.sink.send(piece) :]:
+            self.queue.appendleft((due_s, left))
 
 
 @dataclass(eq=False)
@@ -49,6 +75,7 @@ class _Link:
     connect: Connect
     listener: socket.socket
     dead: bool = False
+    delay_s: float = 0.0
     streams: list[tuple[_Flow, _Flow]] = field(default_factory=list)
 
     def near_ends(self) -> list[socket.socket]:
@@ -70,8 +97,10 @@ class _Link:
         for stream in list(self.streams):
             try:
                 for flow in stream:
-                    if (flow.sink in writable) if flow.pending else (flow.source in readable):
-                        flow.carry()
+                    if flow.source in readable and flow.reads(self.delay_s):
+                        flow.take(self.delay_s)
+                    if flow.due_s() == 0 and (flow.sink in writable or not flow.queue[0][1]):
+                        flow.give()
             except OSError:
                 self.end(stream, _reset)
             else:
@@ -144,6 +173,12 @@ class Forwarder(Generic[Key]):
                 end.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
         self._wake.send(b"x")
 
+    def delay(self, key: Key, delay_s: float) -> None:
+        """Deliver what comes from now on this much later, either way."""
+        with self._lock:
+            self._links[key].delay_s = delay_s
+        self._wake.send(b"x")
+
     def drop(self, key: Key) -> None:
         """Reset every stream; new ones are carried."""
         link = self._links[key]
@@ -155,9 +190,9 @@ class Forwarder(Generic[Key]):
 
     def _run(self) -> None:
         while not self._over:
-            reading, writing = self._watched()
+            reading, writing, wait_s = self._watched()
             try:
-                readable, writable, _ = select.select(reading, writing, [])
+                readable, writable, _ = select.select(reading, writing, [], wait_s)
             except (OSError, ValueError):
                 continue  # `drop` closed one of them
             if self._woken in readable:
@@ -167,13 +202,17 @@ class Forwarder(Generic[Key]):
                     if not link.dead:
                         link.carry({*readable}, {*writable})
 
-    def _watched(self) -> tuple[list[socket.socket], list[socket.socket]]:
+    def _watched(self) -> tuple[list[socket.socket], list[socket.socket], float | None]:
+        """Return what to read from, what to write to, and after which time to look again in any case."""
         with self._lock:
             alive = [link for link in self._links.values() if not link.dead]
-            flows = [flow for link in alive for stream in link.streams for flow in stream]
-            reading = [flow.source for flow in flows if not flow.pending and not flow.ended]
-            writing = [flow.sink for flow in flows if flow.pending]
-            return [self._woken, *(link.listener for link in alive), *reading], writing
+            flows = [(link.delay_s, flow) for link in alive for stream in link.streams for flow in stream]
+            reading = [flow.source for delay_s, flow in flows if flow.reads(delay_s)]
+            due = [(flow.due_s(), flow) for _, flow in flows]
+            writing = [flow.sink for due_s, flow in due if due_s == 0]
+            waits_s = [due_s for due_s, _ in due if due_s]
+            listeners = [link.listener for link in alive]
+            return [self._woken, *listeners, *reading], writing, min(waits_s, default=None)
 
 
 def _reset(end: socket.socket) -> None:

@@ -1,6 +1,7 @@
 """A ground station of few lines, over nothing: it hands datagrams to an autopilot and reads what comes back."""
 
 import math
+import struct
 from collections.abc import Callable, Iterable
 from typing import Final
 
@@ -9,7 +10,7 @@ from pymavlink.dialects.v20 import common as d
 from sim_backends.emulated.autopilot.autopilot import Autopilot
 from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.mavlink import Message
-from sim_backends.emulated.autopilot.parameters import FlightLimits
+from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameters
 from sim_backends.emulated.autopilot.px4 import PX4
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.quadrotor import DUCKIEDRONE
@@ -28,7 +29,8 @@ class GroundStation:
         lost: Says of each datagram, in either direction, whether it is lost.
         limits: Of the drone's profile.
         world: What it flies in; None for open flat ground.
-        firmware: Of which family the autopilot is.
+        firmware: Family of the autopilot.
+        boot_s: Its boot time.
     """
 
     def __init__(
@@ -37,12 +39,15 @@ class GroundStation:
         limits: FlightLimits = LIMITS,
         world: World | None = None,
         firmware: Firmware = PX4,
+        boot_s: float = 0.0,
     ) -> None:
         around = Ground(world, None).around
         self.autopilot = Autopilot(
-            firmware=firmware, system=SYSTEM, limits=limits, can=DUCKIEDRONE, around=around, now_ns=0
+            firmware=firmware, system=SYSTEM, limits=limits, can=DUCKIEDRONE, around=around, now_ns=0, boot_s=boot_s
         )
         self.autopilot.vehicle.place(HOME_M, math.pi / 2, 0)
+        self._ardupilot = firmware.is_ardupilot
+        self._parameters = Parameters(firmware.parameters(limits))
         self.now_ns = 0
         self.heard: list[Message] = []
         self._lost = lost
@@ -76,6 +81,24 @@ class GroundStation:
         (ack,) = [one for one in answers if one.get_type() == "COMMAND_ACK"]
         assert ack.command == command
         return int(ack.result)
+
+    def ask(self, rate_hz: float, *kinds: int) -> None:
+        """Ask for messages at a rate."""
+        for kind in kinds:
+            assert self.command(d.MAV_CMD_SET_MESSAGE_INTERVAL, kind, 1e6 / rate_hz) == d.MAV_RESULT_ACCEPTED
+
+    def texts(self) -> list[tuple[int, str]]:
+        """Return severity and text of each STATUSTEXT so far."""
+        return [(one.severity, one.text) for one in self.heard if one.get_type() == "STATUSTEXT"]
+
+    def set(self, name: str, value: float) -> None:
+        """Set a parameter by its name, and see that it has this value."""
+        is_integer = self._parameters.is_integer(name)
+        bytewise = is_integer and not self._ardupilot
+        packed = struct.unpack("<f", struct.pack("<i", round(value)))[0] if bytewise else value
+        kind = d.MAV_PARAM_TYPE_INT32 if is_integer else d.MAV_PARAM_TYPE_REAL32
+        (now,) = self.say(d.MAVLink_param_set_message(SYSTEM, 1, name.encode(), packed, kind))
+        assert now.param_value == struct.unpack("<f", struct.pack("<f", packed))[0], name
 
     def last(self, kind: str) -> Message:
         """Return the newest message of a kind."""

@@ -54,12 +54,14 @@ class Truth:
         transfers: The transfers.
         pings: How many requests were sent, and answered.
         loads: How many data packets of each iperf3 were sent, and arrived.
+        cookies_bytes: What goes the way of its data before them, and is never lost: the cookie of a TCP client.
         udp_to: The address that each flow of UDP went to.
     """
 
     transfers: dict[str, Sent] = field(default_factory=dict)
     pings: dict[str, tuple[int, int]] = field(default_factory=dict)
     loads: dict[str, tuple[int, int]] = field(default_factory=dict)
+    cookies_bytes: dict[str, int] = field(default_factory=dict)
     udp_to: list[str] = field(default_factory=list)
 
 
@@ -84,7 +86,7 @@ class Attempt:
         for placed in self.plan.procedure.walk():
             open_now = tuple(map(id, placed.within))
             self._clock = self._clock_of(placed)
-            for planned in self._own(list(placed.step.commands(self._scene)), placed.step):
+            for planned in self._own(list(placed.step.jobs(self._scene)), placed.step):
                 if planned.job.name.endswith("capture"):
                     captures.append((id(placed.step), planned))
                 else:
@@ -134,7 +136,7 @@ class Attempt:
 
     def _own(self, planned: list[Planned], step: object) -> list[Planned]:
         """The jobs of a step itself: those of the steps inside come by themselves."""
-        inside = [one.job for entry in getattr(step, "during", ()) for one in entry.step.commands(self._scene)]
+        inside = [one.job for entry in getattr(step, "during", ()) for one in entry.step.jobs(self._scene)]
         return [one for one in planned if one.job not in inside]
 
     def _path(self, name: str | None) -> Path:
@@ -149,10 +151,12 @@ class Attempt:
         stem = words[words.index("-O") + 1]
         write_bag(self._path(f"{stem}.bag"), {"/scan": 60})
 
-    def _cross(self, data: bytes, source: str, to: str, nests: tuple[int, ...], *, lost: bool = False) -> None:
+    def _cross(self, data: bytes, source: str, to: str, nests: tuple[int, ...], *, lost: bool = False) -> int:
+        """Let a packet leave, and arrive if it is not lost; return when it left."""
         at_ns = self._tick()
         came = None if lost else Frame(at_ns + _HOP_NS, data, wire_bytes=65_555)
         self._crossed.append((Frame(at_ns, data, wire_bytes=65_555), came, source, to, nests))
+        return at_ns
 
     def _send(self, sending: Planned, listening: Planned, nests: tuple[int, ...]) -> None:
         assert sending.job.stdin
@@ -215,27 +219,31 @@ class Attempt:
         lines = [f"PING {target} ({target}) {payload}({payload + 28}) bytes of data."]
         for number in range(1, asked + 1):
             lost = self.draw.random() < self.loss
-            # Of a large one the first fragment alone.
-            echo: dict[str, Any] = {"protocol": 1, "size": min(payload + 8, 1480), "ip_id": next(self._ids)}
-            echo["more"] = payload + 8 > echo["size"]
-            self._cross(
-                ipv4(bytes((8, 0, 0, 0)) + identifier + bytes(2), src=source, dst=target, **echo),
-                source,
-                target,
-                nests,
-                lost=lost,
-            )
+            echo = identifier + struct.pack(">H", number)
+            asked_ns = self._echo(bytes((8, 0, 0, 0)) + echo, payload, (source, target), nests, lost=lost)[0]
             if not lost:
-                back = bytes(4) + identifier + bytes(2)
-                self._cross(ipv4(back, src=target, dst=source, **echo), target, source, nests)
-                at_ns = self._tick()
+                replied_ns = self._echo(bytes(4) + echo, payload, (target, source), nests)[-1] + _HOP_NS
+                at_ns = replied_ns + 100_000
                 stamp = f"[{at_ns // 10**9}.{at_ns % 10**9 // 1000:06d}]"
-                timed = " time=4.00 ms" if payload >= 16 else ""
+                timed = f" time={(replied_ns - asked_ns) / 1e6:.2f} ms" if payload >= 16 else ""
                 lines.append(f"{stamp} {payload + 8} bytes from {target}: icmp_seq={number} ttl=64{timed}")
                 answered += 1
         self.truth.pings[name] = (asked, answered)
         lines += [f"{asked} packets transmitted, {answered} received, 0% packet loss, time 1ms", ""]
         self._path(job.stdout).write_text("\n".join(lines), encoding="ascii")
+
+    def _echo(
+        self, head: bytes, payload: int, ends: tuple[str, str], nests: tuple[int, ...], *, lost: bool = False
+    ) -> list[int]:
+        """Let the fragments of an echo cross; return when each left."""
+        ip_id, size = next(self._ids), payload + 8
+        times_ns = []
+        for offset in range(0, size, 1480):
+            part = min(1480, size - offset)
+            cut: dict[str, Any] = {"size": part, "ip_id": ip_id, "offset": offset, "more": offset + part < size}
+            data = ipv4(head if offset == 0 else b"", protocol=1, src=ends[0], dst=ends[1], **cut)
+            times_ns.append(self._cross(data, *ends, nests, lost=lost))
+        return times_ns
 
     def _iperf3(self, client: Planned, server: Planned, nests: tuple[int, ...]) -> None:
         words, ends = client.job.argv, (self._address(client.role), self._address(server.role))
@@ -244,6 +252,9 @@ class Attempt:
         if not udp:
             self._cross(_segment(0x02, 0, ports, ends, next(self._ids)), *ends, nests)
             self._cross(_segment(0x12, 0, ports[::-1], ends[::-1], next(self._ids)), *ends[::-1], nests)
+        cookie_bytes = 0 if udp or "-R" in words else 37
+        if cookie_bytes:
+            self._cross(_segment(0x10, cookie_bytes, ports, ends, next(self._ids), seq=1), *ends, nests)
         if "-R" in words:
             ports, ends = ports[::-1], ends[::-1]
         arrived = 0
@@ -254,14 +265,17 @@ class Attempt:
             data = (
                 ipv4(head, protocol=17, size=1408, ip_id=next(self._ids), src=ends[0], dst=ends[1])
                 if udp
-                else _segment(0x10, 1400, ports, ends, next(self._ids), seq=1 + 1400 * at)
+                else _segment(0x10, 1400, ports, ends, next(self._ids), seq=1 + cookie_bytes + 1400 * at)
             )
             self._cross(data, *ends, nests, lost=lost)
         self.truth.loads[name] = (number, arrived)
+        self.truth.cookies_bytes[name] = cookie_bytes
         self.truth.udp_to += [ends[1]] if udp else []
-        total = {"seconds": 1.0, "bytes": 1400 * arrived}
+        lasted_s = float(words[words.index("-t") + 1]) if "-t" in words else 1.0
         for planned in (client, server):
-            own, other = ports if self._address(planned.role) == ends[0] else ports[::-1]
+            sends = self._address(planned.role) == ends[0]
+            own, other = ports if sends else ports[::-1]
+            total = {"seconds": lasted_s, "bytes": 1400 * (number if sends else arrived)}
             start = {"connected": [{"local_port": own, "remote_port": other}]}
             said = {"start": start, "intervals": [{"sum": total}], "end": {}}
             self._path(planned.job.stdout).write_text(json.dumps(said), encoding="ascii")

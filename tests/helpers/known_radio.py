@@ -3,11 +3,16 @@
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import pytest
+
 from tests.helpers.labs import own_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 LOSSES_PERCENT = (0, 1, 10, 30)
-REPEATS = 20
+IN_CI, AT_NIGHT = 8, 20
+"""Repeats of each trial."""
+REPEATS = [IN_CI, pytest.param(AT_NIGHT, marks=pytest.mark.nightly)]
+"""For a fixture of the module, so that each of its tests is run with either number."""
 
 SITE = """\
 backend: emulated
@@ -40,7 +45,7 @@ steps:
 """
 
 
-def make_lab(lab: Path, radio: str, *, topic: str = "/scan", pings: int = 1, repeats: int = REPEATS) -> Path:
+def make_lab(lab: Path, radio: str, *, topic: str = "/scan", pings: int = 1, repeats: int = IN_CI) -> Path:
     lab.mkdir()
     (lab / "fieldkit.yaml").write_text(SITE.replace("RADIO", radio), encoding="utf-8")
     text = PROCEDURE.replace("TOPIC", topic).replace("PINGS", str(pings)).replace("REPEATS", str(repeats))

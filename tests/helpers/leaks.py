@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Final
 
@@ -57,7 +58,9 @@ class _Watch:
 
     def _look(self) -> None:
         ends = time.monotonic() + self._config.getoption("--end-within")
-        while left := [pid for pid in descendants(os.getpid()) - self._before if alive(pid)]:
+        # The tracker process of multiprocessing lives as long as the process that started it.
+        resource_tracker._resource_tracker._stop()  # type: ignore[attr-defined]
+        while left := self._running():
             if time.monotonic() >= ends:
                 break
             time.sleep(0.05)
@@ -66,13 +69,26 @@ class _Watch:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
+    def _running(self) -> list[int]:
+        """Return the processes that run, after waiting for those that have ended.
+
+        This process adopts orphans, so it must also wait for them: the first process of a PID namespace cannot end
+        before its last zombie has been waited for, also one that `nsenter` started from outside.
+        """
+        started = descendants(os.getpid()) - self._before
+        for pid in started:
+            with suppress(ChildProcessError):
+                os.waitpid(pid, os.WNOHANG)
+        return [pid for pid in started if alive(pid)]
+
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node: Any) -> None:  # noqa: ANN401 (xdist tells no type)
         """Take over what a worker found; one that crashed has told nothing, and fails the run by itself."""
         self.leaks += getattr(node, "workeroutput", {}).get(_KEY, [])
 
+    @pytest.hookimpl(trylast=True)
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Say what was left."""
+        """List the processes that were left behind, after all other sections: the end of a log is what people see."""
         if self.leaks:
             terminalreporter.section(_KEY, red=True)
             for leak in self.leaks:
@@ -101,7 +117,10 @@ def untouched() -> Iterator[Untouched]:
 
 
 def _command(pid: int) -> str:
+    """Return the command line of a process, or where it has none, as while it ends, its name in brackets."""
+    folder = Path(f"/proc/{pid}")
     try:
-        return Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace").replace("\0", " ")
+        command = (folder / "cmdline").read_text(encoding="utf-8", errors="replace").replace("\0", " ")
+        return command or f"[{(folder / 'comm').read_text(encoding='utf-8', errors='replace').strip()}, pid {pid}] "
     except OSError:
         return ""

@@ -37,10 +37,10 @@ def every(found: Measures) -> dict[str, Any]:
 def measure(folder: Path, transfer: Transfer | None) -> Measures:
     """Return what the evidence in `folder` says; each column has a value, or is said to be missing, once."""
     evidence = AttemptEvidence(folder)
-    pings = evidence.known(ping.read, ping.FILE)
-    where = evidence.known(track.read, track.FILE)
+    pings = evidence.read_or_none(ping.read, ping.FILE)
+    where = evidence.read_or_none(track.read, track.FILE)
     replied_ns = [at for one in pings.answers if (at := one.at_utc_ns)] if pings else []
-    found = lateness.measure(evidence.known(lateness.read, lateness.FILE)) | ping.measure(pings)
+    found = lateness.measure(evidence.read_or_none(lateness.read, lateness.FILE)) | ping.measure(pings)
     found |= track.measure(where, ping.WAY_COLUMNS, (Role.SENDER, Role.RECEIVER), replied_ns)
     if transfer is not None:
         found |= figures.measure(evidence, transfer) | _captures(evidence)
@@ -58,7 +58,7 @@ def _captures(evidence: AttemptEvidence) -> Measured:
     found = Measured()
     for role in (Role.SENDER, Role.RECEIVER):
         capture = evidence.whole_capture(tcpdump_log.capture_file(role))
-        log = evidence.known(tcpdump_log.read, tcpdump_log.log_file(role))
+        log = evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_file(role))
         captured = capture.frames if capture else None
         dropped = log.dropped_by_kernel if log else None
         found |= Measured.of({f"{role}_captured": captured, f"{role}_capture_dropped": dropped}, "not at hand")

@@ -2,11 +2,14 @@
 
 from collections.abc import Iterator
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Figure, Kind, Measured, columns
 from fieldkit.core.model import Protocol, Role
-from fieldkit.steps.base import Step, View
+from fieldkit.steps.base import Step
 from fieldkit.steps.scene import Announce, Planned, Scene
+from fieldkit.steps.view import View
 
 TARGET = "tests.helpers.meter:Meter"
 
@@ -29,38 +32,39 @@ class Meter(Step):
     robot: Role = Role.SENDER
 
     @property
+    @override
     def prefix(self) -> str:
-        """See `Step.prefix`."""
         return self.called
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`."""
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
         own = (Column(name, "dBm", "As its YAML says.", figure=Figure(name, Kind.MEDIAN)) for name in self.measures)
         return (*self.columns, *own)
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         return iter(())
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
+        pass
 
+    @override
     def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
         return frozenset({self.robot})
 
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return 0.0
 
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
         return ()
 
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
         return ()
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
-        return Measured.nothing(self.declared(), "there is no meter")
+        return Measured.nothing(self.output_columns(), "there is no meter")

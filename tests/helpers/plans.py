@@ -21,6 +21,13 @@ def steps_of(procedure: Procedure, kind: type[S], *, undisturbed: bool = False) 
             yield placed.step
 
 
+def write_states(folder: Path, *roles: str) -> None:
+    """Write the notes of robots before and after an attempt, without a section; by default of sender and receiver."""
+    for role in roles or ("sender", "receiver"):
+        for moment in ("before", "after"):
+            (folder / f"{role}-{moment}.txt").write_text("==> end <==\n", encoding="ascii")
+
+
 def problems(plan: Plan, protocol: Protocol, folder: Path) -> tuple[str, ...]:
     """Return why what an attempt left in a folder is not whole."""
     return gates.judge(plan, RepeatId(protocol, 1), AttemptEvidence(folder)).problems

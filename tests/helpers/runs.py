@@ -5,7 +5,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,21 @@ def wait_for_line(process: "subprocess.Popen[str]", text: str) -> None:
     """Return when a started run printed a line with `text`."""
     assert process.stdout is not None
     assert any(text in line for line in process.stdout), f"{text} never came"
+
+
+def wait_during(process: "subprocess.Popen[str]", condition: Callable[[], bool], *, within_s: float = 90.0) -> None:
+    """Return when a condition is true while a started run goes on.
+
+    Raises:
+        AssertionError: The run ended before, or the time is over. It says what the run printed, and the run is ended.
+    """
+    ends_s = time.monotonic() + within_s
+    while not condition():
+        if process.poll() is not None or time.monotonic() > ends_s:
+            why = "in time" if process.poll() is None else "before the run ended"
+            process.kill()
+            raise AssertionError(f"the condition did not become true {why}: {finish(process)}")
+        time.sleep(0.01)
 
 
 def finish(process: "subprocess.Popen[str]") -> Run:

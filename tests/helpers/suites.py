@@ -68,7 +68,7 @@ def run(folder: Path, *words: str, python: str = sys.executable, beside: Sequenc
     """
     report = folder / "junit.xml"
     done = subprocess.run(
-        command(f"--junitxml={report}", *words, python=python),
+        command(f"--rootdir={folder}", f"--junitxml={report}", *words, python=python),
         cwd=folder,
         env=environment() | {"PYTHONPATH": os.pathsep.join(map(str, beside))},
         stdin=subprocess.DEVNULL,

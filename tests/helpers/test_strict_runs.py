@@ -37,6 +37,24 @@ DETACHES_A_PROCESS = """
             subprocess.run(("sh", "-c", "setsid sleep 600 &"))
             raise ValueError
 """
+ORPHAN_IN_A_PID_NAMESPACE = """
+    import os, signal, time
+    def children(pid):
+        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    def only_child(pid):
+        while not children(pid):
+            time.sleep(0.01)
+        return children(pid)[0]
+    def test_it():
+        unshare = subprocess.Popen(("unshare", "--pid", "--fork", "sleep", "600"))
+        init = only_child(unshare.pid)
+        nsenter = subprocess.Popen(("nsenter", f"--target={init}", "--pid", "sleep", "600"))
+        only_child(nsenter.pid)
+        for process in (nsenter, unshare):
+            process.kill()
+            process.wait()
+        os.kill(init, signal.SIGKILL)
+"""
 LEAKS_AN_INTERFACE = """
     def test_it(untouched):
         if first_try("tried"):
@@ -57,6 +75,23 @@ WAITS_IN_VAIN = """
                 finally:
                     child.kill()
             child.kill()
+"""
+ORPHAN_OF_A_NAMESPACE = """
+    from tests.helpers.host import alive, descendants
+    from tests.helpers.sshd import wait_until
+    from fieldkit.core.deadline import Deadline
+    def child_of(process):
+        wait_until(lambda: descendants(process.pid), Deadline.after(30))
+        (child,) = descendants(process.pid)
+        return child
+    def test_it():
+        robot = subprocess.Popen(("unshare", "--pid", "--fork", "--kill-child", "sleep", "600"))
+        entered = subprocess.Popen(("nsenter", "--target", str(child_of(robot)), "--pid", "sleep", "600"))
+        orphan = child_of(entered)
+        for process in (entered, robot):
+            process.kill()
+            process.wait()
+        wait_until(lambda: not alive(orphan), Deadline.after(30))
 """
 STRANGER = """
     @pytest.fixture
@@ -120,6 +155,15 @@ def test_a_process_that_a_first_try_leaves_fails_the_run(
 
 
 @pytest.mark.emulated
+def test_an_orphan_in_a_pid_namespace_that_ended_is_not_left_behind(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = run(pytester, monkeypatch, ORPHAN_IN_A_PID_NAMESPACE, *ALONE)
+    done.stdout.no_fnmatch_line("*processes left behind*")
+    assert done.ret == pytest.ExitCode.OK
+
+
+@pytest.mark.emulated
 @pytest.mark.parametrize("test", [LEAKS_AN_INTERFACE, LEAKS_A_NAME], ids=["interface", "namespace"])
 def test_what_a_first_try_leaves_in_the_namespaces_of_the_test_is_no_matter_of_luck(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str
@@ -130,6 +174,16 @@ def test_what_a_first_try_leaves_in_the_namespaces_of_the_test_is_no_matter_of_l
     assert done.ret == pytest.ExitCode.TESTS_FAILED
     done.assert_outcomes(passed=1, errors=1)
     done.stdout.fnmatch_lines(["*LeakError*left*"])
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("how", [ALONE, SIDE_BY_SIDE], ids=["alone", "side by side"])
+def test_an_orphan_that_has_ended_does_not_keep_its_namespace_from_ending(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, how: tuple[str, ...]
+) -> None:
+    done = run(pytester, monkeypatch, ORPHAN_OF_A_NAMESPACE, *how)
+    done.assert_outcomes(passed=1)
+    assert done.ret == pytest.ExitCode.OK, str(done.stdout)
 
 
 def test_waiting_in_vain_for_an_end_gets_no_second_try(

@@ -50,21 +50,24 @@ def write(folder: Path, of: Plan, table: Sequence[Mapping[str, Value]], *, with_
 
 
 def measured(of: Plan, *, repeats: int = 8, seed: int = 1, level_dbm: float = -40.0) -> list[dict[str, Value]]:
-    """Return valid rows of a trial, all of whose columns have a value that they can have."""
-    random = np.random.default_rng(seed)
+    """Return valid rows of a trial, all of whose columns have a value that they can have.
+
+    Each column has random numbers of its own, so that a further column changes no other.
+    """
+    random = {column.name: np.random.default_rng([seed, *column.name.encode()]) for column in of.table}
     table = []
     for protocol in Protocol:
         for number in range(1, repeats + 1):
-            row: dict[str, Value] = {column.name: _value(column, random) for column in of.table}
+            row: dict[str, Value] = {column.name: _value(column, random[column.name]) for column in of.table}
             for column in of.table:
                 figure = column.figure
                 if figure is not None and figure.kind is Kind.COUNTED:
                     assert figure.sent is not None
                     assert figure.arrived is not None
-                    row[figure.sent], row[figure.arrived] = 40, 40 - int(random.integers(0, 9))
+                    row[figure.sent], row[figure.arrived] = 40, 40 - int(random[column.name].integers(0, 9))
                     row[column.name] = 1 - int(row[figure.arrived]) / 40
             if "probe.level" in row:
-                row["probe.level"] = float(level_dbm - of.distance_m + random.normal(0, 2))
+                row["probe.level"] = float(level_dbm - of.distance_m + random["probe.level"].normal(0, 2))
             for step in ("p502", "p8192"):
                 if f"{step}.rtt_payload_bytes" in row:
                     row[f"{step}.rtt_payload_bytes"] = int(step.removeprefix("p"))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.helpers.paths import ROOT
 
-_SOURCES = ("fieldkit", "sim_backends", "robots", "procedures")
+_SOURCES = ("fieldkit", "sim_backends", "robots", "procedures", "docs", ".ci")
 _FILES = ("pyproject.toml", "README.md", "LICENSE")
 
 

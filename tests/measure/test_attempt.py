@@ -35,7 +35,7 @@ def test_a_file_is_parsed_once_whoever_asks(tmp_path: Path) -> None:
     evidence, parser = AttemptEvidence(tmp_path), Parser()
     first = evidence.read(parser.words, "a.txt")
     (tmp_path / "a.txt").write_text("three", encoding="utf-8")
-    assert evidence.read(parser.words, "a.txt") is evidence.known(parser.words, "a.txt") is first
+    assert evidence.read(parser.words, "a.txt") is evidence.read_or_none(parser.words, "a.txt") is first
     assert first == ["one", "two"]
     assert parser.called == [("a.txt", 0)]
 
@@ -56,7 +56,7 @@ def test_an_error_is_raised_again_and_not_looked_for_again(tmp_path: Path) -> No
     with pytest.raises(EvidenceError) as first:
         evidence.read(parser.words, "a.txt")
     (tmp_path / "a.txt").write_text("late", encoding="utf-8")
-    assert evidence.known(parser.words, "a.txt") is None
+    assert evidence.read_or_none(parser.words, "a.txt") is None
     with pytest.raises(EvidenceError) as again:
         evidence.read(parser.words, "a.txt")
     assert again.value is first.value
@@ -66,7 +66,7 @@ def test_an_error_is_raised_again_and_not_looked_for_again(tmp_path: Path) -> No
 def test_an_error_that_was_passed_over_is_raised_where_it_matters(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("one", encoding="utf-8")
     evidence, parser = AttemptEvidence(tmp_path), Parser()
-    assert evidence.known(parser.words, "a.txt", 2) is None
+    assert evidence.read_or_none(parser.words, "a.txt", 2) is None
     with pytest.raises(EvidenceError, match="too short"):
         evidence.read(parser.words, "a.txt", 2)
     assert parser.called == [("a.txt", 2)]
@@ -80,7 +80,7 @@ def test_what_is_found_in_evidence_is_looked_for_once(tmp_path: Path) -> None:
 
     evidence = AttemptEvidence(tmp_path)
     for number in (1, 1, 2, 1):
-        assert evidence.once(find, number) is None
+        assert evidence.cached(find, number) is None
     assert looked == [(tmp_path, 1), (tmp_path, 2)]
 
 
@@ -117,7 +117,7 @@ def test_whatever_a_reader_raises_is_evidence_that_cannot_be_read(tmp_path: Path
         raise error("no such number")
 
     evidence = AttemptEvidence(tmp_path)
-    assert evidence.known(raises, "a.txt") is None
+    assert evidence.read_or_none(raises, "a.txt") is None
     with pytest.raises(EvidenceError, match=f"cannot be read: {error.__name__}") as caught:
         evidence.read(raises, "a.txt")
     assert caught.value.where == str(tmp_path / "a.txt")
@@ -128,4 +128,4 @@ def test_too_little_memory_says_nothing_of_the_evidence(tmp_path: Path) -> None:
         raise MemoryError
 
     with pytest.raises(MemoryError):
-        AttemptEvidence(tmp_path).known(raises, "a.txt")
+        AttemptEvidence(tmp_path).read_or_none(raises, "a.txt")

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import paramiko
 import pytest
@@ -746,3 +747,33 @@ def test_close_is_prompt(shell: SshShell, waiting: Waiting, pool: ThreadPoolExec
     with pytest.raises(LinkError):
         done.result(SOON)
     assert time.monotonic() - began < 1.0
+
+
+class CountingSocket(socket.socket):
+    """Counts how often quick acknowledgement is requested."""
+
+    requests = 0
+
+    def setsockopt(self, *option: Any) -> None:  # noqa: ANN401 (of several kinds)
+        self.requests += option[:2] == (socket.IPPROTO_TCP, socket.TCP_QUICKACK)
+        super().setsockopt(*option)
+
+
+def test_the_handshake_is_acknowledged_immediately_and_later_commands_only_when_they_start(server: Server) -> None:
+    """A server with Nagle's algorithm waits 40 ms otherwise; a packet more crosses the radio under test later."""
+    streams = []
+
+    def connect(timeout_s: float) -> socket.socket:
+        stream = CountingSocket()
+        streams.append(stream)
+        stream.settimeout(timeout_s)
+        stream.connect(("127.0.0.1", server.port))
+        return stream
+
+    with contextlib.closing(server.shell(connect=connect)) as shell:
+        shell.run(("true",), deadline=Deadline.after(60))
+        (stream,) = streams
+        assert stream.requests > 8, "after each message of the version and key exchange, and of the login"
+        before = stream.requests
+        shell.run(("true",), deadline=Deadline.after(60))
+        assert stream.requests - before <= 2, "not after each message"

@@ -28,10 +28,28 @@ def browser() -> Iterator[Browser]:
 def lawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the report on a made-up lawn."""
     folder = tmp_path_factory.mktemp("lawn")
-    tables.write(folder, lawns.lawn(), "all.csv")
+    tables.write(folder, [*lawns.lawn(), *dead()], "all.csv")
     run = fieldkit(folder, "report", "all.csv")
     assert run.code == 0, run.err
     return folder / "report.html"
+
+
+def dead() -> list[tables.RepeatRow]:
+    """Return repeats behind the wall in which nothing arrived."""
+    lost = {"datagrams_received": 0, "datagram_loss": 1.0, "rtt_median_s": None, "transfer_s": None}
+    place = {"scenario": "nlos", "procedure": "nlos", "distance": "60m", "distance_m": 60.0, "trial": "dead"}
+    return [lawns.row(number, **place, **lost) for number in (1, 2, 3)]
+
+
+@pytest.mark.parametrize("width", [PHONE, LAPTOP])
+def test_what_is_missing_is_seen_first_and_in_the_curves(browser: Browser, lawn: Path, width: int) -> None:
+    with opened(browser, lawn, width=width) as found:
+        first = found.page.locator(".headlines .missing strong").nth(1)
+        assert first.is_visible()
+        assert first.inner_text() == "nothing arrived in 3 repeats"
+        cross = found.page.locator("#rtt-median svg text", has_text="nothing arrived: 3 of 3").first
+        assert cross.is_visible()
+        assert cross.bounding_box() is not None
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -104,6 +122,9 @@ def test_an_emulated_trial_is_reported_with_links_to_its_evidence(browser: Brows
         names = [figure.get_attribute("id") for figure in found.page.locator("figure").all()]
         assert "timeline" in names
         assert found.page.locator("svg.raster").count() == 1
+        boxes = [panel.bounding_box() for panel in found.page.locator(".stacked > svg").all()]
+        assert len(boxes) >= 3
+        assert len({(box["x"], box["width"]) for box in boxes if box}) == 1, "one axis of time"
         links = [link.get_attribute("href") or "" for link in found.page.locator("a.mark").all()]
     trial = only_trial(tmp_path).relative_to(tmp_path)
     assert links == [f"{trial}/repeats/udp-0{number}/" for number in (1, 2)]

@@ -39,7 +39,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
-    rows = [row for row in lawns.lawn(2) if row.topology == "master" and row.distance == "20ft"]
+    rows = [row for row in lawns.lawn(2) if row.topology == "master" and row.distance != "55ft"]
     path = tables.write(tmp_path, rows)
     runs = []
     for name in ("one", "two"):

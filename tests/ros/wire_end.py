@@ -1,6 +1,7 @@
 """An end of `/scan` over DDS or Zenoh: `wire_end.py hear|say OVER NETWORK TOPIC FILE`, with JSON for two of them.
 
-`say` publishes the samples in the file, a line of hexadecimal each; `hear` prints each that comes.
+`say` publishes the samples in the file, a line of hexadecimal each, and prints `matched` once a
+subscription matches; `hear` prints each that comes.
 """
 
 import json
@@ -30,4 +31,8 @@ else:
     for sample in Path(sys.argv[5]).read_text(encoding="ascii").split():
         publisher.write(bytes.fromhex(sample))
         pause.wait(0.02)
+    while not publisher.matched():
+        pause.wait(0.02)
+    sys.stdout.write("matched\n")
+    sys.stdout.flush()
 pause.wait()

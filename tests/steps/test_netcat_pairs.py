@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import time
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -23,11 +24,14 @@ TCP_BYTES = 24_000_000
 # Less than a socket buffer holds: on the loopback nothing else paces UDP.
 UDP_BYTES = 60_001
 
-UDP = [
-    (sender, receiver)
-    for sender, receiver in product(netcat.DATAGRAM_BYTES, repeat=2)
-    if not netcat.cut_short(sender, receiver)
-]
+UDP = list(product(netcat.DATAGRAM_BYTES, repeat=2))
+
+
+@cache
+def version(kind: Netcat) -> str:
+    """Return what a netcat of this machine prints of its version; the others than ncat have nothing for it."""
+    words = ("ncat", "--version")
+    return subprocess.run(words, capture_output=True, text=True, check=True).stderr if kind is Netcat.NCAT else ""
 
 
 def program(kind: Netcat, folder: Path) -> str:
@@ -81,9 +85,10 @@ def test_tcp_delivers_the_whole_file(sender: Netcat, receiver: Netcat, tmp_path:
 
 
 @pytest.mark.parametrize(("sender", "receiver"), UDP)
-def test_udp_delivers_the_whole_file(sender: Netcat, receiver: Netcat, tmp_path: Path) -> None:
+def test_udp_delivers_the_whole_file_or_the_pair_is_refused(sender: Netcat, receiver: Netcat, tmp_path: Path) -> None:
     content = (bytes(range(256)) * (UDP_BYTES // 256 + 1))[:UDP_BYTES]
-    assert transfer(sender, receiver, Protocol.UDP, content, tmp_path) == content
+    whole = transfer(sender, receiver, Protocol.UDP, content, tmp_path) == content
+    assert whole != netcat.cut_short(sender, receiver, version(receiver))
 
 
 def test_a_pair_that_is_refused_would_lose_half_of_the_file(tmp_path: Path) -> None:

@@ -55,4 +55,4 @@ def test_what_was_found_is_told(said: Said, verdict: Verdict, told: str) -> None
     found, detail, remedy = routing.judged(said)
     assert found is verdict
     assert detail.startswith(told)
-    assert ("docs/mesh.md" in remedy) == (verdict is Verdict.FAIL)
+    assert ("fieldkit docs mesh" in remedy) == (verdict is Verdict.FAIL)

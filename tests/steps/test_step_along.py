@@ -39,7 +39,7 @@ def procedure(kind: str, words: str, away: str = "2m") -> Procedure:
 
 
 def fitted(kind: str, words: str, away: str = "2m") -> Any:  # noqa: ANN401 (a step of the kind)
-    return list(procedure(kind, words, away).fitted(CAST).walk())[-1].step
+    return list(procedure(kind, words, away).resolved(CAST).walk())[-1].step
 
 
 def test_each_lasts_as_long_as_the_way() -> None:
@@ -63,7 +63,7 @@ def test_a_robot_that_drives_by_itself_needs_time_for_its_turns() -> None:
     text = TEXT.replace("AWAY", "1m}, {left: 1m").replace("KIND: {WORDS}", "wait: {along: true}")
     own = schema.validate(schema.parse(text, source="x.yaml"), Procedure)
     drives = {role: one.model_copy(update={"drives": one.profile.drive is not None}) for role, one in CAST.items()}
-    moved, driven = (list(own.fitted(cast).walk())[-1].step for cast in (CAST, drives))
+    moved, driven = (list(own.resolved(cast).walk())[-1].step for cast in (CAST, drives))
     assert isinstance(moved, WaitStep)
     assert isinstance(driven, WaitStep)
     assert moved.duration == 10.0
@@ -73,7 +73,7 @@ def test_a_robot_that_drives_by_itself_needs_time_for_its_turns() -> None:
 
 def test_what_is_fitted_reads_back() -> None:
     for kind, words in (("ping", ENDS), ("wait", ""), ("topics", ENDS), ("iperf3", ENDS)):
-        one = procedure(kind, f"{words}{', ' if words else ''}along: true", "1.23m").fitted(CAST)
+        one = procedure(kind, f"{words}{', ' if words else ''}along: true", "1.23m").resolved(CAST)
         assert schema.validate(schema.parse(schema.dump(one), source="trial.yaml"), Procedure) == one
 
 
@@ -106,6 +106,6 @@ def test_of_two_ways_the_inner_one_counts() -> None:
     ping = f"ping: {{{ENDS}, along: true}}"
     inner = f"{{name: inner, robot: sender, path: [{{away: 1m}}], speed: 0.1m/s, during: [{{{ping}}}]}}"
     text = text.replace("INNER", inner).replace("AWAY", "1m")
-    steps = list(schema.validate(schema.parse(text, source="x.yaml"), Procedure).fitted(CAST).walk())
+    steps = list(schema.validate(schema.parse(text, source="x.yaml"), Procedure).resolved(CAST).walk())
     assert {placed.step.robot for placed in steps[:2]} == {Role.SENDER, Role.RECEIVER}  # type: ignore[attr-defined]
     assert steps[-1].step.count == 50  # type: ignore[attr-defined]

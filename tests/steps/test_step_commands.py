@@ -3,7 +3,7 @@
 import pytest
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.cli.commands.trial import in_shell
+from fieldkit.cli.dry_run import in_shell
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
@@ -49,13 +49,13 @@ GOLDEN = {
 def test_commands_of_the_papers_trial(protocol: Protocol) -> None:
     plan = los_plan()
     scene = plan.scene(RepeatId(protocol, 1), ".fieldkit/t/r")
-    planned = [one for entry in plan.procedure.steps for one in entry.step.commands(scene)]
+    planned = [one for entry in plan.procedure.steps for one in entry.step.jobs(scene)]
     assert [(one.role, in_shell(one.job)) for one in planned] == GOLDEN[protocol]
 
 
 def test_a_record_override_reaches_the_command_and_nothing_else() -> None:
     (record,) = steps_of(load_procedure("los").with_record(2.5), RecordStep)
-    (planned,) = record.commands(Scene(Protocol.TCP, CAST, "f"))
+    (planned,) = record.jobs(Scene(Protocol.TCP, CAST, "f"))
     assert "--duration=2.5" in planned.job.argv
     assert list(load_procedure("los").with_record(15.0)) == list(load_procedure("los"))
 
@@ -65,7 +65,7 @@ def test_ros2_records_until_sigint_which_is_its_limit() -> None:
     cast = {Role.SENDER: Robot(name="a", address="10.42.0.1", profile=ros2)}
     text = "{robot: sender, topics: [/scan, /imu], duration: 15s}"
     record = schema.validate(schema.parse(text, source="x"), RecordStep)
-    (planned,) = record.commands(Scene(Protocol.TCP, cast, "f"))
+    (planned,) = record.jobs(Scene(Protocol.TCP, cast, "f"))
     assert planned.job.argv[-7:] == ("ros2", "bag", "record", "-o", "scan", "/scan", "/imu")
     assert planned.job.limit_s == 15.0
     assert planned.job.ready == "log:Subscribed to topic", "what it takes to start is not recorded"
@@ -78,16 +78,14 @@ def test_capture_by_sudo_runs_the_whole_job_as_root() -> None:
     cast = {role: robot.model_copy(update={"profile": profile}) for role, robot in CAST.items()}
     (entry,) = [one for one in load_procedure("los").steps if one.kind == "capture"]
     first = next(
-        entry.step.commands(
-            Scene(Protocol.TCP, cast, "f", {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e6),)})
-        )
+        entry.step.jobs(Scene(Protocol.TCP, cast, "f", {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e6),)}))
     )
     assert jobs.command("start", first.job)[:4] == ("sudo", "-n", "sh", jobs.SCRIPT_PATH)
 
 
 def test_a_started_job_is_one_line_of_words() -> None:
     scene = los_plan().scene(RepeatId(Protocol.UDP, 1), ".fieldkit/t/udp-01-1")
-    planned = [one for entry in los_plan().procedure.steps for one in entry.step.commands(scene)]
+    planned = [one for entry in los_plan().procedure.steps for one in entry.step.jobs(scene)]
     listen = next(one.job for one in planned if one.job.name == "listen")
     files = ("/dev/null", "recv.bag", "receiver-listen.log")
     command = ("nc.traditional", "-u", "-l", "-p", "1234", "-w", "2")
@@ -104,7 +102,7 @@ def test_a_procedure_survives_being_written_and_read_again() -> None:
 def test_a_capture_never_ends_before_what_it_captures() -> None:
     text = "during: [{transfer: {from: sender, to: receiver, file: a.bag, limit: 30min}}]"
     step = schema.validate(schema.parse(text, source="x"), CaptureStep)
-    first, _, listen, send = step.commands(
+    first, _, listen, send = step.jobs(
         Scene(Protocol.UDP, CAST, "f", {Role.SENDER: (RecordedFile(Role.SENDER, "a.bag", 1e6),)})
     )
     assert first.job.limit_s > listen.job.limit_s + send.job.limit_s
@@ -127,5 +125,5 @@ def test_a_capture_never_ends_before_what_it_captures() -> None:
 def test_a_capture_takes_what_the_steps_inside_send(during: str, among: str) -> None:
     step = schema.validate(schema.parse(f"during: [{{{during}}}]", source="x"), CaptureStep)
     recorded = {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e6),)}
-    first = next(step.commands(Scene(Protocol.TCP, CAST, "f", recorded)))
+    first = next(step.jobs(Scene(Protocol.TCP, CAST, "f", recorded)))
     assert first.job.argv[-1] == f"{among} or ip[6:2] & 0x1fff != 0)"

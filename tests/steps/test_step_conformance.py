@@ -18,6 +18,7 @@ from fieldkit.cli import main
 from fieldkit.config import schema
 from fieldkit.config.profiles import Limits, Mavlink, RobotProfile
 from fieldkit.config.site import load_site
+from fieldkit.core import runtime
 from fieldkit.core.columns import prefixed
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.events import Event, PhaseStarted
@@ -77,7 +78,10 @@ EXAMPLES: Mapping[str, Example] = {
         outlives=frozenset({"listen", "send"}),
     ),
     "ping": Example(f"[{PING}]"),
-    "fault": Example(f"[fault: {{robot: sender, kind: link-down, for: 1s, limit: 4s, during: [{PING}]}}]"),
+    "fault": Example(
+        f"[fault: {{robot: sender, kind: link-down, for: 1s, limit: 4s, during: [{PING}]}}]",
+        spare=frozenset({"fault-link-down-times.txt"}),  # which recoveries of flows alone need
+    ),
     "move": Example(f"[move: {{robot: sender, path: [away: 1m], speed: 0.2m/s, during: [{PING}]}}]"),
     "wait": Example("[wait: {duration: 100ms}]"),
     "ask": Example("[ask: {column: wind, question: How strong is the wind, usual: '3'}]"),
@@ -87,7 +91,9 @@ EXAMPLES: Mapping[str, Example] = {
         absent="[run: {robot: sender, command: no-such-tool}]",
     ),
     "iperf3": Example("[iperf3: {from: sender, to: receiver, rate: 200kbit/s, duration: 1s, limit: 10s}]"),
-    "soak": Example(f"[soak: {{from: receiver, to: sender, rate: 200kbit/s, during: [{PING}]}}]"),
+    "soak": Example(
+        f"[capture: {{during: [soak: {{from: receiver, to: sender, rate: 200kbit/s, during: [{PING}]}}]}}]"
+    ),
     "send": Example(
         f"[{SEND}]",
         spare=frozenset({"medium.txt"}),
@@ -102,7 +108,7 @@ EXAMPLES: Mapping[str, Example] = {
     ),
     "fly": Example(
         "[fly: {robot: sender, height: 50cm, then: land, during: [ping: {from: sender, to: receiver, count: 2}]}]",
-        spare=frozenset({"fly.orders"}),
+        spare=frozenset({"fly.orders", "guard.orders"}),
     ),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
@@ -154,7 +160,7 @@ def of_kind(kind: str, plan: Plan) -> PlacedStep:
 
 
 def own_jobs(kind: str, plan: Plan) -> list[Planned]:
-    return list(of_kind(kind, plan).step.own(plan.scene(next(plan.order()), "check")))
+    return list(of_kind(kind, plan).step.own_jobs(plan.scene(next(plan.order()), "check")))
 
 
 @dataclass
@@ -178,12 +184,12 @@ class Bench:
     def run(self, plan: Plan, sink: Callable[[Event], None] = lambda event: None) -> tuple[str, str, Path]:
         """Run a trial of one attempt; return its status, the reason, and where its evidence is."""
         self.testbed.place(plan.placement)
-        with locks.held(self.testbed.shells, Holder(plan.session, locks.me(), plan.trial), sink=sink):
+        with locks.held(self.testbed.shells, Holder(plan.session, runtime.me(), plan.trial), sink=sink):
             runner.begin(plan, self.testbed, self.out, sink, Stop())
         return self.ended(plan)
 
     def resume(self, plan: Plan) -> tuple[str, str, Path]:
-        with locks.held(self.testbed.shells, Holder(plan.session, locks.me(), plan.trial), sink=lambda event: None):
+        with locks.held(self.testbed.shells, Holder(plan.session, runtime.me(), plan.trial), sink=lambda event: None):
             runner.go_on(self.out / plan.trial, self.testbed, lambda event: None, Stop())
         return self.ended(plan)
 
@@ -280,10 +286,12 @@ def test_what_lacks_a_file_is_void(valid: Valid, tmp_path: Path) -> None:
 def test_every_column_is_measured_or_missing_for_a_reason(valid: Valid) -> None:
     step = of_kind(valid.kind, valid.plan).step
     found = gates.judge(valid.plan, next(valid.plan.order()), AttemptEvidence(valid.evidence)).measured
-    for column in step.declared():
+    for column in step.output_columns():
         name = prefixed(step.prefix, column.name)
         assert name in found.values or found.missing[name]
-    assert not step.declared() or found.values.keys() & {prefixed(step.prefix, one.name) for one in step.declared()}
+    assert not step.output_columns() or found.values.keys() & {
+        prefixed(step.prefix, one.name) for one in step.output_columns()
+    }
 
 
 def test_the_size_estimate_is_within_a_factor_of_two(valid: Valid) -> None:

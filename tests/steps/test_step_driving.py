@@ -22,10 +22,10 @@ from fieldkit.remote import agent, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed, Shell
 from fieldkit.steps import driving
-from fieldkit.steps.base import View
 from fieldkit.steps.driving import DriveLease
 from fieldkit.steps.kinds.move import MoveStep
 from fieldkit.steps.scene import Scene
+from fieldkit.steps.view import View
 from tests.helpers.casts import CAST, TURTLEBOT, ros_of
 from tests.helpers.idle_testbed import IdleTestbed
 
@@ -42,8 +42,17 @@ def move(text: str) -> MoveStep:
 STEP = move("robot: receiver, path: [{away: 2m}, {right: 1m, towards: 1m}], speed: 0.2m/s, name: out")
 
 
+def test_the_log_of_a_longer_drive_is_larger_and_is_on_the_robot_that_drives_alone() -> None:
+    short, long = (move(f"robot: receiver, path: [{{away: {far}m}}], speed: 0.1m/s") for far in (10, 60))
+    assert [role for role in DRIVES if long.bytes_left(SCENE, role)] == [Role.RECEIVER]
+    # Both ways take 500 s more, and the log has ten lines a second, each of 200 to 250 bytes.
+    grown_bytes = long.bytes_left(SCENE, Role.RECEIVER) - short.bytes_left(SCENE, Role.RECEIVER)
+    assert 200 * 10_000 < grown_bytes < 250 * 10_000
+    assert not long.bytes_left(replace(SCENE, cast=CAST), Role.RECEIVER), "who moves it writes nothing down"
+
+
 def test_the_driver_is_told_legs_limits_and_topics() -> None:
-    first, *_ = STEP.commands(SCENE)
+    first, *_ = STEP.jobs(SCENE)
     assert (first.role, first.job.name, first.job.log) == (Role.RECEIVER, "out.drive", "out.drive.log")
     words = list(first.job.argv)
     assert words[0] == "bash"
@@ -67,11 +76,11 @@ def test_the_driver_is_told_legs_limits_and_topics() -> None:
 
 def test_without_leave_there_is_no_job() -> None:
     scene = replace(SCENE, cast=CAST)
-    assert "drive" not in [one.job.name for one in STEP.commands(scene)]
+    assert "drive" not in [one.job.name for one in STEP.jobs(scene)]
     assert not list(STEP.needs(scene))
-    (line, *_) = STEP.beside(scene)
+    (line, *_) = STEP.dry_run_notes(scene)
     assert "by itself" not in line
-    (line, *_) = STEP.beside(SCENE)
+    (line, *_) = STEP.dry_run_notes(SCENE)
     assert "it stops where the laptop is silent for 2 s, and 30 m from its place" in line
 
 
@@ -100,7 +109,7 @@ def told_with_ros_2(**environment: str) -> Any:  # noqa: ANN401 (of JSON)
     cast_of = {**DRIVES, Role.RECEIVER: DRIVES[Role.RECEIVER].model_copy(update={"profile": profile})}
     scene = replace(SCENE, cast=cast_of)
     assert not list(STEP.refusals(scene))
-    first, *_ = STEP.commands(scene)
+    first, *_ = STEP.jobs(scene)
     (need, *_) = STEP.needs(scene)
     told = json.loads(first.job.argv[-2])
     assert need.name == f"{told['over']} for Python"
@@ -139,14 +148,14 @@ def test_what_is_no_domain_is_told_where_the_profile_says_it(domain: str) -> Non
 
 
 def test_a_drive_whose_log_is_not_whole_does_not_count(tmp_path: Path) -> None:
-    step = STEP.fitted(DRIVES)
+    step = STEP.resolved(DRIVES)
     view = View(SCENE, AttemptEvidence(tmp_path))
-    (problem,) = step.problems(view)
+    (problem,) = step.check(view)
     assert problem.startswith("out.drive.jsonl: cannot be read")
     assert {"drive_out_m", "drive_ended"} <= step.measure(view).missing.keys()
-    assert not list(STEP.problems(view)), "who does not tell how it drove, as trials of before"
-    moved = STEP.fitted(CAST)
-    assert not list(moved.problems(View(replace(SCENE, cast=CAST), AttemptEvidence(tmp_path))))
+    assert not list(STEP.check(view)), "who does not tell how it drove, as trials of before"
+    moved = STEP.resolved(CAST)
+    assert not list(moved.check(View(replace(SCENE, cast=CAST), AttemptEvidence(tmp_path))))
     assert not moved.measure(view).missing
 
 
@@ -192,7 +201,7 @@ def test_a_lease_says_what_is_wanted_until_the_robot_is_home() -> None:
         lease.order("back")
         lease.wait(lambda: lease.why, Deadline.after(60))
         assert lease.status == {"ended": "home"}
-    assert [text.split()[1] for text in link.written[:2]] == ["out", "back"]
+    assert [text.split()[1] for text in link.written[:2]] == ["wait", "back"]
 
 
 @pytest.mark.parametrize("said", ["[1]", "[" * 100_000, '{"ended": ["home"]}'])
@@ -257,20 +266,20 @@ def quick() -> Scene:
 
 def driven(field: Field, body: Any) -> None:  # noqa: ANN401
     scene = quick()
-    first, *_ = STEP.commands(scene)
+    first, *_ = STEP.jobs(scene)
     with driving.driven(scene, field, first, STEP.motion, "out.{}"):
         body()
 
 
 def test_one_that_comes_home_is_not_brought(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": ""}', '{"ended": "home"}']))
+    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home"}']))
     driven(field, lambda: None)
     assert field.brought == [True]
     assert stopped == ["out.drive"]
 
 
 def test_one_that_stopped_is_brought_and_the_attempt_fails(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "odometry was silent for 0.5 s"}']))
+    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "odometry was silent for 0.5 s"}']))
     with pytest.raises(RobotError, match="it stopped on its way: odometry was silent"):
         driven(field, lambda: None)
     assert field.brought == [False]
@@ -280,7 +289,7 @@ def test_one_that_stopped_is_brought_and_the_attempt_fails(stopped: list[str]) -
 def test_one_that_stops_early_ends_the_steps_inside(stopped: list[str]) -> None:
     waits = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
     step = schema.validate(schema.parse(json.dumps(waits), source="x.yaml"), MoveStep)
-    field = Field(Link(status=['{"ended": ""}'] * 4 + ['{"ended": "beyond the fence"}']))
+    field = Field(Link(status=['{"ended": "", "ready": true}'] * 4 + ['{"ended": "beyond the fence"}']))
     with pytest.raises(RobotError, match="it stopped on its way: beyond the fence") as caught:
         step.run(quick(), field, lambda *_: None)
     assert "the wait was cut short" in str(caught.value.__cause__)
@@ -289,7 +298,7 @@ def test_one_that_stops_early_ends_the_steps_inside(stopped: list[str]) -> None:
 
 
 def test_an_interrupted_one_stands_where_it_is(stopped: list[str]) -> None:
-    link = Link(status=['{"ended": ""}'])
+    link = Link(status=['{"ended": "", "ready": true}'])
     field = Field(link)
 
     def interrupt() -> None:
@@ -303,7 +312,7 @@ def test_an_interrupted_one_stands_where_it_is(stopped: list[str]) -> None:
 
 
 def test_an_error_inside_brings_it_back(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "home"}']))
+    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home"}']))
 
     def fail() -> None:
         raise RobotError("it broke", remedy="mend it")

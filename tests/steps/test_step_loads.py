@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.cli.commands.trial import in_shell
+from fieldkit.cli.dry_run import in_shell
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Protocol, Role
@@ -14,8 +14,9 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.base import Step, View
+from fieldkit.steps.base import Step
 from fieldkit.steps.scene import Scene
+from fieldkit.steps.view import View
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
@@ -34,7 +35,7 @@ def procedure(text: str) -> Procedure:
 
 
 def lines(step: Step, protocol: Protocol) -> list[tuple[Role, str]]:
-    return [(one.role, in_shell(one.job)) for one in step.commands(Scene(protocol, CAST, "f"))]
+    return [(one.role, in_shell(one.job)) for one in step.jobs(Scene(protocol, CAST, "f"))]
 
 
 SERVER = "iperf3 -s -1 -p 5201 -i 1 --json > receiver-iperf3.json 2> receiver-iperf3.log"
@@ -56,7 +57,7 @@ def test_what_both_ends_are_told(keys: str, protocol: Protocol, options: str) ->
     step = step_of(f"iperf3: {{from: sender, to: receiver{keys}}}")
     client = f"iperf3 -c 10.42.0.2 -p 5201 {options} {KEPT}"
     assert lines(step, protocol) == [(Role.RECEIVER, SERVER), (Role.SENDER, client)]
-    server, _ = step.commands(Scene(protocol, CAST, "f"))
+    server, _ = step.jobs(Scene(protocol, CAST, "f"))
     assert server.job.ready == "tcp:1451", "its control connection is TCP's"
 
 
@@ -69,7 +70,7 @@ def test_a_soak_surrounds_the_steps_inside() -> None:
         "sh wlan0 iperf3 -c 10.42.0.1 -p 5202 -u -l 1400 -b 3000000 -t 86400 2> receiver-soak.log"
     )
     assert "ping" in ping[1]
-    jobs_of = [one.job for one in step.commands(Scene(Protocol.UDP, CAST, "f"))]
+    jobs_of = [one.job for one in step.jobs(Scene(Protocol.UDP, CAST, "f"))]
     assert jobs_of[0].limit_s == jobs_of[1].limit_s > jobs_of[2].limit_s
 
 
@@ -117,7 +118,7 @@ def test_flows_have_as_many_frames_as_what_is_sent(keys: str, frames: float) -> 
 
 def test_its_filter_is_that_of_a_capture_around_it() -> None:
     step = step_of("capture: {during: [{iperf3: {from: sender, to: receiver, port: 7000}}]}")
-    first = next(step.commands(Scene(Protocol.UDP, CAST, "f")))
+    first = next(step.jobs(Scene(Protocol.UDP, CAST, "f")))
     assert "port 7000" in first.job.argv[-1]
 
 
@@ -129,14 +130,14 @@ def evidence(folder: Path, version: str, test: str) -> AttemptEvidence:
 
 def test_figures_are_those_of_the_end_that_sends_and_the_one_that_receives(tmp_path: Path) -> None:
     scene = Scene(Protocol.UDP, CAST, "f")
-    step = step_of("iperf3: {from: sender, to: receiver, protocol: udp, reverse: true}")
+    step = step_of("iperf3: {from: sender, to: receiver, protocol: udp, reverse: true, duration: 3s}")
     view = View(scene, evidence(tmp_path, "3.12", "udp-reverse"))
     found = step.measure(view)
-    assert not list(step.problems(view))
+    assert not list(step.check(view))
     assert (found.values["iperf3_sent_bytes"], found.values["iperf3_received_bytes"]) == (751800, 704200)
     assert "captures" in found.missing["iperf3_captured_bit_s"]
-    assert list(step.in_words(found.values)) == ["iperf3 1.87 Mbit/s", "iperf3 loss 6.2 %"]
-    declared = {column.name for column in step.declared()}
+    assert list(step.summary(found.values)) == ["iperf3 loss 6.2 %", "iperf3 1.87 Mbit/s"]
+    declared = {column.name for column in step.output_columns()}
     assert found.values.keys() | found.missing.keys() == declared
 
 
@@ -165,7 +166,7 @@ def test_an_end_that_was_cut_or_failed_voids_the_repeat(
     spoil(tmp_path / "receiver-iperf3.json")
     view = View(Scene(Protocol.UDP, CAST, "f"), found)
     step = step_of("iperf3: {from: sender, to: receiver}")
-    (said,) = step.problems(view)
+    (said,) = step.check(view)
     assert said.startswith(problem)
     measured = step.measure(view)
     assert set(measured.values) == {"iperf3_sent_bytes"}

@@ -11,7 +11,8 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.steps.base import Step, View, capture_around
+from fieldkit.steps.base import Step
+from fieldkit.steps.view import View, capture_around
 from fieldkit.trial import gates, rows
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
@@ -68,7 +69,7 @@ def test_jobs_and_files_of_a_step_with_a_name_begin_with_it() -> None:
     scene = plan.scene(REPEAT, "folder")
     for (kind, name), step in steps_by_name(plan).items():
         begin = "" if name in {"", "scan"} else f"{name}."
-        own = [one.job for one in step.own(scene)]
+        own = [one.job for one in step.own_jobs(scene)]
         assert own
         said = {job.name for job in own} | {file for job in own for file in (job.log, job.stdout) if file}
         assert {one for one in said if not one.startswith(begin)} == set(), kind
@@ -78,7 +79,7 @@ def test_jobs_and_files_of_a_step_with_a_name_begin_with_it() -> None:
 
 def test_a_step_without_a_name_has_the_files_that_it_always_had() -> None:
     scene = los_plan().scene(REPEAT, "folder")
-    assert [(one.job.name, one.job.log) for one in los_plan().commands(scene)] == [
+    assert [(one.job.name, one.job.log) for one in los_plan().jobs(scene)] == [
         ("record", "sender-record.log"),
         ("capture", "sender-capture.log"),
         ("capture", "receiver-capture.log"),
@@ -147,7 +148,7 @@ def test_gates_put_names_before_columns_and_reasons_and_rows_before_words(tmp_pa
     assert "bare: bare.recv.bag is missing" in judged.problems
     assert "cut.link_down_outage_s" in missing
     said = rows.in_words(plan, values)
-    assert said.startswith("up: file loss 0.0 %, up: RTT 16.0 ms, RTT 4.0 ms")
+    assert said.startswith("up: file loss 0.0 %, up: ping loss 90.0 %, ping loss 90.0 %, up: RTT 16.0 ms, RTT 4.0 ms")
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import pytest
 
-from fieldkit.cli.commands.trial import in_shell, print_commands
+from fieldkit.cli.dry_run import in_shell, print_commands
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.steps import variants
 from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.scene import Refusal
-from fieldkit.steps.variants import Netcat, PingTool, Recorder, Variants
+from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool, Variants
 from fieldkit.trial.check import tools
 from fieldkit.trial.plan import Plan
 from tests.helpers.casts import TURTLEBOT, los_plan, ros_of
@@ -46,7 +46,7 @@ def lines(protocol: Protocol, found: Mapping[Role, Variants], plan: Plan | None 
     """The command of each job with these tools, by name; of two captures the receiver's."""
     plan = plan or los_plan()
     scene = plan.scene(RepeatId(protocol, 1), "f", found)
-    planned = [one for entry in plan.procedure.steps for one in entry.step.commands(scene)]
+    planned = [one for entry in plan.procedure.steps for one in entry.step.jobs(scene)]
     return {one.job.name: in_shell(one.job) for one in planned}
 
 
@@ -135,8 +135,9 @@ def test_a_dry_run_tells_what_will_be_refused(capsys: pytest.CaptureFixture[str]
     [
         (Netcat.OPENBSD, Netcat.TRADITIONAL, [Role.RECEIVER]),
         (Netcat.OPENBSD, Netcat.OPENBSD, []),
-        (Netcat.OPENBSD, Netcat.NCAT, []),
+        (Netcat.OPENBSD, Netcat.NCAT, [Role.RECEIVER]),
         (Netcat.NCAT, Netcat.TRADITIONAL, []),
+        (Netcat.TRADITIONAL, Netcat.NCAT, []),
         (Netcat.TRADITIONAL, Netcat.OPENBSD, []),
         (Netcat.TRADITIONAL, Netcat.BUSYBOX, [Role.RECEIVER]),
         (Netcat.BUSYBOX, Netcat.TRADITIONAL, [Role.SENDER]),
@@ -145,6 +146,25 @@ def test_a_dry_run_tells_what_will_be_refused(capsys: pytest.CaptureFixture[str]
 def test_a_pair_that_cannot_do_udp_is_refused_once(sender: Netcat, receiver: Netcat, refused: list[Role]) -> None:
     found = {Role.SENDER: replace(USUAL, netcat=sender), Role.RECEIVER: replace(USUAL, netcat=receiver)}
     assert [one.role for one in los_plan().refusals(found)] == refused
+
+
+@pytest.mark.parametrize(
+    ("version", "is_refused"),
+    [
+        ("Ncat: Version 7.93 ( https://nmap.org/ncat )", False),
+        ("Ncat 7.40 ( https://nmap.org/ncat )", False),
+        ("Ncat: Version 7.94SVN ( https://nmap.org/ncat )", True),
+        ("Ncat 7.95 ( https://nmap.org/ncat )", True),
+        ("Ncat 8.00 ( https://nmap.org/ncat )", True),
+        ("", True),
+    ],
+)
+def test_an_ncat_that_reads_half_of_the_datagrams_of_openbsd_is_refused(version: str, is_refused: bool) -> None:
+    receiver = replace(USUAL, netcat=Netcat.NCAT, versions={Tool.NETCAT: version})
+    found = {Role.SENDER: replace(USUAL, netcat=Netcat.OPENBSD), Role.RECEIVER: receiver}
+    refusals = list(los_plan().refusals(found))
+    assert bool(refusals) == is_refused
+    assert all("cuts off the datagrams of 16384 bytes" in refusal.what for refusal in refusals)
 
 
 @pytest.mark.parametrize(

@@ -242,7 +242,7 @@ def _compare(
     missing: Mapping[str, str],
 ) -> None:
     declared = [
-        prefixed(placed.step.prefix, one.name) for placed in procedure.walk() for one in placed.step.declared()
+        prefixed(placed.step.prefix, one.name) for placed in procedure.walk() for one in placed.step.output_columns()
     ]
     assert len(set(declared)) == len(declared)
     assert set(declared) <= values.keys() | missing.keys()
@@ -250,10 +250,11 @@ def _compare(
     for name, (asked, answered) in truth.pings.items():
         assert (values[prefixed(name, "rtt_sent")], values[prefixed(name, "rtt_received")]) == (asked, answered)
     for name, (sent, came) in truth.loads.items():
-        for end in ("sent", "received"):
-            assert values[prefixed(name, f"iperf3_{end}_bytes")] == 1400 * came
-        loss = prefixed(name, "iperf3_captured_loss")
-        assert loss in missing or values[loss] == 1 - came / sent
+        for end, packets in (("sent", sent), ("received", came)):
+            assert values[prefixed(name, f"iperf3_{end}_bytes")] == 1400 * packets
+        loss, cookie_bytes = prefixed(name, "iperf3_captured_loss"), truth.cookies_bytes[name]
+        sent_bytes, came_bytes = (1400 * packets + cookie_bytes for packets in (sent, came))
+        assert loss in missing or values[loss] == 1 - came_bytes / sent_bytes
         SEEN["valid, iperf3 captured"] += loss in values
     SEEN["valid, two pings or more"] += len(truth.pings) > 1
     SEEN["valid, two transfers or more"] += len(truth.transfers) > 1

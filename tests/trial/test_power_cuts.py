@@ -24,6 +24,7 @@ from tests.helpers.cut_trials import (
 )
 from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, workplace
 from tests.helpers.host import Untouched
+from tests.helpers.nightly import others_at_night
 from tests.helpers.paths import ROOT
 from tests.helpers.power import Cut, Witness, demand_resumable, everything
 from tests.helpers.sshd import wait_until
@@ -35,6 +36,9 @@ BROUGHT_ALONG = {"store.create: files.sync_folder(out)"}
 the file, which POSIX does not promise; see fsync(2)."""
 
 every_file_system = pytest.mark.parametrize("file_system", FILE_SYSTEMS, ids=lambda one: one.name)
+strictest_in_ci = pytest.mark.parametrize(
+    "file_system", others_at_night(FILE_SYSTEMS, in_ci=[STRICTEST]), ids=lambda one: one.name
+)
 
 
 @pytest.fixture
@@ -70,7 +74,7 @@ def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -
         assert (mounted / "synced").read_bytes() == b"synced" * 10_000
 
 
-@every_file_system
+@strictest_in_ci
 def test_a_cut_at_any_write_loses_nothing_told(place: Path, file_system: FileSystem) -> None:
     cuts, witness, _ = cuts_at_every_sync(Disk.make(file_system, place / "disk.img"), place)
     assert len(cuts) > 30, "hardly a write was met"
@@ -99,7 +103,7 @@ def test_each_sync_is_missed_when_it_is_taken_out(place: Path) -> None:
     assert {one for one in places if not lost(one)[0]} <= BROUGHT_ALONG
 
 
-@every_file_system
+@strictest_in_ci
 def test_cuts_at_random_moments_one_after_the_other_lose_nothing(place: Path, file_system: FileSystem) -> None:
     draw, calls = random.Random(file_system.name), calls_of_a_trial(place)
     assert sum(cuts_in_a_row(file_system, place, draw, calls=calls, most=4) for _ in range(3)) > 3

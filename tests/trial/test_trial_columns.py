@@ -12,7 +12,7 @@ from fieldkit.config import schema
 from fieldkit.core import plugins
 from fieldkit.core.columns import Column, Figure, Kind, Value, named
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.steps.base import known
+from fieldkit.steps.base import step_types
 from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.columns import IDENTITY, filled_by, installed, of_steps, trial_columns
 from fieldkit.trial.frozen import freeze
@@ -143,10 +143,10 @@ def meters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An installed package with `meter`."""
     write_package(tmp_path / "installed", "meters", f"[{plugins.STEPS}]\nmeter = {meter.TARGET}\n")
     monkeypatch.syspath_prepend(tmp_path / "installed")
-    for one in (known, installed, plugins.versions):
+    for one in (step_types, installed):
         one.cache_clear()
     yield
-    for one in (known, installed, plugins.versions):
+    for one in (step_types, installed):
         one.cache_clear()
 
 

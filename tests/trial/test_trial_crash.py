@@ -28,7 +28,7 @@ from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.runner import resume_trial, run_trial
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
-from tests.helpers.plans import problems
+from tests.helpers.plans import problems, write_states
 
 REPEATS = 1
 KILLED = 9
@@ -63,6 +63,7 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
         (into / "ping.txt").write_text("" if remote.endswith(VOID_FIRST) else PING, encoding="utf-8")
+        write_states(into)
         return []
 
     def nothing(*_words: object, **_more: object) -> dict[str, object]:

@@ -9,13 +9,13 @@ from fieldkit.core.columns import Measured
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
-from fieldkit.steps.base import View
 from fieldkit.steps.kinds.ping import PingStep
+from fieldkit.steps.view import View
 from fieldkit.trial import gates
 from fieldkit.trial.procedure import load_procedure
 from tests.helpers.captures import datagram, file_bytes, timed
 from tests.helpers.casts import los_plan
-from tests.helpers.plans import problems
+from tests.helpers.plans import problems, write_states
 from tests.measure.evidence.test_measure_bag import write_bag
 
 PLAN = los_plan(record_s=2.0, protocols=(Protocol.UDP,))
@@ -41,6 +41,7 @@ def log(captured: int = len(FRAMES), matched: int = len(FRAMES), dropped: int = 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
+    write_states(tmp_path)
     write_bag(tmp_path / "scan.bag", {"/scan": 11})
     (tmp_path / "recv.bag").touch()
     for name in ("sender.pcap", "receiver.pcap"):
@@ -190,5 +191,6 @@ def test_a_figure_that_is_neither_there_nor_missing_for_a_reason_voids(
 def test_what_a_fault_disturbed_need_not_be_whole(tmp_path: Path) -> None:
     """Its own evidence must be; the ping inside left nothing."""
     plan = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
+    write_states(tmp_path)
     found = problems(plan, Protocol.TCP, tmp_path)
     assert [one.partition(":")[0] for one in found] == ["fault-link-down.txt", "fault-reboot.txt"]

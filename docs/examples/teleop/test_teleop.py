@@ -1,4 +1,4 @@
-"""Whether our rover can be driven from afar, and stops when nobody is heard."""
+"""Remote driving of our rover, and its stop when commands cease."""
 
 from pathlib import Path
 

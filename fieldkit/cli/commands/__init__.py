@@ -1,11 +1,10 @@
-"""Every command with its help line; what it takes is in `cli.arguments`, what runs it in a module here.
+"""Every command with its help line, in a module of its name: `add` declares its arguments, `run` runs it.
 
-Both are imported when they are needed, and the first without the second: Python imports what a module names at its
-top, which is half a second for some commands, and neither help nor the Tab key shall pay for it.
+A module is imported when its command is named. What takes long to import is imported by the function that needs
+it, because neither help nor the Tab key may wait for it.
 """
 
-import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
 from types import MappingProxyType
@@ -21,6 +20,7 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
         "trial": "run a procedure at one or more distances",
         "campaign": "run the trials of a campaign file, or go on with them",
         "resume": "go on with a trial that stopped",
+        "stop": "stop robots that move by themselves, now",
         "abort": "end every job of fieldkit on the robots and break their locks",
         "lab": "bring robots up on this machine to play with",
         "aggregate": "put the repeats of many trials together, with intervals",
@@ -28,6 +28,7 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
         "report": "make one page of figures and tables from trials",
         "export": "write trials for pandas, R or Foxglove",
         "bag": "look into bags of ROS 1 and ROS 2, check, repair and convert them",
+        "middleware": "recommend a middleware's configuration from measured trials",
         "bridge": "carry topics between ROS 1, DDS and Zenoh",
         "robots": "list robots, or show NAME",
         "procedures": "list procedures, or show NAME",
@@ -35,6 +36,7 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
         "positions": "say where robots really stood, from GPX or CSV, or list who tells it",
         "rebuild": "make trial.csv and summary.csv again from raw evidence",
         "verify": "compare a trial's files with its manifest",
+        "docs": "open this documentation in a browser, without a network",
         "completion": "print what completes fieldkit's words in a shell",
     }
 )
@@ -48,12 +50,5 @@ def add_all(commands: Commands) -> None:
         parser.declare = partial(_declare, name)
 
 
-def load(target: str) -> Callable[[argparse.Namespace], int]:
-    """Return the function that runs a command, `module:function`."""
-    module, _, function = target.partition(":")
-    run: Callable[[argparse.Namespace], int] = getattr(import_module(f"{__name__}.{module}"), function)
-    return run
-
-
 def _declare(name: str, parser: Parser) -> None:
-    import_module(f"fieldkit.cli.arguments.{name}").add(parser)
+    import_module(f"{__name__}.{name}").add(parser)

@@ -3,19 +3,43 @@
 import argparse
 from typing import Final
 
-from fieldkit.cli import options
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, watching
+from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import confirmed
+from fieldkit.core import runtime
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.events import Note
+from fieldkit.core.printing import say
 from fieldkit.core.units import format_count
-from fieldkit.trial.running import locks
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit abort` takes."""
+    parser.description = (
+        "End every job of fieldkit on every robot of the site file, of any trial and from any laptop, and break the "
+        "robots' locks. Lists per robot the jobs that were ended, and processes whose folder was removed; `not "
+        "locked` means that no program held the robot. A trial that runs there stops, and reports who aborted it. "
+        "Exit code 3 if a robot was not reached, a job was not ended or, on a full disk, a lock was not broken; 1 "
+        "after the answer no. The other robots are served nevertheless. Emulated robots end with their lab, so "
+        "nothing is done for them."
+    )
+    shared.add_site(parser)
+    parser.add_argument("--yes", action="store_true", help="do not ask; required without a terminal")
+    parser.set_defaults(run=run)
+
 
 _NONE: Final = "no robot stands without fieldkit on this backend: its robots end with their lab"
+
+_ENDS: Final = "It ends when the drone has landed, 60 s after the last heartbeat of its autopilot, or after 10 min"
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Abort, and print what was ended robot by robot."""
+    from fieldkit.cli import options
+    from fieldkit.remote.motion import IN_WORDS, MotionState
+    from fieldkit.trial.running import locks
+
     with watching(as_json=False) as sink:
         _, backend = options.backend(arguments, sink)
         with backend.standing(sink=sink) as robots:
@@ -24,16 +48,18 @@ def run(arguments: argparse.Namespace) -> int:
                 return 0
             question = f"end every job of fieldkit on {', '.join(robots)}"
             if not arguments.yes and not confirmed(question, unasked="fieldkit abort --yes"):
-                print("nothing was ended")
+                say("nothing was ended")
                 return FieldkitError.exit_code
-            ended = locks.abort(robots, locks.me())
+            ended = locks.abort(robots, runtime.me())
     for robot, one in ended.items():
         count = f"{format_count(len(one.jobs), 'job')} ended"
         if one.error is None:
-            print(f"{robot}: {'lock broken' if one.locked else 'not locked'}, {count}")
+            say(f"{robot}: {'lock broken' if one.locked else 'not locked'}, {count}")
         elif one.jobs:
-            print(f"{robot}: {count}")
-        print("".join(f"  {job}\n" for job in one.jobs), end="")
+            say(f"{robot}: {count}")
+        say("".join(f"  {job}\n" for job in one.jobs), end="")
+        for program, state in one.landing:
+            say(f"  {program.rpartition('/')[2]} still runs: {IN_WORDS[MotionState(state)]}. {_ENDS}")
         if one.error is not None:
             show_error(str(one.error))
     return RobotError.exit_code if any(aborted.error for aborted in ended.values()) else 0

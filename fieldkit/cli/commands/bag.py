@@ -1,24 +1,63 @@
 """`fieldkit bag`: look into bags, check them, save what can be read of a damaged one, convert them."""
 
 import argparse
-import json
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Final
 
 from fieldkit.bags import contents
 from fieldkit.bags.contents import BagContents
 from fieldkit.bags.formats import LAST_RESORT, BagFormat
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, show_note, table
+from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import EvidenceError, FieldkitError, typed
+from fieldkit.core.printing import say
+from fieldkit.core.text import json_text
 from fieldkit.core.units import format_bytes, format_count, format_duration
+
+STORAGES: Final = ("mcap", "sqlite3")
+DISTRIBUTIONS: Final = ("noetic", "foxy", "humble", "jazzy", "kilted")
+"""Whose message types `bags.worker` has, which a test sees."""
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit bag` takes."""
+    parser.description = "Bags of ROS 1 (.bag) and ROS 2 (SQLite, MCAP), without ROS. A bag is never changed."
+    actions = parser.add_commands(title="commands", metavar="COMMAND")
+    action = actions.add_parser("info", help="what a bag holds, by its index")
+    shared.add_bag(action)
+    shared.add_json(action)
+    action.set_defaults(run=info)
+    action = actions.add_parser("check", help="read every message of bags, and tell what is wrong")
+    action.add_argument("bags", type=Path, nargs="+", metavar="BAG", help=shared.BAG_HELP)
+    action.set_defaults(run=check)
+    action = actions.add_parser("repair", help="write what can be read of a damaged bag into a new one")
+    shared.add_bag(action)
+    action.add_argument("to", type=Path, metavar="NEW", help="the new bag, of the same format")
+    action.set_defaults(run=repair)
+    action = actions.add_parser(
+        "convert",
+        help="write a bag in another format",
+        epilog="example: fieldkit bag convert scan.bag scan --storage mcap --distribution humble",
+    )
+    shared.add_bag(action)
+    action.add_argument("to", type=Path, metavar="NEW", help="NAME.bag for ROS 1, else a folder for ROS 2")
+    action.add_choice("--storage", STORAGES, default=STORAGES[0], help="of a bag of ROS 2 (default: mcap)")
+    action.add_choice(
+        "--distribution",
+        DISTRIBUTIONS,
+        help=f"whose message types it has: {', '.join(DISTRIBUTIONS)} (default: noetic or jazzy)",
+    )
+    action.set_defaults(run=convert)
 
 
 def info(arguments: argparse.Namespace) -> int:
     """Print what a bag holds by its index, and what is wrong with that."""
     found = contents.inspect(arguments.bag)
     if arguments.json:
-        print(json.dumps(asdict(found) | {"messages": found.messages}))
+        say(json_text(asdict(found) | {"messages": found.messages}))
     else:
         _show(arguments.bag, found)
     return EvidenceError.exit_code if found.problems else 0
@@ -26,13 +65,13 @@ def info(arguments: argparse.Namespace) -> int:
 
 def _show(path: Path, found: BagContents) -> None:
     if found.problems:
-        print(f"{path}: {found.format}, {format_bytes(found.size_bytes)}, damaged")
+        say(f"{path}: {found.format}, {format_bytes(found.size_bytes)}, damaged")
     else:
         count = format_count(found.messages, "message")
-        print(f"{path}: {found.format}, {format_bytes(found.size_bytes)}, {count}")
+        say(f"{path}: {found.format}, {format_bytes(found.size_bytes)}, {count}")
     if found.messages:
         begun = datetime.fromtimestamp(found.started_utc_ns / 1e9, UTC)
-        print(f"{begun:%Y-%m-%d %H:%M:%S} UTC, {format_duration(found.duration_s)}")
+        say(f"{begun:%Y-%m-%d %H:%M:%S} UTC, {format_duration(found.duration_s)}")
     rows = [
         (topic.name, topic.type, str(topic.messages), _rate(topic.messages, found.duration_s))
         for topic in found.topics
@@ -71,14 +110,14 @@ def _checked(path: Path) -> int:
     if found.problems:
         _tell(path, found)
         return EvidenceError.exit_code
-    print(f"{path}: whole, {format_count(found.messages, 'message')}")
+    say(f"{path}: whole, {format_count(found.messages, 'message')}")
     return 0
 
 
 def repair(arguments: argparse.Namespace) -> int:
     """Save what can be read of a bag."""
     found = contents.repair(arguments.bag, arguments.to)
-    print(f"{arguments.to}: {format_count(found.messages or 0, 'message')} saved")
+    say(f"{arguments.to}: {format_count(found.messages or 0, 'message')} saved")
     for note in found.notes:
         show_note(f"{arguments.bag}: {note}")
     return 0

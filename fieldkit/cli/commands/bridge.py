@@ -16,15 +16,92 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from fieldkit.agent.middleware import Network
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, show_note, table
+from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
+from fieldkit.core.printing import say
+from fieldkit.core.text import json_text
 from fieldkit.core.units import format_bytes
 from fieldkit.ros import bridge
 from fieldkit.ros.bridge import Carrier, Side
 from fieldkit.ros.crossings import Crossed, Crossing
 from fieldkit.ros.ports import MOST_DOMAIN
 from fieldkit.ros.types import Distribution, MessageTypes
+
+MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
+"""`agent.middleware.ADAPTERS`, which a test compares, without `ros2`: that needs the Python of a robot's ROS 2."""
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit bridge` takes."""
+    parser.description = (
+        "Carry topics from one middleware to another until Ctrl-C or SIGTERM, then report how many messages and how "
+        "late. TOPIC is NAME:TYPE, or NAME:TYPE:QOS. QOS is a profile of ROS 2 (default, sensor_data, "
+        "services_default, parameters, parameter_events, system_default), or policies (reliable, best_effort, "
+        "keep_all, transient_local, depth=N), or a profile and then policies, separated by commas."
+    )
+    parser.epilog = (
+        "example: fieldkit bridge --from ros1 --to dds /scan:sensor_msgs/LaserScan:sensor_data "
+        "--back /cmd_vel:geometry_msgs/Twist"
+    )
+    parser.add_choice("--from", MIDDLEWARES, dest="near", required=True, help=f"one of: {', '.join(MIDDLEWARES)}")
+    parser.add_choice("--to", MIDDLEWARES, dest="far", required=True, help="another of them")
+    parser.add_argument("topics", metavar="TOPIC", nargs="*", help="goes from the first to the second")
+    for option, what in (("--back", "goes the other way"), ("--both", "goes both ways")):
+        parser.add_argument(
+            option, metavar="TOPIC", action="append", default=[], help=f"{what}; may be given more than once"
+        )
+    parser.add_argument(
+        "--address",
+        metavar="IP",
+        default="127.0.0.1",
+        help="address of this machine where the others are (default: 127.0.0.1)",
+    )
+    parser.add_argument(
+        "--master", metavar="HOST[:PORT]", help="master of ROS 1 (default: ROS_MASTER_URI, or this address and 11311)"
+    )
+    parser.add_argument(
+        "--patience", type=shared.natural, default=3, metavar="S", help="seconds to wait for the master (default: 3)"
+    )
+    parser.add_argument("--router", metavar="HOST[:PORT]", help="router of Zenoh, port 7447 (default: scouting)")
+    parser.add_argument(
+        "--peer",
+        metavar="IP",
+        action="append",
+        default=[],
+        help="who is asked over DDS or Zenoh in place of multicast; may be given more than once",
+    )
+    parser.add_argument(
+        "--domain", type=shared.natural, metavar="N", help="domain of ROS 2 (default: ROS_DOMAIN_ID, or 0)"
+    )
+    parser.add_argument(
+        "--node",
+        metavar="NAME",
+        default="fieldkit_bridge",
+        help="name of the bridge's node; a second bridge on a master needs another (default: fieldkit_bridge)",
+    )
+    parser.add_choice(
+        "--distribution",
+        ("humble", "jazzy"),
+        default="jazzy",
+        help="distribution of ROS 2 whose types are used, with their hashes (default: jazzy)",
+    )
+    parser.add_argument(
+        "--type",
+        metavar="NAME=FILE",
+        action="append",
+        default=[],
+        help="a message type of your own and its .msg file; may be given more than once",
+    )
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print a list with an object per topic and direction in place of the table",
+    )
+    parser.set_defaults(run=run)
+
 
 _LOOKS_S: Final = 1.0
 _ROUTER_PORT: Final = 7447
@@ -41,7 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
         _watch(carriers, over)
         told = [carrier.told() for carrier in carriers]
     if arguments.json:
-        print(json.dumps([asdict(crossed) for crossed in told]))
+        say(json_text([asdict(crossed) for crossed in told]))
     else:
         _show(told)
     return 0

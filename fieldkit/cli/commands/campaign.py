@@ -2,38 +2,67 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fieldkit.campaign import plan
-from fieldkit.campaign.journal import CampaignJournal
-from fieldkit.campaign.runner import CampaignOutcome, CampaignRun
-from fieldkit.cli import options, results
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, watching
+from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import interruptible
 from fieldkit.core.errors import EvidenceError, FieldkitError, typed
 from fieldkit.core.units import format_count
 
+if TYPE_CHECKING:
+    from fieldkit.campaign.runner import CampaignOutcome
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit campaign` takes."""
+    parser.description = (
+        "Run the trials of a campaign file in a shuffled order; the same command continues them later."
+    )
+    parser.epilog = "example: fieldkit campaign lawn.yaml --dry-run"
+    parser.add_argument("file", type=Path, metavar="FILE", help="campaign file, see `fieldkit docs campaign`")
+    shared.add_site(parser)
+    shared.add_out(parser, "the campaign's folder goes")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="print order, path, time and disk space; touch nothing"
+    )
+    parser.add_argument("--failed", action="store_true", help="redo the repeats that failed, too")
+    shared.add_json(parser)
+    shared.add_operator(parser)
+    shared.add_junit(parser)
+    parser.set_defaults(run=run)
+
 
 def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the campaign."""
+    from fieldkit.campaign import plan
+    from fieldkit.campaign.journal import CampaignJournal
+    from fieldkit.campaign.runner import CampaignRun
+    from fieldkit.cli import options, results
+
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = options.backend(arguments, sink)
         asked, document = plan.make_plan(arguments.file, name)
         folder = arguments.out / f"campaign_{asked.campaign.name}"
         begun = plan.begun(folder, asked, document)
-        campaign = CampaignRun(begun or asked, CampaignJournal(folder), backend, sink)
+        campaign = CampaignRun(begun or asked, CampaignJournal(folder), backend, sink, failed=arguments.failed)
         campaign.announce()
         if arguments.dry_run:
             return 0
         with options.operator(arguments, sink) as operator:
             outcome = campaign.run(operator, stop)
     results.keep_junit(arguments, outcome.folders)
-    return _code(outcome, folder)
+    return _code(outcome, arguments.file, folder)
 
 
-def _code(outcome: CampaignOutcome, folder: Path) -> int:
+def _code(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
     if outcome.failed:
         failed = format_count(outcome.failed, "repeat")
-        show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}")
+        remedy = (
+            f"correct what the reasons name, then add --failed: {typed('fieldkit', 'campaign', file, '--failed')}"
+        )
+        show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}\n  remedy: {remedy}")
     if outcome.left:
         names = ", ".join(map(str, outcome.left))
         show_error(f"skipped: {names}\n  remedy: give the same command again to run what was skipped")

@@ -4,14 +4,32 @@ import argparse
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fieldkit.cli import options
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_findings, watching
+from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import RobotError
 from fieldkit.core.events import PhaseStarted
 from fieldkit.core.model import Distance, Verdict
 from fieldkit.core.prompts import Nobody
-from fieldkit.trial.request import make_plan
-from fieldkit.trial.running import preflight
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit check` takes."""
+    parser.description = (
+        "Check everything that a trial of the procedure needs from the robots and from this machine; change nothing, "
+        "and ask nobody to place robots. `fieldkit trial` does this too, without a test recording. --repeats and "
+        "--record are those of the planned trial, for the estimate of disk space."
+    )
+    parser.takes_lengths = True
+    parser.epilog = "example: fieldkit check los --topology masterless"
+    parser.add_argument(
+        "procedure", metavar="PROCEDURE", nargs="?", default="los", help="name of a procedure (default: los)"
+    )
+    shared.add_site(parser)
+    shared.add_changes(parser)
+    shared.add_json(parser)
+    parser.set_defaults(run=run)
+
 
 # Nobody is asked to carry anything; robots that fieldkit places itself stand next to each other.
 _CLOSE = Distance(metres=1.0, label="check")
@@ -19,6 +37,10 @@ _CLOSE = Distance(metres=1.0, label="check")
 
 def run(arguments: argparse.Namespace) -> int:
     """Check, print every finding, and return whether a trial could begin."""
+    from fieldkit.cli import options
+    from fieldkit.trial.request import make_plan
+    from fieldkit.trial.running import preflight
+
     request = options.request(arguments, _CLOSE)
     with watching(as_json=arguments.json) as sink:
         name, backend = options.backend(arguments, sink)

@@ -20,6 +20,23 @@ from fieldkit.config import locations
 from fieldkit.core import plugins
 from fieldkit.core.errors import FieldkitError
 
+SHELLS: Final = ("bash", "zsh", "fish")
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit completion` takes."""
+    parser.description = (
+        "Print a script with which the Tab key completes commands, options, robots, procedures, backends and trial "
+        "folders. In zsh, compinit must have run before."
+    )
+    parser.epilog = (
+        'in ~/.bashrc or ~/.zshrc: eval "$(fieldkit completion bash)", or zsh; '
+        "in ~/.config/fish/config.fish: fieldkit completion fish | source"
+    )
+    parser.add_choice("shell", SHELLS, metavar="SHELL", help=f"one of: {', '.join(SHELLS)}")
+    parser.set_defaults(run=run)
+
+
 PLAN_FILE: Final = "trial.yaml"
 """`trial.plan.PLAN_FILE`, which a test compares."""
 
@@ -61,7 +78,7 @@ class _Values(BaseCompleter):
 
 
 def _robots_of_site() -> list[str]:
-    from fieldkit.config import documents  # noqa: PLC0415 (pyyaml)
+    from fieldkit.config import documents
 
     try:
         robots = documents.read(Path(locations.SITE_FILE)).data["robots"]
@@ -71,7 +88,7 @@ def _robots_of_site() -> list[str]:
 
 
 def _robots_of_lab() -> list[str]:
-    from fieldkit.lab import folder  # noqa: PLC0415 (hashes of OpenSSL)
+    from fieldkit.lab import folder
 
     try:
         hosts = folder.of_directory(Path.cwd()).known_hosts.read_text(encoding="utf-8")
@@ -106,13 +123,13 @@ def _backends(_prefix: str) -> Iterable[str]:
 
 
 def _quantities(_prefix: str) -> Iterable[str]:
-    from fieldkit.trial.columns import installed  # noqa: PLC0415 (as below)
+    from fieldkit.trial.columns import installed
 
     return (column.name for column in installed() if column.figure)
 
 
 def _columns(_prefix: str) -> Iterable[str]:
-    from fieldkit.trial.columns import installed  # noqa: PLC0415 (kinds of steps declare them, with pydantic)
+    from fieldkit.trial.columns import installed
 
     return (column.name for column in installed())
 

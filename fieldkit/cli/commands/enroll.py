@@ -2,20 +2,44 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import confirmed
-from fieldkit.config import site_file
-from fieldkit.config.site import SiteRobot, load_site
+from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError, HostKeyError, nearest, typed
+from fieldkit.core.printing import say
 from fieldkit.remote.identity import Address, HostKey
-from fieldkit.remote.link import over_tcp
-from fieldkit.remote.login import offered_key
-from fieldkit.remote.ssh import CONNECT_S
+
+if TYPE_CHECKING:
+    from fieldkit.config.site import SiteRobot
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit enroll` takes."""
+    parser.description = (
+        "Ask a robot for its SSH host key (ed25519 if it has one) without logging in, show type and fingerprint, ask "
+        "for confirmation, and write the key into the site file as host_key; nothing else in the file changes. A key "
+        "that is already pinned is not changed. If the robot offers another key, enroll ends with both fingerprints "
+        "and exit code 3. After the answer no the exit code is 1."
+    )
+    parser.add_argument("robot", metavar="ROBOT", help="name of a robot in the site file")
+    parser.add_argument(
+        "--site", type=Path, metavar="FILE", default=Path(SITE_FILE), help=f"site file (default: {SITE_FILE})"
+    )
+    parser.add_argument("--yes", action="store_true", help="do not ask for confirmation; required without a terminal")
+    parser.add_argument("--replace", action="store_true", help="pin it also in place of another one")
+    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Pin the key, or say that it is pinned."""
+    from fieldkit.config import site_file
+    from fieldkit.remote.link import over_tcp
+    from fieldkit.remote.login import offered_key
+    from fieldkit.remote.ssh import CONNECT_S
+
     name, path = arguments.robot, arguments.site
     robot, where = _robot(name, path)
     address = Address(name, robot.host or "", robot.port)
@@ -27,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         kind=pinned.kind if pinned else "ssh-ed25519",
     )
     if offered == pinned:
-        print(f"{name}: this key is pinned already: {offered.fingerprint}")
+        say(f"{name}: this key is pinned already: {offered.fingerprint}")
         return 0
     if pinned is not None and not arguments.replace:
         raise HostKeyError(
@@ -37,15 +61,17 @@ def run(arguments: argparse.Namespace) -> int:
         )
     _show(address, offered, pinned)
     if not arguments.yes and not confirmed("pin it", unasked="compare the fingerprints, then add --yes"):
-        print("not pinned")
+        say("not pinned")
         return FieldkitError.exit_code
     site_file.pin(path, name, offered.text)
-    print(f"pinned in {path}")
+    say(f"pinned in {path}")
     return 0
 
 
-def _robot(name: str, path: Path) -> tuple[SiteRobot, str]:
+def _robot(name: str, path: Path) -> "tuple[SiteRobot, str]":
     """Return a robot of the site file, and where it stands there."""
+    from fieldkit.config.site import load_site
+
     if not path.exists():
         raise ConfigurationError(
             "there is no site file", where=str(path), remedy=typed("fieldkit", "init", "--out", path)
@@ -63,7 +89,7 @@ def _robot(name: str, path: Path) -> tuple[SiteRobot, str]:
     return site.robots[name], where
 
 
-def _pinned(name: str, robot: SiteRobot, *, or_none: bool) -> HostKey | None:
+def _pinned(name: str, robot: "SiteRobot", *, or_none: bool) -> HostKey | None:
     if robot.host_key is None:
         return None
     try:
@@ -76,6 +102,6 @@ def _pinned(name: str, robot: SiteRobot, *, or_none: bool) -> HostKey | None:
 
 def _show(address: Address, offered: HostKey, pinned: HostKey | None) -> None:
     if pinned is not None:
-        print(f"pinned until now: {pinned.kind} {pinned.fingerprint}")
-    print(f"{address.robot} at {address.host} port {address.port} offers: {offered.kind} {offered.fingerprint}")
-    print(f"compare it with what the robot itself says, at its own keyboard:\n  {offered.by_hand}")
+        say(f"pinned until now: {pinned.kind} {pinned.fingerprint}")
+    say(f"{address.robot} at {address.host} port {address.port} offers: {offered.kind} {offered.fingerprint}")
+    say(f"compare it with what the robot itself says, at its own keyboard:\n  {offered.by_hand}")

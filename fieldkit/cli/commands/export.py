@@ -4,15 +4,33 @@ import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import BinaryIO, Final
+from typing import TYPE_CHECKING, BinaryIO, Final
 
-from fieldkit.analysis.repeats import Repeats
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_note
+from fieldkit.cli.parser import Parser
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.printing import say
 from fieldkit.core.units import format_bytes
-from fieldkit.export import junit, mcap, table, timeline
-from fieldkit.trial import sources, store
+
+if TYPE_CHECKING:
+    from fieldkit.analysis.repeats import Repeats
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit export` takes."""
+    parser.description = "Write the rows of trials as one table, or what happened in one trial as a time line."
+    shared.add_paths(parser)
+    parser.add_choice(
+        "--format",
+        ("csv", "parquet", "mcap", "junit"),
+        required=True,
+        help="csv or parquet: the rows of all trials as one table; mcap: the time line of one trial, for "
+        "Foxglove; junit: repeats and expectations, for CI servers",
+    )
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help="the file; none may be there")
+    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -32,23 +50,32 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"cannot be written: {error.strerror}", where=str(out), remedy="choose another -o"
         ) from error
-    print(f"wrote {out} ({format_bytes(size_bytes)})")
+    say(f"wrote {out} ({format_bytes(size_bytes)})")
     return 0
 
 
 def _csv(arguments: argparse.Namespace, file: BinaryIO) -> None:
+    from fieldkit.export import table
+
     table.write_csv(file, _load(arguments))
 
 
 def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
+    from fieldkit.export import table
+
     table.write_parquet(file, _load(arguments))
 
 
-def _load(arguments: argparse.Namespace) -> Repeats:
+def _load(arguments: argparse.Namespace) -> "Repeats":
+    from fieldkit.trial import sources
+
     return sources.find(arguments.paths, show_note, rebuild=arguments.rebuild).read(undeclared=True)
 
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
+    from fieldkit.export import mcap, timeline
+    from fieldkit.trial import sources, store
+
     folder: Path = arguments.paths[0]
     if len(arguments.paths) > 1:
         raise ConfigurationError(
@@ -62,7 +89,12 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
 
 
 def _junit(arguments: argparse.Namespace, file: BinaryIO) -> None:
-    file.write(junit.text(table.parent for table in sources.find(arguments.paths, show_note).tables))
+    from fieldkit.export import junit
+    from fieldkit.trial import sources
+
+    # As for measuring anew, which takes trials without a table, too: none may be left out of what a CI server shows.
+    trials = sources.find(arguments.paths, show_note, rebuild=True).tables
+    file.write(junit.text(table.parent for table in trials))
 
 
 _WRITERS: Final[Mapping[str, Callable[[argparse.Namespace, BinaryIO], None]]] = MappingProxyType(

@@ -3,14 +3,26 @@
 import argparse
 from pathlib import Path
 
-from fieldkit.config import site_file
+from fieldkit.cli.parser import Parser
 from fieldkit.config.locations import SITE_FILE
-from fieldkit.config.site import load_site
 from fieldkit.core.errors import typed
+from fieldkit.core.printing import say
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit init` takes."""
+    parser.description = "Write a site file in which every line is explained; a file that exists is not overwritten."
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", default=Path(SITE_FILE), help=f"the file (default: {SITE_FILE})"
+    )
+    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the file and print what to type next."""
+    from fieldkit.config import site_file
+    from fieldkit.config.site import load_site
+
     path: Path = arguments.out
     site_file.create(path)
     site, _ = load_site(path)
@@ -22,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
         (typed("fieldkit", "trial", "los", "30ft", "--repeats", 1, *option), "a first trial"),
     ]
     width = max(len(command) for command, _ in steps)
-    print(f"wrote {path}; next:")
+    say(f"wrote {path}; next:")
     for command, what in steps:
-        print(f"  {command:{width}}  # {what}")
+        say(f"  {command:{width}}  # {what}")
     return 0

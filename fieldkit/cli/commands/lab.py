@@ -5,21 +5,110 @@ import os
 import shutil
 import sys
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from fieldkit.backends.registry import load_backend
-from fieldkit.cli import options
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, show_note, table
-from fieldkit.config.site import Site, SiteRobot
+from fieldkit.cli.parser import Commands, Parser
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Vector
+from fieldkit.core.printing import say
+from fieldkit.core.text import json_text
 from fieldkit.core.units import format_count, format_duration, parse_offset_m
-from fieldkit.lab import background, client, folder, protocol, server
+from fieldkit.lab import background, folder
 from fieldkit.lab.folder import LabFolder
-from fieldkit.lab.protocol import Destination, Lab, LabBackend, Overview
+
+if TYPE_CHECKING:
+    from fieldkit.lab.protocol import Lab, LabBackend, Overview
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit lab` takes."""
+    parser.description = "Emulated robots that stay up until they are taken down: one lab per directory."
+    actions = parser.add_commands(title="commands", metavar="COMMAND")
+    action = actions.add_parser(
+        "up",
+        help="bring the robots of the site file up, all in one place, or N alike",
+        description="Bring up every robot of the site file, whatever its roles and its backend, or --robots N alike, "
+        "and return when all can be reached. They are placed in a square in the middle of the world, at most 5 m "
+        "apart, and talk directly to each other; radio, world and ROS are those of the site file's `emulated`. SSH "
+        "does not use the radio: `control: radio` is ignored, with a note. No program listens on the network of this "
+        "machine; the files that others need to reach the robots are in a folder of this user, in memory if there is "
+        "/run/user. The lab ends with its process.",
+    )
+    shared.add_robots(action)
+    action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of everything random (default 1)")
+    action.add_argument("--foreground", action="store_true", help="keep this terminal; Ctrl-C takes the robots down")
+    action.set_defaults(run=up)
+    listing = actions.add_parser(
+        "ps",
+        help="list the robots: where they are, what runs on them",
+        description="List the robots: profile, roles, address on the radio, position, programs. --json prints one "
+        "object: pid and up_s of the lab, and robots, each with name, profile, roles, address, place_m (metres east, "
+        "north, up) and programs, which is empty for a robot that has ended.",
+    )
+    listing.add_argument("--json", action="store_true", help="print them as JSON")
+    listing.set_defaults(run=list_robots)
+    action = actions.add_parser(
+        "shell",
+        help="log in on a robot, or run a command there as ssh does",
+        description="Log in on a robot, or run COMMAND there as ssh does: its words are joined for the robot's "
+        "shell, and its exit code is that of fieldkit.",
+    )
+    action.add_argument("robot", metavar="ROBOT", help="name of the robot")
+    action.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND", help="what its shell runs")
+    action.set_defaults(run=shell)
+    _lab_move(actions)
+    config = actions.add_parser("ssh-config", help="print a configuration for ssh -F, scp -F, rsync and Ansible")
+    config.set_defaults(run=print_ssh_config)
+    actions.add_parser("down", help="end the robots").set_defaults(run=down)
+    action = actions.add_parser(
+        "plot",
+        help="draw the robots that are up, or would be, from above, and how well they hear each other",
+        description="Draw the lab from above, with the mean SNR of each link without shadowing, and the obstacles on "
+        "it; frames do not arrive over a dotted link. If no lab is up, or with --robots, --site or --backend, draw "
+        "what `up` would bring up.",
+    )
+    shared.add_robots(action)
+    action.add_argument(
+        "-o", "--out", type=Path, default=Path("lab.svg"), metavar="FILE", help="SVG, PDF or PNG (default lab.svg)"
+    )
+    action.set_defaults(run=plot)
+
+
+def _lab_move(actions: Commands) -> None:
+    parser: Parser = actions.add_parser(
+        "move",
+        help="put a robot elsewhere, at once",
+        usage="%(prog)s [-h] ROBOT (--to EAST NORTH [UP] | --by EAST NORTH [UP])",
+        description="Move a robot immediately, and print its position. --to is a position in the world: lengths east "
+        "and north of its corner (20m, 30ft), and the height of the antenna; without UP the robot is on the ground. "
+        "--by is relative to its position, and may be negative; without UP the height above the ground is kept. A "
+        "position outside of the world's area_m, below the ground or above 100 km is refused.",
+    )
+    parser.takes_lengths = True
+    parser.add_argument("robot", metavar="ROBOT", help="name of the robot")
+    way = parser.add_mutually_exclusive_group(required=True)
+    way.add_argument(
+        "--to",
+        nargs="+",
+        type=str.strip,
+        metavar="LENGTH",
+        help="EAST NORTH [UP] in the world; on the ground without UP",
+    )
+    way.add_argument(
+        "--by",
+        nargs="+",
+        type=str.strip,
+        metavar="LENGTH",
+        help="EAST NORTH [UP] from where it is, UP over the ground",
+    )
+    parser.set_defaults(run=move)
+
 
 _EXAMPLE: Final = "fieldkit lab move ROBOT --to 20m 10m, or --by 0m -30ft, and 5m for UP where it flies"
 _NEXT: Final = "fieldkit lab ps | shell ROBOT | move ROBOT | ssh-config | down"
@@ -27,18 +116,20 @@ _NEXT: Final = "fieldkit lab ps | shell ROBOT | move ROBOT | ssh-config | down"
 
 def up(arguments: argparse.Namespace) -> int:
     """Bring the robots up; return at once, or when they are down."""
+    from fieldkit.lab import server
+
     here, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
-    def stay(robots: Lab) -> None:
-        print(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
+    def stay(robots: "Lab") -> None:
+        say(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
         server.run(here, backend, seed=arguments.seed, sink=_tell, ready=stay)
         return 0
 
     def work(leave: background.Leave) -> int:
-        def ready(robots: Lab) -> None:
-            print(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
+        def ready(robots: "Lab") -> None:
+            say(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
             leave(here.log)
 
         try:
@@ -51,9 +142,14 @@ def up(arguments: argparse.Namespace) -> int:
     return background.detached(work)
 
 
-def list_robots(_: argparse.Namespace) -> int:
+def list_robots(arguments: argparse.Namespace) -> int:
     """List the robots."""
+    from fieldkit.lab import client
+
     state = client.state(_here())
+    if arguments.json:
+        say(json_text(asdict(state)))
+        return 0
     rows = [
         (
             robot.name,
@@ -66,12 +162,15 @@ def list_robots(_: argparse.Namespace) -> int:
         for robot in state.robots
     ]
     table(("robot", "profile", "roles", "address", "east, north, up (m)", "runs"), rows)
-    print(f"up for {format_duration(state.up_s)}, pid {state.pid}")
+    say(f"up for {format_duration(state.up_s)}, pid {state.pid}")
     return 0
 
 
 def move(arguments: argparse.Namespace) -> int:
     """Move the robot and say where it is."""
+    from fieldkit.lab import client
+    from fieldkit.lab.protocol import Destination
+
     relative = arguments.to is None
     option, words = ("--by", arguments.by) if relative else ("--to", arguments.to)
     if len(words) not in {2, 3}:
@@ -79,12 +178,14 @@ def move(arguments: argparse.Namespace) -> int:
     east_m, north_m, *up_m = map(parse_offset_m, words)
     to = Destination(east_m, north_m, up_m[0] if up_m else None, relative)
     place_m = client.move(_here(), arguments.robot, to)
-    print(f"{arguments.robot} is at {_place(place_m)} (m east, north, up)")
+    say(f"{arguments.robot} is at {_place(place_m)} (m east, north, up)")
     return 0
 
 
 def shell(arguments: argparse.Namespace) -> int:
     """Become ssh."""
+    from fieldkit.lab import client, protocol
+
     here = _here()
     names = [robot.name for robot in client.state(here).robots]
     if arguments.robot not in names:
@@ -99,28 +200,32 @@ def shell(arguments: argparse.Namespace) -> int:
 
 def print_ssh_config(_: argparse.Namespace) -> int:
     """Print the configuration."""
+    from fieldkit.lab import client
+
     here = _here()
     client.state(here)
-    print(here.ssh_config.read_text(encoding="utf-8"), end="")
+    say(here.ssh_config.read_text(encoding="utf-8"), end="")
     return 0
 
 
 def down(_: argparse.Namespace) -> int:
     """End the robots."""
+    from fieldkit.lab import client
+
     client.end(_here())
-    print("the robots are down")
+    say("the robots are down")
     return 0
 
 
 def plot(arguments: argparse.Namespace) -> int:
     """Draw the lab."""
     # matplotlib takes half a second to import, which no other command shall pay.
-    from fieldkit.report import figures, theme  # noqa: PLC0415
+    from fieldkit.report import figures, theme
 
     out: Path = arguments.out
     form = theme.format_of(out, "--out")
     files.write(out, figures.overview(_overview(arguments), form))
-    print(out)
+    say(out)
     return 0
 
 
@@ -129,8 +234,10 @@ def _place(place_m: Vector) -> str:
     return ", ".join(f"{round(metres, 2):.10g}" for metres in place_m)
 
 
-def _overview(arguments: argparse.Namespace) -> Overview:
+def _overview(arguments: argparse.Namespace) -> "Overview":
     """Return the lab that is up; what `up` would bring up if none is, or if the options say which robots."""
+    from fieldkit.lab import client
+
     if arguments.robots is None and arguments.site is None and arguments.backend is None:
         with suppress(client.NoLabError):
             return client.overview(_here())
@@ -141,10 +248,15 @@ def _here() -> LabFolder:
     return folder.of_directory(Path.cwd())
 
 
-def _backend(arguments: argparse.Namespace) -> LabBackend:
+def _backend(arguments: argparse.Namespace) -> "LabBackend":
     """Return what brings up the robots that the options choose."""
-    site, document = options.lab_site(arguments)
-    name = arguments.backend or options.DEFAULT_BACKEND
+    from fieldkit.backends.registry import load_backend
+    from fieldkit.cli import sites
+    from fieldkit.config.site import Site, SiteRobot
+    from fieldkit.lab import protocol
+
+    site, document = sites.lab_site(arguments)
+    name = arguments.backend or sites.DEFAULT_BACKEND
     if arguments.robots is not None:
         if arguments.robots < 1:
             raise ConfigurationError("--robots: a lab has at least one", remedy="fieldkit lab up --robots 2")

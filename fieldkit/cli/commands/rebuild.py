@@ -2,16 +2,29 @@
 
 import argparse
 
-from fieldkit.cli.display import show_note
-from fieldkit.cli.results import summary_table
-from fieldkit.trial.rebuild import rebuild
+from fieldkit.cli import shared_arguments as shared
+from fieldkit.cli.display import prose, show_note
+from fieldkit.cli.parser import Parser
+from fieldkit.core.printing import say
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit rebuild` takes."""
+    parser.description = "Make trial.csv and summary.csv again from plan, journal and raw evidence: the same bytes."
+    shared.add_trial(parser)
+    shared.add_all(parser)
+    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Rebuild, show the summary, and say whether bytes changed."""
+    from fieldkit.cli import summary
+    from fieldkit.trial.rebuild import rebuild
+
     rebuilt = rebuild(arguments.trial)
     if not rebuilt.is_summed:
         show_note(f"{arguments.trial}: there is no manifest to say whether its evidence is as it was kept")
-    summary_table(rebuilt.cells)
-    print(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
+    if left_out := summary.show(rebuilt.cells, every=arguments.all, expected=rebuilt.expected):
+        prose(f"{summary.more(left_out)}: add --all")
+    say(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
     return 0

@@ -6,10 +6,52 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_note
+from fieldkit.cli.parser import Parser
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, typed
-from fieldkit.trial import sources
+from fieldkit.core.printing import say
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit report` takes."""
+    parser.description = (
+        "Make one HTML file of figures, tables and strips. It begins with what is missing and with the worst "
+        "conditions. It opens without a network and contains no script. For the folder of a campaign, or the folder "
+        "above, it lists planned trials without an attempt."
+    )
+    shared.add_paths(parser)
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("report.html"),
+        metavar="FILE",
+        help="the page (default report.html)",
+    )
+    parser.add_argument("--title", default="", help="its title (default: made of the procedures)")
+    parser.add_argument(
+        "--repeat",
+        default="",
+        metavar="NAME",
+        help="whose time line is drawn: udp-07, or TRIAL/udp-07 (default: the median one where most is lost)",
+    )
+    parser.add_argument(
+        "--quantity",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="column to draw besides those that are drawn anyway, may be given more than once",
+    )
+    parser.add_argument(
+        "--figures",
+        type=Path,
+        metavar="FOLDER",
+        help="keep the figures there too: SVG, PDF and PNG, in the width of a paper's column",
+    )
+    parser.set_defaults(run=run)
+
 
 _OUT: Final = Path("report.html")
 _PAGE: Final = b"<!DOCTYPE html>"
@@ -18,27 +60,31 @@ _PAGE: Final = b"<!DOCTYPE html>"
 def run(arguments: argparse.Namespace) -> int:
     """Write the page, and the figures if they are asked for."""
     # matplotlib takes half a second to import, which no other command shall pay.
-    from fieldkit.report import contents, figures, page  # noqa: PLC0415
+    from fieldkit.campaign.unmeasured import unmeasured
+    from fieldkit.report import contents, figures, page
+    from fieldkit.trial import sources
 
     out, folder = arguments.out, arguments.figures
     _demand_place(out)
     found = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
     chosen = [found.quantity(name).name for name in arguments.quantity]
+    repeats = found.read()
     made = contents.put_together(
-        found.read(),
+        repeats,
         title=arguments.title,
         repeat=arguments.repeat,
         command=_command(arguments),
         quantities=chosen,
+        unmeasured=list(unmeasured(arguments.paths, set(repeats.texts["source"].tolist()), show_note)),
     )
     with _explained(out, "-o"):
         files.write(out, page.render(made, out).encode())
-    print(out)
+    say(out)
     if folder is not None:
         with _explained(folder, "--figures"):
             folder.mkdir(parents=True, exist_ok=True)
             for path in figures.save(made.charts, folder):
-                print(path)
+                say(path)
     return 0
 
 

@@ -2,18 +2,49 @@
 
 import argparse
 
-from fieldkit.cli import options, results
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import watching
+from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import interruptible
-from fieldkit.trial.running import opening
-from fieldkit.trial.running.resumption import resumable
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit resume` takes."""
+    parser.description = (
+        "Continue a trial that stopped: by Ctrl-C, a kill, a lost robot or testbed, a full disk. What is done is not "
+        "repeated. Files that differ from their checksums are reported; if trial.csv would have to be made again "
+        "from them, the trial does not continue (exit code 4). Backend and cast must be those that the trial began "
+        "with."
+    )
+    shared.add_trial(parser, "folder of the trial")
+    parser.add_argument(
+        "--failed", action="store_true", help="repeat what failed, too; the failed attempts are kept as void"
+    )
+    shared.add_site(parser)
+    shared.add_operator(parser)
+    shared.add_json(parser)
+    shared.add_all(parser)
+    shared.add_junit(parser)
+    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run what is left of the trial and print its table."""
+    from fieldkit.cli import options, results
+    from fieldkit.trial.running import opening
+    from fieldkit.trial.running.resumption import resumable
+
     resumable(arguments.trial)  # before anything is said of site files and backends
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = options.backend(arguments, sink)
         with options.operator(arguments, sink) as operator:
-            outcome = opening.resume(arguments.trial, name, backend, sink=sink, operator=operator, stop=stop)
+            outcome = opening.resume(
+                arguments.trial,
+                name,
+                backend,
+                failed=arguments.failed,
+                sink=sink,
+                operator=operator,
+                stop=stop,
+            )
     return results.report([outcome], arguments)

@@ -2,18 +2,31 @@
 
 import argparse
 
+from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error
+from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.printing import say
 from fieldkit.core.units import format_count
-from fieldkit.trial.manifest import verify
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit verify` takes."""
+    parser.description = (
+        "Compare every file of a trial with MANIFEST.sha256: changed, missing, not in it, or not a regular file."
+    )
+    shared.add_trial(parser)
+    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what differs."""
+    from fieldkit.trial.manifest import verify
+
     problems = verify(arguments.trial)
     for problem in problems:
         show_error(problem)
-    print(
+    say(
         f"{format_count(len(problems), 'file')} not as the manifest says"
         if problems
         else "every file is as its manifest says"

@@ -3,6 +3,7 @@
 Headers: RFC 791 (IPv4), RFC 8200 (IPv6 and its extension headers), RFC 4302 (authentication), RFC 2675 (jumbograms).
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Final
@@ -10,7 +11,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import BIG, Frames, Integers, Ints, Mask, Table, layout
 
 ICMP: Final = 1

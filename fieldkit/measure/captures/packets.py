@@ -3,12 +3,14 @@
 Headers: RFC 9293 (TCP), RFC 7323 (its time stamps), RFC 768 (UDP), RFC 792 (ICMP).
 """
 
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final
 
 import numpy as np
 
-from fieldkit.core.lazy import dataclass
-from fieldkit.measure.captures.arrays import BIG, LITTLE, Frames, Integers, Ints, Mask, Table, layout, mixed
+from fieldkit.measure.captures.arrays import BIG, LITTLE, Frames, Integers, Ints, Mask, Narrow, Table, layout, mixed
 from fieldkit.measure.captures.ip import ICMP, SCTP, TCP, UDP, Addresses, address, headers
 from fieldkit.measure.captures.links import network
 
@@ -77,6 +79,7 @@ class Packets(Table):
         udp_bytes: Length in the UDP header, itself included; 0 without one.
         echo: Identifier of an ICMP echo request, which each ping has for itself, and of a reply, plus `ECHO_REPLY`;
             `NO_ECHO` without one.
+        echo_seq: Sequence number of an ICMP echo request or reply; `NO_ECHO` without one.
         content: A number for the first `CONTENT_BYTES` behind the TCP or UDP header, else behind the IP header (so
             that a checksum, which offload leaves for later, is not in it): other numbers are other bytes. `NOT_KEPT`
             where so many are not there to be read.
@@ -102,6 +105,7 @@ class Packets(Table):
     tcp_payload_bytes: Ints
     udp_bytes: Ints
     echo: Ints
+    echo_seq: Ints
     content: Ints
 
     def are_from(self, text: str) -> Mask:
@@ -111,6 +115,23 @@ class Packets(Table):
     def are_to(self, text: str) -> Mask:
         """Return which packets have this IPv4 or IPv6 destination address."""
         return _equals(self.dst, text)
+
+
+_KEPT_AS: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
+    {
+        **dict.fromkeys(("protocol", "tcp_flags"), np.uint8),
+        **dict.fromkeys(("fragment_offset", "tcp_mss", "udp_bytes"), np.uint16),
+        **dict.fromkeys(("wire_bytes", "ip_id", "ip_header_bytes", "ip_payload_bytes"), np.uint32),
+        **dict.fromkeys(("tcp_seq", "tcp_ack", "tcp_payload_bytes"), np.uint32),
+        **dict.fromkeys(("sport", "dport", "echo", "echo_seq"), np.int32),
+    }
+)
+"""Columns that need fewer than eight bytes: what their header fields hold, and the marks below 0."""
+
+for _name, _kind in _KEPT_AS.items():
+    _column = Narrow(_kind)
+    _column.__set_name__(Packets, _name)
+    setattr(Packets, _name, _column)
 
 
 def decode(integers: Integers, frames: Frames) -> Packets:
@@ -130,6 +151,7 @@ def decode(integers: Integers, frames: Frames) -> Packets:
     tcp_header = (head["length"] >> 4) * 4
     tcp_flags = np.where(tcp, head["flags"], 0)
     options_end = transport + np.minimum(kept, tcp_header)
+    echo = _echoes(integers, first & (protocol == ICMP) & (kept >= 8), transport)
     skipped = np.where(tcp, tcp_header, np.where(udp, UDP_HEADER_BYTES, 0))
     return Packets(
         time_ns=frames.time_ns,
@@ -151,7 +173,8 @@ def decode(integers: Integers, frames: Frames) -> Packets:
         tcp_mss=_option(integers, np.flatnonzero(tcp_flags & SYN), transport, options_end, _MSS_OPTION, missing=0),
         tcp_payload_bytes=np.where(tcp, np.maximum(payload - tcp_header, 0), 0),
         udp_bytes=np.where(udp, head["udp_bytes"], 0),
-        echo=_echoes(integers, first & (protocol == ICMP) & (kept >= 8), transport),
+        echo=echo,
+        echo_seq=np.where(echo == NO_ECHO, NO_ECHO, integers.u16(np.where(echo == NO_ECHO, 0, transport + 6))),
         content=_contents(integers, transport + skipped, kept - skipped, payload - skipped),
     )
 

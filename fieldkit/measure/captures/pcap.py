@@ -1,12 +1,12 @@
 """Capture files, pcap and pcapng: their IP packets as columns, whole or chunk by chunk."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from mmap import MADV_DONTNEED, mmap
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures import classic, pcapng
 from fieldkit.measure.captures.arrays import Buffer, Integers
 from fieldkit.measure.captures.packets import Packets, decode
@@ -18,7 +18,8 @@ CHUNK_BYTES: Final = 1 << 22
 _SPARE: Final = 8
 """Beside the rows that are expected there is room for one more in so many."""
 
-_READERS: Final = dict.fromkeys(classic.MAGIC, classic.chunks) | {pcapng.MAGIC: pcapng.chunks}
+READERS: Final = dict.fromkeys(classic.MAGIC, classic.chunks) | {pcapng.MAGIC: pcapng.chunks}
+"""Readers of a file's frames, by the first four bytes of the file."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +77,14 @@ def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
 
 def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
     magic = bytes(data[:4])
-    if magic not in _READERS:
+    if magic not in READERS:
         raise EvidenceError(
             "is no pcap or pcapng file" if data else "is empty",
             where=where,
             remedy="read the capture's log: did tcpdump start, and was it ended by a signal that it can catch?",
         )
     integers = Integers(data)
-    for chunk in _READERS[magic](data, where=where, chunk_bytes=chunk_bytes):
+    for chunk in READERS[magic](data, where=where, chunk_bytes=chunk_bytes):
         yield Capture(decode(integers, chunk.frames), len(chunk.frames), chunk.damage)
 
 

@@ -5,13 +5,13 @@ File format: draft-ietf-opsawg-pcapng. A section has its own byte order and its 
 
 import struct
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import BIG, LITTLE, NO_TIME, Buffer, Chunk, Frames, Integers, Ints, Mask, Order
 from fieldkit.measure.captures.links import check_link_type
 

@@ -1,12 +1,12 @@
 """Contents of a ROS bag; read in a process of its own, as a bag is what a library of others makes of it."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError, Json
 
 METADATA: Final = "metadata.yaml"

@@ -47,6 +47,9 @@ def answer(question: Json) -> Json:
 def _ros2(path: Path) -> "rosbag2.Reader":
     from rosbags import rosbag2  # noqa: PLC0415 (SQLite, YAML and MCAP take a third of the start of this process)
 
+    from fieldkit.measure.evidence import bag_paths  # noqa: PLC0415 (as above)
+
+    bag_paths.allow_any()
     return rosbag2.Reader(path)
 
 
@@ -124,6 +127,10 @@ def _decoding(path: Path) -> "AnyReader":
     """Return a reader of the bag at a path that knows what messages are made of."""
     from rosbags.highlevel import AnyReader  # noqa: PLC0415 (takes 30 ms, and few questions need it)
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+
+    from fieldkit.measure.evidence import bag_paths  # noqa: PLC0415
+
+    bag_paths.allow_any()
 
     # A bag in SQLite does not say what its types are made of.
     types = get_typestore(Stores.ROS2_FOXY)

@@ -10,9 +10,8 @@ Each line bounds the difference from both sides, however long the robot took to 
 
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Final
-
-from fieldkit.core.lazy import dataclass
 
 _READING: Final = re.compile(r"(\d{1,12})\.(\d{2}) (\d{1,11})(?:\.(\d{9}))? (\d{1,12})\.(\d{2})", re.ASCII)
 

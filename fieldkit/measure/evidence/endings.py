@@ -3,10 +3,9 @@
 import re
 import signal
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
-
-from fieldkit.core.lazy import dataclass
 
 _ENDING: Final = re.compile(
     r"(?P<name>[A-Za-z0-9._-]{1,60}) (?P<how>itself|asked|limit|running) (?P<code>\d{1,3}|-) "
@@ -49,11 +48,13 @@ class Ending:
         cause: Who ended it; whoever sends a signal on the robot, past fieldkit, makes it end by itself.
         code: Its exit code; None where it was killed together with what watched over it.
         lasted_s: How long it ran, in seconds; None where nobody saw its end.
+        ended_s: When it ended, in seconds since boot; None if that is unknown.
     """
 
     cause: Cause
     code: int | None
     lasted_s: float | None
+    ended_s: float | None = None
 
 
 def parse(lines: Iterable[str]) -> Mapping[str, Ending]:
@@ -61,9 +62,18 @@ def parse(lines: Iterable[str]) -> Mapping[str, Ending]:
     return {match["name"]: _ending(match) for line in lines if (match := _ENDING.fullmatch(line))}
 
 
+def times_s(lines: Iterable[str]) -> Mapping[str, tuple[float, float | None]]:
+    """Return when each job started and ended, in seconds since boot; the end is None if that is unknown."""
+    matches = [match for line in lines if (match := _ENDING.fullmatch(line))]
+    started_s = {match["name"]: int(match["started"]) / _TICKS_PER_S for match in matches}
+    ended_s = {match["name"]: None if match["ended"] == "-" else float(match["ended"]) for match in matches}
+    return {name: (at_s, ended_s[name]) for name, at_s in started_s.items()}
+
+
 def _ending(match: re.Match[str]) -> Ending:
-    lasted_s = None if match["ended"] == "-" else float(match["ended"]) - int(match["started"]) / _TICKS_PER_S
-    return Ending(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), lasted_s)
+    ended_s = None if match["ended"] == "-" else float(match["ended"])
+    lasted_s = None if ended_s is None else ended_s - int(match["started"]) / _TICKS_PER_S
+    return Ending(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), lasted_s, ended_s)
 
 
 def problem(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) -> str | None:

@@ -6,19 +6,20 @@ sums over those. A test whose end did not say good-bye lacks its last interval, 
 """
 
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
 from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.text import brief
 from fieldkit.measure.evidence import reading
+from fieldkit.measure.evidence.iperf3_summary import IperfStart, IperfTotals, parse_start, parse_totals
+from fieldkit.measure.evidence.json_fields import count, items, mapping, number
 
 COLUMNS: Final = columns(
     100,
@@ -48,8 +49,11 @@ COLUMNS: Final = columns(
     (
         "iperf3_jitter_s",
         "s",
-        "Interarrival jitter (RFC 3550, section 6.4.1) at the end. Empty for TCP.",
-        Figure("iperf3 jitter", Kind.MEDIAN, rank=63),
+        (
+            "Interarrival jitter (RFC 3550, section 6.4.1) by iperf3 itself, after the last datagram: the last 16 or "
+            "so decide it. Of the whole test: iperf3_captured_jitter_mean_s. Empty for TCP."
+        ),
+        Figure("iperf3's last jitter value (RFC 3550)", Kind.MEDIAN, rank=63),
     ),
     (
         "iperf3_retransmits",
@@ -63,7 +67,6 @@ _OF_UDP: Final = ("iperf3_datagrams_sent", "iperf3_datagrams_received", "iperf3_
 _OF_TCP: Final = ("iperf3_retransmits",)
 _MOST_BYTES: Final = 16 << 20
 """An hour of intervals of 1 s, of 8 streams, is 8 MB."""
-_MOST_COUNT: Final = 2**53
 # cJSON before 1.5.9 printed what is no number as C does, which no JSON has.
 _NO_NUMBER: Final = re.compile(r"(?<=[:,\[])(\s*)[-+]?(?:nan|inf(?:inity)?)\b(?=\s*[,\]}])", re.IGNORECASE)
 _ENOUGH: Final = 3
@@ -87,6 +90,10 @@ class IperfInterval:
         datagrams: UDP datagrams, at the receiver those that it expected.
         lost: Of these, the ones that the receiver missed.
         retransmits: Segments sent again.
+        start_s: Its start in seconds; None if the JSON does not say.
+        end_s: Its end, likewise.
+        stream_bytes: Payload of each stream in it, added up; None without streams.
+        rate_bit_s: Payload bits per second, as iperf3 wrote them.
     """
 
     lasted_s: float
@@ -94,6 +101,10 @@ class IperfInterval:
     datagrams: int | None
     lost: int | None
     retransmits: int | None
+    start_s: float | None = None
+    end_s: float | None = None
+    stream_bytes: int | None = None
+    rate_bit_s: float | None = None
 
     @property
     def bit_s(self) -> float:
@@ -110,12 +121,16 @@ class IperfTest:
         ports: Ports of this end's data connections, and of the other's.
         intervals: Intervals in order, those that iperf3 was told to omit left out.
         jitter_s: Jitter at the end, in seconds; None where it tells none.
+        start: Parameters of the test.
+        totals: Totals at its end.
     """
 
     error: str
     ports: tuple[tuple[int, int], ...]
     intervals: tuple[IperfInterval, ...]
     jitter_s: float | None
+    start: IperfStart = field(default_factory=IperfStart)
+    totals: IperfTotals = field(default_factory=IperfTotals)
 
     @property
     def _whole(self) -> tuple[IperfInterval, ...]:
@@ -164,53 +179,45 @@ def parse(text: str) -> IperfTest:
         raise EvidenceError("is no JSON of iperf3, or was cut: did iperf3 end by itself?") from error
     if not isinstance(found, dict) or not {"start", "intervals"} & found.keys():
         raise EvidenceError("is JSON, but none of iperf3")
-    start, end = _mapping(found, "start"), _mapping(found, "end")
-    jitters_ms = [_number(_mapping(end, name), "jitter_ms") for name in ("sum_received", "sum")]
+    start, end = mapping(found, "start"), mapping(found, "end")
+    jitters_ms = [number(mapping(end, name), "jitter_ms") for name in ("sum_received", "sum")]
     jitter_ms = next((one for one in jitters_ms if one is not None), None)
     return IperfTest(
         error=brief(str(found.get("error", ""))),
         ports=tuple(_ports(start)),
         intervals=tuple(_intervals(found)),
         jitter_s=None if jitter_ms is None else jitter_ms / 1e3,
+        start=parse_start(found),
+        totals=parse_totals(found),
     )
 
 
 def _intervals(found: Mapping[str, Any]) -> Iterator[IperfInterval]:
-    for interval in _items(found, "intervals"):
-        total = _mapping(interval, "sum")
-        lasted_s, payload_bytes = _number(total, "seconds"), _count(total, "bytes")
+    for interval in items(found, "intervals"):
+        total = mapping(interval, "sum")
+        lasted_s, payload_bytes = number(total, "seconds"), count(total, "bytes")
         if total.get("omitted") is True or not lasted_s or payload_bytes is None:
             continue
-        datagrams, lost, again = (_count(total, name) for name in ("packets", "lost_packets", "retransmits"))
-        yield IperfInterval(lasted_s, payload_bytes, datagrams, lost, again)
+        datagrams, lost, again = (count(total, name) for name in ("packets", "lost_packets", "retransmits"))
+        streams = [count(stream, "bytes") for stream in items(interval, "streams")]
+        yield IperfInterval(
+            lasted_s,
+            payload_bytes,
+            datagrams,
+            lost,
+            again,
+            start_s=number(total, "start"),
+            end_s=number(total, "end"),
+            stream_bytes=_sum(streams),
+            rate_bit_s=number(total, "bits_per_second"),
+        )
 
 
 def _ports(start: Mapping[str, Any]) -> Iterator[tuple[int, int]]:
-    for connection in _items(start, "connected"):
-        own, other = _count(connection, "local_port"), _count(connection, "remote_port")
+    for connection in items(start, "connected"):
+        own, other = count(connection, "local_port"), count(connection, "remote_port")
         if own is not None and other is not None:
             yield own, other
-
-
-def _mapping(found: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    value = found.get(key)
-    return value if isinstance(value, dict) else {}
-
-
-def _items(found: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
-    value = found.get(key)
-    return [one for one in value if isinstance(one, dict)] if isinstance(value, list) else []
-
-
-def _number(found: Mapping[str, Any], key: str) -> float | None:
-    value = found.get(key)
-    fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _MOST_COUNT
-    return float(value) if fits and value is not None and math.isfinite(value) else None
-
-
-def _count(found: Mapping[str, Any], key: str) -> int | None:
-    value = _number(found, key)
-    return None if value is None else int(value)
 
 
 def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | None) -> Measured:

@@ -10,12 +10,13 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core import laptop_files
 from fieldkit.core.columns import Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness
 from fieldkit.measure.evidence import reading
 
-FILE: Final = "lateness.txt"
+FILE: Final = laptop_files.LATENESS
 
 COLUMNS: Final = columns(
     50,

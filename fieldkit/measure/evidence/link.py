@@ -40,7 +40,7 @@ def _declared(role: Role) -> tuple[Column, ...]:
                 "point that it exchanges the most packets with. This and the following are empty of a robot without "
                 "Wi-Fi or iw, and where its driver does not tell."
             ),
-            Figure(f"signal at the {role}", Kind.MEDIAN, rank=BACKGROUND),
+            Figure(f"signal, {role}", Kind.MEDIAN, rank=BACKGROUND),
             _DBM,
         ),
         (f"{role}_signal_min_dbm", "dBm", "The weakest of these samples.", _DBM),
@@ -50,13 +50,13 @@ def _declared(role: Role) -> tuple[Column, ...]:
             f"{role}_busy_share",
             "share",
             f"Share of the time in which the {role} found its channel busy, by whomever, itself included.",
-            Figure(f"channel busy at the {role}", Kind.MEAN, rank=BACKGROUND + 3),
+            Figure(f"channel busy, {role}", Kind.MEAN, rank=BACKGROUND + 3),
         ),
         (
             f"{role}_tx_rate_bit_s",
             "bit/s",
             f"Median over the samples of the rate at which the {role}'s radio last sent a frame to it.",
-            Figure(f"rate that the {role} sends at", Kind.MEDIAN, rank=BACKGROUND + 1),
+            Figure(f"PHY rate, {role}", Kind.MEDIAN, rank=BACKGROUND + 1),
         ),
         (f"{role}_rx_rate_bit_s", "bit/s", "Likewise of the rate of the last frame from it."),
         (f"{role}_radio_tx_packets", "count", f"Packets that the {role}'s radio sent to it, whoever they are of."),
@@ -65,7 +65,7 @@ def _declared(role: Role) -> tuple[Column, ...]:
             f"{role}_tx_retries",
             "count",
             "Frames that were sent again to it, because no acknowledgement came.",
-            Figure(f"frames the {role} sent again", Kind.MEDIAN, rank=BACKGROUND + 2),
+            Figure(f"Wi-Fi retries, {role}", Kind.MEDIAN, rank=BACKGROUND + 2),
         ),
         (f"{role}_tx_failures", "count", "Packets to it that were given up after the last retry."),
         (f"{role}_beacon_losses", "count", "Times that its beacons stayed away."),

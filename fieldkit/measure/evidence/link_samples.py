@@ -15,11 +15,12 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core import laptop_files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role, StationSample
 from fieldkit.measure.evidence import counted_csv, host, iw, reading
 
-FILE: Final = "link.csv"
+FILE: Final = laptop_files.LINK
 
 _HEADER: Final = (
     "utc_ns,role,noise_dbm,active_ns,busy_ns,station,signal_dbm,tx_bit_s,rx_bit_s,"

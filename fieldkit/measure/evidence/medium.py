@@ -8,12 +8,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core import laptop_files
 from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import DelayParts
 from fieldkit.measure.evidence import reading
 
-FILE: Final = "medium.txt"
+FILE: Final = laptop_files.MEDIUM
 
 COLUMNS: Final = columns(
     30,
@@ -24,7 +25,7 @@ COLUMNS: Final = columns(
             "Mean delay of the transfer's packets from sender to receiver, the sum of the paper's four parts (its "
             "eq. 2). Empty where nobody knows them, as in the field."
         ),
-        Figure("delay on the air", Kind.MEDIAN, rank=34),
+        Figure("air delay", Kind.MEDIAN, rank=34),
     ),
     ("delay_processing_s", "s", "Of delay_s, what the stations took."),
     ("delay_transmission_s", "s", "Of delay_s, what the packet's bits took at the rate of the link."),

@@ -5,6 +5,8 @@ them prints are kept, and never fatal.
 """
 
 import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -12,8 +14,8 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.columns import Figure, Kind, Measured, columns
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.evidence import reading
+from fieldkit.measure.evidence.survivors import quantile_of_sent
 
 FILE: Final = "ping.txt"
 """What it said on its standard output."""
@@ -26,15 +28,31 @@ COLUMNS: Final = columns(
         "rtt_loss",
         "share",
         "1 - rtt_received/rtt_sent.",
-        Figure("echo loss", Kind.COUNTED, "rtt_received", "rtt_sent", rank=16),
+        Figure("ping loss", Kind.COUNTED, "rtt_received", "rtt_sent", rank=16),
     ),
     ("rtt_payload_bytes", "B", "ICMP payload of each echo request."),
     ("rtt_min_s", "s", "Smallest round-trip time."),
-    ("rtt_median_s", "s", "Median round-trip time.", Figure("RTT", Kind.MEDIAN, rank=30)),
+    (
+        "rtt_median_s",
+        "s",
+        "Median round-trip time.",
+        Figure("RTT", Kind.MEDIAN, rank=30, of_sent="rtt_median_sent_s"),
+    ),
     ("rtt_mean_s", "s", "Mean round-trip time."),
     ("rtt_p95_s", "s", "95th percentile of the round-trip time."),
     ("rtt_max_s", "s", "Largest round-trip time."),
     ("rtt_jitter_s", "s", "Mean absolute difference between one round-trip time and the next."),
+)
+SENT_COLUMNS: Final = columns(
+    110,
+    (
+        "rtt_median_sent_s",
+        "s",
+        (
+            "Median round-trip time over all echo requests, an unanswered one as later than every answer; empty when "
+            "half of them or more stayed unanswered."
+        ),
+    ),
 )
 GAP_COLUMNS: Final = columns(
     20,
@@ -42,18 +60,37 @@ GAP_COLUMNS: Final = columns(
         "rtt_gap_s",
         "s",
         (
-            "Longest time from one answer to the next; empty when the last requests stayed unanswered for longer, or "
-            "ping has no time stamps."
+            "Longest time from one answer to the next; empty when the ping began or ended in a longer one, or in one "
+            "of 1 s or more, and when ping has no time stamps."
         ),
-        Figure("longest gap between answers", Kind.MEDIAN),
+        Figure("longest gap between answers", Kind.MEDIAN, at_least="rtt_gap_at_least_s"),
     ),
     (
         "rtt_gap_lost",
         "count",
         "Echo requests without an answer in that time; empty as rtt_gap_s.",
-        Figure("lost in the gap", Kind.MEDIAN),
+        Figure("lost in the gap", Kind.MEDIAN, at_least="rtt_gap_lost_at_least"),
     ),
 )
+OPEN_GAP_COLUMNS: Final = columns(
+    110,
+    (
+        "rtt_gap_at_least_s",
+        "s",
+        (
+            "Lower bound of rtt_gap_s where the ping began or ended in the gap: the longest time without an answer "
+            "that was observed. Empty otherwise."
+        ),
+    ),
+    ("rtt_gap_lost_at_least", "count", "Lower bound of rtt_gap_lost, likewise."),
+)
+_SEQUENCES: Final = 1 << 16
+"""Sequence numbers of ICMP."""
+_LATE: Final = 1 << 10
+"""An answer that is behind the one before it by fewer numbers is late; else the numbers began again."""
+
+UNREMARKABLE_S: Final = 1.0
+"""A shorter gap at either end of a ping, and shorter than the longest that ended, is taken for a lost echo."""
 WAY_COLUMNS: Final = columns(
     40,
     (
@@ -85,6 +122,10 @@ _REPLY: Final = re.compile(
 _PROBLEM: Final = re.compile(_STAMP + r"From (?P<source>[^ ]+?):? icmp_seq=(?P<seq>[0-9]{1,9}) (?P<text>.+)\Z")
 _SUMMARY: Final = re.compile(
     r"(?P<sent>[0-9]{1,18}) packets transmitted, (?P<received>[0-9]{1,18})(?: packets)? received, .+\Z"
+)
+_MS: Final = r"[0-9]{1,9}\.[0-9]{1,9}"
+_TIMES: Final = re.compile(
+    rf"(?:rtt min/avg/max/mdev|round-trip min/avg/max) = (?P<min>{_MS})/(?P<avg>{_MS})/(?P<max>{_MS})(?:/{_MS})? ms"
 )
 _SILENT: Final = re.compile(
     r"|--- .+ ping statistics ---|rtt min/avg/max/mdev = .+ ms(?:, .+)?|round-trip min/avg/max = .+ ms"
@@ -140,6 +181,7 @@ class Ping:
         received: Requests answered, by the summary.
         unknown: Lines that are no ping's, as they stand.
         first_seq: Sequence number of the first request: 1, or busybox's 0.
+        summary_s: Shortest, mean and longest round-trip time, by the summary; None if it has none.
     """
 
     payload_bytes: int | None
@@ -149,6 +191,7 @@ class Ping:
     received: int | None
     unknown: tuple[str, ...]
     first_seq: int = 1
+    summary_s: tuple[float, float, float] | None = None
 
     @property
     def answers(self) -> tuple[Reply, ...]:
@@ -183,6 +226,7 @@ def parse(text: str) -> Ping:
     """Return what `text` says; never raises, whatever it is."""
     payload_bytes = transmitted = received = None
     first_seq = 1
+    summary_s = None
     replies: list[Reply] = []
     problems: list[Problem] = []
     unknown: list[str] = []
@@ -197,32 +241,84 @@ def parse(text: str) -> Ping:
             first_seq = 0 if match["busybox"] else 1
         elif match := _SUMMARY.match(line):
             transmitted, received = int(match["sent"]), int(match["received"])
+        elif match := _TIMES.match(line):
+            summary_s = (float(match["min"]) / 1e3, float(match["avg"]) / 1e3, float(match["max"]) / 1e3)
         elif not _SILENT.fullmatch(line):
             unknown.append(line)
-    return Ping(payload_bytes, tuple(replies), tuple(problems), transmitted, received, tuple(unknown), first_seq)
+    said = tuple(replies), tuple(problems), transmitted, received, tuple(unknown)
+    return Ping(payload_bytes, *said, first_seq, summary_s)
 
 
-def longest_gap(found: Ping) -> tuple[float, int] | None:
-    """Return the longest time in seconds from one answer to the next, by their requests, and how many are between.
+@dataclass(frozen=True)
+class AnswerGap:
+    """The longest time without an answer in a ping.
 
-    None where no two answers have a time stamp, or the requests after the last one are at least as many: that gap has
-    no end.
+    Attributes:
+        lasted_s: From the answer before it to the one after it, in seconds; as far as observed if it is open.
+        lost: Requests without an answer in it.
+        is_open: Whether the ping began or ended in it, so that both numbers are lower bounds.
     """
-    stamped = sorted((answer.seq, answer.at_utc_ns) for answer in found.answers if answer.at_utc_ns is not None)
-    gaps = [(later_ns - ns, later - seq - 1) for (seq, ns), (later, later_ns) in pairwise(stamped)]
-    if not gaps:
+
+    lasted_s: float
+    lost: int
+    is_open: bool
+
+
+def longest_gap(found: Ping, interval_s: float) -> AnswerGap | None:
+    """Return the longest time without an answer, by the order of requests; None if answers have no time stamps.
+
+    A gap that the ping began or ended in is open. It counts where it is as long as the longest that has both ends, or
+    lasts `UNREMARKABLE_S`.
+
+    Args:
+        found: The ping.
+        interval_s: Time between two requests. Open gaps are counted in requests that were sent and not answered.
+    """
+    stamped = sorted(_numbered(found))
+    if not stamped and (found.answers or not found.transmitted):
         return None
-    gap_ns, lost = max(gaps)
-    unanswered_since = sum(seq > stamped[-1][0] for seq in found.gaps)
-    return None if unanswered_since and unanswered_since >= lost else (gap_ns / 1e9, lost)
+    ended = [(later_ns - ns, later - seq - 1) for (seq, ns), (later, later_ns) in pairwise(stamped)]
+    gap_ns, lost = max(ended, default=(0, 0))
+    unanswered = _open_ends(found, [seq for seq, _ in stamped])
+    open_s = unanswered * interval_s
+    if unanswered and (unanswered >= lost or open_s >= UNREMARKABLE_S):
+        return AnswerGap(max(open_s, gap_ns / 1e9), max(unanswered, lost), is_open=True)
+    return AnswerGap(gap_ns / 1e9, lost, is_open=False) if ended else None
 
 
-def measure_gap(found: Ping | None) -> Measured:
-    """Return the columns of the longest gap between answers; `found` is None where ping's output is not at hand."""
-    gap = None if found is None else longest_gap(found)
+def _numbered(found: Ping) -> Iterator[tuple[int, int]]:
+    """Yield the number of the request and the time stamp of each answer that has one; 16 bits are unwrapped."""
+    last: int | None = None
+    for answer in found.answers:
+        if answer.at_utc_ns is not None:
+            ahead = 0 if last is None else (answer.seq - last + _LATE) % _SEQUENCES - _LATE
+            last = answer.seq if last is None else last + ahead
+            yield last, answer.at_utc_ns
+
+
+def _open_ends(found: Ping, answered: Sequence[int]) -> int:
+    """Return how many requests stayed unanswered before the first answer, or after the last, whichever is more."""
+    sent = found.transmitted or 0
+    if not answered:
+        return sent
+    return max(answered[0] - found.first_seq, found.first_seq + sent - 1 - answered[-1], 0)
+
+
+def measure_gap(found: Ping | None, interval_s: float) -> Measured:
+    """Return the columns of the longest gap between answers.
+
+    Args:
+        found: The ping; None if its output is not at hand.
+        interval_s: As `longest_gap`.
+    """
+    gap = None if found is None else longest_gap(found, interval_s)
     if gap is None:
-        return Measured.nothing(GAP_COLUMNS, "no two answers have a time stamp, or the gap did not end")
-    return Measured({"rtt_gap_s": gap[0], "rtt_gap_lost": gap[1]})
+        return Measured.nothing((*GAP_COLUMNS, *OPEN_GAP_COLUMNS), "no two answers have a time stamp")
+    ended, bounds = (tuple(column.name for column in columns) for columns in (GAP_COLUMNS, OPEN_GAP_COLUMNS))
+    known, others = (bounds, ended) if gap.is_open else (ended, bounds)
+    reason = "the ping began or ended in the gap" if gap.is_open else "the gap ended within the ping"
+    values = dict(zip(known, (gap.lasted_s, gap.lost), strict=True))
+    return Measured(values, dict.fromkeys(others, reason))
 
 
 def _reply(match: re.Match[str]) -> Reply:
@@ -245,7 +341,7 @@ def measure(pings: Ping | None) -> Measured:
     """Return the columns of what ping said; None where its output is not at hand."""
     # Without its first line ping never ran: no answer is then no measurement.
     if pings is None or pings.payload_bytes is None:
-        return Measured.nothing(COLUMNS, "ping did not run")
+        return Measured.nothing((*COLUMNS, *SENT_COLUMNS), "ping did not run")
     rtt_s = pings.rtt_s
     counts = {
         "rtt_sent": pings.transmitted,
@@ -261,4 +357,9 @@ def measure(pings: Ping | None) -> Measured:
         "rtt_max_s": max(rtt_s, default=None),
         "rtt_jitter_s": float(np.abs(np.diff(rtt_s)).mean()) if len(rtt_s) > 1 else None,
     }
-    return Measured.of(counts, "ping was cut short") | Measured.of(times, "too few replies have a time")
+    of_sent = {"rtt_median_sent_s": quantile_of_sent(rtt_s, pings.transmitted or 0, 0.5)}
+    return (
+        Measured.of(counts, "ping was cut short")
+        | Measured.of(times, "too few replies have a time")
+        | Measured.of(of_sent, "half of the requests or more stayed unanswered")
+    )

@@ -81,7 +81,7 @@ def json_lines(path: Path, parse: Callable[[Any], T], wrong: str) -> list[T]:
     Args:
         path: The log.
         parse: Makes of a line's value what it says; raises one of `JSON_ERRORS` where it is none.
-        wrong: What a wrong line does not: `does not say where a robot drove`.
+        wrong: What a wrong line does not: `does not say where the robot drove`.
 
     Raises:
         EvidenceError: As `text`; or a line is wrong.

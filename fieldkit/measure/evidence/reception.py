@@ -7,12 +7,12 @@ When a message came, a bag says by the same clock (recorder.cpp of ros_comm 1.15
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.evidence import bag, reading
 
 COLUMNS: Final = columns(

@@ -6,13 +6,13 @@ and for G less two intervals at least.
 
 import re
 from collections.abc import Sequence, Set
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.columns import Column, Figure, Kind, Measured, columns, of_fault, prefixed
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
 
@@ -29,18 +29,27 @@ _NOTE: Final = re.compile(rf"lasted_s (?P<lasted>{_NUMBER}|unknown)\ninterval_s 
 _SEEN: Final = re.compile(rf"(?P<at>{_NUMBER})(?: up(?P<pids>(?: [0-9]{{1,9}})+))?\Z")
 
 
+def _observer(kind: FaultKind) -> str:
+    """Return what the outage was seen by, which is not the traffic of other steps."""
+    return "process" if kind is FaultKind.KILL else "ping"
+
+
 def declared(kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns of a kind of fault."""
     gone = f"Longest time without an answer around the fault {kind}; empty when it did not recover."
     left = f"What of the outage by {kind} was left when its cause was over; empty when nobody knows."
     back = f"Whether the robot was back within the limit after {kind}."
-    place = list(FaultKind).index(kind)
-    return columns(
+    least = f"Lower bound of the recovery where the robot was not back when the observer of {kind} ended, else empty."
+    place, bound = list(FaultKind).index(kind), of_fault(kind, "recovery_at_least_s")
+    returned = Figure(f"{_observer(kind)} back after {kind}", Kind.FLAG, rank=70 + place)
+    recovery = Figure(f"{_observer(kind)} recovery after {kind}", Kind.MEDIAN, rank=80 + place, at_least=bound)
+    times = columns(
         90,
         (of_fault(kind, "outage_s"), "s", gone),
-        (of_fault(kind, "recovery_s"), "s", left, Figure(f"recovery from {kind}", Kind.MEDIAN, rank=80 + place)),
-        (of_fault(kind, "recovered"), "bool", back, Figure(f"back after {kind}", Kind.FLAG, rank=70 + place)),
+        (of_fault(kind, "recovery_s"), "s", left, recovery),
+        (of_fault(kind, "recovered"), "bool", back, returned),
     )
+    return (*times, *columns(110, (bound, "s", least)))
 
 
 COLUMNS: Final = tuple(column for kind in _ORDER for column in declared(kind))
@@ -73,11 +82,13 @@ class Recovery:
         recovery_s: What of it was left when the cause was over, never negative; None as `outage_s`, and where nobody
             knows how long the cause lasted.
         recovered: Whether the robot answered when the observer ended.
+        recovery_at_least_s: Lower bound of `recovery_s` where it did not, as far as it was observed.
     """
 
     outage_s: float | None
     recovery_s: float | None
     recovered: bool
+    recovery_at_least_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -108,13 +119,24 @@ def read(folder: Path, kind: FaultKind, name: str = "") -> Recovery:
     answers = _watched(path) if kind is FaultKind.KILL else _pinged(path, note)
     if not answers.at_s:
         raise EvidenceError("the robot was not there before the fault", where=path.name)
-    if answers.end_s - answers.at_s[-1] >= SILENT_S:
-        return Recovery(outage_s=None, recovery_s=None, recovered=False)
+    silent_s = answers.end_s - answers.at_s[-1]
+    if silent_s >= SILENT_S:
+        bound_s = None if note.lasted_s is None else max(0.0, silent_s - note.lasted_s)
+        return Recovery(outage_s=None, recovery_s=None, recovered=False, recovery_at_least_s=bound_s)
     outage_s = max((after - before for before, after in pairwise(answers.at_s)), default=0.0)
     if answers.survivors or (kind is not FaultKind.KILL and outage_s < _least_s(note)):
         raise EvidenceError("the fault left no mark: what it should befall was there all the time", where=path.name)
     recovery_s = None if note.lasted_s is None else max(0.0, outage_s - note.lasted_s)
     return Recovery(outage_s=outage_s, recovery_s=recovery_s, recovered=True)
+
+
+def cause_lasted_s(path: Path) -> float | None:
+    """Return how long the cause of a fault lasted, by its note; None if that is unknown.
+
+    Raises:
+        EvidenceError: The note is missing or not whole.
+    """
+    return _note(path).lasted_s
 
 
 def _least_s(note: _Note) -> float:
@@ -157,6 +179,9 @@ def measure(kind: FaultKind, found: Recovery | None) -> Measured:
         return Measured.nothing(declared(kind), "what was observed is not at hand")
     gone = {of_fault(kind, "outage_s"): found.outage_s, of_fault(kind, "recovered"): found.recovered}
     left = {of_fault(kind, "recovery_s"): found.recovery_s}
-    return Measured.of(gone, "the robot did not recover") | Measured.of(
-        left, "nobody knows how long the cause lasted, or the robot did not recover"
+    bound = {of_fault(kind, "recovery_at_least_s"): found.recovery_at_least_s}
+    return (
+        Measured.of(gone, "the robot did not recover")
+        | Measured.of(left, "the time of the cause is unknown, or the robot did not recover")
+        | Measured.of(bound, "the robot recovered, or the time of the cause is unknown")
     )

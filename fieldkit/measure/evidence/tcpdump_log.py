@@ -1,10 +1,10 @@
 """tcpdump's own account of a capture, from standard error."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role
 from fieldkit.measure.evidence import reading
 
@@ -24,6 +24,11 @@ def capture_file(role: Role) -> str:
 def log_file(role: Role) -> str:
     """Return the file of what its tcpdump said on standard error."""
     return f"{role}-capture.log"
+
+
+def log_of(capture: str) -> str:
+    """Return the log of a capture by its file, whatever name of a step both begin with."""
+    return f"{capture.removesuffix('.pcap')}-capture.log"
 
 
 @dataclass(frozen=True)

@@ -7,17 +7,18 @@ import math
 import re
 from bisect import bisect_right
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role, Vector, Whereabouts
 from fieldkit.measure.evidence import counted_csv
 
-FILE: Final = "track.csv"
+FILE: Final = laptop_files.TRACK
 
 _HEADER: Final = "utc_ns,role,east_m,north_m,up_m,east_m_s,north_m_s,up_m_s"
 _NUMBER: Final = r"(-?[0-9]{1,9}\.[0-9]{4})"

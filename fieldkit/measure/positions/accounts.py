@@ -6,20 +6,20 @@ Steps that follow robots write the former, `fieldkit positions` the latter, whic
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, Final
 
+from fieldkit.core import laptop_files
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Role, Vector
 from fieldkit.core.text import JSON_ERRORS
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions.samples import PLACED
 
-FILE: Final = "positions.json"
+FILE: Final = laptop_files.POSITIONS
 Place = tuple[float, float, float | None]
 """Metres along three axes, or degrees north and east and metres up; None where no height is told."""
 GAP_S: Final = 3.0

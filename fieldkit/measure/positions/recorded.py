@@ -79,7 +79,7 @@ def read_tlog(path: Path, account: Account) -> Samples:
     Raises:
         EvidenceError: The log cannot be read, has no such message, or the autopilot was started anew meanwhile.
     """
-    from fieldkit.measure.evidence import tlog  # noqa: PLC0415 (its columns take 2 ms to make, and few have one)
+    from fieldkit.measure.motion import tlog  # noqa: PLC0415 (its columns take 2 ms to make, and few have one)
 
     rows = tlog.positions(path, account.system, account.topic)
     if not rows:

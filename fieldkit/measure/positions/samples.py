@@ -4,6 +4,7 @@ import csv
 import math
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
@@ -12,7 +13,6 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.units import METRES_PER_UNIT
 from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.evidence import reading
@@ -162,7 +162,9 @@ def _columns(names: Sequence[str], where: str) -> _Columns:
             found[axis] = (index, factor, 1e9)
         elif name.removesuffix("_deg") in _DEGREES:
             found[name.removesuffix("_deg")] = (index, 1.0, _DEGREES[name.removesuffix("_deg")])
-    remedy = "name columns t (with its zone) or t_s, and x_m, y_m, z_m or lat, lon, alt_m; see docs/reference.md"
+    remedy = (
+        "name columns t (with its zone) or t_s, and x_m, y_m, z_m or lat, lon, alt_m; see: fieldkit docs positions"
+    )
     if len(times) != 1:
         raise EvidenceError(f"has {len(times)} columns of times", where=where, remedy=remedy)
     if {"x", "y"} <= found.keys() and not found.keys() & _DEGREES.keys():

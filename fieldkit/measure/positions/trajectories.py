@@ -1,11 +1,11 @@
 """Trajectories of robots through samples of where they were: straight between two of them, and nowhere in a gap."""
 
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.evidence.track import Apart
 

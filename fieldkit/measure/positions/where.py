@@ -43,7 +43,7 @@ def measure(
     try:
         told = given(evidence)
         if not told.robots.keys() & set(ends):
-            return track.measure(evidence.known(track.read, track.FILE), declared, ends, times_ns)
+            return track.measure(evidence.read_or_none(track.read, track.FILE), declared, ends, times_ns)
         source, destination = of_two(evidence, ends)
     except EvidenceError as error:
         return Measured.nothing(declared, error.what)
@@ -67,7 +67,7 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
     try:
         told = given(evidence)
         if not told.robots.keys() & set(ends):
-            return list(track.distances_m(evidence.known(track.read, track.FILE) or (), *ends))
+            return list(track.distances_m(evidence.read_or_none(track.read, track.FILE) or (), *ends))
         source, destination = of_two(evidence, ends)
     except EvidenceError:
         return ()
@@ -86,7 +86,7 @@ def given(evidence: AttemptEvidence) -> Accounts:
     Raises:
         EvidenceError: A file that says so is damaged.
     """
-    return evidence.once(_given)
+    return evidence.cached(_given)
 
 
 def _given(evidence: AttemptEvidence) -> Accounts:
@@ -114,7 +114,7 @@ def of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajecto
     Raises:
         EvidenceError: Nobody tells of one of them, what does cannot be read, or both are told in different frames.
     """
-    return evidence.once(_of_two, ends)
+    return evidence.cached(_of_two, ends)
 
 
 def _of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
@@ -188,6 +188,11 @@ def _read(path: Path, _mtime_ns: int, _size_bytes: int) -> Samples:
 def _ahead_ns(told: Accounts, role: Role) -> int:
     """Return how far a robot's clock was ahead of the laptop's: not at all, where nobody asked."""
     return round(told.clocks[role].offset_s * 1e9) if role in told.clocks else 0
+
+
+def ahead_ns(evidence: AttemptEvidence, role: Role) -> int:
+    """Return how far a robot's clock was ahead of the laptop's; 0 if that was not measured. Raises as `given`."""
+    return _ahead_ns(given(evidence), role)
 
 
 def clock_error_s(evidence: AttemptEvidence) -> float | None:

@@ -9,11 +9,11 @@ nothing more: how a round trip is divided between its two ways cannot be seen (P
 packet transit times", SIGMETRICS 1998).
 """
 
+from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Floats, Ints, Table
 
 MAX_SKEW: Final = 500e-6

@@ -4,7 +4,7 @@ from typing import Final
 
 from fieldkit.core.columns import OVERCOUNTED, Column, Figure, Kind, columns
 from fieldkit.measure.evidence import host, medium
-from fieldkit.measure.transfers import delay, rates
+from fieldkit.measure.transfers import delay, rates, stalls
 
 FILES: Final = columns(
     10,
@@ -14,7 +14,7 @@ FILES: Final = columns(
         "file_loss",
         "share",
         "1 - received_bytes/sent_bytes, what the application missed.",
-        Figure("file bytes lost", Kind.MEAN, rank=14),
+        Figure("file loss", Kind.MEAN, rank=14),
         OVERCOUNTED,
     ),
     ("hash_match", "bool", "Whether the received file equals the bag, byte for byte."),
@@ -85,7 +85,7 @@ LAYERS: Final = columns(
         "byte_loss",
         "share",
         "Share of payload bytes of the transfer that never reached the receiver's interface.",
-        Figure("payload bytes lost", Kind.MEAN, rank=13),
+        Figure("payload byte loss", Kind.MEAN, rank=13),
     ),
     ("tcp_sent_bytes", "B", "TCP payload bytes sent, retransmissions included. Empty for UDP."),
     ("tcp_unique_bytes", "B", "TCP payload bytes sent, each sequence number once. Empty for UDP."),
@@ -101,7 +101,7 @@ LAYERS: Final = columns(
         "tcp_byte_loss",
         "share",
         "1 - tcp_received_bytes/tcp_sent_bytes: what the radio lost and TCP repaired. Empty for UDP.",
-        Figure("TCP bytes lost and repaired", Kind.MEAN, rank=12),
+        Figure("TCP byte loss before retransmission", Kind.MEAN, rank=12),
     ),
     (
         "tcp_retransmitted_segments",
@@ -192,10 +192,11 @@ PAPER: Final = columns(
         "paper_loss",
         "share",
         "1 - paper_received/paper_packets; sees first fragments only.",
-        Figure("loss as the paper counts", Kind.COUNTED, "paper_received", "paper_packets", rank=15),
+        Figure("paper's loss (eq. 1)", Kind.COUNTED, "paper_received", "paper_packets", rank=15),
         OVERCOUNTED,
     ),
 )
+STALLS: Final = stalls.declared("transfer", "the transfer", 36)
 
 COLUMNS: Final[tuple[Column, ...]] = (
     *FILES,
@@ -205,7 +206,10 @@ COLUMNS: Final[tuple[Column, ...]] = (
     *WAY,
     *PAPER,
     *host.COLUMNS,
+    *host.SYSTEM,
     *rates.COLUMNS,
+    *STALLS,
+    *delay.SENT_COLUMNS,
 )
 
 TIMES: Final = [column for column in LAYERS if column.name in {"transfer_s", "transfer_from"}]

@@ -9,6 +9,7 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
 from fieldkit.measure.captures.ip import UDP
 from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.evidence.survivors import quantile_of_sent
 from fieldkit.measure.transfers import tcp, udp
 from fieldkit.measure.transfers.clocks import QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
 from fieldkit.measure.transfers.match import Match, match
@@ -25,7 +26,12 @@ COLUMNS: Final = columns(
             "This and the next three are empty when one_way_error_s is above a tenth of them."
         ),
     ),
-    ("one_way_median_s", "s", "Median of that delay.", Figure("one-way delay", Kind.MEDIAN, rank=31)),
+    (
+        "one_way_median_s",
+        "s",
+        "Median of that delay.",
+        Figure("one-way delay", Kind.MEDIAN, rank=31, of_sent="one_way_median_sent_s"),
+    ),
     ("one_way_mean_s", "s", "Mean of that delay."),
     ("one_way_p95_s", "s", "95th percentile of that delay."),
     ("one_way_error_s", "s", "The most that each of these can be wrong by the two clocks."),
@@ -41,7 +47,7 @@ COLUMNS: Final = columns(
         "jitter_s",
         "s",
         "Interarrival jitter of the same packets after the last one (RFC 3550, section 6.4.1).",
-        Figure("jitter", Kind.MEDIAN, rank=33),
+        Figure("last jitter value (RFC 3550)", Kind.MEDIAN, rank=33),
     ),
     (
         "clock_offset_s",
@@ -56,6 +62,17 @@ COLUMNS: Final = columns(
         "How much faster the receiver's clock goes; empty when it can be wrong by more than 100.",
     ),
     ("clock_skew_error_ppm", "ppm", "The most that clock_skew_ppm can be wrong."),
+)
+SENT_COLUMNS: Final = columns(
+    110,
+    (
+        "one_way_median_sent_s",
+        "s",
+        (
+            "Median one-way delay over all of the transfer's packets that were sent, one without a known arrival as "
+            "later than all others; empty where that is half of them or more, and where one_way_median_s is empty."
+        ),
+    ),
 )
 
 LARGEST_ERROR: Final = 0.1
@@ -96,6 +113,11 @@ def tcp_copies(crossing: tcp.TcpFrames) -> tuple[Ints, Ints]:
     return left.frame[certain], came.frame[matched.received_index[certain]]
 
 
+def tcp_sent(crossing: tcp.TcpFrames) -> int:
+    """Return how many frames with payload were sent, of which `tcp_frames` are those that arrived."""
+    return int(_ends(crossing.payload.sent).sum())
+
+
 def _ends(pieces: Pieces) -> Mask:
     """Return which pieces are the last of their frame."""
     last: Mask = np.diff(pieces.frame, append=-1) != 0
@@ -103,7 +125,7 @@ def _ends(pieces: Pieces) -> Mask:
 
 
 def measure(
-    own: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer, *, alike: bool = False
+    own: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer, *, sent: int, alike: bool = False
 ) -> Measured:
     """Return what both captures say of the transfer's delay, and of the receiver's clock against the sender's.
 
@@ -112,6 +134,7 @@ def measure(
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.
         transfer: What tells the transfer's packets.
+        sent: How many of them were sent.
         alike: Whether some of these are left out of `own`, since nothing tells them apart.
     """
     others = _others(sender, receiver, transfer)
@@ -136,7 +159,7 @@ def measure(
     if clocks is None:
         return _withheld(UNSTEADY)
     delay_s, error_s = _delays_s(own, clocks)
-    one_way = _one_way(delay_s, error_s)
+    one_way = _one_way(delay_s, error_s, sent)
     return jitter | _clock(clocks) | one_way | _variation(delay_s)
 
 
@@ -186,7 +209,7 @@ def _delays_s(own: StampPairs, clocks: Clocks) -> tuple[Floats, float]:
 
 def _withheld(reason: str) -> Measured:
     """Return that no delay can be told, and why."""
-    return Measured({"one_way_withheld": reason}) | Measured.nothing(COLUMNS, reason)
+    return Measured({"one_way_withheld": reason}) | Measured.nothing((*COLUMNS, *SENT_COLUMNS), reason)
 
 
 def jitter_s(transit_ns: Ints) -> float | None:
@@ -200,6 +223,16 @@ def jitter_s(transit_ns: Ints) -> float | None:
     # J += (|D| - J) / 16 from J = 0, written out; what is older weighs less than a float can tell.
     recent_s = np.abs(np.diff(transit_ns[-_REMEMBERED:])) / 1e9
     return float(_JITTER_GAIN * (1 - _JITTER_GAIN) ** np.arange(len(recent_s))[::-1] @ recent_s)
+
+
+def mean_jitter_s(transit_ns: Ints) -> float | None:
+    """Return the mean of `jitter_s` after each packet from the second on; arguments as of `jitter_s`."""
+    if len(transit_ns) < 2:
+        return None
+    # Each |D| counts in J after it and after all later packets: the sum of its weights is a geometric series.
+    steps_s = np.abs(np.diff(transit_ns)) / 1e9
+    weights = 1 - (1 - _JITTER_GAIN) ** np.arange(len(steps_s), 0, -1)
+    return float(weights @ steps_s) / len(steps_s)
 
 
 def _variation(delay_s: Floats) -> Measured:
@@ -223,7 +256,7 @@ def _clock(clocks: Clocks) -> Measured:
     return Measured.of(values, "it can be wrong by more than 100 ppm")
 
 
-def _one_way(delay_s: Floats, error_s: float) -> Measured:
+def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
     figures = {
         "one_way_min_s": float(delay_s.min()),
         "one_way_median_s": float(np.median(delay_s)),
@@ -233,8 +266,10 @@ def _one_way(delay_s: Floats, error_s: float) -> Measured:
     shown = {name: value if error_s <= LARGEST_ERROR * value else None for name, value in figures.items()}
     withheld = ", ".join(name.split("_")[2] for name, value in shown.items() if value is None)
     reason = f"the error is above a tenth of: {withheld}" if withheld else None
+    of_sent = None if shown["one_way_median_s"] is None else quantile_of_sent(delay_s, sent, 0.5)
     return (
         Measured({"one_way_error_s": error_s})
+        | Measured.of({"one_way_median_sent_s": of_sent}, "the median is withheld, or half of the packets were lost")
         | Measured.of(shown, "its error is above a tenth of it")
         | Measured.of({"one_way_withheld": reason}, "nothing is withheld")
     )

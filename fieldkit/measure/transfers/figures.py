@@ -10,12 +10,13 @@ from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import bag, host, medium, ping, reading
 from fieldkit.measure.positions import where
-from fieldkit.measure.transfers import delay, paper, rates, strangers, tcp, udp
-from fieldkit.measure.transfers.columns import LAYERS, OF_TCP, OF_UDP, TIMES, WAY
+from fieldkit.measure.transfers import delay, paper, rates, stalls, strangers, tcp, transfer_stalls, udp
+from fieldkit.measure.transfers.columns import LAYERS, OF_TCP, OF_UDP, STALLS, TIMES, WAY
+from fieldkit.measure.transfers.deliveries import FlowSchedule
 from fieldkit.measure.transfers.transfer import Transfer
 
 
-def measure(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
+def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -> Measured:
     """Return every figure of a transfer.
 
     What rests on missing, unreadable or damaged evidence is missing, never a guess; whether the repeat is valid
@@ -24,21 +25,32 @@ def measure(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
     Args:
         evidence: What the attempt left.
         transfer: What was sent from where to where.
+        listener: Job that received it; empty where that is not known.
     """
     whole = [evidence.whole_capture(file) for file in transfer.captures]
     sender, receiver = whole if transfer.captured else (None, None)
     contradiction = incomparable(evidence, transfer)
-    pings = evidence.known(ping.read, prefixed(transfer.name, ping.FILE))
+    pings = evidence.read_or_none(ping.read, prefixed(transfer.name, ping.FILE))
     states = (host.before(transfer.destination), host.after(transfer.destination))
     files = _files(evidence, transfer)
     return (
         files
-        | _layers(sender, receiver, transfer, files, contradiction)
-        | medium.measure(evidence.known(medium.read, prefixed(transfer.name, medium.FILE)))
+        | _layers(
+            (sender, receiver), transfer, files, contradiction, transfer_stalls.expected(evidence, transfer, listener)
+        )
+        | medium.measure(evidence.read_or_none(medium.read, prefixed(transfer.name, medium.FILE)))
         | where.measure(evidence, WAY, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
         | _paper(sender, None if contradiction else receiver, pings, transfer)
-        | host.measure(*(evidence.known(host.read, name) for name in states))
+        | host.measure(*(evidence.read_or_none(host.read, name) for name in states))
+        | _system(evidence, transfer)
     )
+
+
+def _system(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
+    """Return what is known of the operating systems of both ends."""
+    if transfer.protocol is Protocol.UDP:
+        return Measured.nothing(host.SYSTEM, "UDP has no congestion control")
+    return host.measure_system(evidence.read_or_none(host.congestion_control, host.before(transfer.source)))
 
 
 def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
@@ -46,14 +58,14 @@ def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
 
     They contradict the file, or each other.
     """
-    return evidence.once(_incomparable, transfer) if transfer.captured else None
+    return evidence.cached(_incomparable, transfer) if transfer.captured else None
 
 
 def _incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     sender, receiver = map(evidence.whole_capture, transfer.captures)
     if sender and receiver and (why := strangers.reason(sender.packets, receiver.packets, transfer)):
         return f"the captures of the transfer do not compare: {why}"
-    if evidence.known(reading.size, transfer.received_file):
+    if evidence.read_or_none(reading.size, transfer.received_file):
         for role, capture in ((transfer.source, sender), (transfer.destination, receiver)):
             if capture is not None and not len(transfer.forward(capture.packets)):
                 return (
@@ -69,14 +81,14 @@ def loss(arrived: int | None, sent: int | None) -> float | None:
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
-    sent = evidence.known(reading.size, transfer.sent_file)
-    received = evidence.known(reading.size, transfer.received_file)
-    contents = evidence.known(bag.read, transfer.sent_file)
+    sent = evidence.read_or_none(reading.size, transfer.sent_file)
+    received = evidence.read_or_none(reading.size, transfer.received_file)
+    contents = evidence.read_or_none(bag.read, transfer.sent_file)
     files: dict[str, Value | None] = {
         "sent_bytes": sent,
         "received_bytes": received,
         "file_loss": loss(received, sent),
-        "hash_match": evidence.known(reading.same, "", transfer.sent_file, transfer.received_file),
+        "hash_match": evidence.read_or_none(reading.same, "", transfer.sent_file, transfer.received_file),
     }
     messages: dict[str, Value | None] = {
         "bag_messages": contents.messages if contents else None,
@@ -86,14 +98,15 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
 
 
 def _layers(
-    sender: Capture | None,
-    receiver: Capture | None,
+    ends: tuple[Capture | None, Capture | None],
     transfer: Transfer,
     files: Measured,
     contradiction: str | None,
+    expected: FlowSchedule,
 ) -> Measured:
-    """Return what the packets of both captures say of a transfer: its losses, its delay, and how fast it was."""
-    declared = (*LAYERS, *delay.COLUMNS, *rates.COLUMNS)
+    """Return what the packets of both captures say of a transfer: losses, delay, stalls, and how fast it was."""
+    declared = (*LAYERS, *delay.COLUMNS, *delay.SENT_COLUMNS, *rates.COLUMNS, *STALLS)
+    sender, receiver = ends
     if contradiction:
         return Measured({"one_way_withheld": contradiction}) | Measured.nothing(declared, contradiction)
     if sender is None or receiver is None:
@@ -101,20 +114,25 @@ def _layers(
     try:
         if transfer.protocol is Protocol.UDP:
             crossing = udp.cross(sender.packets, receiver.packets, transfer)
-            own, counts = delay.udp_packets(crossing), _udp(udp.count(crossing))
+            packets = udp.count(crossing)
+            own, counts, sent = delay.udp_packets(crossing), _udp(packets), packets.packets_sent
             speed = rates.of_udp(crossing)
+            stalled = stalls.measure("transfer", lambda: transfer_stalls.of_udp(crossing, expected))
         else:
             frames = tcp.cross(sender.packets, receiver.packets, transfer)
             counted = tcp.count(frames)
-            own, counts = delay.tcp_frames(frames), _tcp(counted)
+            own, counts, sent = delay.tcp_frames(frames), _tcp(counted), delay.tcp_sent(frames)
             speed = rates.of_tcp(frames, receiver.packets, transfer, counted)
+            back = transfer.backward(sender.packets)
+            stalled = stalls.measure("transfer", lambda: transfer_stalls.of_tcp(frames, back, expected))
         alike = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
-        delays = delay.measure(own, sender.packets, receiver.packets, transfer, alike=alike)
+        delays = delay.measure(own, sender.packets, receiver.packets, transfer, sent=sent or 0, alike=alike)
     except EvidenceError as error:  # as for a damaged capture
         return Measured.nothing(declared, error.what)
     fast_values = speed.values(files.values.get("received_bytes"))
     if delays.values.get("one_way_withheld") == delay.UNSTEADY:
         delays |= Measured.nothing((*TIMES, *rates.COLUMNS), delay.UNSTEADY)
+        stalled = Measured.nothing(STALLS, delay.UNSTEADY)
         counts, fast_values = (
             {name: value for name, value in told.items() if name not in delays.missing}
             for told in (counts, fast_values)
@@ -123,7 +141,7 @@ def _layers(
     others = [column for column in LAYERS if column.name in foreign]
     own_figures = Measured.of(counts, "no such packet was sent, none arrived, or it is in doubt which of them did")
     fast = Measured.of(fast_values, "no two packets, or not the end, of the transfer were seen")
-    return delays | own_figures | fast | Measured.nothing(others, f"{transfer.protocol} has none")
+    return delays | own_figures | fast | stalled | Measured.nothing(others, f"{transfer.protocol} has none")
 
 
 def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:

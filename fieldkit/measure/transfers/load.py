@@ -1,11 +1,11 @@
 """Figures of an iperf3 test by two captures: the independent witness of its own."""
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from fieldkit.core.columns import OVERCOUNTED, Figure, Kind, Measured, columns
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Ints
 from fieldkit.measure.captures.ip import TCP, UDP

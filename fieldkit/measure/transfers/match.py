@@ -6,12 +6,11 @@ their content or by TCP's time stamps, else by time if they were sent far enough
 doubt.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Ints, Keys, Mask, mixed
 from fieldkit.measure.captures.ip import TCP
 from fieldkit.measure.captures.packets import NO_STAMP, NOT_KEPT, RST, Packets

@@ -4,12 +4,12 @@ A byte is told by its sequence number (RFC 9293, section 3.4). With segmentation
 segments, and each end other ones: so all frames are cut wherever one of either end starts or stops.
 """
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Ints, Table, mixed
 from fieldkit.measure.captures.ip import TCP
 from fieldkit.measure.captures.packets import SYN, Packets

@@ -7,12 +7,12 @@ Ramanathan and Moore 2001, INFOCOM, eq. 8): of packets that come at the rate of 
 however few they are.
 """
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from fieldkit.core.columns import Figure, Kind, Value, columns
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.packets import FIN, SYN, Packets
 from fieldkit.measure.transfers import tcp, udp

@@ -4,11 +4,11 @@ Each connection has a stretch of one line of bytes, from the sequence number aft
 captures and the acknowledgments say compares (RFC 9293, section 3.4).
 """
 
+from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Ints, Mask
 from fieldkit.measure.captures.packets import ACK, FIN, SYN, Packets
 

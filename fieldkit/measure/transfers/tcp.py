@@ -4,9 +4,10 @@ A byte is told by its sequence number (RFC 9293, section 3.4), so neither segmen
 see frames of many segments, nor reordering, duplicates, retransmissions or partial overlaps change what is counted.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Mask
 from fieldkit.measure.captures.packets import SYN, Packets
 from fieldkit.measure.transfers.match import NONE, Payload, match_payload, reordered
@@ -89,6 +90,11 @@ def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpFrames:
     sent = sent.where(begun)
     received = received.where(np.isin(received.sport, sent.sport))
     return TcpFrames(sent, received, match_payload(sent, received), _mss_bytes(sender, receiver, transfer.port))
+
+
+def beside(sent: Packets, received: Packets) -> TcpFrames:
+    """Return TCP frames of one direction in both captures beside each other; errors as `cross`."""
+    return TcpFrames(sent, received, match_payload(sent, received), 0)
 
 
 def count(crossing: TcpFrames) -> TcpCounts:

@@ -15,6 +15,7 @@ from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
 from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.captures.ip import UDP
 from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.evidence.survivors import quantile_of_sent
 from fieldkit.measure.transfers.clocks import Clocks
 from fieldkit.measure.transfers.datagrams import with_ports
 from fieldkit.measure.transfers.delay import LARGEST_ERROR, between, jitter_s
@@ -56,10 +57,15 @@ _TIMES: Final = columns(
             "Median delay from before a sample is handed to the middleware until the subscriber has it. This, the "
             "next three, and the two of age are empty where topic_delay_error_s is above a tenth of them, or unknown."
         ),
-        Figure("topic delay", Kind.MEDIAN, rank=73),
+        Figure("topic delay", Kind.MEDIAN, rank=73, of_sent="topic_delay_median_sent_s"),
     ),
     ("topic_delay_mean_s", "s", "Mean of that delay."),
-    ("topic_delay_p95_s", "s", "95th percentile of it.", Figure("topic delay, 95 %", Kind.MEDIAN, rank=74)),
+    (
+        "topic_delay_p95_s",
+        "s",
+        "95th percentile of it.",
+        Figure("topic delay, 95 %", Kind.MEDIAN, rank=74, of_sent="topic_delay_p95_sent_s"),
+    ),
     ("topic_delay_max_s", "s", "Largest of it."),
     ("topic_delay_error_s", "s", "The most that each of these can be wrong by the two clocks, told by the captures."),
     (
@@ -72,7 +78,7 @@ _TIMES: Final = columns(
         "topic_jitter_s",
         "s",
         "Interarrival jitter after the last sample (RFC 3550, section 6.4.1).",
-        Figure("topic jitter", Kind.MEDIAN, rank=76),
+        Figure("topic's last jitter value (RFC 3550)", Kind.MEDIAN, rank=76),
     ),
     (
         "topic_age_mean_s",
@@ -100,7 +106,7 @@ _TRAFFIC: Final = columns(
         "topic_data_bytes",
         "B",
         "Bytes of these with their frames' headers.",
-        Figure("topic bytes of data", Kind.MEAN, rank=80),
+        Figure("topic data bytes", Kind.MEAN, rank=80),
     ),
     (
         "topic_packet_loss",
@@ -116,11 +122,37 @@ _TRAFFIC: Final = columns(
         "topic_discovery_bytes",
         "B",
         "Bytes of these with their frames' headers.",
-        Figure("topic bytes of discovery", Kind.MEAN, rank=81),
+        Figure("topic discovery bytes", Kind.MEAN, rank=81),
     ),
 )
 
-COLUMNS: Final = (*_COUNTS, *_TIMES, *_TRAFFIC)
+_OF_SENT: Final = columns(
+    110,
+    (
+        "topic_delay_median_sent_s",
+        "s",
+        (
+            "Median delay over all samples that were sent, a lost one as later than all others; empty where half of "
+            "them or more were lost, and where topic_delay_error_s is above a tenth of it."
+        ),
+    ),
+    ("topic_delay_p95_sent_s", "s", "95th percentile likewise; empty where about 5 % or more were lost."),
+)
+
+_WITHHELD: Final = columns(
+    120,
+    (
+        "topic_capture_withheld",
+        "text",
+        (
+            "Why columns that depend on the captures are empty though the repeat is valid: packets were dropped "
+            "before tcpdump. Samples, losses, delay variation and jitter are of the logs alone. Empty when no "
+            "packet was."
+        ),
+    ),
+)
+
+COLUMNS: Final = (*_COUNTS, *_TIMES, *_TRAFFIC, *_OF_SENT, *_WITHHELD)
 
 
 @dataclass(frozen=True)
@@ -160,27 +192,43 @@ def measure(
     """
     traffic = _packet_loss(flow, sender, receiver) | _traffic(flow, sender)
     if sent is None or came is None:
-        return traffic | Measured.nothing((*_COUNTS, *_TIMES), "there are no whole logs of both ends")
-    # Of a sample that came more than once, the first.
-    _, first = np.unique(came.samples.sequence, return_index=True)
-    arrived = came.samples.where(np.sort(first))
+        nothing = (*_COUNTS, *_TIMES, *_OF_SENT)
+        return traffic | Measured.nothing(nothing, "there are no whole logs of both ends")
+    arrived = first_arrivals(came)
     clocks = None
     if sender is not None and receiver is not None:
         clocks = between(sender, receiver, flow.sender_address, flow.receiver_address)
     counts = _counts(sent, arrived, len(came.samples))
-    return traffic | counts | _times(arrived, clocks, flow.deadline_s)
+    return traffic | counts | _times(arrived, clocks, flow.deadline_s, len(sent.samples))
 
 
-def contradiction(sent: TopicLog, came: TopicLog) -> str | None:
-    """Return why the logs of two ends are not of one stream, None where they may be.
+def without_captures(measured: Measured, reason: str) -> dict[str, str]:
+    """Return the reason for each column of a topic that is missing because packets were dropped before tcpdump.
 
-    Everybody who sends a sample has its own number and time in it: one that arrived under a number that was sent has
-    the time of that, or it is of another stream.
+    Args:
+        measured: Columns measured without the captures.
+        reason: Why the captures are not used; empty if they are.
     """
-    _, left, arrived = np.intersect1d(sent.samples.sequence, came.samples.sequence, return_indices=True)
-    if (sent.samples.sent_ns[left] != came.samples.sent_ns[arrived]).any():
-        return "samples arrived that the publisher did not send: another stream has the same topic and domain"
-    return None
+    if not reason:
+        return {}
+    by_clocks = {column.name for column in (*_TIMES, *_OF_SENT)} - {"topic_deadline_misses"}
+    names = by_clocks | {column.name for column in _TRAFFIC}
+    return {name: reason for name in sorted(names) if name not in measured.values}
+
+
+def withheld_mark(reason: str) -> Measured:
+    """Return the column that marks a topic measured without its captures.
+
+    Args:
+        reason: Why the captures are not used; empty if they are.
+    """
+    return Measured.of({"topic_capture_withheld": reason or None}, "nothing is withheld")
+
+
+def first_arrivals(came: TopicLog) -> Stamped:
+    """Return the samples that arrived in the order of the log; of one that arrived more than once, the first."""
+    _, first = np.unique(came.samples.sequence, return_index=True)
+    return came.samples.where(np.sort(first))
 
 
 def _counts(sent: TopicLog, arrived: Stamped, came: int) -> Measured:
@@ -202,7 +250,7 @@ def _counts(sent: TopicLog, arrived: Stamped, came: int) -> Measured:
     return Measured.of(values, "the publisher found no subscription, so nothing was sent")
 
 
-def _times(arrived: Stamped, clocks: Clocks | None, deadline_s: float | None) -> Measured:
+def _times(arrived: Stamped, clocks: Clocks | None, deadline_s: float | None, sent: int) -> Measured:
     """Return what the times of samples say, each of which has arrived once, in the order of arrival."""
     transit_ns = arrived.at_ns - arrived.sent_ns
     told: dict[str, Value | None] = {"topic_jitter_s": jitter_s(transit_ns)}
@@ -212,12 +260,12 @@ def _times(arrived: Stamped, clocks: Clocks | None, deadline_s: float | None) ->
         over_s = (transit_ns - transit_ns.min()) / 1e9
         told["topic_delay_variation_p95_s"] = float(np.percentile(over_s, 95))
     if len(arrived) and clocks is not None:
-        told |= _by_clocks(arrived, clocks)
+        told |= _by_clocks(arrived, clocks, sent)
     why = "too few samples arrived, there is no deadline, or the captures do not tell the clocks well enough"
-    return Measured.of(told, why) | Measured.nothing(_TIMES, why)
+    return Measured.of(told, why) | Measured.nothing((*_TIMES, *_OF_SENT), why)
 
 
-def _by_clocks(arrived: Stamped, clocks: Clocks) -> dict[str, float]:
+def _by_clocks(arrived: Stamped, clocks: Clocks, sent: int) -> dict[str, float]:
     """Return delays and ages, as far as the clocks tell them well enough."""
     delay_s, error_s = clocks.delays_s(arrived.sent_ns, arrived.at_ns), clocks.error_s(arrived.at_ns)
     mean_s, peak_s = age_s((arrived.at_ns - arrived.at_ns[0]) / 1e9, delay_s)
@@ -228,6 +276,8 @@ def _by_clocks(arrived: Stamped, clocks: Clocks) -> dict[str, float]:
         "topic_delay_max_s": float(delay_s.max()),
         "topic_age_mean_s": mean_s,
         "topic_age_peak_s": peak_s,
+        "topic_delay_median_sent_s": quantile_of_sent(delay_s, sent, 0.5),
+        "topic_delay_p95_sent_s": quantile_of_sent(delay_s, sent, 0.95),
     }
     told = {name: value for name, value in figures.items() if value is not None and error_s <= LARGEST_ERROR * value}
     return {"topic_delay_error_s": error_s, **told}

@@ -1,8 +1,8 @@
 """A transfer under test: addresses, port and files, which tell its packets from all others."""
 
+from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.ip import TCP, UDP

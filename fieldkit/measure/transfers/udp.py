@@ -1,8 +1,9 @@
 """Loss of a UDP transfer layer by layer: IP packets (fragments), datagrams, payload bytes."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.measure.captures.arrays import Ints, Mask
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
 from fieldkit.measure.transfers.datagrams import NO_DATAGRAM, datagrams

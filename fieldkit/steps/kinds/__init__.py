@@ -1,12 +1,12 @@
 """The kinds of step that a procedure can name: fieldkit's own, and those of entry points."""
 
 from collections.abc import Iterator
+from importlib.metadata import EntryPoint
 from types import MappingProxyType
 from typing import Any, Final
 
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.plugins import EntryPoint
 
 _OWN: Final = MappingProxyType(
     {

@@ -8,16 +8,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Field, Number
+from fieldkit.core import laptop_files
 from fieldkit.core.columns import MISSING, Column, Figure, Kind, Measured, Value
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.model import Protocol
 from fieldkit.core.prompts import UNKNOWN, Question
 from fieldkit.measure.evidence import reading
-from fieldkit.steps.base import Step, StepName, View
+from fieldkit.steps.base import Step, StepName
 from fieldkit.steps.scene import Announce, Planned, Scene
+from fieldkit.steps.view import View
 
 _MOST_LETTERS: Final = 31
 
@@ -34,19 +39,21 @@ _Word = Annotated[str, AfterValidator(_can_be_chosen)]
 
 
 class AskStep(Step):
-    """A question to the operator, whose answer is a column.
+    """Asks the operator for a number or for one of several words, which becomes a column.
 
-    A number where there are no `choices`, else one of them. Who does not know answers `-`, and the column is empty.
+    The answer `-` means unknown: the column is then empty, as it is where no operator is asked (`--yes`) and there is
+    no `usual` answer. Leaves `answer-COLUMN.txt`.
 
     Attributes:
-        column: The column that keeps the answer.
-        question: What is asked, without a question mark.
-        unit: Of the number.
-        choices: What the answer is one of.
-        least: Smallest number that is possible.
-        most: Largest number that is possible.
-        usual: What Enter alone answers, and what stands there where nobody is asked.
-        each: Whether it is asked in each repeat, or once for all of a trial.
+        column: Name of the column.
+        question: The question, without a question mark.
+        unit: Unit of the number; the operator need not type it.
+        choices: Possible words, for an answer that is not a number: 2 to 20 of up to 31 characters. The operator
+            types a word or its position in the list.
+        least: Smallest possible number.
+        most: Largest possible number.
+        usual: Default answer: for Enter alone, and where no operator is asked.
+        each: `trial`: asked once, before the first repeat that contains the step; `repeat`: asked in each.
     """
 
     column: StepName
@@ -78,12 +85,12 @@ class AskStep(Step):
         bounds = (-math.inf if self.least is None else self.least, math.inf if self.most is None else self.most)
         return Question(self.question, self.unit or "", self.choices or (), bounds, self.usual or "")
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:  # noqa: ARG002 (nothing runs)
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         return iter(())
 
-    def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (the same for every scene)
-        """See `Step.beside`."""
+    @override
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         yield f"the operator is asked: {self.question}? {self._asked.how}"
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
@@ -106,24 +113,30 @@ class AskStep(Step):
                 return _read(kept, self._asked)
         return None
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset()
+    cross_checks = (
+        CrossCheck(
+            "answer", ("*",), "`answer-COLUMN.txt`", (), "the operator alone knows it", CheckOutcome.UNCHECKED
+        ),
+    )
 
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
         return (f"an answer {self.column}",)
 
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
+        return (self._file,)
+
+    @override
+    def laptop_files(self) -> tuple[str, ...]:
         return (self._file,)
 
     @property
     def _file(self) -> str:
-        return self.own_name(f"answer-{self.column}.txt")
+        return self.own_name(laptop_files.answer(self.column))
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`."""
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
         unit = "text" if self.choices else self.unit or "number"
         meaning = f"What the operator answered to: {self.question}? Empty where nobody knew."
         label = self.column.replace("_", " ")
@@ -133,31 +146,31 @@ class AskStep(Step):
         bounds = (max(low, -sys.float_info.max), min(high, sys.float_info.max))
         return (Column(self.column, unit, meaning, bounds=bounds, figure=Figure(label, Kind.MEDIAN)),)
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`."""
-        if view.evidence.known(_read, self._file, self._asked) is None:
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        if view.evidence.read_or_none(_read, self._file, self._asked) is None:
             yield f"{self._file} does not say what the operator answered"
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
-        answer = view.evidence.known(_read, self._file, self._asked)
+        answer = view.evidence.read_or_none(_read, self._file, self._asked)
         known = answer if answer != UNKNOWN else None
         value: Value | None = known if known is None or self.choices else float(known)
         return Measured.of({self.column: value}, "the operator did not know")
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         if self.column in values:
             value = values[self.column]
             shown = value if isinstance(value, str) else f"{value:g}{f' {self.unit}' if self.unit else ''}"
             yield f"{self.column} {shown}"
 
+    @override
     def asks(self) -> bool:
-        """See `Step.asks`."""
         return True
 
-    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (nobody knows how long a person takes)
-        """See `Step.expected_s`."""
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
         return 0.0
 
 

@@ -6,12 +6,14 @@ from functools import partial
 from typing import Annotated, Final
 
 import numpy as np
+from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Field, Int
 from fieldkit.core.columns import Measured, columns
+from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Protocol, Role, Verdict, in_order
 from fieldkit.core.threads import together
@@ -23,9 +25,11 @@ from fieldkit.measure.evidence.tcpdump_log import capture_file, log_file
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Nest, StepEntry, View
+from fieldkit.steps.base import StepEntry
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Need, Planned, Said, Scene
 from fieldkit.steps.variants import Tool
+from fieldkit.steps.view import View
 
 # Immediate mode with the default snap length dropped 177 of 215 packets in a burst; with these, none (field notes).
 SNAP_BYTES: Final = 128
@@ -34,7 +38,7 @@ BUFFER_KIB: Final = 4096
 LIMIT_S: Final = 900.0
 
 # Each frame is captured with a header.
-_FRAME_BYTES: Final = SNAP_BYTES + 16
+_RECORD_BYTES: Final = 16
 
 # Without immediate mode the kernel hands a packet over within a second: of 215, none 0.5 s later, all 1.0 s later.
 RING_S: Final = 2
@@ -50,15 +54,17 @@ STAMP_NS: Final = 1_000
 
 
 class CaptureStep(Nest):
-    """tcpdump on each robot, up before the steps in `during` begin and drained after they end.
+    """Runs tcpdump on each robot, from before the steps in `during` begin until they have ended.
 
-    The filter takes what the steps inside send: their ports, and every later fragment between their ends, as `port`
-    alone sees first fragments only. It takes ICMP too, of a ping inside: a UDP transfer has no answer, and only
-    packets in both directions tell the offset between two clocks.
+    The filter takes the ports of the steps inside, ICMP, and every later IP fragment between their ends (a filter by
+    port matches first fragments only). Losses and delays of a transfer need a capture on both of its ends around it;
+    without, these columns are empty. With a `ping` inside, after the transfer, the captures give the offset between
+    the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP transfer has no answer, and the
+    offset needs packets in both directions. Leaves `ROLE.pcap` and `ROLE-capture.log`.
 
     Attributes:
-        robots: Who captures.
-        port: A port to capture beside those of the steps inside.
+        robots: Roles that capture.
+        port: A port to capture in addition to those of the steps inside.
         during: Steps to capture.
     """
 
@@ -68,6 +74,17 @@ class CaptureStep(Nest):
         ("sender_capture_dropped", "count", "Packets that the sender's kernel dropped before tcpdump."),
         ("receiver_captured", "count", "Packets in the receiver's capture."),
         ("receiver_capture_dropped", "count", "Packets that the receiver's kernel dropped before tcpdump."),
+    )
+
+    cross_checks = (
+        CrossCheck(
+            "packets captured and dropped",
+            ("*_captured", "*_capture_dropped"),
+            "`ROLE.pcap`, `ROLE-capture.log`",
+            ("each other", "each robot's clock before and after", "the order of times in the file"),
+            "0.1 s backwards between two packets, because two processors take them in; packets dropped before "
+            "tcpdump where only topics and pings run inside, which withhold what depends on them",
+        ),
     )
 
     robots: Annotated[tuple[Role, ...], Field(min_length=1)] = (Role.SENDER, Role.RECEIVER)
@@ -80,8 +97,8 @@ class CaptureStep(Nest):
             raise schema.complaint("a robot is named twice", "robots")
         return self
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         for role in self.robots:
             yield self._planned(scene, role)
         yield from self.inside(scene)
@@ -89,7 +106,7 @@ class CaptureStep(Nest):
     def _planned(self, scene: Scene, role: Role) -> Planned:
         profile = scene.robot(role).profile
         immediate = ("--immediate-mode",) if scene.tools(role).immediate_mode else ()
-        options = ("-n", "-U", *immediate, "-s", str(SNAP_BYTES), "-B", str(BUFFER_KIB))
+        options = ("-n", "-U", *immediate, "-s", str(self._snap_bytes), "-B", str(self._buffer_kib))
         job = Job(
             folder=scene.folder,
             name=self.own_name("capture"),
@@ -105,6 +122,19 @@ class CaptureStep(Nest):
         )
         return Planned(role, job, program=profile.tools.capture, tool=Tool.CAPTURE, ends=BY_FIELDKIT)
 
+    @property
+    def _snap_bytes(self) -> int:
+        return max(SNAP_BYTES, self.kept_bytes_inside())
+
+    @property
+    def _buffer_kib(self) -> int:
+        return max(BUFFER_KIB, *(step.capture_buffer_kib for step in self.leaves_inside()))
+
+    @property
+    def _needs_all(self) -> bool:
+        """Whether a packet that was dropped before tcpdump makes a figure of a step inside wrong."""
+        return any(step.needs_complete_capture for step in self.leaves_inside())
+
     def _filter(self, scene: Scene) -> str:
         """Return the capture filter (pcap-filter(7))."""
         flows = list(self.flows_inside(scene)) or [Flow(Role.SENDER, Role.RECEIVER)]
@@ -117,8 +147,9 @@ class CaptureStep(Nest):
         among = hosts[0] if len(hosts) == 1 else f"({' or '.join(f'({pair})' for pair in hosts)})"
         return f"{among} and ({kinds})"
 
+    @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """See `Step.needs`: the right to capture."""
+        """The right to capture."""
         for role in self.robots:
             profile = scene.robot(role).profile
             names = profile.tools
@@ -128,14 +159,14 @@ class CaptureStep(Nest):
             argv = (*prefix, names.capture, "-L", "-i", profile.radio.interface)
             yield Need(role, "right to capture", argv, partial(_judged, profile), of=names.capture)
 
+    @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
-        """See `Step.bytes_left`."""
         if role not in self.robots:
             return 0.0
-        return _FRAME_BYTES * sum(flow.frames for flow in self.flows_inside(scene))
+        return (self._snap_bytes + _RECORD_BYTES) * sum(flow.frames for flow in self.flows_inside(scene))
 
+    @override
     def captures(self) -> Mapping[Role, str]:
-        """See `Nest.captures`."""
         return {role: self._file(role) for role in self.robots}
 
     def _file(self, role: Role) -> str:
@@ -144,8 +175,8 @@ class CaptureStep(Nest):
     def _log(self, role: Role) -> str:
         return self.own_name(log_file(role))
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
         captures = [self._planned(scene, role) for role in self.robots]
         first, *others = (entry.step for entry in self.during)
         prepared: list[Callable[[Announce], None]] = []
@@ -185,26 +216,25 @@ class CaptureStep(Nest):
 
         return together(stop, captures)
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset(self.robots) | self.roles_inside()
-
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
         return tuple(f"a capture on {role}" for role in self.robots)
 
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
         return tuple(name for role in self.robots for name in (self._file(role), self._log(role)))
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: whole files that hold what tcpdump counted, nothing dropped."""
+    def check(self, view: View) -> Iterator[str]:
+        """See `Step.check`: whole files that hold what tcpdump counted, nothing dropped.
+
+        Packets dropped before tcpdump are no problem if each step inside withholds what depends on them.
+        """
         for role in self.robots:
-            for problem in _problems(role, self._file(role), self._log(role), view):
+            for problem in _problems(role, self._file(role), self._log(role), view, needs_all=self._needs_all):
                 yield f"{role} capture: {problem}"
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
         found = Measured()
         for role in (Role.SENDER, Role.RECEIVER):
             if role not in self.robots:
@@ -212,7 +242,7 @@ class CaptureStep(Nest):
                 found |= Measured.nothing(mine, f"the {role} does not capture")
                 continue
             capture = view.evidence.whole_capture(self._file(role))
-            log = view.evidence.known(tcpdump_log.read, self._log(role))
+            log = view.evidence.read_or_none(tcpdump_log.read, self._log(role))
             values = {
                 f"{role}_captured": capture.frames if capture else None,
                 f"{role}_capture_dropped": log.dropped_by_kernel if log else None,
@@ -220,12 +250,12 @@ class CaptureStep(Nest):
             found |= Measured.of(values, "its capture is not whole")
         return found
 
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return 0.2 + self.inside_s(protocol)
 
 
-def _problems(role: Role, file: str, log_file: str, view: View) -> Iterator[str]:
+def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bool) -> Iterator[str]:
     try:
         log = view.evidence.read(tcpdump_log.read, log_file)
         read = view.evidence.read(pcap.read, file)
@@ -237,7 +267,7 @@ def _problems(role: Role, file: str, log_file: str, view: View) -> Iterator[str]
     if log.captured is None:
         yield "tcpdump ended without its counters"
         return
-    if log.dropped_by_kernel or log.dropped_by_interface:
+    if needs_all and (log.dropped_by_kernel or log.dropped_by_interface):
         yield f"dropped {log.dropped_by_kernel} packets, its interface {log.dropped_by_interface}"
     # More may have matched than were written: see `CaptureLog.received_by_filter`.
     if log.received_by_filter is not None and log.received_by_filter < log.captured:
@@ -258,7 +288,7 @@ def _problems_of_time(role: Role, read: Capture, view: View) -> Iterator[str]:
     back_s = float(-np.diff(times_ns).min(initial=0)) / 1e9
     if back_s > BACK_S:
         yield f"a packet is {back_s:.3f} s earlier than the one before it: the clock was set back"
-    before, after = (view.evidence.known(host.state, file(role)) for file in (host.before, host.after))
+    before, after = (view.evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
     if before and before.clock and times_ns.min() < before.clock.first_ns - STAMP_NS:
         early_s = (before.clock.first_ns - int(times_ns.min())) / 1e9
         yield f"holds a packet of {early_s:.3f} s before the attempt began, by the robot's clock"

@@ -7,19 +7,30 @@ from dataclasses import replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field
 from fieldkit.core import model
 from fieldkit.core.columns import Column, Measured, Value, of_fault
+from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, Role
+from fieldkit.core.threads import together
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import recovery
+from fieldkit.measure.offsets import Offset, offset
+from fieldkit.measure.transfers import fault_times, recoveries
+from fieldkit.measure.transfers.fault_times import FaultTimes
 from fieldkit.remote import jobs
-from fieldkit.steps.base import Nest, StepEntry, View
+from fieldkit.steps import across, clocks
+from fieldkit.steps.base import StepEntry
 from fieldkit.steps.kinds.observer import HEALED_S, Observer, observed_from
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Planned, Scene
+from fieldkit.steps.view import View
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -27,25 +38,50 @@ if TYPE_CHECKING:
 # How long an operator may take for what a fault asks of him.
 PATIENCE_S: Final = 600.0
 
+_CLOCK_S: Final = 5.0
+"""How long a robot may take to tell the time."""
+
 _LASTING: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
 
 
 class FaultStep(Nest):
-    """A fault while other steps run, seen by pings from the other robot; a process that is killed, by a watch of it.
+    """Causes a fault of a robot while the steps in `during` run; their losses are a result, not an error.
 
-    Steps inside may fail once the fault has begun: they are what is tested.
+    A backend that can cause the fault does (on a lab's robots it is real). In the field the operator is asked to
+    cause it; with `--yes` no operator is asked, and the attempts are void.
+
+    - `link-down`: the radio interface is down for `for`, then up again.
+    - `out-of-range`: no other robot receives the robot for `for`; without the relay, no robot receives another.
+    - `reboot`: every process ends at the same moment, data in memory is lost, and the robot boots.
+    - `kill`: every process named `process` ends at the same moment.
+
+    An observer records when the robot answers, from before the fault until it has answered for a second again: a ping
+    every 100 ms from the other end of the pair (200 ms where old iputils allows no less), or for `kill` a poll of the
+    robot's processes. Leaves `fault-KIND-ping.txt` or `fault-kill-watch.txt`, `fault-KIND.txt` (duration of the cause
+    and its interval) and `fault-KIND-times.txt` (when, see [recovery](method-delay.md#recovery)).
 
     Attributes:
-        robot: Whom it befalls.
-        kind: What.
-        lasts: How long (`for`), for `link-down` and `out-of-range`; the others last as long as they do.
-        process: Name of the process, for `kill`.
-        after: How long the steps inside run before it.
-        limit: How long it may take to heal, from when the cause is over.
-        during: The steps inside.
+        robot: Role of the robot with the fault.
+        kind: `link-down`, `out-of-range`, `reboot` or `kill`.
+        lasts: Duration; required by `link-down` and `out-of-range`, not allowed for the others.
+        process: Name of the process, as `ps -e -o comm` shows it, up to 15 letters; required by `kill`, not allowed
+            for the others.
+        after: How long the steps inside run before the fault.
+        limit: Maximum time until the robot answers again after the cause is over.
+        during: Steps during which the fault occurs.
     """
 
     columns = recovery.COLUMNS
+    cross_checks = (
+        CrossCheck(
+            "outage and recovery",
+            ("*_outage_s", "*_recovery_s", "*_recovery_at_least_s", "*_recovered"),
+            "`fault-KIND-ping.txt`, `fault-KIND-watch.txt`",
+            ("`fault-KIND.txt`: how long the cause lasted", "how the observer's job ended"),
+            "two intervals of the observer",
+        ),
+        *recoveries.CROSS_CHECKS,
+    )
     disturbs: ClassVar[bool] = True
 
     robot: Role
@@ -74,18 +110,18 @@ class FaultStep(Nest):
         """The fault that the testbed is asked for."""
         return model.Fault(self.kind, self.robot, self.lasts or 0.0, self.process or "")
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         yield self._watch(scene)
         yield from self.inside(scene)
         yield self._observer(scene).heals("SECONDS", self.limit)
 
-    def beside(self, scene: Scene) -> Iterator[str]:
-        """See `Step.beside`."""
+    @override
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         lasts = f" for {self.lasts:g} s" if self.lasts else ""
         what = f" of the process {self.process}" if self.process else ""
         yield f"{self.kind}{what} of {scene.robot(self.robot).name}{lasts}, after {self.after:g} s"
-        yield from super().beside(scene)
+        yield from super().dry_run_notes(scene)
 
     def _observer(self, scene: Scene) -> Observer:
         return Observer(scene, self.cause, self.prefix)
@@ -93,21 +129,25 @@ class FaultStep(Nest):
     def _watch(self, scene: Scene) -> Planned:
         return self._observer(scene).watch(self.after + (self.lasts or 0.0) + PATIENCE_S + self.limit)
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`; the testbed acts in this thread, where a person can be asked."""
+        """The testbed acts in this thread, where a person can be asked."""
         from concurrent.futures import ThreadPoolExecutor, wait  # noqa: PLC0415 (with logging, 5 ms)
 
         watch, observer = self._watch(scene), self._observer(scene)
         shell = testbed.shells[observer.role]
         announce(f"watch {scene.robot(self.robot).name}", None)
         jobs.start(shell, watch.job)
+        ahead = {} if scene.here is None else self._clocks(testbed)
         inner = replace(scene, halt=scene.halt.inside())
         pool = ThreadPoolExecutor(max_workers=1)
         steps = pool.submit(self._steps, inner, testbed, announce)
         try:
             self._lead_in(steps)
             announce(f"{self.kind} of {scene.robot(self.robot).name}", self.lasts)
+            asked_ns = time.time_ns()
             lasted_s = testbed.inject(self.cause)
+            self._note_times(scene, asked_ns, lasted_s, ahead)
             announce("recovery", None)
             heals = observer.heals("unknown" if lasted_s is None else f"{lasted_s:.3f}", self.limit)
             jobs.run(shell, heals.job)  # whether it healed is for the measures to say
@@ -122,6 +162,33 @@ class FaultStep(Nest):
         finally:
             inner.halt.call()
             pool.shutdown(wait=False)  # after Ctrl-C: whoever catches it ends what the steps wait for
+
+    def _clocks(self, testbed: Testbed) -> dict[Role, Offset]:
+        """Return how far the clocks of robots are ahead; a robot that does not tell has no recoveries of flows."""
+
+        def ask(role: Role) -> Offset | None:
+            with suppress(LinkError):
+                if exchanges := clocks.exchanges(testbed.shells[role], _CLOCK_S):
+                    return offset(exchanges)
+            return None
+
+        roles = list(testbed.shells)
+        return {role: ahead for role, ahead in zip(roles, together(ask, roles), strict=True) if ahead is not None}
+
+    def _note_times(self, scene: Scene, asked_ns: int, lasted_s: float | None, ahead: Mapping[Role, Offset]) -> None:
+        """Write down when the fault was, by the laptop's clock, now that its cause is over."""
+        if scene.here is None:
+            return
+        now_ns = time.time_ns()
+        # What lasts begins when the operator has answered; a reboot and a kill take as long as they are asked for.
+        began_ns = now_ns - round(1e9 * lasted_s) if lasted_s else asked_ns
+        times = FaultTimes(began_ns, None if lasted_s is None else now_ns, ahead)
+        path = scene.here / self.own_name(fault_times.file(self.kind))
+        path.write_text(fault_times.text(times), encoding="ascii")
+
+    def times(self, evidence: AttemptEvidence) -> FaultTimes | None:
+        """See `CausesFault.times`."""
+        return evidence.read_or_none(fault_times.read, self.own_name(fault_times.file(self.kind)))
 
     def _steps(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         for entry in self.during:
@@ -146,49 +213,52 @@ class FaultStep(Nest):
                 raise
             self.end_inside(scene, testbed)
 
+    @override
     def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
         return frozenset({self.robot, observed_from(self.cause)}) | self.roles_inside()
 
+    @override
     def asks(self) -> bool:
-        """See `Step.asks`."""
         return True
 
+    @override
     def restarts(self) -> frozenset[Role]:
-        """See `Step.restarts`."""
         return frozenset({self.robot}) if self.kind is FaultKind.REBOOT else frozenset()
 
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
         return (f"a fault {self.kind}",)
 
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
-        of_kind = (recovery.note_file(self.kind), recovery.observed_file(self.kind), recovery.log_file(self.kind))
-        return tuple(map(self.own_name, of_kind))
+        names = (recovery.note_file, recovery.observed_file, recovery.log_file, fault_times.file)
+        return tuple(self.own_name(name(self.kind)) for name in names)
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: the observer's files are whole, and the fault left a mark in them."""
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """The observer's files are whole, and the fault left a mark in them."""
         try:
             view.evidence.read(recovery.read, "", self.kind, self.prefix)
         except EvidenceError as error:
             yield f"{PurePath(error.where).name}: {error.what}"
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`; columns of other kinds of fault are for their steps to fill."""
-        return recovery.declared(self.kind)
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        """Columns of other kinds of fault are for their steps to fill."""
+        return (*recovery.declared(self.kind), *across.declared(self))
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
-        return recovery.measure(self.kind, view.evidence.known(recovery.read, "", self.kind, self.prefix))
+        observed = view.evidence.read_or_none(recovery.read, "", self.kind, self.prefix)
+        return recovery.measure(self.kind, observed) | across.measure(self, view)
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         outage_s, recovered = (values.get(of_fault(self.kind, what)) for what in ("outage_s", "recovered"))
         if recovered is not None:
             gone = f"gone for {outage_s:.1f} s" if isinstance(outage_s, float) else "did not come back"
             yield f"{self.kind}: {gone}"
 
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return max(self.after + (self.lasts or 0.0) + HEALED_S, self.inside_s(protocol)) + 0.3

@@ -1,27 +1,36 @@
 """Fly a drone over MAVLink while other steps run, within the limits of its profile; it comes down at the end."""
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Annotated, Final
+
+from typing_extensions import override
 
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
-from fieldkit.core.text import JSON_ERRORS, harmless
+from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.model import Control, OnAbort, Protocol, Role
 from fieldkit.core.units import format_duration
-from fieldkit.measure.evidence import fly_log
-from fieldkit.remote import agent
-from fieldkit.steps import piloting, streams
-from fieldkit.steps.base import Nest, Step, StepEntry, View
+from fieldkit.measure.evidence import numbered_lines
+from fieldkit.measure.motion import fly_checks, fly_log, motion_sources
+from fieldkit.remote.shell import Shell
+from fieldkit.steps import piloting
+from fieldkit.steps.arming_need import arming_need
+from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.flight_alarm import alarmed
+from fieldkit.steps.flight_rescue import FlightRescue
+from fieldkit.steps.kinds import follow
+from fieldkit.steps.kinds.mavlink import MavlinkStep
 from fieldkit.steps.kinds.move import PathLeg
 from fieldkit.steps.lease import orders_file, run_inside
-from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Said, Scene
+from fieldkit.steps.link_need import link_need
+from fieldkit.steps.nest import Nest
+from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
+from fieldkit.steps.view import View
 
 _Way = Annotated[Length, Field(gt=0)] | None
 
@@ -32,14 +41,18 @@ _SLACK_S: Final = 30.0
 _SLOWEST_M_S: Final = 0.3
 """PX4's land speed is 0.7 m/s (MPC_LAND_SPEED), and less near the ground (MPC_LAND_CRWL)."""
 _LIMIT_S: Final = 3600.0
+_AT_REST_S: Final = 3.0
+"""About how long the log has lines of a drone that has not risen yet or has landed."""
+_LOG_BYTES_PER_S: Final = 2200.0
+"""Ten lines a second (`agent/flight_log.py`), each of about 200 bytes."""
 
 
 class FlyLeg(PathLeg):
     """A straight piece of a way in the air; along, across and up together are a slant.
 
     Attributes:
-        up: So far up.
-        down: So far down.
+        up: Distance up; the keys of one entry together are one diagonal segment.
+        down: Distance down, but not to the ground.
     """
 
     up: _Way = None
@@ -61,18 +74,32 @@ class FlyLeg(PathLeg):
 
 
 class FlyStep(Nest):
-    """A drone rises, flies its way while other steps run, and comes down.
+    """Lets a drone take off, fly its path while the steps in `during` run, and land.
+
+    See [MAVLink](mavlink.md#fly-in-a-procedure). Forward is where its nose points before take-off: place it with its
+    nose away from the robot at the other end of its link. Real drones need `--allow-motion`. A flight beyond `limits`
+    of the profile is refused, and so is a robot whose profile has no `mavlink`. Before the trial and before each
+    take-off its autopilot, PX4 or ArduCopter, must report [that it can be
+    armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight, but not a
+    flight inside them. Adds columns of the flight (`fly_height_median_m` and others,
+    [MAVLink](mavlink.md#what-a-flight-leaves)). Leaves `fly.jsonl`, `fly.log` and `fly.orders`.
 
     Attributes:
-        robot: Which.
-        height: To which height it rises first, above where it stands.
-        path: Its way then, piece by piece, as its nose points before it rises; that is away. At its end it waits.
-        speed: How fast it flies it.
-        climb: How fast it rises.
-        then: Where it comes down: `return` to where it rose, or `land` where it is.
-        lease: For how long it goes on without the laptop.
-        during: The steps inside.
+        robot: Role that flies.
+        height: Height above the take-off point to which it climbs first; together with all segments upwards at most
+            `limits.max_height_m`.
+        path: Its path then, a list of straight segments; forward is where its nose points before take-off. Without a
+            path it hovers; at the end of the path it waits. Every corner must be within `limits.fence_m` of the
+            take-off point.
+        speed: Speed, at most `limits.max_speed_m_s`.
+        climb: Rate of climb, at most `limits.max_speed_m_s`.
+        then: Where it lands: `return` to the take-off point, or `land` where it is.
+        lease: How long it continues without contact to the laptop, 3 s to 10 min; then it does what `on_abort` says,
+            or lands.
+        during: Steps that run meanwhile.
     """
+
+    cross_checks = motion_sources.OF_FLIGHT
 
     robot: Role
     height: Annotated[Length, Field(gt=0)]
@@ -117,6 +144,7 @@ class FlyStep(Nest):
 
     def _plan(self, scene: Scene) -> FlightPlan:
         limits, mavlink = scene.robot(self.robot).profile.limits, scene.robot(self.robot).profile.mavlink
+        origin = scene.origins.get(self.robot)
         return FlightPlan(
             connection=piloting.connection(scene.robot(self.robot)),
             orders=orders_file(self.own_name("fly")),
@@ -128,8 +156,11 @@ class FlyStep(Nest):
             speed_m_s=self.speed,
             climb_m_s=self.climb,
             ceiling_m=limits.max_height_m or 0.0,
+            fence_m=limits.fence_m or 0.0,
             least_charge=mavlink.least_charge if mavlink else 0.0,
+            origin=None if origin is None else asdict(origin),
             log=self._log,
+            liveness=piloting.liveness_file(self.own_name("guard")),
         )
 
     @property
@@ -140,38 +171,48 @@ class FlyStep(Nest):
         limit_s = _LIMIT_S + self.expected_s(scene.protocol)
         return piloting.planned(scene, self.robot, self.own_name("fly"), self._plan(scene), limit_s)
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @property
+    def _lease_s(self) -> float:
+        """The lease of the guard, which must not end before the pilot's."""
+        return max(self.lease, piloting.LEASE_S)
+
+    def _guard(self, scene: Scene) -> Planned:
+        return piloting.guard(scene, self.robot, self.own_name("guard"), lease_s=self._lease_s, flown=True)
+
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         if scene.robot(self.robot).profile.mavlink is not None:  # it is refused then
+            yield self._guard(scene)
             yield self._pilot(scene)
         yield from self.inside(scene)
 
-    def beside(self, scene: Scene) -> Iterator[str]:
-        """See `Step.beside`."""
+    @override
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         way_m = sum(math.hypot(*leg.metres) for leg in self.path)
         name, then = scene.robot(self.robot).name, {"return": "comes back", "land": "lands there"}[self.then]
         way = f"rises to {self.height:g} m, flies {way_m:g} m at {self.speed:g} m/s, and {then}"
-        yield f"{name} {way}; cut short, by Ctrl-C twice for example, it {self._given_up(scene)}"
-        yield from super().beside(scene)
+        yield f"{name} {way}; cut short, by Ctrl-C for example, it {self._given_up(scene)}"
+        yield from super().dry_run_notes(scene)
 
     def _given_up(self, scene: Scene) -> str:
         return {"return": "returns by itself", "land": "lands"}[piloting.abort_of(scene, self.robot)]
 
-    def cut_short(self, scene: Scene) -> Iterator[str]:
-        """See `Step.cut_short`."""
+    @override
+    def abort_notes(self, scene: Scene) -> Iterator[str]:
         takes = format_duration(self._comes_down_s + _SLACK_S)
         when = f"if it is in the air: for up to about {takes}, also when fieldkit has ended"
         yield f"{scene.robot(self.robot).name} {self._given_up(scene)}, {when}"
-        yield from super().cut_short(scene)
+        yield from super().abort_notes(scene)
 
+    @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """See `Step.refusals`: it flies within the limits of its profile, or not at all."""
+        """It flies within the limits of its profile, or not at all."""
         profile, name = scene.robot(self.robot).profile, scene.robot(self.robot).profile.name
         limits = profile.limits
         if profile.mavlink is None:
             yield Refusal(self.robot, "its profile has no mavlink: nothing flies it", "a drone in this role")
         elif not scene.robot(self.robot).flies:
-            remedy = "--allow-motion, where its way is free and somebody can take it over; see docs/mavlink.md"
+            remedy = "--allow-motion, where its way is free and somebody can take it over; see: fieldkit docs mavlink"
             yield Refusal(self.robot, "it is real, and fieldkit is to fly it", remedy)
         for what, asked, most, key in (
             ("high", self._highest_m, limits.max_height_m, "max_height_m"),
@@ -190,23 +231,52 @@ class FlyStep(Nest):
             yield Refusal(self.robot, why, remedy)
         yield from super().refusals(scene)
 
+    @override
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        """Its log has lines from before the drone rises until its motors have stopped."""
+        lasts_s = self.expected_s(scene.protocol) + _AT_REST_S
+        return _LOG_BYTES_PER_S * lasts_s if role == self.robot else 0.0
+
+    @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """See `Step.needs`: an autopilot that may be armed for this flight."""
+        """An autopilot that may be armed for this flight."""
         robot = scene.robot(self.robot)
         if robot.profile.mavlink is not None and robot.profile.limits.max_height_m is not None:  # refused otherwise
             plan = self._plan(scene)
-            told = streams.compact({"connection": plan.connection, "needs": asdict(plan.needs)})
-            argv = streams.python(robot, agent.path_from_home(), "arming", told)
-            yield Need(self.robot, "autopilot", argv, _judged, of=robot.profile.tools.python, agent=True)
+            yield link_need(robot, self.robot, plan.connection, ("pilot", "guard"))
+            yield arming_need(robot, self.robot, plan)
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
-        name, one = scene.robot(self.robot).name, self._pilot(scene)
-        body_s, ends_s = self.inside_s(scene.protocol), self._comes_down_s + _SLACK_S
-        with piloting.leashed(
-            scene, testbed.shells[self.robot], one, lease_s=self.lease, body_s=body_s, ends_s=_SLACK_S
-        ) as leash:
-            leash.until("standing", STANDS_S)
+        shell, guard = testbed.shells[self.robot], self._guard(scene)
+        flight_s, body_s = self.expected_s(scene.protocol), self.inside_s(scene.protocol)
+        with (
+            piloting.guarding(scene, shell, guard, lease_s=self._lease_s, body_s=flight_s),
+            piloting.leashed(
+                scene, shell, self._pilot(scene), lease_s=self.lease, body_s=body_s, ends_s=_SLACK_S
+            ) as leash,
+            self._rescue(scene, shell, leash, announce) as rescue,
+            alarmed(leash, guard, rescue, self._log, announce, lands_s=self._comes_down_s + _SLACK_S),
+        ):
+            self._fly(scene, testbed, announce, leash)
+
+    def _rescue(self, scene: Scene, shell: Shell, leash: piloting.Leash, announce: Announce) -> FlightRescue:
+        """Return the rescue of the drone; nothing may be sent over a radio under test."""
+
+        def lose(text: str) -> None:
+            leash.lost = "neither its pilot nor its guard runs"
+            announce(text, None)
+
+        guard_name = self.own_name("guard")
+        job = piloting.rescue(scene, self.robot, self.own_name("rescue"), guard_name)
+        sends = scene.robot(self.robot).control is not Control.RADIO
+        return FlightRescue(shell, job, piloting.liveness_file(guard_name), lose, sends=sends)
+
+    def _fly(self, scene: Scene, testbed: Testbed, announce: Announce, leash: piloting.Leash) -> None:
+        """Give the orders of the flight; the origin is stored before the first one that moves the drone."""
+        name = scene.robot(self.robot).name
+        self._wait_for_start(scene, leash)
+        with scene.origins.moving(self.robot) as motion:
             announce(f"take off with {name}", self._rises_s)
             leash.order(CLIMB)
             leash.until("up", self._rises_s + _SLACK_S)
@@ -215,78 +285,81 @@ class FlyStep(Nest):
             run_inside(self, leash, scene, testbed, announce)
             announce(f"land {name}", self._comes_down_s)
             leash.order(HOME)
-            leash.until("landed", ends_s)
+            leash.until("landed", self._comes_down_s + _SLACK_S)
+            motion.ended()
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset({self.robot}) | self.roles_inside()
+    def _wait_for_start(self, scene: Scene, leash: piloting.Leash) -> None:
+        """Wait until the drone is ready at its origin; record the origin of a first start."""
+        try:
+            leash.until("standing", STANDS_S)
+        except RobotError as error:
+            if leash.is_misplaced:
+                scene.origins.refuse(self.robot, error.what)
+            raise
+        if scene.origins.get(self.robot) is None:
+            scene.origins.record(self.robot, leash.origin())
 
+    @override
     def moves(self) -> frozenset[Role]:
-        """See `Step.moves`."""
         return frozenset({self.robot})
 
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
         return ("a flight",)
 
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
         name = self.own_name("fly")
-        return (f"{name}.log", orders_file(name), self._log)
+        guard = self.own_name("guard")
+        rescue = self.own_name("rescue")
+        return (f"{name}.log", orders_file(name), self._log, f"{guard}.log", orders_file(guard), f"{rescue}.log")
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`; a trial without a flight has no columns for it."""
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        """A trial without a flight has no columns for it."""
         return fly_log.COLUMNS
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: where it flew is written down."""
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """Where it flew is written down, and it can have flown so."""
         try:
-            view.evidence.read(fly_log.read, self._log)
+            log = view.evidence.read(fly_log.read, self._log)
+            damage = view.evidence.read(numbered_lines.problem, self._log)
         except EvidenceError as error:
             yield f"{self._log}: {error.what}"
+            return
+        limits = view.scene.robot(self.robot).profile.limits
+        plan = fly_checks.FlyPlan(
+            highest_m=self._highest_m,
+            farthest_m=self._back_m,
+            fastest_m_s=max(self.speed, self.climb, limits.max_speed_m_s),
+            window=view.attempt_window(self.robot),
+        )
+        reasons = [damage] if damage else list(fly_checks.contradictions(log, plan))
+        for step in (*view.within, *follow.steps_inside(self)):
+            if isinstance(step, MavlinkStep) and step.robot == self.robot and not reasons:
+                reasons += filter(None, (fly_checks.of_telemetry(log, step.places_m(view)),))
+        yield from (f"{self._log}: {why}" for why in reasons)
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
-        return fly_log.measure(view.evidence.known(fly_log.read, self._log))
+        return fly_log.measure(view.evidence.read_or_none(fly_log.read, self._log))
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         if isinstance(farthest_m := values.get("fly_farthest_m"), float):
             yield f"flew {farthest_m:.1f} m away"
         if isinstance(height_m := values.get("fly_height_median_m"), float):
             yield f"{height_m:.1f} m high"
 
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
-        """See `Step.misplaced`."""
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         if any(nest.disturbs for nest in within):
             return "a fault has no flight inside: put the fault into the flight"
         if any(nest.parallel for nest in within):
             return "a flight does not stand in together: put together into the flight"
         return None
 
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return self._rises_s + self.inside_s(protocol) + self._comes_down_s
-
-
-def _judged(said: Said) -> tuple[Verdict, str, str]:
-    """Return whether an autopilot answers that can be armed for the flight; grave faults come first."""
-    try:
-        *faults, told = (json.loads(line) for line in said.text.splitlines())
-        faults.sort(key=lambda fault: not fault["grave"])
-        what, remedy = ("; ".join(harmless(fault[key]) for fault in faults) for key in ("what", "remedy"))
-        name, charge = harmless(told["autopilot"]), told["charge"]
-        has = f", its battery has {charge:.0%}" if charge is not None else ""
-    except JSON_ERRORS:
-        last = (said.text.splitlines() or ["it does not say why"])[-1]
-        remedy = (
-            "see that it has power, and that its messages reach mavlink.connection or mavlink.port of the profile"
-        )
-        return (
-            Verdict.FAIL,
-            harmless(last).removeprefix("error: "),
-            f"{remedy} on the robot: mavlink-router, for example",
-        )
-    if not faults:
-        return Verdict.OK, f"{name} says that it may be armed{has}", ""
-    return (Verdict.FAIL if faults[0]["grave"] else Verdict.WARN), what, remedy

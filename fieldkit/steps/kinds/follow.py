@@ -1,5 +1,6 @@
 """Follow robots while steps run: record what tells where they are, ask for their clocks, and keep who told it."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -13,16 +14,20 @@ from fieldkit.core.threads import together
 from fieldkit.measure.offsets import Exchange, Offset, offset
 from fieldkit.measure.positions import accounts, where
 from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions.samples import PLACED
 from fieldkit.remote import jobs
 from fieldkit.steps import clocks
-from fieldkit.steps.base import Nest, Step, View
+from fieldkit.steps.base import Step
 from fieldkit.steps.kinds.move import MoveStep
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Planned, Scene
+from fieldkit.steps.view import View
 
 LIMIT_S: Final = 900.0
 """For how long a recording may outlast the limits of the steps inside."""
 CLOSE_S: Final = 10.0
 ASK_S: Final = 15.0
+_ROUNDING_M: Final = 1e-3
 
 COLUMNS: Final = columns(
     100,
@@ -115,7 +120,7 @@ def steps_inside(nest: Nest) -> Iterator[Step]:
             yield from steps_inside(entry.step)
 
 
-def misplaced(what: str, within: Sequence[Nest]) -> str | None:
+def placement_error(what: str, within: Sequence[Nest]) -> str | None:
     """Return why a step cannot tell where robots were inside others; None where it can."""
     if any(isinstance(nest, MoveStep) for nest in within):
         return f"a {what} begins where robots were placed: put the move into the {what}"
@@ -135,6 +140,19 @@ def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
         return
     if not told.robots:
         yield f"{accounts.FILE} is missing"
+    yield from _of_places(view, told)
+
+
+def _of_places(view: View, told: Accounts) -> Iterator[str]:
+    """Yield which robots are said to have stood, or begun, elsewhere than where the plan placed them."""
+    for role, account in told.robots.items():
+        planned_m = view.scene.places_m.get(role)
+        said_m = account.place if account.place is not None else account.start
+        if planned_m is None or account.frame != PLACED or account.offset_s or not (account.place or account.topic):
+            continue
+        off_m = math.dist(planned_m, [metres or 0.0 for metres in said_m])
+        if off_m > _ROUNDING_M:
+            yield f"{accounts.FILE} has the {role} {off_m:.1f} m from where it was placed"
 
 
 def measure(view: View) -> Measured:

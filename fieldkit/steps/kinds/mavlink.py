@@ -5,6 +5,9 @@ from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Final, Literal
 
+import numpy as np
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Duration, Field, Hertz, Int
@@ -12,17 +15,21 @@ from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.evidence import tlog
-from fieldkit.measure.evidence.tlog import GLOBAL, LOCAL, Tlog
+from fieldkit.measure.captures.arrays import Floats
+from fieldkit.measure.motion import motion_sources, tlog
+from fieldkit.measure.motion.tlog import GLOBAL, LOCAL, Tlog
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions import accounts
 from fieldkit.measure.positions.accounts import GAP_S, Account, Accounts
 from fieldkit.remote import agent
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import streams
-from fieldkit.steps.base import Nest, Step, StepEntry, View
+from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.kinds import follow
-from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Planned, Scene
+from fieldkit.steps.link_need import link_need
+from fieldkit.steps.nest import Nest
+from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Need, Planned, Scene
+from fieldkit.steps.view import View
 
 MESSAGES: Final = MappingProxyType(
     {
@@ -47,6 +54,10 @@ _USUAL_HZ: Final = 40.0
 _FRAME_BYTES: Final = 40
 _STAMP_BYTES: Final = 8
 _BEGINS_S: Final = 2.0
+_READY_S: Final = 75
+"""An ArduCopter sends LOCAL_POSITION_NED about 30 s after its boot; the recorder itself gives up after 60 s."""
+_ON_GROUND_M: Final = 0.1
+"""A lower height is noise of the estimate of a drone that did not fly."""
 _OUTLASTS_S: Final = 2
 """Behind the last step a message of each kind is to come, at the usual rates."""
 
@@ -58,20 +69,30 @@ def _is_message(name: str) -> str:
 
 
 class MavlinkStep(Nest):
-    """A telemetry log of a robot's autopilot, recorded on that robot or, over the radio, on another.
+    """Records the telemetry of a robot's autopilot while the steps in `during` run.
+
+    That is position, speed, attitude, battery and losses; see [MAVLink](mavlink.md#record-telemetry), also for
+    the columns. The profile of its robot has `mavlink`. Leaves `mavlink.tlog`, `mavlink.json` (counters of the
+    recorder) and `ROLE-mavlink.log`; with `positions` also `positions.json` and the columns of a `track`.
 
     Attributes:
-        robot: Whose autopilot.
-        at: On whose robot it is recorded; None for the robot's own computer.
-        system: The autopilot's system id; 0 for the first that is heard.
-        rates: Messages a second that are asked for; others come as the autopilot sends them.
-        positions: Which message fills the columns of distances and speeds; None for none.
-        facing: Where the robot faces when the step begins, as who looks away from the other end of its link sees it.
-        times: `header`, messages were true when the autopilot's own time says; `received`, when they came.
-        gap: Longest time between two messages in which it went straight.
-        heights: Whether heights over the sea count, with `global`.
-        during: Steps inside.
+        robot: Role of the robot with the autopilot.
+        at: Role of the robot that records, over the radio; without it, the robot's own computer.
+        system: The autopilot's system id; 0 for the first one that is heard, which is then the only one in the log.
+        rates: Requested messages per second, of `SYS_STATUS`, `GPS_RAW_INT`, `ATTITUDE`, `LOCAL_POSITION_NED`,
+            `GLOBAL_POSITION_INT`, `VFR_HUD`, `RADIO_STATUS`, `BATTERY_STATUS`, `ESTIMATOR_STATUS`, `HOME_POSITION`
+            and `EXTENDED_SYS_STATE`: `{ATTITUDE: 20Hz}`. Every message received is recorded.
+        positions: Message that fills the columns of distances and speeds: `local` for `LOCAL_POSITION_NED`, `global`
+            for `GLOBAL_POSITION_INT`. Such a step must not be inside a move, a fault or a `together`.
+        facing: With `local`, direction of the robot when the step begins: `away`, `towards`, `left` or `right`, seen
+            by an observer who looks away from the other end of its link.
+        times: Time of a message: `header`, the autopilot's own time, or `received`, when it arrived.
+        gap: If two consecutive messages are further apart than this, the position between them is unknown.
+        heights: Whether heights above the sea are used, with `global`.
+        during: Steps that run meanwhile.
     """
+
+    cross_checks = (*motion_sources.OF_TELEMETRY, *motion_sources.OF_POSITIONS)
 
     robot: Role
     at: Role | None = None
@@ -97,8 +118,8 @@ class MavlinkStep(Nest):
         """On whose robot it is recorded."""
         return self.at or self.robot
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         yield self._recording(scene)
         yield from self.inside(scene)
 
@@ -115,6 +136,7 @@ class MavlinkStep(Nest):
             log=self._log,
             stdout=self._told,
             ready="log:up,",
+            ready_s=_READY_S,
         )
         setup, program = streams.setup(robot), robot.profile.tools.python
         return Planned(self.recorder, job, program=program, setup=setup, ends=BY_FIELDKIT)
@@ -135,8 +157,14 @@ class MavlinkStep(Nest):
             return f"udpout:{robot.address}:{mavlink.port}"
         return mavlink.own
 
+    @override
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """A connection by which the autopilot is heard; over the radio its loss is measured."""
+        if self.recorder == self.robot:
+            yield link_need(scene.robot(self.recorder), self.recorder, self._connection(scene), ("recorder",))
+
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
         agent.install(testbed.shells[self.recorder])
         announce("record MAVLink", None)
         ((planned, code),) = follow.follow(
@@ -166,17 +194,21 @@ class MavlinkStep(Nest):
         )
         return Accounts({**follow.standing(self, scene), self.robot: account}, offsets, self.heights)
 
+    @override
     def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
         return frozenset({self.robot, self.recorder}) | self.roles_inside()
 
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
         return ("a telemetry log", *(("a track",) if self.positions else ()))
 
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
-        return (self._file, self._told, self._log, *((accounts.FILE,) if self.positions else ()))
+        return (self._file, self._told, self._log, *self.laptop_files())
+
+    @override
+    def laptop_files(self) -> tuple[str, ...]:
+        return (accounts.FILE,) if self.positions else ()
 
     @property
     def _file(self) -> str:
@@ -190,30 +222,33 @@ class MavlinkStep(Nest):
     def _log(self) -> str:
         return self.own_name(f"{self.recorder}-mavlink.log")
 
+    @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        """See `Step.flows`: over the radio, where another robot records it."""
+        """Over the radio, where another robot records it."""
         mavlink = scene.robot(self.robot).profile.mavlink
         if self.recorder != self.robot and mavlink is not None:
             frames = self._messages(scene)
             yield Flow(self.robot, self.recorder, mavlink.port, frames, Protocol.UDP, served=True)
 
+    @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
-        """See `Step.bytes_left`."""
         return (_FRAME_BYTES + _STAMP_BYTES) * self._messages(scene) if role == self.recorder else 0.0
 
     def _messages(self, scene: Scene) -> float:
         """Return about how many messages are recorded."""
         return (_USUAL_HZ + sum(self.rates.values())) * self.expected_s(scene.protocol)
 
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (others may tell of other robots)
-        """See `Step.misplaced`."""
-        return None if self.positions is None else follow.misplaced("mavlink with positions", within)
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+        return None if self.positions is None else follow.placement_error("mavlink with positions", within)
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: the log is whole, of one autopilot, and has what was asked for."""
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """The log is whole, of one autopilot, and has what was asked for."""
         try:
             told = view.evidence.read(tlog.told, self._told)
             log = self._read(view)
+            total = view.evidence.read(tlog.sum_of, self._file)
         except EvidenceError as error:
             yield f"{self._file}: {error.what}"
             return
@@ -221,6 +256,8 @@ class MavlinkStep(Nest):
             yield f"{self._file}: {told.left_out} frames more came than it has room for"
         if log.frames != told.frames:
             yield f"{self._file} has {log.frames} frames, its recorder wrote {told.frames}"
+        window = view.attempt_window(self.recorder)
+        yield from (f"{self._file} {why}" for why in tlog.contradictions(log, told, total, window))
         for name in self.rates:
             if (result := told.refused.get(MESSAGES[name])) is not None:
                 yield f"the autopilot does not send {name} as asked (MAV_RESULT {result})"
@@ -228,6 +265,11 @@ class MavlinkStep(Nest):
                 yield f"{self._file}: no {name}, which was asked for"
         if self.positions:
             yield from follow.problems(view, (self.robot,))
+
+    def places_m(self, view: View) -> Floats:
+        """Return where LOCAL_POSITION_NED had the autopilot: metres north, east and up. Shape (n, 3)."""
+        rows = view.evidence.read_or_none(tlog.positions, self._file, self.system, LOCAL) or []
+        return np.array([row[2:5] for row in rows], dtype=float).reshape(-1, 3)
 
     def _read(self, view: View) -> Tlog:
         """Return what the log says.
@@ -238,25 +280,25 @@ class MavlinkStep(Nest):
         told = view.evidence.read(tlog.told, self._told)
         return view.evidence.read(tlog.read, self._file, self.system, told.ended_us)
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`."""
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
         return (*tlog.COLUMNS, *(follow.COLUMNS if self.positions else ()))
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
         try:
-            found = tlog.measure(self._read(view))
+            found = tlog.measure(self._read(view), view.evidence.read(tlog.told, self._told).slow_s)
         except EvidenceError:
             found = tlog.measure(None)
         return found | follow.measure(view) if self.positions else found
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         if isinstance(loss := values.get("mavlink_loss"), float):
             yield f"MAVLink loss {100 * loss:.1f} %"
-        if isinstance(height_m := values.get("mavlink_height_max_m"), float):
+        if isinstance(height_m := values.get("mavlink_height_max_m"), float) and height_m > _ON_GROUND_M:
             yield f"up to {height_m:.1f} m high"
 
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return _BEGINS_S + _OUTLASTS_S + self.inside_s(protocol)

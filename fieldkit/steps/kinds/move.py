@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Final, Self
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Field, Length, Speed, Strict
@@ -11,14 +13,20 @@ from fieldkit.core import geometry, model
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.evidence import drive_log
+from fieldkit.measure.evidence import numbered_lines
+from fieldkit.measure.motion import drive_checks, drive_log, motion_sources
+from fieldkit.measure.positions import farthest
 from fieldkit.steps import driving, streams
-from fieldkit.steps.base import Nest, Step, StepEntry, View
+from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.lease import run_inside
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
+from fieldkit.steps.view import View
 
 _Way = Annotated[Length, Field(gt=0)] | None
 
+_LOG_BYTES_PER_S: Final = 2200.0
+"""Ten lines a second (`agent/drive.py`), each of about 220 bytes."""
 _SHORT_OF_FENCE_M: Final = 0.5
 """So far before its fence a way ends that is cut short: who steers along it may overshoot."""
 
@@ -27,10 +35,12 @@ class PathLeg(Strict):
     """A straight piece of a way; along and across together are a slant.
 
     Attributes:
-        away: So far away from the robot at the other end of the link.
-        towards: So far towards it.
-        left: So far to the left, as who looks away from it sees it.
-        right: So far to the right.
+        away: Distance away from the robot at the other end of the link, along the line between them (the relay: from
+            the sender). For a drone: forward.
+        towards: Distance towards that robot. For a drone: backward.
+        left: Distance to the left, seen by an observer who looks away from that robot. Combined with `away` or
+            `towards` it is a diagonal.
+        right: Distance to the right.
     """
 
     away: _Way = None
@@ -65,20 +75,29 @@ class PathLeg(Strict):
 
 
 class MoveStep(Nest):
-    """A robot moves while other steps run, for as long as they do; then it comes back to its place.
+    """Moves a robot while the steps in `during` run; afterwards the robot is at its place again.
 
-    One that drives by itself (`Robot.drives`) does so by the agent on it; others the testbed moves.
+    So each repeat begins alike. At the end of its path the robot stops and waits. Robots of a lab move on the ground
+    of their world, and return instantly; in the field the operator is asked to start the motion and to bring the
+    robot back. Ground robots that [drive by themselves](motion.md) do both, with `--allow-motion`, and leave
+    `drive.jsonl`. `--dry-run` describes the path. A move may be inside another one of another robot, with a `name`
+    for one of them, since each may leave such a file; a `fault` may be inside a move, but not a move inside a fault.
 
     Attributes:
-        robot: Which.
-        path: Its way from its place, piece by piece. At the end of it the robot stands.
-        speed: How fast; None for as fast as the robot may.
-        within_limits: Whether a robot that may not go as fast or as far goes as it may; otherwise it is refused.
-        driven: Whether columns tell how it drove by itself; a plan says so where it does.
-        during: The steps inside.
+        robot: Role that moves.
+        path: Its path, a list of straight segments; each begins where the previous one ends.
+        speed: Speed, `0.2m/s`; at most `limits.max_speed_m_s` of its profile, or the trial is refused. Without it,
+            that speed.
+        within_limits: Whether a robot whose `limits.max_speed_m_s` or `limits.fence_m` are exceeded moves as far and
+            as fast as they allow, and stops half a metre before the fence; `trial.yaml` records the actual motion.
+            Otherwise the trial is refused.
+        driven: Whether there are columns of how it [drove by itself](motion.md#what-is-kept). A robot that drives by
+            itself always has them.
+        during: Steps that run meanwhile.
     """
 
     leads = True
+    cross_checks = motion_sources.OF_DRIVE
 
     robot: Role
     path: Annotated[tuple[PathLeg, ...], Field(min_length=1)]
@@ -87,8 +106,9 @@ class MoveStep(Nest):
     driven: Bool = Field(default=False, exclude_if=schema.is_empty)
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
-    def fitted(self, cast: Cast, way_s: float | None = None) -> Self:  # noqa: ARG002 (its own is the innermost)
-        """See `Step.fitted`: with a speed, and within the robot's limits where that is asked for."""
+    @override
+    def resolved(self, cast: Cast, way_s: float | None = None) -> Self:
+        """With a speed, and within the robot's limits where that is asked for."""
         robot = cast[self.robot]
         fastest_m_s, fence_m = robot.profile.limits.max_speed_m_s, robot.profile.limits.fence_m
         speed_m_s = fastest_m_s if self.speed is None else self.speed
@@ -101,19 +121,19 @@ class MoveStep(Nest):
                 path = tuple(filter(None, map(PathLeg.of, geometry.within(legs, fence_m - short_m)))) or path
         update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or robot.drives}
         own = self.model_copy(update=update)
-        return super(MoveStep, own).fitted(cast, own.way_s(robot))
+        return super(MoveStep, own).resolved(cast, own.way_s(robot))
 
-    def shortened(self, cast: Cast) -> Iterator[str]:
-        """See `Step.shortened`."""
+    @override
+    def adjustments(self, cast: Cast) -> Iterator[str]:
         if self.within_limits:
-            asked = self.model_copy(update={"within_limits": False}).fitted(cast).motion
-            may = self.fitted(cast).motion
+            asked = self.model_copy(update={"within_limits": False}).resolved(cast).motion
+            may = self.resolved(cast).motion
             if may != asked:
                 yield (
                     f"{cast[self.robot].name} moves {geometry.in_words(may)}; {geometry.in_words(asked)} is beyond "
                     "its limits"
                 )
-        yield from super().shortened(cast)
+        yield from super().adjustments(cast)
 
     @property
     def motion(self) -> model.Move:
@@ -136,8 +156,9 @@ class MoveStep(Nest):
         """Return how long its way takes: of a robot that drives by itself with all turns, else `lasts_s`."""
         return driving.way_s(robot, self.motion) if robot.drives else self.lasts_s
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`; a robot that is moved takes none."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
+        """A robot that is moved takes none."""
         if scene.robot(self.robot).drives:
             yield self._driving(scene)
         yield from self.inside(scene)
@@ -155,8 +176,8 @@ class MoveStep(Nest):
     def _log(self) -> str:
         return self.own_name(drive_log.FILE)
 
-    def beside(self, scene: Scene) -> Iterator[str]:
-        """See `Step.beside`."""
+    @override
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         robot = scene.robot(self.robot)
         by_itself = ""
         if robot.drives and robot.profile.drive is not None:
@@ -167,16 +188,16 @@ class MoveStep(Nest):
             )
         lasts = f"for up to {round(self.way_s(robot), 1):g} s"
         yield f"{robot.name} moves {geometry.in_words(self.motion)}, {lasts}{by_itself}"
-        yield from super().beside(scene)
+        yield from super().dry_run_notes(scene)
 
-    def cut_short(self, scene: Scene) -> Iterator[str]:
-        """See `Step.cut_short`."""
+    @override
+    def abort_notes(self, scene: Scene) -> Iterator[str]:
         if scene.robot(self.robot).drives:
-            yield f"{scene.robot(self.robot).name} stands where it is"
-        yield from super().cut_short(scene)
+            yield f"{scene.robot(self.robot).name} stops where it is"
+        yield from super().abort_notes(scene)
 
+    @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """See `Step.refusals`."""
         robot = scene.robot(self.robot)
         fastest_m_s = robot.profile.limits.max_speed_m_s
         speed_m_s = self.motion.speed_m_s
@@ -190,14 +211,23 @@ class MoveStep(Nest):
             yield from driving.refusals(scene, self.motion)
         yield from super().refusals(scene)
 
+    @override
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        """The log of a robot that drives has its way, the steps inside and its way back."""
+        robot = scene.robot(role)
+        if role != self.robot or not robot.drives or robot.profile.drive is None:
+            return 0.0
+        return _LOG_BYTES_PER_S * (2 * self.way_s(robot) + self.inside_s(scene.protocol))
+
+    @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """See `Step.needs`: a robot that drives by itself needs its middleware's Python package."""
+        """A robot that drives by itself needs its middleware's Python package."""
         robot = scene.robot(self.robot)
         if robot.drives:
             yield streams.need(self.robot, robot, driving.over(robot))
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
         robot = scene.robot(self.robot)
         announce(f"move {robot.name}", None)
         if robot.drives:
@@ -209,55 +239,67 @@ class MoveStep(Nest):
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset({self.robot}) | self.roles_inside()
-
+    @override
     def moves(self) -> frozenset[Role]:
-        """See `Step.moves`."""
         return frozenset({self.robot})
 
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
-        return ("a move",)  # each robot may write down how it drove
-
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`: what the driver of a robot writes, where that drives by itself."""
+        """What the driver of a robot writes, where that drives by itself."""
         return driving.files(self._form)
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`; a trial whose robots are moved has no columns for it."""
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        """A trial whose robots are moved has no columns for it."""
         return drive_log.COLUMNS if self.driven else ()
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: a robot that drove by itself has written down how."""
-        if self.driven and view.scene.robot(self.robot).drives:
-            try:
-                view.evidence.read(drive_log.read, self._log)
-            except EvidenceError as error:
-                yield f"{self._log}: {error.what}"
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """A robot that drove by itself has written down how, and it can have driven so."""
+        if not (self.driven and view.scene.robot(self.robot).drives):
+            return
+        try:
+            log = view.evidence.read(drive_log.read, self._log)
+            damage = view.evidence.read(numbered_lines.problem, self._log)
+        except EvidenceError as error:
+            yield f"{self._log}: {error.what}"
+            return
+        motion = self.motion
+        plan = drive_checks.DrivePlan(motion.legs, motion.speed_m_s, view.attempt_window(self.robot))
+        reasons = [damage] if damage else drive_checks.contradictions(log, plan)
+        yield from (f"{self._log}: {why}" for why in reasons)
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
-        return drive_log.measure(view.evidence.known(drive_log.read, self._log)) if self.driven else Measured()
+        """Nothing of a drive that other sources of the robot's position contradict."""
+        if not self.driven:
+            return Measured()
+        log = view.evidence.read_or_none(drive_log.read, self._log)
+        measured = drive_log.measure(log)
+        if log is None:
+            return measured
+        during_ns = (log[0].utc_ns, log[-1].utc_ns) if log[0].utc_ns else None
+        away_m = max(moment.off_m for moment in log)
+        why = farthest.contradiction(view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns)
+        return measured.without({name: why for name in measured.values if name != "drive_ended"}) if why else measured
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         if isinstance(driven_m := values.get("drive_out_m"), float):
             yield f"drove {driven_m:.1f} m"
 
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
-        """See `Step.misplaced`."""
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         if any(nest.disturbs for nest in within):
             return "a fault has no move inside: put the fault into the move"
         if any(nest.parallel for nest in within):
             return "a move does not stand in together: put together into the move"
         return None
 
+    @override
     def asks(self) -> bool:
-        """See `Step.asks`."""
         return True
 
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return self.inside_s(protocol) + (self.lasts_s if self.driven else 0.0)

@@ -1,9 +1,9 @@
 """Observers of a robot while a fault befalls it: jobs that write down when it answered."""
 
+from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.core.columns import prefixed
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Fault, FaultKind, Role
 from fieldkit.measure.evidence import recovery
 from fieldkit.remote.jobs import Job

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Final, Self
 
 import numpy as np
+from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
@@ -13,19 +14,21 @@ from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
-from fieldkit.measure.captures.arrays import Mask
+from fieldkit.measure.captures.arrays import NO_TIME, Mask
 from fieldkit.measure.captures.ip import ICMP
 from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
+from fieldkit.measure.checks import ping_checks
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.evidence.ping import Ping
 from fieldkit.measure.positions import where
+from fieldkit.measure.transfers import echoes
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import routing
 from fieldkit.steps.along import AlongStep
-from fieldkit.steps.base import View
 from fieldkit.steps.scene import Announce, Flow, Need, Pinging, Planned, Refusal, Scene, fragments
 from fieldkit.steps.variants import PingTool, Tool
+from fieldkit.steps.view import View
 
 LAST_REPLY_S: Final = 2
 _HEADER_BYTES: Final = 8
@@ -47,8 +50,8 @@ class Payloads(Strict):
     """ICMP payload in bytes per protocol; the defaults are what the paper calls each protocol's window.
 
     Attributes:
-        tcp: For TCP repeats.
-        udp: For UDP repeats.
+        tcp: In TCP repeats.
+        udp: In UDP repeats.
     """
 
     tcp: Payload = 502
@@ -62,19 +65,23 @@ class Payloads(Strict):
 
 
 class PingStep(AlongStep):
-    """ping with raw lines kept.
+    """Measures round-trip times with ping. Leaves `ping.txt`.
 
     Attributes:
-        sender: Who asks (`from`).
-        receiver: Who answers (`to`).
+        sender: Role that sends the requests.
+        receiver: Role that answers.
         count: Echo requests.
-        interval: Seconds between them; below 0.2 s iputils before 20210722 needs root.
-        payload_bytes: ICMP payload per protocol, or one for both.
-        gap: Whether columns tell the longest time without an answer.
-        forwarded: Whether robots forward for each other; preflight then looks for what finds the ways on all of them.
+        interval: Time between them; below `200ms` iputils before 20210722 needs root.
+        payload_bytes: ICMP payload per protocol; one number sets both.
+        gap: Whether columns report the longest time without an answer, `rtt_gap_s`, and the requests lost in it,
+            `rtt_gap_lost`. If the ping began or ended in the gap, the columns have lower bounds
+            (`rtt_gap_at_least_s`).
+        forwarded: Whether robots forward for each other; preflight then looks for a routing daemon on all of them.
     """
 
-    columns = (*ping.COLUMNS, *ping.WAY_COLUMNS)
+    columns = (*ping.COLUMNS, *ping.SENT_COLUMNS, *ping.WAY_COLUMNS)
+    cross_checks = ping_checks.CROSS_CHECKS
+    needs_complete_capture = False
     lasts_by = "count"
 
     sender: Role = Field(alias="from")
@@ -91,13 +98,13 @@ class PingStep(AlongStep):
             raise schema.complaint(f"{self.sender} cannot ping itself; name another robot", "to")
         return self
 
+    @override
     def lasting(self, seconds: float) -> Self:
-        """See `AlongStep.lasting`."""
         count = math.ceil(seconds / self.interval - _ROUNDING)
         return self.model_copy(update={"count": min(max(count, 1), MOST)})
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         sends = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(self._payload_bytes(scene.protocol)))
         options = (*sends, "-W", str(LAST_REPLY_S))
         yield Planned(
@@ -117,8 +124,8 @@ class PingStep(AlongStep):
     def _payload_bytes(self, protocol: Protocol) -> int:
         return self.payload_bytes.udp if protocol is Protocol.UDP else self.payload_bytes.tcp
 
+    @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """See `Step.refusals`."""
         tools = scene.tools(self.sender)
         if tools.ping is PingTool.IPUTILS_OLD and not tools.root and self.interval < OLD_INTERVAL_S:
             yield Refusal(
@@ -127,14 +134,14 @@ class PingStep(AlongStep):
                 "interval: 200ms in the procedure, or user: root in the site file",
             )
 
+    @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """See `Step.needs`."""
         if self.forwarded:
             yield from routing.needs(scene)
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
-        (planned,) = self.commands(scene)
+        (planned,) = self.jobs(scene)
         announce("ping", self.expected_s(scene.protocol))
         shell = testbed.shells[self.sender]
         with shell.silence(planned.job.limit_s):
@@ -142,16 +149,8 @@ class PingStep(AlongStep):
         if code not in {0, 1}:  # 1: some or all replies are missing, which is a measurement
             raise scene.failure(planned, f"ping ended with exit code {code}")
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset({self.sender, self.receiver})
-
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
-        return ("a ping",)
-
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
         return (self._file, self._log)
 
     @property
@@ -162,17 +161,18 @@ class PingStep(AlongStep):
     def _log(self) -> str:
         return self.own_name(f"{self.sender}-ping.log")
 
+    @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        """See `Step.flows`."""
         there_and_back = 2 * self.count * fragments(self._payload_bytes(scene.protocol))
         yield Flow(self.sender, self.receiver, frames=there_and_back)
 
+    @override
     def pinging(self) -> Pinging:
-        """See `Step.pinging`."""
         return Pinging(self.sender, self._file, self.prefix)
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: every request was sent, and ping said so."""
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """Every request was sent, and ping said so."""
         try:
             found = view.evidence.read(ping.read, self._file)
         except EvidenceError:
@@ -182,6 +182,8 @@ class PingStep(AlongStep):
             yield f"{self._file}: ping was cut short, its summary is missing"
         elif found.transmitted < self.count:
             yield f"{self._file}: ping sent {found.transmitted} of {self.count} requests"
+        asked_bytes, window = self._payload_bytes(view.scene.protocol), view.attempt_window(self.sender)
+        yield from (f"{self._file}: {why}" for why in ping_checks.within(found, self.count, asked_bytes, window))
         if found.received is not None and found.received != len(found.answers):
             yield f"{self._file}: ping counted {found.received} answers and printed {len(found.answers)}"
         # iputils takes 0 for a time below it, and says "time of day goes back" in its log.
@@ -189,11 +191,23 @@ class PingStep(AlongStep):
             yield f"{self._file} has an answer that took no time: the clock was set back while ping waited"
         roles = (self.sender, self.receiver)
         unseen = [what for role in roles if view.captured(role) for what in self._unseen(found, role, view)]
-        yield from unseen
+        yield from unseen or self._contradictions(found, view)
         # A capture that lacks this attempt's own packets does not tell whose others are.
         if not unseen and view.captured(*roles) and (earlier := self._earlier(view)):
             of = f"{format_count(earlier, 'packet')} came of a ping that sent none in this one"
             yield f"packets of an earlier attempt were still on the way: {of}"
+
+    def _contradictions(self, found: Ping, view: View) -> Iterator[str]:
+        """Yield the contradictions with the ping in each capture that has the fewest, where several run."""
+        asks, answers = (view.scene.robot(end).address for end in (self.sender, self.receiver))
+        for role in (self.sender, self.receiver):
+            capture = view.capture(role)
+            if capture is None or found.payload_bytes is None or (capture.packets.time_ns == NO_TIME).any():
+                continue
+            pings = echoes.of_each_ping(capture.packets, asks, answers, found.payload_bytes)
+            on_sender = role == self.sender
+            reasons = [list(ping_checks.beside(found, one, self.interval, role, asks=on_sender)) for one in pings]
+            yield from (f"{self._file}: {why}" for why in min(reasons, key=len, default=[]))
 
     def _unseen(self, found: Ping, role: Role, view: View) -> Iterator[str]:
         """Yield what ping printed more of than there is in a capture: answers, and requests that were answered.
@@ -237,27 +251,32 @@ class PingStep(AlongStep):
             earlier += int(((came.fragment_offset > 0) & ~np.isin(came.ip_id, left.ip_id)).sum())
         return earlier
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`."""
-        return (*self.columns, *ping.GAP_COLUMNS) if self.gap else self.columns
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        return (*self.columns, *ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS) if self.gap else self.columns
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
-        found = view.evidence.known(ping.read, self._file)
+        found = view.evidence.read_or_none(ping.read, self._file)
         replied_ns = [at_ns for reply in found.answers if (at_ns := reply.at_utc_ns)] if found else []
         ends = self.sender, self.receiver
-        gap = ping.measure_gap(found) if self.gap else Measured()
+        gap = ping.measure_gap(found, self.interval) if self.gap else Measured()
         return ping.measure(found) | gap | where.measure(view.evidence, ping.WAY_COLUMNS, ends, replied_ns)
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
+        if isinstance(loss := values.get("rtt_loss"), float | int):
+            unanswered = f" ({format_count(int(values['rtt_sent']), 'request')}, no reply)" if loss >= 1 else ""
+            yield f"ping loss {100 * loss:.1f} %{unanswered}"
         if isinstance(gap_s := values.get("rtt_gap_s"), float):
             yield f"longest gap {gap_s:.1f} s with {values['rtt_gap_lost']} lost"
+        if isinstance(open_s := values.get("rtt_gap_at_least_s"), float):
+            yield f"longest gap >= {open_s:.1f} s with {values['rtt_gap_lost_at_least']} lost"
         if isinstance(median_s := values.get("rtt_median_s"), float):
             yield f"RTT {1e3 * median_s:.1f} ms"
 
-    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
-        """See `Step.expected_s`."""
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
         return (self.count - 1) * self.interval
 
 

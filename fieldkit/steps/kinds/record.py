@@ -4,11 +4,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import PurePosixPath
 from typing import Annotated, Final, Self
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Cast, Robot, Testbed
-from fieldkit.config import schema
+from fieldkit.config import locations, schema
 from fieldkit.config.profiles import Ros, TopicName
 from fieldkit.config.schema import Bool, Duration, Field
 from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.errors import ConfigurationError, EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role, Verdict
 from fieldkit.measure.evidence import bag, reception
@@ -16,9 +19,10 @@ from fieldkit.remote import jobs
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import ros_master, variants
-from fieldkit.steps.base import Step, StepName, View
+from fieldkit.steps.base import Step, StepName
 from fieldkit.steps.scene import BY_ITSELF, BY_LIMIT, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
 from fieldkit.steps.variants import Recorder, Tool
+from fieldkit.steps.view import View
 
 USUAL_BAG: Final = "scan"
 
@@ -54,15 +58,28 @@ SUBSCRIBED: Final = "log:Subscribed to topic"
 
 
 class RecordStep(Step):
-    """`rosbag record` for a fixed time, by the command that the robot's profile names.
+    """Records a ROS bag, by the record command of the robot's profile.
+
+    A robot may record several bags of different names, one after the other; a `transfer` then names its `file`.
 
     Attributes:
-        robot: Who records.
-        topics: What.
-        duration: How long, in seconds.
-        name: Name of the bag without its ending; another than the usual one tells the step from others, too.
-        reception: Whether columns tell how soon its topics were heard, and how steadily.
+        robot: Role that records.
+        topics: List of topics.
+        duration: Duration of the recording.
+        name: Name of the bag without its extension; names of its job and log begin with it, unless it is `scan`.
+        reception: Whether columns report how soon its topics were received, and how regularly: [what a recorder
+            heard](method-delay.md#what-a-recorder-received).
     """
+
+    cross_checks = (
+        CrossCheck(
+            "what a bag holds, and when it was heard",
+            ("*",),
+            "the bag",
+            ("the procedure: topics and duration", "how long the recorder ran"),
+            "half of the duration, because a recorder needs time to subscribe",
+        ),
+    )
 
     robot: Role
     topics: Annotated[tuple[TopicName, ...], Field(min_length=1)]
@@ -71,8 +88,9 @@ class RecordStep(Step):
     reception: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @property
+    @override
     def prefix(self) -> str:
-        """See `Step.prefix`; the bag has the name anyway."""
+        """The bag has the name anyway."""
         return "" if self.name == USUAL_BAG else self.name
 
     def bag(self, robot: Robot) -> str:
@@ -83,8 +101,8 @@ class RecordStep(Step):
         """
         return _ros(robot).command.writes.format(name=self.name)
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         robot = scene.robot(self.robot)
         ros = _ros(robot)
         argv: list[str] = []
@@ -112,8 +130,8 @@ class RecordStep(Step):
             least_s=self.duration,
         )
 
+    @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """See `Step.refusals`."""
         profile = scene.robot(self.robot).profile
         found, wanted = scene.tools(self.robot).recorder, variants.expected(profile).recorder
         if found is wanted:
@@ -132,9 +150,9 @@ class RecordStep(Step):
             what = f"its record command writes {found}, its profile says {command.writes}"
             yield Refusal(self.robot, what, f"--storage in record, or writes, in the profile {profile.name}")
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
-        (planned,) = self.commands(scene)
+        (planned,) = self.jobs(scene)
         announce("record", self.duration)
         code = jobs.run(testbed.shells[self.robot], planned.job)
         # What a recorder ended by SIGINT returns differs from version to version; the bag tells whether it recorded.
@@ -145,8 +163,9 @@ class RecordStep(Step):
                 remedy=f"see {planned.job.log} of this repeat; is ROS running on the robot?",
             )
 
+    @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """See `Step.needs`: the environment that the setup files make."""
+        """The environment that the setup files make."""
         robot = scene.robot(self.robot)
         ros = _ros(robot)
         said = ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
@@ -154,51 +173,48 @@ class RecordStep(Step):
         yield Need(self.robot, "ROS", argv, lambda answer: _judged(robot, answer), explains=ros.command.record[0])
         yield from ros_master.needs(scene, self.robot, explains=ros.command.record[0])
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset({self.robot})
-
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
         return (f"a recording on {self.robot}",)
 
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
         return (f"{self.name}.bag", self.name, self._log)
 
     @property
     def _log(self) -> str:
         return self.own_name(f"{self.robot}-record.log")
 
+    @override
     def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
-        """See `Step.recorded`."""
         robot = cast[self.robot]
         size_bytes = _BAG_BYTES + self.duration * sum(_bytes_per_s(robot, topic) for topic in self.topics)
         yield RecordedFile(self.robot, self.bag(robot), size_bytes, called=self.name)
 
+    @override
     def records_on(self) -> frozenset[Role]:
-        """See `Step.records_on`."""
         return frozenset({self.robot})
 
+    @override
     def live_topics(self, role: Role) -> tuple[str, ...]:
-        """See `Step.live_topics`."""
         return self.topics if role is self.robot else ()
 
+    @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
-        """See `Step.bytes_left`."""
         return sum(made.size_bytes for made in self.recorded(scene.cast) if made.role is role)
 
+    @override
     def reserve_bytes(self, scene: Scene, role: Role) -> int:
-        """See `Step.reserve_bytes`."""
         program = _ros(scene.robot(self.robot)).command.record[0]
         return ROSBAG_RESERVE_BYTES if role is self.robot and PurePosixPath(program).name == "rosbag" else 0
 
+    @override
     def with_record(self, duration_s: float) -> Self:
-        """See `Step.with_record`."""
         return self.model_copy(update={"duration": duration_s})
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: a bag that can be read, each topic in it, long enough."""
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """A bag that can be read, each topic in it, long enough."""
         path = self.bag(view.scene.robot(self.robot))
         name = PurePosixPath(path).name
         try:
@@ -212,25 +228,25 @@ class RecordStep(Step):
         if content.duration_s + SUBSCRIBE_S < MIN_RECORDED_SHARE * self.duration:
             yield f"{name}: spans {content.duration_s:.1f} s of the {self.duration:g} s asked for"
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`."""
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
         return reception.COLUMNS if self.reception else ()
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
         if not self.reception:
             return Measured()
         what = self._log, self.bag(view.scene.robot(self.robot)), self.topics, self.duration
-        return reception.measure(view.evidence.known(reception.read, "", *what))
+        return reception.measure(view.evidence.read_or_none(reception.read, "", *what))
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         heard_s = values.get("bag_discovery_s")
         if "bag_discovered" in values:
             yield f"heard after {heard_s:.2f} s" if isinstance(heard_s, float) else "heard nothing"
 
-    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
-        """See `Step.expected_s`."""
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
         return self.duration + 0.5
 
 
@@ -239,7 +255,8 @@ def _ros(robot: Robot) -> Ros:
     if robot.profile.ros is None:
         raise ConfigurationError(
             f"{robot.name} is to record, and its profile {robot.profile.name} has no ros",
-            remedy="describe its ROS under ros: in the profile, or let another robot record",
+            remedy="let another robot record, or describe its ROS under ros: in the profile: "
+            + locations.own_copy(robot.profile.name),
         )
     return robot.profile.ros
 

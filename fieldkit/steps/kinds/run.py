@@ -1,30 +1,27 @@
 """Run any program on a robot, and make columns of what it prints."""
 
-import re
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Annotated, Final
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
+from fieldkit.config.programs import NamedProgram
 from fieldkit.config.schema import AfterValidator, Bool, Bytes, Duration, Field, Int, Number, Strict
 from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import host, printed
-from fieldkit.remote import jobs
+from fieldkit.remote import jobs, programs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import FileName, Step, View
-from fieldkit.steps.scene import Announce, Planned, Scene
-
-_ADDRESS: Final = re.compile(r"\{address\.(?P<role>[^{}]*)\}")
-
-# Lets no more than $1 bytes of either output through, whatever the program says; its exit code is the program's.
-_BOUNDED: Final = (
-    'n=$1; shift; exec 5>&1 6>&2; exit "$( { { { "$@" 3>&- 5>&- 6>&-; echo $? >&3; } 2>&1 >&4 4>&- 5>&- 6>&- '
-    '| head -c "$n" >&6; } 4>&1 | head -c "$n" >&5; } 3>&1 )"'
-)
+from fieldkit.steps import arguments
+from fieldkit.steps.base import FileName, Step
+from fieldkit.steps.scene import Announce, Planned, PutProgram, Scene
+from fieldkit.steps.view import View
 
 _OF_SHELLS: Final = frozenset({"|", "||", "&", "&&", ";", "<", ">", ">>", "2>", "2>&1", "&>"})
 """Words that a program gets by mistake alone; who means one writes `argv`."""
@@ -48,13 +45,15 @@ class PrintedColumn(Strict):
     """A column, and where its value stands in what a program prints.
 
     Attributes:
-        name: Its name.
-        unit: Unit of its values; `text`, `bool` or `count` where they have none.
-        meaning: What it says.
-        path: Where it stands in JSON (`json`), JMESPath.
-        expression: What prints it (`regex`), RE2 with one group; the first match counts.
-        optional: Whether the program may leave it out: it is then empty, and the repeat valid.
-        label: What people call it; empty for its name.
+        name: Name of the column.
+        unit: Any unit, `V`, `dBm`, `%`; `text`, `bool` or `count` for values without one.
+        meaning: Meaning of the values, for `fieldkit columns`.
+        path: Where the value is in JSON output, `battery.cells[0].mV`: a [JMESPath](https://jmespath.org). Of
+            duplicate keys the last one counts.
+        expression: In place of `json`, a regular expression ([RE2](https://github.com/google/re2/wiki/Syntax)) with
+            one group; its first match is the value. `^` and `$` match at ends of a line.
+        optional: Whether the value may be missing in a valid repeat.
+        label: Label in tables and figures, in place of its name.
     """
 
     name: Annotated[
@@ -124,8 +123,8 @@ class Expected(Strict):
     """What a program must do for a repeat to be valid.
 
     Attributes:
-        code: Exit codes, one of them.
-        values: Bounds of columns.
+        code: Permitted exit codes, 0 to 125.
+        values: Bounds of columns, by name.
     """
 
     code: Annotated[tuple[Annotated[Int, Field(ge=0, le=125)], ...], Field(min_length=1)] = (0,)
@@ -133,23 +132,37 @@ class Expected(Strict):
 
 
 class RunStep(Step):
-    """A program on a robot, what it prints kept in a file, and columns made of that.
+    """Runs a program on a robot, keeps its output, and reads columns from the output.
+
+    The program is found in the PATH of a session without a terminal, or by its absolute path; it runs in the folder
+    of the attempt. No shell is involved: for one, write `sh -c '...'`. At most 1 MiB each of output and of errors is
+    kept; a program that prints more is ended. Leaves `run.txt` and `ROLE-run.log`.
+
+    Variables in `command` and `argv`: `{address.ROLE}` is the address of a robot on the radio, `{distance}` the
+    distance as typed (`30ft`), `{repeat}` the number of the repeat of its protocol, from 1, and `{put}` the path of
+    the copied program. `{{distance}}` is the text `{distance}`; other braces, and `${distance}`, are not changed, but
+    a name that is almost one of these is refused. Inside `for`, write `{{distance}}`.
 
     Attributes:
-        robot: Whose.
-        command: The command, split into words as a shell does; no shell sees it.
-        argv: The command as words, in place of `command`.
-        takes: About how long it takes.
-        limit: When it is ended.
-        output: File for what it prints.
-        prints: About how much that is, in bytes.
-        figures: What is read there (`columns`).
-        expect: What must be so for a repeat to be valid.
+        robot: Role of the robot on which it runs.
+        command: The command, split into words as a shell does, without shell operators such as a pipe; with
+            variables.
+        argv: The command as a list of words, in place of `command`.
+        put: A program of the lab, at most 8.4 MB, which is copied to the robot before the first step: a path relative
+            to the folder of the procedure, else of the lab; links must not lead out of them. `{put}` is its path on
+            the robot. In `trial.yaml` it is a mapping with the keys below; in a procedure it is a path.
+        takes: Approximate duration, for the estimate of the time left.
+        limit: A program that runs longer is ended, and the repeat is void.
+        output: File for its standard output.
+        prints: Approximate size of the output, for the estimate of disk space.
+        figures: Columns of the repeat, read from the output.
+        expect: Conditions without which the repeat is void.
     """
 
     robot: Role
     command: _Word = ""
     argv: tuple[_Word, ...] = ()
+    put: NamedProgram | None = Field(default=None, exclude_if=schema.is_empty)
     takes: Duration = 1.0
     limit: Annotated[Duration, Field(gt=0)] = 60.0
     output: FileName = "run.txt"
@@ -170,7 +183,25 @@ class RunStep(Step):
             raise schema.complaint(f"no shell sees this command, and {alien} is a shell's: sh -c '...'", "command")
         if not words[0]:
             raise schema.complaint("the first word, the program, is empty", "argv" if self.argv else "command")
+        self._check_variables()
         return self
+
+    def _check_variables(self) -> None:
+        for index, word in enumerate(self.words):
+            if why := arguments.problem(word, has_program=self.put is not None):
+                raise schema.complaint(why, *(("argv", index) if self.argv else ("command",)))
+        program = self.words[0]
+        if arguments.varies(program):
+            what = f"the program cannot depend on a variable, and {program} does; write it as an argument"
+            raise schema.complaint(what, "argv" if self.argv else "command")
+        if self.put is None:
+            return
+        if not any(arguments.PUT in arguments.names(word) for word in self.words):
+            what = f"nothing runs {self.put.name}: write {{put}} in the command where its path is to be"
+            raise schema.complaint(what, "put")
+        if program == f"{{{arguments.PUT}}}" and not self.put.executable:
+            what = f"{self.put.file} is not executable: chmod +x it, or name its interpreter: python3 {{put}}"
+            raise schema.complaint(what, "put")
 
     def _check_roles(self) -> None:
         try:
@@ -191,61 +222,89 @@ class RunStep(Step):
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The command as words, addresses not filled in."""
+        """The command as words, variables not filled in."""
         return self.argv or tuple(shlex.split(self.command))
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
 
-        def address(match: re.Match[str]) -> str:
-            return scene.robot(Role(match["role"])).address
+        def address(role: str) -> str:
+            return scene.robot(Role(role)).address
 
-        argv = [_ADDRESS.sub(address, word) for word in self.words]
+        put, values = self._copied, dict[str, str]()
+        if put is not None:
+            values[arguments.PUT] = put.at
+        if scene.placement is not None:
+            values["distance"] = scene.placement.distance.label
+        if scene.repeat is not None:
+            values["repeat"] = str(scene.repeat)
+        argv = [arguments.filled(word, values, address) for word in self.words]
         job = Job(
             folder=scene.folder,
             name=self.own_name("run"),
-            argv=("sh", "-c", _BOUNDED, "sh", str(printed.MOST_BYTES), *argv),
+            argv=tuple(argv),
             limit_s=self.limit,
             log=self._log,
             stdout=self._output,
+            output_limit_bytes=printed.MOST_BYTES,
         )
         remedy = f"install {argv[0]}, or correct the command of this run in the procedure"
-        yield Planned(self.robot, job, program=argv[0], remedy=remedy)
+        # Preflight looks for the program; one that is copied is not there yet.
+        program = "sh" if self.words[0] == f"{{{arguments.PUT}}}" else argv[0]
+        yield Planned(self.robot, job, program=program, remedy=remedy, put=put)
 
+    @property
+    def _copied(self) -> PutProgram | None:
+        if self.put is None:
+            return None
+        return PutProgram(self.robot, self.put, programs.path(self.own_name("run"), self.put.name))
+
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
-        (planned,) = self.commands(scene)
-        announce(planned.program, self.takes)
+        (planned,) = self.jobs(scene)
+        announce(self._called, self.takes)
         shell = testbed.shells[self.robot]
         with shell.silence(self.limit):
             code = jobs.run(shell, planned.job)
         if code not in self.expect.code:
             raise RobotError(
-                f"{planned.program} ended with exit code {code}",
+                f"{self._called} ended with exit code {code}",
                 where=scene.robot(self.robot).name,
                 remedy=f"see {self._log} and {self._output} of this repeat",
             )
 
+    cross_checks = (
+        CrossCheck(
+            "what a program of the lab prints",
+            ("*",),
+            "the step's output file",
+            (),
+            "fieldkit does not know the program; `expect:` bounds its values",
+            CheckOutcome.UNCHECKED,
+        ),
+    )
+
+    @override
     def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        named = {Role(match["role"]) for word in self.words for match in _ADDRESS.finditer(word)}
+        named = {Role(role) for word in self.words for role in arguments.roles(word)}
         return frozenset({self.robot}) | named
 
-    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
-        """See `Step.expected_s`."""
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
         return self.takes
 
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
-        return ("a run",)
-
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
         return (self._output, self._log)
 
-    def bytes_left(self, scene: Scene, role: Role) -> float:  # noqa: ARG002 (the same for every scene)
-        """See `Step.bytes_left`."""
+    @override
+    def bytes_left(self, scene: Scene, role: Role) -> float:
         return self.prints if role == self.robot else 0.0
+
+    @property
+    def _called(self) -> str:
+        """What the program is called in messages."""
+        return self.put.name if self.put and self.words[0] == f"{{{arguments.PUT}}}" else self.words[0]
 
     @property
     def _log(self) -> str:
@@ -255,16 +314,18 @@ class RunStep(Step):
     def _output(self) -> str:
         return self.own_name(self.output)
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`: what the procedure says."""
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        """What the procedure says."""
         return tuple(column.column for column in self.figures)
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: the program ended as it is to, and printed what is to be read, within bounds."""
-        after = view.evidence.known(host.state, host.after(self.robot))
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """The program ended as it is to, and printed what is to be read, within bounds."""
+        after = view.evidence.read_or_none(host.state, host.after(self.robot))
         ending = (after.endings or {}).get(self.own_name("run")) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.expect.code:
-            yield f"{view.scene.robot(self.robot).name}: {self.words[0]} ended with exit code {ending.code}"
+            yield f"{view.scene.robot(self.robot).name}: {self._called} ended with exit code {ending.code}"
         try:
             view.evidence.read(printed.text, self._output)
         except EvidenceError as error:
@@ -279,8 +340,8 @@ class RunStep(Step):
                 if why := bounds.problem(value):
                     yield f"{self._output}: {column.name} is {value}, {why}"
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
         values, missing = dict[str, Value](), dict[str, str]()
         for column in self.figures:
             try:
@@ -289,8 +350,8 @@ class RunStep(Step):
                 missing[column.name] = error.what
         return Measured(values, missing)
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         for column in self.figures:
             if column.name in values:
                 value = values[column.name]

@@ -1,24 +1,34 @@
-"""Load the radio while other steps run; nobody measures the load."""
+"""Load the radio while other steps run; of the load itself only its stalls are measured."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
+
+from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config.schema import Field, Int
+from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.transfers import load_streams, recoveries, stalls
+from fieldkit.measure.transfers.deliveries import Delivery
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Nest, StepEntry
+from fieldkit.steps import across
+from fieldkit.steps.base import StepEntry
 from fieldkit.steps.loads import PROGRAM, LoadOptions
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, ListeningPort, Planned, Scene
+from fieldkit.steps.view import View
 
 LIMIT_S: Final = 900.0
 """For how long the load may outlast the limits of the steps inside."""
 
 _FOREVER_S: Final = 86_400
 """The longest that iperf3 takes."""
+
+_STALLS: Final = stalls.declared("soak", "the load", 69)
 
 # Says "flows" when 10 kB more have left by interface $1, and is the command after it. iperf3 itself says nothing of
 # its packets before a second is over, and old versions nothing at all while their output is a file.
@@ -30,18 +40,24 @@ _FLOWS: Final = (
 
 
 class SoakStep(LoadOptions, Nest):
-    """A load of iperf3 from one robot to another, from before the first step inside until after the last.
+    """Loads the radio while the steps in `during` run: iperf3 sends until the last of them has ended.
+
+    Of the load only [stalls](method-delay.md#stalls-of-a-flow) are measured. Its robots need iperf3, 3.1 or later. A
+    load that ends early makes the repeat void. Leaves `ROLE-soak.log`.
 
     Attributes:
-        port: As for any load; another than that of an `iperf3` inside.
-        during: The steps inside.
+        port: Port that the receiver listens on; it must differ from that of an `iperf3` inside.
+        during: Steps that run meanwhile.
     """
+
+    flow_kind: ClassVar[str] = "soak"
+    cross_checks = (*stalls.cross_checks("soak"), *recoveries.CROSS_CHECKS)
 
     port: Annotated[Int, Field(gt=0, lt=65536)] = 5202
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         yield from self._load(scene)
         yield from self.inside(scene)
 
@@ -66,8 +82,8 @@ class SoakStep(LoadOptions, Nest):
         )
         return server, sender
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
         server, client = self._load(scene)
         announce("start load", None)
         try:
@@ -84,29 +100,41 @@ class SoakStep(LoadOptions, Nest):
         for planned in (client, server):
             jobs.stop(testbed.shells[planned.role], planned.job)
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset({self.sender, self.receiver}) | self.roles_inside()
-
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return 0.5 + self.inside_s(protocol)
 
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
-        return ("a soak",)
-
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
         return (self._log(self.sender), self._log(self.receiver))
 
     def _log(self, role: Role) -> str:
         return self.own_name(f"{role}-soak.log")
 
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        """A trial without a load has no columns for it."""
+        return (*_STALLS, *across.declared(self))
+
+    @override
+    def measure(self, view: View) -> Measured:
+        return stalls.measure("soak", lambda: self.deliveries(view)) | across.measure(self, view)
+
+    @property
+    def destination(self) -> Role:
+        """See `SendsFlow.destination`."""
+        return self.receiver
+
+    def deliveries(self, view: View) -> Sequence[Delivery]:
+        """See `SendsFlow.deliveries`."""
+        left, came = (view.capture(role) for role in (self.sender, self.receiver))
+        load = self.data_streams(view.scene)
+        return load_streams.read(load, left.packets if left else None, came.packets if came else None)
+
+    @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """See `Step.listens`."""
         return (ListeningPort(self.receiver, self.port, self.sender),)
 
+    @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        """See `Step.flows`."""
         yield self.flow(scene.protocol, self.inside_s(scene.protocol) * self.expected_bit_s(scene.protocol) / 8)

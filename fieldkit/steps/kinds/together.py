@@ -6,13 +6,16 @@ from dataclasses import replace
 from functools import partial
 from typing import Annotated, ClassVar, Final, TypeVar
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Field
 from fieldkit.core.errors import FieldkitError
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.model import Protocol
 from fieldkit.core.threads import together
-from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Planned, Scene
 
 T = TypeVar("T")
@@ -22,13 +25,15 @@ MOST: Final = 8
 
 
 class TogetherStep(Nest):
-    """Steps that begin at the same time, each in a thread of its own; over when the last of them is.
+    """Runs its steps at the same time: all listeners are up before the first step begins.
 
-    What is to be up before they begin, as listeners, is up in all of them before the first begins. The first that
-    fails ends the others' jobs and waits.
+    It ends when the last of them ends. The first that fails ends the others, a `wait` too. For a sequence within it,
+    use a step that has `during`, for example a `capture`. A step that may ask the operator (`fault`, `move`, `ask`,
+    `wait` with `until`) must be around or before it, not inside. Commands on the control link of one step then affect
+    the measurement of another, as far as SSH uses the radio under test.
 
     Attributes:
-        during: The steps; what is inside one of them runs one after the other.
+        during: Two steps or more; at most 8 run at the same time.
     """
 
     parallel: ClassVar[bool] = True
@@ -43,18 +48,18 @@ class TogetherStep(Nest):
             raise schema.complaint(f"{kind} may ask the operator: no other step runs beside it", *at)
         return self
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         yield from self.inside(scene)
 
-    def beside(self, scene: Scene) -> Iterator[str]:
-        """See `Step.beside`."""
+    @override
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         names = (f"{entry.kind} {entry.step.prefix}".rstrip() for entry in self.during)
         yield f"at the same time: {', '.join(names)}"
-        yield from super().beside(scene)
+        yield from super().dry_run_notes(scene)
 
+    @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        """See `Step.prepare`."""
         inner = replace(scene, halt=scene.halt.inside())
         prepared = self._each([partial(entry.step.prepare, inner, testbed) for entry in self.during], inner, testbed)
 
@@ -63,8 +68,8 @@ class TogetherStep(Nest):
 
         return carry_out
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
         self.prepare(scene, testbed)(announce)
 
     def _each(self, calls: list[Callable[[], T]], scene: Scene, testbed: Testbed) -> list[T]:
@@ -84,20 +89,12 @@ class TogetherStep(Nest):
             scene.halt.call()  # whoever catches Ctrl-C ends the jobs
             raise
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return self.roles_inside()
-
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
         return ()
 
-    def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
-        return ()
-
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return max(entry.step.expected_s(protocol) for entry in self.during)
 
 

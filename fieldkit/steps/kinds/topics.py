@@ -1,21 +1,23 @@
 """Stream samples of a topic from one robot to another over a middleware, and measure what arrives, and when."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, ClassVar, Final, Self
+
+from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role, in_order
 from fieldkit.core.threads import together
+from fieldkit.measure.checks import topic_sources
+from fieldkit.measure.transfers import stalls
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import streams
 from fieldkit.steps.along import AlongStep
-from fieldkit.steps.base import View
 from fieldkit.steps.middlewares import Discovery, Over
 from fieldkit.steps.scene import (
     BY_FIELDKIT,
@@ -29,12 +31,25 @@ from fieldkit.steps.scene import (
     fragments,
 )
 from fieldkit.steps.streams import LONGEST_S, StreamOptions
+from fieldkit.steps.view import View
 
 if TYPE_CHECKING:
+    from fieldkit.measure.captures.packets import Packets
+    from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
     from fieldkit.measure.transfers.topic_log import TopicLog
+    from fieldkit.measure.transfers.topics import TopicTraffic
+
 
 MASTER: Final = "rosmaster"
 """ROS's own."""
+
+KEPT_BYTES: Final = 256
+"""A capture must show the head of each sample: it ends 138 bytes behind an Ethernet header over DDS, 154 if DDS names
+the reader, and at about 190 over Zenoh, whose attachment and key expression come first."""
+
+BUFFER_KIB: Final = 32_768
+"""Kernel buffer of a capture around a topic. In immediate mode a frame takes about 400 bytes of it with `KEPT_BYTES`
+kept, so 4 MiB hold 10,000 packets. Fast DDS sent 60,000 per second where it asked again for lost fragments."""
 
 _GRACE_S: Final = 5
 _ENDS_S: Final = 10.0
@@ -46,17 +61,25 @@ _ENVELOPE_BYTES: Final = 100
 
 
 class TopicsStep(StreamOptions, AlongStep):
-    """A topic between two robots, by the agent on both.
+    """Streams samples of a topic from one robot to another over a middleware.
 
-    The subscriber is up before the publisher starts, so that discovery is timed by one clock: that of the publisher.
+    The program is part of fieldkit; both robots need the middleware for Python. See [topics](topics.md), also for the
+    columns. Inside a `capture` its traffic is counted, and delays are measured if there are packets in both
+    directions. Leaves `ROLE-topic.bin` and `ROLE-topic.log`, and `ROLE-serve.log` of a router or a master.
     """
 
+    cross_checks = (*topic_sources.CROSS_CHECKS, *stalls.cross_checks("topic"))
+    kept_bytes = KEPT_BYTES
+    capture_buffer_kib = BUFFER_KIB
+    needs_complete_capture = False
+    flow_kind: ClassVar[str] = "topic"
+
+    @override
     def lasting(self, seconds: float) -> Self:
-        """See `AlongStep.lasting`."""
         return self.model_copy(update={"duration": min(seconds, LONGEST_S)})
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         if self.serves:
             yield self._serve(scene, self.serves)
         yield self._end(scene, self.receiver, "subscribe")
@@ -103,17 +126,18 @@ class TopicsStep(StreamOptions, AlongStep):
         )
         return Planned(role, job, program=program, setup=setup, ends=BY_FIELDKIT)
 
+    @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        """See `Step.prepare`: the agent is there, and all but the publisher is up."""
+        """The agent is there, and all but the publisher is up."""
         members = in_order(self.members)
         together(lambda role: agent.install(testbed.shells[role]), members)
-        *before, publish = self.commands(scene)
+        *before, publish = self.jobs(scene)
         for planned in before:
             jobs.start(testbed.shells[planned.role], planned.job)
         return partial(self._stream, scene, testbed, before, publish)
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
         self.prepare(scene, testbed)(announce)
 
     def _stream(
@@ -132,16 +156,17 @@ class TopicsStep(StreamOptions, AlongStep):
             if left != 0:
                 raise scene.failure(planned, f"{planned.job.name} ended with exit code {left}")
 
+    @override
     def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
         return self.members
 
-    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
-        """See `Step.expected_s`."""
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
         return self.duration + 3.0
 
+    @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """See `Step.listens`: each domain has ports of its own."""
+        """Each domain has ports of its own."""
         if not self.served_on:  # of DDS, whose participants take the next ports that are free
             return (ListeningPort(self.receiver, min(self.wire.data), self.sender, by="domain", shared=True),)
         listeners = {(self.receiver, self.sender), (self.sender, self.receiver)}
@@ -152,18 +177,19 @@ class TopicsStep(StreamOptions, AlongStep):
         found = (ListeningPort(role, self.served_on, peer, by="domain") for role, peer in listeners)
         return tuple(sorted(found, key=lambda one: (one.role, one.peer)))
 
+    @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """See `Step.needs`: the middleware's Python package."""
+        """The middleware's Python package."""
         # A master needs none of it.
         for role in in_order(self.members - ({self.serves} if self.way is Discovery.MASTER else set())):
             yield self.need(role, scene.robot(role))
 
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
         return ("topics",)
 
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
         ends = [name for role in (self.receiver, self.sender) for name in (self._file(role), self._log(role))]
         return (*ends, *([self.own_name(f"{self.serves}-serve.log")] if self.serves else []))
 
@@ -173,8 +199,8 @@ class TopicsStep(StreamOptions, AlongStep):
     def _log(self, role: Role) -> str:
         return self.own_name(f"{role}-topic.log")
 
-    def flows(self, scene: Scene) -> Iterator[Flow]:  # noqa: ARG002 (the same for every scene)
-        """See `Step.flows`."""
+    @override
+    def flows(self, scene: Scene) -> Iterator[Flow]:
         frames = 2 * self._samples * fragments(round(self.bytes) + _ENVELOPE_BYTES)
         ends = (self.sender, self.receiver)
         pairs = [ends, *((end, self.serves) for end in ends if self.serves and end != self.serves)]
@@ -187,58 +213,86 @@ class TopicsStep(StreamOptions, AlongStep):
     def _samples(self) -> float:
         return self.rate * self.duration
 
-    def bytes_left(self, scene: Scene, role: Role) -> float:  # noqa: ARG002 (the same for every scene)
-        """See `Step.bytes_left`."""
+    @override
+    def bytes_left(self, scene: Scene, role: Role) -> float:
         return _RECORD_BYTES * self._samples if role in {self.sender, self.receiver} else 0.0
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`; a trial without topics has no columns for them."""
-        from fieldkit.measure.transfers import topics  # noqa: PLC0415 (only where there are any)
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        """A trial without topics has no columns for them."""
+        from fieldkit.measure.transfers import topic_stalls, topics  # noqa: PLC0415 (only where there are any)
 
-        return topics.COLUMNS
+        return (*topics.COLUMNS, *topic_stalls.COLUMNS)
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: both logs have their end, and nobody got what was never sent."""
-        from fieldkit.measure.transfers import topic_log, topics  # noqa: PLC0415 (as above)
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """Both logs are whole, and agree with each other, the attempt and the captures."""
+        from fieldkit.steps import topic_evidence  # noqa: PLC0415 (as above)
 
-        logs: dict[Role, TopicLog] = {}
-        for role in (self.sender, self.receiver):
-            try:
-                logs[role] = view.evidence.read(topic_log.read, self._file(role))
-            except EvidenceError as error:
-                yield f"{self._file(role)}: {error.what}"
-                continue
-            if not logs[role].whole:
-                yield f"{self._file(role)} has no end: the agent was ended"
-            if logs[role].foreign:
-                yield f"{self._file(role)}: somebody else publishes {self.topic}, too: take another topic or domain"
-        if len(logs) == 2 and (why := topics.contradiction(logs[self.sender], logs[self.receiver])):
-            yield why
+        logs, wrong = topic_evidence.read(self, view, self._logs)
+        yield from wrong
+        yield from topic_evidence.problems(self, view, logs)
 
+    @property
+    def _logs(self) -> Mapping[Role, str]:
+        return {role: self._file(role) for role in (self.sender, self.receiver)}
+
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
+        from fieldkit.measure.transfers import topic_stalls, topics  # noqa: PLC0415 (as above)
+        from fieldkit.steps import topic_evidence  # noqa: PLC0415 (as above)
+
+        logs, _ = topic_evidence.read(self, view, self._logs)
+        ends = logs.get(self.sender), logs.get(self.receiver)
+        flow, captured = self._traffic(view), self._captured(view)
+        stalled = topic_stalls.measure(flow, ends, captured, self._expected)
+        measured = topics.measure(flow, *ends, *captured) | stalled
+        measured = measured.without(topics.without_captures(measured, topic_evidence.dropped(self, view)))
+        measured = topic_evidence.checked(self, view, logs, measured)
+        return measured | topics.withheld_mark(topic_evidence.dropped(self, view))
+
+    def deliveries(self, view: View) -> "Sequence[Delivery]":
+        """See `SendsFlow.deliveries`."""
+        from fieldkit.measure.transfers import topic_stalls  # noqa: PLC0415 (as above)
+
+        return topic_stalls.read(self._traffic(view), self._both_logs(view), self._captured(view), self._expected)
+
+    @property
+    def destination(self) -> Role:
+        """See `SendsFlow.destination`."""
+        return self.receiver
+
+    def _traffic(self, view: View) -> "TopicTraffic":
         from fieldkit.measure.transfers import topics  # noqa: PLC0415 (as above)
 
-        sent, came = (self._whole(view, role) for role in (self.sender, self.receiver))
-        left, arrived = (view.capture(role) for role in (self.sender, self.receiver))
-        flow = topics.TopicTraffic(
+        return topics.TopicTraffic(
             sender_address=view.scene.robot(self.sender).address,
             receiver_address=view.scene.robot(self.receiver).address,
             data_ports=self.wire.data,
             discovery_ports=self.wire.discovery,
             deadline_s=self.qos.deadline,
         )
-        captured = (left.packets if left else None, arrived.packets if arrived else None)
-        return topics.measure(flow, sent, came, *captured)
 
-    def _whole(self, view: View, role: Role) -> "TopicLog | None":
-        from fieldkit.measure.transfers import topic_log  # noqa: PLC0415 (as above)
+    def _both_logs(self, view: View) -> "tuple[TopicLog | None, TopicLog | None]":
+        """Return the whole logs of publisher and subscriber."""
+        from fieldkit.steps import topic_evidence  # noqa: PLC0415 (as above)
 
-        found = view.evidence.known(topic_log.read, self._file(role))
-        return found if found and found.whole else None
+        logs, _ = topic_evidence.read(self, view, self._logs)
+        return logs.get(self.sender), logs.get(self.receiver)
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    def _captured(self, view: View) -> "tuple[Packets | None, Packets | None]":
+        left, arrived = (view.capture(role) for role in (self.sender, self.receiver))
+        return left.packets if left else None, arrived.packets if arrived else None
+
+    @property
+    def _expected(self) -> "FlowSchedule":
+        from fieldkit.measure.transfers.deliveries import FlowSchedule  # noqa: PLC0415 (as above)
+
+        # The last sample is sent one interval before the end.
+        return FlowSchedule(interval_s=1 / self.rate, lasts_s=max(self.duration - 1 / self.rate, 0.0))
+
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         if values.get("topic_discovered") is False:
             yield "topic not discovered"
         if isinstance(loss := values.get("topic_loss"), float):

@@ -6,6 +6,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Annotated, Final, Literal
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.profiles import TopicName
@@ -13,13 +15,16 @@ from fieldkit.config.schema import Duration, Field, Number, Strict
 from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.motion import motion_sources
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions import accounts, samples
 from fieldkit.measure.positions.accounts import Account, Accounts
-from fieldkit.steps.base import Nest, Step, StepEntry, View
+from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.kinds.record import SUBSCRIBE_S, RecordStep
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, Scene
+from fieldkit.steps.view import View
 
 _PERIODS: Final = 1.5
 ODOMETRY: Final = "nav_msgs/Odometry"
@@ -36,13 +41,13 @@ class Spot(Strict):
     """A place in which a robot stands: degrees and metres on the earth, or metres in the frame of a tracker.
 
     Attributes:
-        lat: Degrees north.
+        lat: Degrees north, together with robots that publish `NavSatFix`.
         lon: Degrees east.
-        alt: Metres over the ellipsoid.
-        frame: A tracker's frame, its `frame_id`.
-        x: Metres along its first axis.
-        y: Along the second.
-        z: Along the third.
+        alt: Metres above the ellipsoid.
+        frame: A tracker's frame, the `frame_id` of its messages.
+        x: Metres along the first axis of that frame.
+        y: Metres along its second axis.
+        z: Metres along its third axis.
     """
 
     lat: Annotated[Number | schema.Int, Field(ge=-90, le=90)] | None = None
@@ -75,12 +80,15 @@ class TrackedRobot(Strict):
     """What tells where one robot is.
 
     Attributes:
-        topic: Odometry, a fix of satellites, or a pose or transform of a tracker.
-        facing: Where the robot faces when the step begins, as who looks away from the other end of its link sees it.
-        child: Of a tree of transforms, the robot's frame.
-        times: `header`, messages say when they were true; `received`, they were when the recorder had them.
-        gap: Longest time between two messages in which it went straight.
-        at: Where it stands instead, all the time.
+        topic: `nav_msgs/Odometry`, `sensor_msgs/NavSatFix`, or of a tracker `geometry_msgs/PoseStamped`,
+            `PoseWithCovarianceStamped`, `TransformStamped` or `tf2_msgs/TFMessage`. Either this or `at`.
+        facing: Direction of the robot when the step begins: `away`, `towards`, `left` or `right`, seen by an observer
+            who looks away from the other end of its link; required for odometry.
+        child: Frame of the robot in a tree of transforms, whose parent is the tracker's frame.
+        times: Time of a message: `header`, its stamp, or `received`, when the recorder received it, for stamps of
+            another clock.
+        gap: If two consecutive messages are further apart than this, the position between them is unknown.
+        at: A fixed position, in place of a topic.
     """
 
     topic: TopicName | None = None
@@ -98,22 +106,29 @@ class TrackedRobot(Strict):
 
 
 class TrackStep(Nest):
-    """Each robot records what it knows of its own place, by its own recorder, while the steps in `during` run.
+    """Records on each robot its own position while the steps in `during` run, by its profile's record command.
 
-    Robots of the steps inside that are not named stand where they were placed.
+    The distance and speed columns of the transfers and pings inside use these positions
+    ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to be where they were
+    placed, unless they move. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the
+    columns `positions_from` and `positions_clock_error_s`. Leaves `track_ROLE.bag` (ROS 2: a folder) and
+    `positions.json`, which records the source of each position and how far the robots' clocks were ahead of the
+    laptop's.
 
     Attributes:
-        robots: What tells where each is.
-        heights: Whether heights over the ellipsoid count.
-        during: Steps inside.
+        robots: Source of each robot's position, by role.
+        heights: Whether heights above the ellipsoid are used; those of satellite receivers are often wrong by 10 m.
+        during: Steps that run meanwhile.
     """
+
+    cross_checks = motion_sources.OF_POSITIONS
 
     robots: Annotated[dict[Role, TrackedRobot], Field(min_length=1)]
     heights: schema.Bool = False
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         yield from self._recordings(scene)
         yield from self.inside(scene)
 
@@ -123,7 +138,7 @@ class TrackStep(Nest):
         return [self._recording(scene, recorder) for recorder in self._recorders(limit_s).values()]
 
     def _recording(self, scene: Scene, recorder: RecordStep) -> Planned:
-        (planned,) = recorder.commands(scene)
+        (planned,) = recorder.jobs(scene)
         words = (recorder.bag(scene.robot(planned.role)), str(self._period_s(scene, planned.role)))
         job = replace(
             planned.job,
@@ -150,8 +165,9 @@ class TrackStep(Nest):
             if tracked.topic is not None
         }
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`; whether a recording is whole its bag tells."""
+        """Whether a recording is whole its bag tells."""
         announce("record positions", None)
         follow.follow(
             self,
@@ -193,8 +209,9 @@ class TrackStep(Nest):
                 )
         return Accounts(found, offsets, self.heights)
 
+    @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """See `Step.refusals`: recorders, and odometry of which nobody says where its robot faces."""
+        """Recorders, and odometry of which nobody says where its robot faces."""
         for role, recorder in self._recorders(1.0).items():
             yield from recorder.refusals(scene)
             ros = scene.robot(role).profile.ros
@@ -204,56 +221,53 @@ class TrackStep(Nest):
                 yield Refusal(role, what, "facing: away, towards, left or right, in the step track")
         yield from super().refusals(scene)
 
+    @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """See `Step.needs`."""
         for recorder in self._recorders(1.0).values():
             yield from recorder.needs(scene)
 
+    @override
     def live_topics(self, role: Role) -> tuple[str, ...]:
-        """See `Step.live_topics`."""
         recorder = self._recorders(1.0).get(role)
         return recorder.topics if recorder else ()
 
+    @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
-        """See `Step.bytes_left`."""
         recorder = self._recorders(self.expected_s(scene.protocol)).get(role)
         return recorder.bytes_left(scene, role) if recorder else 0.0
 
+    @override
     def reserve_bytes(self, scene: Scene, role: Role) -> int:
-        """See `Step.reserve_bytes`."""
         recorder = self._recorders(1.0).get(role)
         return recorder.reserve_bytes(scene, role) if recorder else 0
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset(self.robots) | self.roles_inside()
-
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
-        return ("a track",)
-
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
         return (accounts.FILE, *(name for recorder in self._recorders(1.0).values() for name in recorder.files()))
 
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
-        """See `Step.misplaced`."""
+    @override
+    def laptop_files(self) -> tuple[str, ...]:
+        return (accounts.FILE,)
+
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         if any(isinstance(step, TrackStep) for step in earlier):
             return "one track records a repeat: name all its robots, and put all steps into it"
-        return follow.misplaced("track", within)
+        return follow.placement_error("track", within)
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: a bag of each topic, in which it says places."""
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """A bag of each topic, in which it says places."""
         yield from follow.problems(view, list(self._recorders(1.0)))
 
-    def declared(self) -> tuple[Column, ...]:
-        """See `Step.declared`."""
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
         return follow.COLUMNS
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
         return follow.measure(view)
 
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return 2 * SUBSCRIBE_S + 1.0 + self.inside_s(protocol)

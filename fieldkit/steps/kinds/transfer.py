@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import PurePosixPath
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
+
+from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
@@ -14,15 +16,19 @@ from fieldkit.config.schema import Duration, Field, Int
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.checks import contradictions
+from fieldkit.measure.checks.cross_checks import CROSS_CHECKS
 from fieldkit.measure.evidence import host, medium, reading
 from fieldkit.measure.evidence.endings import Cause, Ending
-from fieldkit.measure.transfers import contradictions, figures, paper
+from fieldkit.measure.transfers import figures, paper, stalls, transfer_stalls
 from fieldkit.measure.transfers.columns import COLUMNS
+from fieldkit.measure.transfers.deliveries import Delivery
 from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job, Pending
 from fieldkit.steps import netcat
-from fieldkit.steps.base import FileName, Nest, Step, View, capture_around
+from fieldkit.steps.base import FileName, Step
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import (
     BY_ITSELF_OR_LIMIT,
     Announce,
@@ -35,6 +41,7 @@ from fieldkit.steps.scene import (
     frames,
 )
 from fieldkit.steps.variants import Netcat, Tool
+from fieldkit.steps.view import View, capture_around
 
 BagName = Annotated[
     str,
@@ -53,21 +60,26 @@ _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.t
 
 
 class TransferStep(Step):
-    """The paper's transfer: `nc -l -p PORT > recv.bag` on the receiver, `nc ADDRESS PORT < scan.bag` on the sender.
+    """Sends a file with netcat, by the protocol of the repeat.
 
-    What is typed depends on the netcats that the robots have: `fieldkit.steps.netcat`.
+    The receiver runs `nc -l -p PORT > recv.bag`, the sender `nc ADDRESS PORT < scan.bag`, with the options of the
+    [netcat that each robot has](method-loss.md#tools-that-differ). A TCP transfer ends when its connection closes, a
+    UDP transfer when nothing has arrived for `idle`.
 
     Attributes:
-        sender: Who sends (`from`).
-        receiver: Who receives (`to`).
-        file: The file sent: its name, or that of the bag; None for the only one recorded on the sender.
+        sender: Role that sends; columns with "sender" in their name refer to it.
+        receiver: Role that receives.
+        file: The file to send: name of a recording on the sender (`scan`) or of its file (`scan.bag`). Without it,
+            the only recording on the sender.
         into: The file written by the receiver.
         port: Port that the receiver listens on.
-        idle: A UDP listener ends after so many seconds without a datagram.
-        limit: A transfer that takes longer is ended where it stands, and measured as it is.
+        idle: A UDP listener ends after this time without a datagram; at least `1s`, rounded up to whole seconds.
+        limit: A transfer that takes longer is ended, and what had arrived by then is measured.
     """
 
     columns = COLUMNS
+    flow_kind: ClassVar[str] = "transfer"
+    cross_checks = (*CROSS_CHECKS, *stalls.cross_checks("transfer"))
 
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
@@ -83,8 +95,8 @@ class TransferStep(Step):
             raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
         return self
 
-    def misplaced(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:  # noqa: ARG002 (see the base)
-        """See `Step.misplaced`."""
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         recorders = [step for step in earlier if self.sender in step.records_on()]
         what = f"the transfer from {self.sender} {f'sends {self.file}' if self.file else 'names no file'}"
         if not recorders:
@@ -101,8 +113,8 @@ class TransferStep(Step):
         made = scene.recorded[self.sender]
         return next((file for file in made if self.file in {file.name, file.called}), made[0])
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         yield from self._netcats(scene)
 
     def _netcats(self, scene: Scene) -> Iterator[Planned]:
@@ -140,8 +152,8 @@ class TransferStep(Step):
             ends=BY_ITSELF_OR_LIMIT,
         )
 
+    @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """See `Step.refusals`."""
         yield from self._refused_file(scene)
         if scene.protocol is not Protocol.UDP:
             return
@@ -149,7 +161,8 @@ class TransferStep(Step):
         for role, kind in ends.items():
             if kind is Netcat.BUSYBOX:
                 yield Refusal(role, "busybox nc has no UDP", _TRADITIONAL)
-        if netcat.cut_short(ends[self.sender], ends[self.receiver]):
+        version = scene.tools(self.receiver).versions.get(Tool.NETCAT, "")
+        if netcat.cut_short(ends[self.sender], ends[self.receiver], version):
             size = netcat.DATAGRAM_BYTES[ends[self.sender]]
             what = f"its netcat cuts off the datagrams of {size} bytes that the sender's sends"
             yield Refusal(
@@ -164,15 +177,16 @@ class TransferStep(Step):
             leave_out = "leave out file: in the transfer, or " if len(made) == 1 else ""
             yield Refusal(self.sender, what, f"{leave_out}write file: {made[0]}")
 
+    @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        """See `Step.prepare`: the listener is up."""
+        """The listener is up."""
         listen, _ = self._netcats(scene)
         started_s = time.monotonic()
         listening = jobs.serve(testbed.shells[self.receiver], listen.job)
         return partial(self._send, scene, testbed, listening, started_s)
 
+    @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`."""
         self.prepare(scene, testbed)(announce)
 
     def _send(self, scene: Scene, testbed: Testbed, listening: Pending, started_s: float, announce: Announce) -> None:
@@ -212,21 +226,22 @@ class TransferStep(Step):
             remedy="look at the control link; a larger `idle` or `limit` in the procedure leaves it more time",
         )
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset({self.sender, self.receiver})
-
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
+        """Of a `send`, too."""
         return ("a transfer",)
 
+    @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """See `Step.listens`."""
         return (ListeningPort(self.receiver, self.port, self.sender),)
 
+    @override
     def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
-        return (self._into, self.own_name(medium.FILE), *self._logs)
+        return (self._into, *self.laptop_files(), *self._logs)
+
+    @override
+    def laptop_files(self) -> tuple[str, ...]:
+        return (self.own_name(medium.FILE),)
 
     @property
     def _into(self) -> str:
@@ -236,20 +251,20 @@ class TransferStep(Step):
     def _logs(self) -> tuple[str, str]:
         return self.own_name(f"{self.receiver}-listen.log"), self.own_name(f"{self.sender}-send.log")
 
+    @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        """See `Step.flows`."""
         sent = frames(scene.protocol, self._size_bytes(scene), netcat.DATAGRAM_BYTES[Netcat.TRADITIONAL])
         yield Flow(self.sender, self.receiver, self.port, sent)
 
+    @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
-        """See `Step.bytes_left`."""
         return self._size_bytes(scene) if role == self.receiver else 0.0
 
     def _size_bytes(self, scene: Scene) -> float:
         return self._sent(scene).size_bytes
 
+    @override
     def transfer(self, scene: Scene, within: Sequence[Nest]) -> Transfer:
-        """See `Step.transfer`."""
         return Transfer(
             protocol=scene.protocol,
             source=self.sender,
@@ -263,18 +278,21 @@ class TransferStep(Step):
             name=self.prefix,
         )
 
-    def problems(self, view: View) -> Iterator[str]:
-        """See `Step.problems`: a file, netcats that nobody ended, and captures that do not contradict the file."""
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """A file, netcats that nobody ended, and captures that do not contradict the file."""
         transfer = self.transfer(view.scene, view.within)
-        listened, sent = (self._ending(view, role, job) for role, job in self._ends)
+        endings = [self._ending(view, role, job) for role, job in self._ends]
+        listened, sent = (ending if ending and ending.cause is Cause.ITSELF else None for ending in endings)
         if not view.evidence.has(self._into):
             yield f"{self._into} is missing"
         elif why := figures.incomparable(view.evidence, transfer):
             yield why
         else:
             finished = listened is not None and listened.code == 0
-            yield from contradictions.find(view.evidence, transfer, finished=finished)
-        said = [view.evidence.known(reading.text, log) for log in self._logs]
+            cut = endings[0] is not None and listened is None
+            yield from contradictions.find(view.evidence, transfer, finished=finished, cut=cut)
+        said = [view.evidence.read_or_none(reading.text, log) for log in self._logs]
         if listened is not None and netcat.listener_cut(listened.code, said[0]):
             yield f"{self._logs[0]}: netcat was ended by a signal, or could not write {self._into}"
         if sent is not None and netcat.sender_cut(sent.code, said[1]):
@@ -285,19 +303,27 @@ class TransferStep(Step):
         return (self.receiver, self.own_name(_LISTEN)), (self.sender, self.own_name(_SEND))
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
-        """Return how a robot noted that a netcat ended, None where it did not, or where the netcat was ended."""
-        after = view.evidence.known(host.state, host.after(role))
-        ending = (after.endings or {}).get(job) if after else None
-        return ending if ending is not None and ending.cause is Cause.ITSELF else None
+        """Return how a robot noted that a netcat ended, None if it did not."""
+        after = view.evidence.read_or_none(host.state, host.after(role))
+        return (after.endings or {}).get(job) if after else None
 
+    @override
     def measure(self, view: View) -> Measured:
-        """See `Step.measure`."""
-        found = figures.measure(view.evidence, self.transfer(view.scene, view.within))
+        found = figures.measure(view.evidence, self.transfer(view.scene, view.within), self.own_name(_LISTEN))
         if self._shares_kernel(view.scene):
             found = host.shared(found)
         if self._shares_port(view):
             found = found.without(dict.fromkeys(paper.COUNTED, "the paper's filter counts another flow, too"))
         return found
+
+    @property
+    def destination(self) -> Role:
+        """See `SendsFlow.destination`."""
+        return self.receiver
+
+    def deliveries(self, view: View) -> Sequence[Delivery]:
+        """See `SendsFlow.deliveries`."""
+        return transfer_stalls.read(view.evidence, self.transfer(view.scene, view.within), self.own_name(_LISTEN))
 
     def _shares_port(self, view: View) -> bool:
         """Return whether another flow that was captured with it has its port: of other robots, or the other way."""
@@ -311,8 +337,8 @@ class TransferStep(Step):
         udp = sum((flow.protocol or scene.protocol) is Protocol.UDP for flow in to_it)
         return udp > (scene.protocol is Protocol.UDP)
 
-    def in_words(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """See `Step.in_words`."""
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         for name, layer in (("ip_loss", "IP"), ("datagram_loss", "datagram"), ("file_loss", "file")):
             if name in values:
                 yield f"{layer} loss {100 * float(values[name]):.1f} %"
@@ -321,6 +347,6 @@ class TransferStep(Step):
         if "tcp_retransmitted_segments" in values:
             yield f"{values['tcp_retransmitted_segments']} retransmitted"
 
+    @override
     def expected_s(self, protocol: Protocol) -> float:
-        """See `Step.expected_s`."""
         return 0.3 + (self.idle if protocol is Protocol.UDP else 0.0)

@@ -1,24 +1,30 @@
 """Wait for some time, or until the operator says so."""
 
 from collections.abc import Iterator
-from typing import Annotated, Self
+from typing import Annotated, ClassVar, Self
+
+from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field
 from fieldkit.core.errors import RobotError
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.model import Protocol
 from fieldkit.steps.along import AlongStep
 from fieldkit.steps.scene import Announce, Planned, Scene
 
 
 class WaitStep(AlongStep):
-    """Nothing happens for a while: robots settle, a person does something.
+    """Waits for a time, or until the operator has done something and pressed Enter.
+
+    With `--yes` no operator is asked.
 
     Attributes:
-        duration: So long.
-        until: What the operator is asked to see to, in the imperative; it goes on with the answer.
+        duration: How long to wait; exactly one of this, `until` and `along` is given.
+        until: What the operator must do, in the imperative: `open the door`.
     """
+
+    needs_complete_capture: ClassVar[bool] = False
 
     duration: Annotated[Duration, Field(gt=0)] | None = None
     until: Annotated[str, Field(pattern=r"^\S[^\n]{0,200}$")] | None = None
@@ -29,16 +35,16 @@ class WaitStep(AlongStep):
             raise schema.complaint("a wait has a duration, or until: what the operator is to do, or along: true")
         return self
 
+    @override
     def lasting(self, seconds: float) -> Self:
-        """See `AlongStep.lasting`."""
         return self.model_copy(update={"duration": seconds})
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:  # noqa: ARG002 (nothing runs)
-        """See `Step.commands`."""
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         return iter(())
 
-    def beside(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (the same for every scene)
-        """See `Step.beside`."""
+    @override
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         yield f"the operator is asked to {self.until}" if self.until else f"wait {self.duration:g} s"
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
@@ -54,22 +60,16 @@ class WaitStep(AlongStep):
         elif scene.halt.wait(self.duration or 0.0):
             raise RobotError("the wait was cut short, since a step beside it had failed")
 
-    def roles(self) -> frozenset[Role]:
-        """See `Step.roles`."""
-        return frozenset()
-
-    def claims(self) -> tuple[str, ...]:
-        """See `Step.claims`; there may be any number."""
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
+        """There may be any number."""
         return ()
 
-    def files(self) -> tuple[str, ...]:
-        """See `Step.files`."""
-        return ()
-
+    @override
     def asks(self) -> bool:
-        """See `Step.asks`."""
         return self.until is not None
 
-    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
-        """See `Step.expected_s`; nobody knows how long a person takes."""
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
+        """Nobody knows how long a person takes."""
         return self.duration or 0.0

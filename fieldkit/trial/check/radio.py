@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from fieldkit.backends.protocols import Robot
+from fieldkit.config import locations
 from fieldkit.core.model import Control
 from fieldkit.steps.scene import Said
 from fieldkit.trial.check.probe import NOTHING, Sections
@@ -57,7 +58,9 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
     if said.code == Said.MISSING:
         report.fail(check, "ip is not installed", "sudo apt-get install iproute2")
     elif flags is None or is_missing(sections):
-        report.fail(check, said.text, "ip link   # then correct radio.interface in the profile")
+        report.fail(
+            check, said.text, f"ip link   # then correct radio.interface: {locations.own_copy(robot.profile.name)}"
+        )
     elif "UP" not in flags["flags"].split(","):
         report.fail(check, "down", f"sudo ip link set {name} up")
     elif "NO-CARRIER" in flags["flags"]:

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+from fieldkit.config import locations
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
@@ -42,7 +43,7 @@ _PACKAGES: Final = {
 }
 _TOOLS: Final = "tools"
 _AGENT_S: Final = 30.0
-_BRIDGE: Final = "on the robot: python3 -m pip install 'fieldkit[ros2]', or correct ros.bridge.program in the profile"
+_BRIDGE: Final = "on the robot: python3 -m pip install 'fieldkit[ros2]', or correct ros.bridge.program"
 
 
 def commands(plan: Plan, role: Role) -> dict[str, Sequence[str]]:
@@ -67,7 +68,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     programs = dict.fromkeys(program for program, _ in _programs(plan, role))
     remedies = {planned.program: planned.remedy for planned in _planned(plan, role)}
     if profile.ros is not None and profile.ros.bridge is not None:
-        remedies[profile.ros.bridge.program] = _BRIDGE
+        remedies[profile.ros.bridge.program] = f"{_BRIDGE}: {locations.own_copy(profile.name)}"
     found = [program for program in programs if sections.get(_at(program), NOTHING).ok]
     report.ok("programs", ", ".join(found) or "none found")
     needs = _needs(plan, role)
@@ -76,7 +77,9 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     for program in programs:
         if program not in found and program not in explained:
             package = _PACKAGES.get(Path(program).name)
-            correct = remedies.get(program) or f"correct its name in profile {profile.name}"
+            correct = remedies.get(program) or (
+                f"correct its name in profile {profile.name}: {locations.own_copy(profile.name)}"
+            )
             report.fail(program, "not found", f"sudo apt-get install {package}" if package else correct)
     interface = profile.radio.interface if radio.is_missing(sections) else None
     for need in needs:
@@ -145,7 +148,7 @@ def _programs(plan: Plan, role: Role) -> Iterator[tuple[str, tuple[str, ...]]]:
 
 def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
     for scene in plan.scenes():
-        yield from (job for job in plan.commands(scene) if job.role is role)
+        yield from (job for job in plan.jobs(scene) if job.role is role)
 
 
 def _needs(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:

@@ -119,7 +119,7 @@ def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient
     """
     robot = scene.robot(step.robot)
     where = (scene.folder, step.robot, robot.profile.radio.interface)
-    (planned,) = step.commands(scene)
+    (planned,) = step.jobs(scene)
     job = planned.job if patient else replace(planned.job, limit_s=min(planned.job.limit_s, _PATIENCE_S))
     evidence.begin(shell, *where)
     jobs.run(shell, job)

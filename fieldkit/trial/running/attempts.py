@@ -6,10 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from fieldkit.core.columns import Measured
-from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, LockLostError, RobotError
+from fieldkit.core.errors import (
+    EvidenceError,
+    FieldkitError,
+    LinkError,
+    LockLostError,
+    RobotError,
+    TestbedLostError,
+)
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.steps.motions import STOPPED, Motions
+from fieldkit.steps.origins import Origins
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import gates, hosts, size, store
 from fieldkit.trial.gates import Judged
@@ -29,6 +38,8 @@ class Attempts:
         ledger: Told what becomes of each attempt.
         variants: The tools of each robot.
         sink: Told of each phase.
+        motions: The robots that move by themselves.
+        origins: Origins of the robots that move by themselves.
     """
 
     def __init__(
@@ -40,6 +51,8 @@ class Attempts:
         *,
         variants: Mapping[Role, Variants],
         sink: Sink,
+        motions: Motions,
+        origins: Origins,
     ) -> None:
         self._plan = plan
         self._folder = folder
@@ -47,6 +60,8 @@ class Attempts:
         self._ledger = ledger
         self._variants = variants
         self._sink = sink
+        self._motions = motions
+        self._origins = origins
         self._last_remote = ""
         self._reached: Status | None = None
 
@@ -59,6 +74,7 @@ class Attempts:
             KeyboardInterrupt: Likewise; one whose steps are done is left to `recover`.
             OSError: The disk is full or gone.
         """
+        self._robots.demand_up()
         store.demand_room(self._folder, size.attempt_bytes(self._plan))
         begun = self._ledger.begin(repeat)
         partial = store.open_attempt(self._folder, repeat)
@@ -68,7 +84,9 @@ class Attempts:
             self._robots.begin(remote, old=self._last_remote or None)
             failure = self._measure(begun, remote, partial)
             reasons = [failure.located] if failure else []
-            if not reasons:
+            if reasons:
+                self._robots.demand_up()  # nobody waits for robots that have ended
+            else:
                 self._ledger.measured(begun)
                 self._reached = Status.MEASURED
             self._sink(PhaseStarted("collect evidence", str(repeat)))
@@ -77,6 +95,7 @@ class Attempts:
             reasons = reasons or list(judged.problems)
             self._last_remote = remote
             if reasons:
+                self._robots.demand_up()
                 self._robots.demand_held()  # whose jobs somebody else ended, it counts for none of those allowed
         bad = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
         why = "; ".join(hosts.without_effects(reasons))
@@ -107,12 +126,15 @@ class Attempts:
         """Run the steps of an attempt; return why it is not whole."""
         repeat = begun.repeat
         self._reached = Status.RUNNING
+        planned = self._plan.scene(repeat, remote, self._variants)
+        scene = replace(planned, here=here, motions=self._motions, origins=self._origins)
 
         def announce(name: str, expected_s: float | None) -> None:
             self._sink(PhaseStarted(name, str(repeat), expected_s))
 
         try:
-            self._robots.measure(replace(self._plan.scene(repeat, remote, self._variants), here=here), announce)
+            self._robots.measure(scene, announce)
+            self._motions.ahead = ()  # what is left to do may be finished
         except (RobotError, LinkError, EvidenceError) as error:
             if error.ends_trial:
                 raise
@@ -128,15 +150,16 @@ class Attempts:
         try:
             yield
         except BaseException as error:
-            if not isinstance(error, Exception):
+            if not isinstance(error, Exception) or isinstance(error, TestbedLostError):
                 self._robots.hang_up()  # ends what other threads still wait for
             with suppress(FieldkitError):  # a robot that cannot be reached ends its jobs at their own limits
                 self._robots.end_jobs(begun.remote(self._plan.trial))
             if isinstance(error, OSError):
                 raise  # nothing more can be written; the journal says that it began, and resume goes on from there
-            if self._reached is Status.MEASURED and isinstance(error, KeyboardInterrupt):
+            is_fetched_later = self._reached is Status.MEASURED and not self._robots.transient
+            if is_fetched_later and isinstance(error, KeyboardInterrupt):
                 raise  # nothing is wrong with it: resume fetches it, and what has come of it stays
-            reason = _why_cut(error)
+            reason = STOPPED if self._motions.called else _why_cut(error)
             if self._reached:
                 self._robots.leave(begun.remote(self._plan.trial), partial, reason)
             ended = replace(begun, status=Status.VOID, reason=reason, excused=True)

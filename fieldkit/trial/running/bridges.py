@@ -11,7 +11,7 @@ from typing import Final
 from fieldkit.backends.protocols import Cast, Robot
 from fieldkit.config.profiles import RobotBridge, Ros
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import FieldkitError, RobotError
+from fieldkit.core.errors import FieldkitError, RobotError, TestbedLostError
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import BRIDGE_IS_UP, Role
 from fieldkit.core.threads import together
@@ -108,7 +108,7 @@ def _start(robot: Robot, shell: Shell, role: Role, job: Job) -> None:
         raise RobotError(
             f"its bridge does not start: {error.what}",
             where=robot.name,
-            remedy="see docs/bridge.md for what it takes there, or leave ros.bridge out of a copy of the profile",
+            remedy="see what it needs there: fieldkit docs bridge; or leave ros.bridge out of a copy of the profile",
         ) from error
 
 
@@ -118,6 +118,8 @@ def _end(shell: Shell, job: Job) -> str:
         runs = any(f"{job.folder}/" in line for line in jobs.left(shell, Deadline.after(jobs.REPLY_S)))
         code = jobs.stop(shell, job, grace_s=_GRACE_S)
         evidence.discard(shell, job.folder.split("/")[-2])
+    except TestbedLostError:
+        return ""  # it ended with its robot
     except FieldkitError as error:
         return f"was not ended: {error.what}"
     early = "" if runs else "before its time, "

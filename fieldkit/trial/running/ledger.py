@@ -61,15 +61,19 @@ class Ledger:
             )
             journal.append(folder, *planned)
         ended = journal.ended(past)
+        for attempt in ended:
+            self._rename(attempt)
         self.differences = dict(self._differing(ended))
         """What is not as it was when it was summed, by file."""
         known = self._known_lines(len(ended))
-        if len(known) < len(ended) and self.differences:
-            self._demand_evidence(ended[len(known) :])
+        remade = [attempt for index, attempt in enumerate(ended) if index >= len(known) or attempt.reopened]
+        if remade and self.differences:
+            self._demand_evidence(remade)
         for number, attempt in enumerate(ended):
             evidence = store.attempt_folder(folder, attempt.folder)
-            row = {} if number < len(known) else rebuild.row(plan, attempt, AttemptEvidence(evidence))
-            self._enter(attempt, known[number] if number < len(known) else rows.line(row, self._plan.table))
+            is_known = number < len(known) and not attempt.reopened  # its row said that it failed
+            row = {} if is_known else rebuild.row(plan, attempt, AttemptEvidence(evidence))
+            self._enter(attempt, known[number] if is_known else rows.line(row, self._plan.table))
             if attempt.folder not in self._manifest:
                 self._manifest.add(evidence)
         self.ended = tuple(ended)
@@ -144,6 +148,17 @@ class Ledger:
             cells = rows.write_summary(self._folder, self._plan, self._table())
             self._write()
         return cells
+
+    def _rename(self, attempt: Attempt) -> None:
+        """Give the folder of an attempt that failed before its repeat was reopened the name of a void one."""
+        if not attempt.reopened:
+            return
+        before = attempt.repeat.folder(Status.FAILED, attempt.number)
+        failed, final = (store.attempt_folder(self._folder, name) for name in (before, attempt.folder))
+        if failed.is_dir():
+            failed.rename(final)
+            files.sync_folder(final.parent)
+        self._manifest.rename(before, attempt.folder)
 
     def _is_due(self, in_table: int) -> bool:
         return len(self._lines) - in_table >= TABLE_SHARE * len(self._lines)

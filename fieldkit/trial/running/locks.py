@@ -1,16 +1,16 @@
 """Locks on robots: one trial at a time, told to everyone else, given back at its end or by their expiry."""
 
-import getpass
 import re
-import socket
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Final
 
+from fieldkit.core import runtime
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Note, Sink
+from fieldkit.core.runtime import NameHeldError
 from fieldkit.core.threads import together
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import REPLY_S, Aborted
@@ -30,22 +30,13 @@ class Holder:
 
     Attributes:
         token: Tells this trial from any other; the same token takes its own lock again.
-        who: `user@laptop`, see `me`.
+        who: `user@laptop`, see `runtime.me`.
         what: The trial.
     """
 
     token: str
     who: str
     what: str
-
-
-def me() -> str:
-    """Return `user@laptop`."""
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):  # a user id without an account
-        user = "unknown"
-    return f"{user}@{socket.gethostname()}"
 
 
 @contextmanager
@@ -56,18 +47,17 @@ def held(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
         ConfigurationError: Another one has the token: it would take the robots for its own, and so give them back.
         FieldkitError: As `taken`.
     """
-    # The name ends with its process, however that ends.
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as name:
+    with ExitStack() as stack:
         try:
-            name.bind(f"\0fieldkit {word(holder.token)}")  # a name has room for 107 bytes
-        except OSError as error:
+            stack.enter_context(runtime.held(f"trial-{word(holder.token)}"))
+        except NameHeldError as error:
             raise ConfigurationError(
                 "another fieldkit runs this trial, or one that was begun with it",
                 where=holder.what,
                 remedy="wait until it has ended, or end it",
             ) from error
-        with taken(shells, holder, sink=sink):
-            yield
+        stack.enter_context(taken(shells, holder, sink=sink))
+        yield
 
 
 @contextmanager
@@ -160,7 +150,7 @@ def abort(robots: Mapping[str, Shell | FieldkitError], who: str) -> Mapping[str,
 
     Args:
         robots: From `Backend.standing`.
-        who: Told to those whose trial ends, see `me`.
+        who: Told to those whose trial ends, see `runtime.me`.
     """
     return dict(zip(robots, together(lambda name: _abort(robots[name], who), robots), strict=True))
 

@@ -7,12 +7,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from fieldkit.backends.protocols import Backend, Cast, Testbed
+from fieldkit.backends.protocols import Backend, Cast, Testbed, Transient
+from fieldkit.core import runtime
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
-from fieldkit.trial import store
+from fieldkit.trial import step_packages, store
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import bridges, locks, preflight, runner
+from fieldkit.trial.running import bridges, locks, motion_leave, preflight, runner
 from fieldkit.trial.running.locks import Holder
 from fieldkit.trial.running.resumption import demand_backend, demand_cast, resumable
 from fieldkit.trial.running.runner import Outcome
@@ -42,8 +43,10 @@ def opened(
     """
     with backend.open(cast, seed=seed, sink=sink, operator=operator) as testbed:
         preflight.meet(cast, testbed.shells, sink)
+        # A lock that could not be given back is of no matter where its robot ends now.
+        on_lost_lock = (lambda _: None) if isinstance(testbed, Transient) else sink
         with (
-            locks.held(testbed.shells, Holder(session, locks.me(), what), sink=sink),
+            locks.held(testbed.shells, Holder(session, runtime.me(), what), sink=on_lost_lock),
             bridges.running(cast, testbed.shells, session, sink=sink),
         ):
             yield testbed
@@ -67,8 +70,10 @@ def run(
         What each came to; None for one that the operator left for later.
 
     Raises:
+        ConfigurationError: As `motion_leave.demand_one_place`.
         FieldkitError: As `opened` and `runner.run_trial`; trials that were not begun are told.
     """
+    motion_leave.demand_one_place(plans, backend, operator)
     store.prepare(out)
     first = plans[0]
     ended: list[Outcome | None] = []
@@ -87,7 +92,7 @@ def run(
 
 
 def resume(
-    folder: Path, name: str, backend: Backend, *, sink: Sink, operator: Operator, stop: Stop
+    folder: Path, name: str, backend: Backend, *, failed: bool, sink: Sink, operator: Operator, stop: Stop
 ) -> Outcome | None:
     """Go on with a trial that stopped.
 
@@ -95,6 +100,7 @@ def resume(
         folder: The trial's folder.
         name: Name of the backend.
         backend: Where its robots come from.
+        failed: Whether failed repeats are redone too.
         sink: Told what happens.
         operator: Does what the backend cannot do by itself.
         stop: Tells the trial to stop.
@@ -107,9 +113,11 @@ def resume(
             `runner.resume_trial`.
     """
     plan = resumable(folder)
+    for change in step_packages.changes(plan.step_packages):
+        sink(Note(change))
     demand_backend(plan, name, folder)
     demand_cast(plan, backend.cast(plan.topology))
     with opened(
         backend, plan.cast, session=plan.session, what=plan.trial, seed=plan.seed, sink=sink, operator=operator
     ) as testbed:
-        return runner.resume_trial(folder, testbed, sink, stop)
+        return runner.resume_trial(folder, testbed, sink, stop, failed=failed)

@@ -14,7 +14,8 @@ def resumable(folder: Path) -> Plan:
     """Return the plan of a trial that this fieldkit can go on with.
 
     Raises:
-        ConfigurationError: `folder` is no trial, or other code began it: its rows would mix two ways to measure.
+        ConfigurationError: `folder` is no trial, or other code began it: its rows would mix two ways to measure. Or a
+            program of the lab that it copies to robots has changed, or is missing.
     """
     plan = store.read_plan(folder)
     was = plan.versions
@@ -30,6 +31,8 @@ def resumable(folder: Path) -> Plan:
             remedy="go on with that version, or start a new trial; what had ended is complete: "
             + typed("fieldkit", "rebuild", folder),
         )
+    for put in plan.puts():
+        put.program.content()
     return plan
 
 

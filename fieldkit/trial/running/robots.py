@@ -1,33 +1,46 @@
 """The robots of a trial during one attempt: make the folders, run the steps, fetch the evidence, clean up."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from threading import Event, Thread
+from typing import Final, TypeVar
 
-from fieldkit.backends.protocols import Testbed
+from fieldkit.backends.protocols import Testbed, Transient
+from fieldkit.core import laptop_files
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, LockLostError, RobotError
+from fieldkit.core.errors import (
+    EvidenceError,
+    FieldkitError,
+    LinkError,
+    LockLostError,
+    RobotError,
+    TestbedLostError,
+)
 from fieldkit.core.events import PhaseStarted, Sink
-from fieldkit.core.model import Role, Status
+from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.core.text import encodable
 from fieldkit.core.threads import together
 from fieldkit.measure.evidence import lateness, link_samples, track
-from fieldkit.remote import evidence, fetching, jobs
+from fieldkit.remote import evidence, fetching, jobs, programs
 from fieldkit.remote.fetching import FetchProgress, LateError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
+from fieldkit.trial.owners import FileOwners
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import guards, locks
+from fieldkit.trial.running import guards, locks, step_errors
 
 T = TypeVar("T")
+
+_WATCH_S: Final = 0.5
 
 
 def unfetched_file(role: Role) -> str:
     """Return the name of the file that says that evidence stays on the robot in `role`, and why."""
-    return f"{role}-unfetched.txt"
+    return f"{role}-{laptop_files.UNFETCHED}"
 
 
 class Robots:
@@ -43,7 +56,11 @@ class Robots:
         self._plan = plan
         self._testbed = testbed
         self._sink = sink
+        self.transient = isinstance(testbed, Transient)
+        """Whether the robots, and all files on them, end with this run of fieldkit."""
         self._roles = sorted(plan.procedure.roles())
+        protocol = plan.procedure.protocols[0]
+        self._owners = FileOwners.of(plan.procedure, plan.scene(RepeatId(protocol, 1), ""))
         self._hung_up = False
         self._unfetched: dict[Role, list[str]] = {role: [] for role in self._roles}
         self._boots: dict[Role, str] = {}
@@ -56,10 +73,13 @@ class Robots:
     def begin(self, remote: str, *, old: str | None) -> None:
         """Make an attempt's folder `remote` on each robot, and remove the folder `old` where it was fetched.
 
+        Programs of the lab are copied here, before the first step, so that nothing of them crosses the radio later.
+
         Raises:
-            FieldkitError: As `evidence.begin`.
+            FieldkitError: As `evidence.begin` and `programs.place`; or a program of the lab has changed.
         """
         plan = self._plan
+        puts = [(put, put.program.content()) for put in plan.puts()]
 
         def make(role: Role) -> None:
             self._boots[role] = evidence.begin(
@@ -71,6 +91,10 @@ class Robots:
                 token=plan.session,
                 need_kib=(size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)) // 1024,
             )
+            for put, content in puts:
+                if put.role == role:
+                    sha256, executable = put.program.sha256, put.program.executable
+                    programs.place(self.shells[role], remote, put.at, content, sha256, executable=executable)
 
         self._everywhere(make)
 
@@ -94,9 +118,32 @@ class Robots:
             (scene.here / lateness.FILE).write_text(lateness.text(before, after), encoding="ascii")
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
-        with guards.guarded(self._plan, scene, self.shells):
+        with self._watched(), guards.guarded(self._plan, scene, self.shells):
             for entry in self._plan.procedure.steps:
-                entry.step.run(scene, self._testbed, announce)
+                with step_errors.reported(entry.kind, scene.here):
+                    entry.step.run(scene, self._testbed, announce)
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        """End what the body waits for when a process that the robots need has ended: no answer comes any more."""
+        ended = Event()
+
+        def watch() -> None:
+            while not ended.wait(_WATCH_S):
+                try:
+                    self.demand_up()
+                except TestbedLostError:
+                    self.hang_up()
+
+        watching = Thread(target=watch, name="testbed", daemon=True)
+        if self.transient:
+            watching.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            if self.transient:
+                watching.join()
 
     def fetch(self, remote: str, into: Path, *, clean: bool) -> list[str]:
         """Collect an attempt's evidence, after ending its jobs where it did not end cleanly.
@@ -133,7 +180,14 @@ class Robots:
             if not clean:
                 evidence.end_jobs(shell, remote)
             fetching.fetch(
-                shell, remote, role, self._interface(role), into, expected_bytes=expected_bytes, progress=progress
+                shell,
+                remote,
+                role,
+                self._interface(role),
+                into,
+                expected_bytes=expected_bytes,
+                progress=progress,
+                foreign=partial(self._owners.refusal, role),
             )
         except LinkError as error:
             return error.located, True
@@ -151,18 +205,22 @@ class Robots:
         """Leave an attempt's folder on a robot, and write down that it is there."""
         if remote not in self._unfetched[role]:
             self._unfetched[role].append(remote)
-        text = f"{reason}\n{self._plan.cast[role].name} has it in ~/{remote}\n"
+        verb = "had" if self.transient else "has"
+        end = "; its files ended with it" if self.transient else ""
+        text = f"{reason}\n{self._plan.cast[role].name} {verb} it in ~/{remote}{end}\n"
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 
     def remember(self, ended: Attempt, kept: Path) -> None:
         """Know again what of an earlier attempt, kept in a folder, was not fetched."""
-        if ended.status is not Status.VALID:
+        if ended.status is not Status.VALID and not self.transient:
             for role in self._roles:
                 if (kept / unfetched_file(role)).is_file():
                     self._unfetched[role].append(ended.remote(self._plan.trial))
 
     def left(self) -> Mapping[str, Sequence[str]]:
-        """Return the folders on each robot whose evidence was not fetched, by the robot's name."""
+        """Return the folders whose evidence was not fetched and stays on its robot, by the robot's name."""
+        if self.transient:
+            return {}
         return {self._plan.cast[role].name: folders for role, folders in self._unfetched.items() if folders}
 
     def _rebooted(self, role: Role) -> str | None:
@@ -172,6 +230,11 @@ class Robots:
             if booted and hosts.rebooted(booted, evidence.boot(self.shells[role])):
                 return f"{self._plan.cast[role].name}: {hosts.REBOOTED}"
         return None
+
+    def demand_up(self) -> None:
+        """Return if every process runs that the robots need; errors as `Transient.demand_up`."""
+        if isinstance(self._testbed, Transient):
+            self._testbed.demand_up()
 
     def demand_held(self) -> None:
         """Go on only if no robot that can tell says that somebody ended this trial.

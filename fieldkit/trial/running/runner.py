@@ -2,24 +2,38 @@
 
 import errno
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 
+from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.judgements import Judgement, judge
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.errors import ConfigurationError, typed
-from fieldkit.core.events import Note, PhaseStarted, Placed, RepeatEnded, Sink, TrialEnded, TrialStarted, TrialStopped
-from fieldkit.core.model import ENDED
+from fieldkit.core.events import (
+    ExpectationJudged,
+    Note,
+    PhaseStarted,
+    Placed,
+    RepeatEnded,
+    Sink,
+    TrialEnded,
+    TrialStarted,
+    TrialStopped,
+)
+from fieldkit.core.model import ENDED, RepeatId
 from fieldkit.core.prompts import Answer
-from fieldkit.trial import journal, manifest, rows, store
+from fieldkit.core.units import TimeEstimate
+from fieldkit.trial import estimates, journal, manifest, rows, store
+from fieldkit.trial.estimates import Taken
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import preflight
 from fieldkit.trial.running.attempts import Attempts
 from fieldkit.trial.running.ledger import Ledger
+from fieldkit.trial.running.motion_leave import MotionLeave
 from fieldkit.trial.running.resumption import resumable
 from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.stop import Stop
@@ -52,10 +66,12 @@ def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | 
     return begin(plan.with_note(placing.answer.note), testbed, out, sink, stop or Stop())
 
 
-def resume_trial(folder: Path, testbed: Testbed, sink: Sink, stop: Stop | None = None) -> Outcome | None:
+def resume_trial(
+    folder: Path, testbed: Testbed, sink: Sink, stop: Stop | None = None, *, failed: bool = False
+) -> Outcome | None:
     """Place the robots and go on with a trial; None when the operator left it for later. Errors as `go_on`."""
     placing = place(resumable(folder), testbed, sink)
-    return None if placing.answer.skip else go_on(folder, testbed, sink, stop or Stop())
+    return None if placing.answer.skip else go_on(folder, testbed, sink, stop or Stop(), failed=failed)
 
 
 @dataclass(frozen=True)
@@ -105,7 +121,9 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, to
         return _run(plan, testbed, folder, sink, stop, told=told)
 
 
-def go_on(folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, told: bool = True) -> Outcome:
+def go_on(
+    folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, told: bool = True, failed: bool = False
+) -> Outcome:
     """Go on with a trial that stopped: what is over stays as it is, each other repeat is run once more.
 
     An attempt whose steps were done is fetched and judged; one that was cut short is kept as void and counts for none
@@ -117,6 +135,7 @@ def go_on(folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, told: bool 
         sink: Told what happens.
         stop: Tells the trial to stop.
         told: As `begin`.
+        failed: Whether failed repeats are redone too, with as many attempts as the procedure allows.
 
     Raises:
         ConfigurationError: `folder` is no trial, other code began it, or another fieldkit runs it now.
@@ -125,6 +144,8 @@ def go_on(folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, told: bool 
     """
     plan = resumable(folder)
     with journal.claimed(folder), _writing(folder):
+        if failed and not journal.reopen_failed(folder, plan) and told:
+            sink(Note("no repeat of this trial failed"))
         return _run(plan, testbed, folder, sink, stop, told=told)
 
 
@@ -135,7 +156,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
     for ended in ledger.ended:
         robots.remember(ended, store.attempt_folder(folder, ended.folder))
     repeats = list(plan.order())
-    took_s: list[float] = []
+    past = estimates.taken(plan, journal.read(folder))
     if ledger.differences:
         sink(Note(f"not as it was when it was kept, and left so: {manifest.few(ledger.differences)}"))
     try:
@@ -143,21 +164,32 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
         robots.end_left()
         sink(PhaseStarted("preflight"))
         variants = preflight.preflight(plan, robots.shells, folder, sink)
-        attempts = Attempts(plan, folder, robots, ledger, variants=variants, sink=sink)
+        leave = MotionLeave(plan, testbed, folder)
+        attempts = Attempts(
+            plan,
+            folder,
+            robots,
+            ledger,
+            variants=variants,
+            sink=sink,
+            motions=stop.motions,
+            origins=leave.origins,
+        )
         for cut in ledger.cut_short:
             attempts.recover(cut)
         for repeat in repeats:
+            began_s = time.monotonic()
             while not ledger.is_over(repeat):
+                leave.demand()
                 lasts_s = plan.procedure.expected_s(repeat.protocol)
-                with stop.finishing(lasts_s, plan.cut_short(plan.scene(repeat, ""))):
-                    began_s = time.monotonic()
+                notes = plan.abort_notes(plan.scene(repeat, ""))
+                with leave.noting(sink), stop.finishing(lasts_s, notes):
                     remedy = attempts.make(repeat)
                     if ledger.is_over(repeat):
-                        took_s.append(time.monotonic() - began_s)
-                    # A void attempt, which may have waited for a robot, says nothing of how long the others take.
-                    per_repeat_s = fmean(took_s) if took_s else plan.expected_s() / len(repeats)
+                        past.append(Taken(plan, repeat.protocol, time.monotonic() - began_s))
+                    left = [one for one in repeats if not ledger.is_over(one)]
                     # Before a request to stop is taken up: what was let finish is told too.
-                    sink(_ended(plan, ledger, len(repeats), per_repeat_s, remedy))
+                    sink(_ended(plan, ledger, len(repeats), _left(plan, left, past), remedy))
     except BaseException as error:
         if told:
             sink(TrialStopped(str(folder), ledger.done, len(repeats)))
@@ -170,8 +202,31 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
     robots.discard()
     _tell_left(robots, sink)
     valid, void, failed = map(ledger.counts, ENDED)
+    judgements = judge(plan.procedure.expectations, cells)
+    _show_judgements(judgements, sink)
     sink(TrialEnded(str(folder), valid, void, failed))
-    return Outcome(folder, cells, valid, failed, judge(plan.procedure.expectations, cells))
+    return Outcome(folder, cells, valid, failed, judgements)
+
+
+def _show_judgements(judgements: Iterable[Judgement], sink: Sink) -> None:
+    for judgement in judgements:
+        sink(_judged(judgement))
+
+
+def _judged(judgement: Judgement) -> ExpectationJudged:
+    _, protocol, measured, interval, _ = wording.judged(judgement)
+    found = judgement.found
+    return ExpectationJudged(
+        expectation=judgement.expectation.text,
+        protocol=protocol.lower(),
+        ruling=judgement.ruling,
+        why=judgement.why,
+        measured=measured,
+        interval=interval,
+        n=found.n if found else 0,
+        n_valid=judgement.cell.n_valid if judgement.cell else 0,
+        n_censored=found.n_censored if found else 0,
+    )
 
 
 def _tell_left(robots: Robots, sink: Sink) -> None:
@@ -181,7 +236,13 @@ def _tell_left(robots: Robots, sink: Sink) -> None:
         sink(Note(f"{robot}: evidence that was not fetched stays on it; delete it when nobody needs it: {where}"))
 
 
-def _ended(plan: Plan, ledger: Ledger, total: int, per_repeat_s: float, remedy: str) -> RepeatEnded:
+def _left(plan: Plan, left: Sequence[RepeatId], past: Sequence[Taken]) -> TimeEstimate:
+    """Return how long the repeats take that are left."""
+    counts = Counter(repeat.protocol for repeat in left)
+    return estimates.total(estimates.of_repeats(plan, protocol, counts[protocol], past) for protocol in counts)
+
+
+def _ended(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: str) -> RepeatEnded:
     attempt, row = ledger.last
     return RepeatEnded(
         repeat=str(attempt.repeat),
@@ -191,8 +252,9 @@ def _ended(plan: Plan, ledger: Ledger, total: int, per_repeat_s: float, remedy: 
         summary=rows.in_words(plan, row),
         done=ledger.done,
         total=total,
-        left_s=per_repeat_s * (total - ledger.done),
+        left_s=left.likely_s,
         remedy=remedy,
+        left_most_s=left.most_s,
     )
 
 

@@ -4,17 +4,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from fieldkit.core.deadline import Deadline
+from fieldkit.steps.motions import Motions
 
 
 class Stop:
-    """One request to stop: taken up between two repeats while one runs, at once otherwise.
+    """One request to stop.
+
+    It is taken up at once while a robot moves by itself or may begin to (`motions`); otherwise between two repeats
+    while one runs, and at once while none does.
 
     Attributes:
         asked: Whether the trial is to stop after the repeat that runs.
         patient: Whether a repeat runs that may be finished first.
         saving: Whether something is being written that must not be left half done.
         due: Whether to stop as soon as it is.
-        cut_short: In words what robots do that move where the repeat that runs is stopped at once; empty if none is.
+        motions: The robots that move by themselves.
     """
 
     def __init__(self) -> None:
@@ -22,7 +26,7 @@ class Stop:
         self.patient = False
         self.saving = False
         self.due = False
-        self.cut_short = ""
+        self.motions = Motions()
         self._ends = Deadline.after(0.0)
 
     @property
@@ -31,22 +35,22 @@ class Stop:
         return self._ends.remaining_s
 
     @contextmanager
-    def finishing(self, lasts_s: float, cut_short: str) -> Iterator[None]:
-        """Let the body end before a request to stop is taken up.
+    def finishing(self, lasts_s: float, motions: tuple[str, ...]) -> Iterator[None]:
+        """Let the body end before a request to stop is taken up, unless robots move in it by themselves.
 
         Args:
             lasts_s: About how long it takes.
-            cut_short: See the class.
+            motions: See `Motions.ahead`: until the body clears that, a request to stop is taken up at once.
 
         Raises:
-            KeyboardInterrupt: The body has ended, and somebody asked meanwhile.
+            KeyboardInterrupt: The body has ended, and a stop was requested meanwhile.
         """
-        self._ends, self.cut_short = Deadline.after(lasts_s), cut_short
+        self._ends, self.motions.ahead = Deadline.after(lasts_s), motions
         self.patient = True
         try:
             yield
         finally:
-            self.patient, self.cut_short = False, ""
+            self.patient, self.motions.ahead = False, ()
         if self.asked:
             raise KeyboardInterrupt
 

@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit.cli.arguments.shared import natural, repeats
 from fieldkit.cli.parser import Commands, Parser
+from fieldkit.cli.shared_arguments import natural, repeats
 
 _HERE: Final = "sim_backends.cosim.commands"
 _FORMATS: Final = ("table", "csv", "json", "markdown")
@@ -47,7 +47,7 @@ def _run(commands: Commands) -> None:
     parser.add_argument(
         "--deadline",
         metavar="TIME",
-        help="wall time in which physics, network and programs have to answer (default 30s)",
+        help="longest wait of physics or network for an answer, in wall time (default 30s)",
     )
     _add_format(parser)
     parser.set_defaults(run=f"{_HERE}.run:run")
@@ -93,7 +93,9 @@ def _paper(commands: Commands) -> None:
         epilog="example: fieldkit cosim table 1 --format markdown",
     )
     parser.add_choice("which", _TABLES, metavar="TABLE", help="1, 2 or 3 of its simulation, emane, or claims")
-    parser.add_argument(
+    seeds = parser.add_mutually_exclusive_group()
+    _add_seed(seeds, "see --seeds")
+    seeds.add_argument(
         "--seeds", type=repeats, default=20, metavar="N", help="run each row N times, with seeds 1 to N (default 20)"
     )
     _add_changes(parser)
@@ -157,6 +159,7 @@ def _list(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "list", help="list scenarios and sync policies", description="List every scenario and sync policy."
     )
+    _add_format(parser)
     parser.set_defaults(run=f"{_HERE}.listing:list_all")
 
 

@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         scenario = settings.with_window(scenario, settings.windows_s(arguments, scenario)[0])
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
     build(scenario)  # what cannot be run is told before anything runs
+    settings.note_shared_beats(scenario, policies, [scenario.policy.window], len(seeds))
     with working() as sink:
         runs = len({*policies, EventDriven.name}) * len(seeds)
         found = outcomes(partial(_make, scenario), policies, seeds, progress=partial(teller(sink), "bias", runs))

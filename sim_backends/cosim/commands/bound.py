@@ -1,12 +1,14 @@
 """`fieldkit cosim shootout SCENARIO --bound`: what a bound costs, by `error_bounded` and by fixed windows."""
 
 import argparse
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
 from fieldkit.cli.display import working
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.printing import say
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
@@ -23,6 +25,7 @@ _COLUMNS: Final = (
     SheetColumn("seed", "seed", ""),
     SheetColumn("largest_m", "largest (mm)", "error of position by error_bounded", 1e3),
     SheetColumn("exchanges", "exchanges", "of error_bounded"),
+    SheetColumn("added_s", "added (ms)", "what error_bounded adds to a delay, mean", 1e3),
     SheetColumn("all_window_s", "all (ms)", "longest fixed window that, by a search, keeps it in all runs", 1e3),
     SheetColumn("all_exchanges", "its exchanges", ""),
     SheetColumn("all_factor", "factor", "by which error_bounded needs fewer exchanges"),
@@ -63,12 +66,12 @@ def run(arguments: argparse.Namespace) -> int:
         )
     _sheet(scenario, seeds, costs, window_s, fixed).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        print(_words(scenario, costs, window_s, fixed))
+        say(_words(scenario, costs, window_s, fixed))
     return 0
 
 
 def _run_by(scenario: CosimScenario, task: Task, policy: SyncPolicy) -> Run:
-    return build(scenario, policy=policy, seed=task.seed).run()
+    return build(scenario, policy=policy, seed=task.seed, measures_all=True).run()
 
 
 def _cost(scenario: CosimScenario, task: Task) -> BoundCost:
@@ -93,6 +96,7 @@ def _sheet(
             seed,
             cost.largest_m,
             cost.exchanges,
+            cost.added_s,
             window_s,
             fixed[place].exchanges if fixed else None,
             fixed[place].exchanges / cost.exchanges if fixed else None,
@@ -107,13 +111,19 @@ def _sheet(
     return Sheet(
         _COLUMNS,
         rows,
-        [SheetPart(title, names[:6]), SheetPart("the window that would have done", [names[0], *names[6:]])],
+        [SheetPart(title, names[:7]), SheetPart("the window that would have done", [names[0], *names[7:]])],
     )
 
 
 def _words(scenario: CosimScenario, costs: Sequence[BoundCost], window_s: float, fixed: Sequence[FixedCost]) -> str:
     mine = sum(cost.exchanges for cost in costs)
+    late_s = [cost.added_s for cost in costs if not math.isnan(cost.added_s)]
     words = f"error_bounded keeps {number(scenario.policy.bound * 1e3)} mm in {format_count(mine, 'exchange')}"
+    if late_s:
+        words += (
+            f", and adds {number(math.fsum(late_s) / len(late_s) * 1e3)} ms to a delay, as an arrival waits for its "
+            f"window's end: half of policy.longest is {number(scenario.policy.longest * 500)} ms"
+        )
     if not fixed:
         return f"{words}, and no fixed window does"
     theirs, own = sum(one.exchanges for one in fixed), sum(cost.fixed_exchanges for cost in costs)

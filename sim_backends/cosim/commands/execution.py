@@ -5,17 +5,18 @@ from contextlib import nullcontext
 from functools import partial
 
 from fieldkit.config import schema
-from fieldkit.core.errors import FieldkitError
+from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Sink
 from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.folder import RunFolder
 from sim_backends.cosim.commands.results import SeedResult, seed_result
-from sim_backends.cosim.coordinator import DEADLINE_S
+from sim_backends.cosim.interrupts import between_windows
 from sim_backends.cosim.recording.manifest import About
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.samples import StateSamples
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.stalls import DEADLINE_S
 from sim_backends.cosim.studies.formation import has_followers
 from sim_backends.cosim.studies.seeds import Task, as_they_end
 
@@ -45,14 +46,18 @@ def simulate(
     begin = [(0, name, state) for name, state in simulation.agents.states(0).items()]
     ended_by: FieldkitError | KeyboardInterrupt | None = None
     try:
-        with recorder or nullcontext():
+        with recorder or nullcontext(), between_windows(simulation.coordinator):
             simulation.run(progress=told)
     except (FieldkitError, KeyboardInterrupt) as error:
         ended_by = error
     states = begin if samples is None else samples.states
     result = seed_result(scenario, seed, simulation.coordinator.run, states, ended_by)
     if folder is not None:
-        folder.keep(result)
+        try:
+            folder.keep(result)
+        except ConfigurationError:
+            if ended_by is None:  # else what ended the run, which may be the same disk, is told
+                raise
     return result
 
 

@@ -58,8 +58,14 @@ class RunFolder:
         """Write the rows of a run that has ended beside its recording.
 
         Raises:
-            OSError: They cannot be written.
+            ConfigurationError: They cannot be written.
         """
         number = self._seeds.index(result.seed) + 1
         table = trial_rows.table(self.path.resolve().name, self._scenario, self._policy, number, result)
-        files.write(self.of(result.seed) / TRIAL_CSV, table.encode())
+        path = self.of(result.seed) / TRIAL_CSV
+        try:
+            files.write(path, table.encode())
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot be written: {error.strerror}", where=str(path), remedy="free some space and run it again"
+            ) from error

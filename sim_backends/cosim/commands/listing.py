@@ -1,16 +1,22 @@
 """`fieldkit cosim list` and `fieldkit cosim schema`."""
 
 import argparse
-import json
+from typing import Final
 
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import FieldkitError
+from fieldkit.core.printing import say
+from fieldkit.core.text import json_text
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, show_all
 from sim_backends.cosim.scenario.loading import load_scenario, scenario_files
 from sim_backends.cosim.scenario.policies import POLICIES
 from sim_backends.cosim.scenario.schema import CosimScenario
 
+_SCENARIO: Final = (SheetColumn("scenario", "scenario", ""), SheetColumn("summary", "summary", ""))
+_POLICY: Final = (SheetColumn("policy", "policy", ""), SheetColumn("summary", "what it does", ""))
 
-def list_all(_: argparse.Namespace) -> int:
+
+def list_all(arguments: argparse.Namespace) -> int:
     """Print each scenario and each sync policy in a line."""
     scenarios = []
     for name, path in scenario_files().items():
@@ -18,14 +24,22 @@ def list_all(_: argparse.Namespace) -> int:
             scenarios.append((name, load_scenario(path).summary))
         except FieldkitError as error:
             show_note(f"{error.located}: it is left out")
-    table(("scenario", "summary"), scenarios)
-    table(("policy", "what it does"), [(name, _summary(kind)) for name, kind in POLICIES.items()])
+    policies = [(name, _summary(kind)) for name, kind in POLICIES.items()]
+    if arguments.format == "table":
+        table([column.head for column in _SCENARIO], scenarios)
+        table([column.head for column in _POLICY], policies)
+        return 0
+    sheets = {
+        "scenarios": Sheet(_SCENARIO, scenarios, [SheetPart("scenarios", ("scenario", "summary"))]),
+        "policies": Sheet(_POLICY, policies, [SheetPart("sync policies", ("policy", "summary"))]),
+    }
+    show_all(sheets, arguments.format)
     return 0
 
 
 def print_schema(_: argparse.Namespace) -> int:
     """Print the JSON schema of scenario files."""
-    print(json.dumps(CosimScenario.model_json_schema(by_alias=True), indent=2))
+    say(json_text(CosimScenario.model_json_schema(by_alias=True), indent=2))
     return 0
 
 

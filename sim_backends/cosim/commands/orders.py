@@ -30,7 +30,7 @@ _COLUMNS: Final = (
     SheetColumn("window_s", "w (ms)", "window as it was, mean", 1e3),
     SheetColumn("delivery_s", "time (ms)", "delivery time less the reference's, magnitude, mean", 1e3),
     SheetColumn("late_s", "late (ms)", "by how much receivers had passed an arrival, mean", 1e3),
-    SheetColumn("position_m", "place (mm)", "how far off the network took the sender to be, mean", 1e3),
+    SheetColumn("position_m", "place (mm)", "how wrong the network was about two agents, mean", 1e3),
     SheetColumn("fates", "fate (%)", "packets with another fate", 100),
     SheetColumn("path_m", "path (mm)", "how far off agents are at the window's end, mean", 1e3),
 )
@@ -82,7 +82,7 @@ def _measured(
 
 def _local(scenario: CosimScenario, windows_s: Sequence[float], task: Task) -> LocalErrors | PolicyError:
     def make(policy: SyncPolicy) -> Coordinator:
-        return build(scenario, policy=policy, seed=task.seed).coordinator
+        return build(scenario, policy=policy, seed=task.seed, measures_all=True).coordinator
 
     def method(window_s: float) -> SyncPolicy:
         # Windows of error_bounded are as long as others', but where its bound would not be kept.

@@ -7,12 +7,15 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.errors import EvidenceError
+from fieldkit.cli.display import show_note
+from fieldkit.core.errors import ConfigurationError, EvidenceError
 from sim_backends.cosim.commands import figures, settings
 from sim_backends.cosim.commands.figures import CostPoint
-from sim_backends.cosim.commands.replay import recording_at, title
+from sim_backends.cosim.commands.replay import recording_at, scenario_of, title
+from sim_backends.cosim.from_above import ObstacleOutline, outlines
 from sim_backends.cosim.plots import FlowTrace, run_figure
 from sim_backends.cosim.recording.replay import Recording
+from sim_backends.world.world import load_world
 
 _TABLE: Final = "write one with fieldkit cosim shootout SCENARIO --format csv > shootout.csv"
 
@@ -24,7 +27,8 @@ def run(arguments: argparse.Namespace) -> int:
         draw(figures.error_against_cost(_points(arguments.recording)))
         return 0
     recording = recording_at(arguments.recording)
-    draw(lambda form: run_figure(title(recording), _ways_m(recording), _traces(recording), form))
+    around = _around(recording)
+    draw(lambda form: run_figure(title(recording), _ways_m(recording), _traces(recording), form, around))
     return 0
 
 
@@ -49,6 +53,16 @@ def _points(path: Path) -> list[CostPoint]:
     if not found:
         raise EvidenceError("no policy has numbers in this table", where=str(path), remedy=_TABLE)
     return found
+
+
+def _around(recording: Recording) -> list[ObstacleOutline]:
+    """Return what stands in the world of a run; nothing, with a note, where that world is not here any more."""
+    name = scenario_of(recording).world
+    try:
+        return list(outlines(load_world(name)))
+    except ConfigurationError as error:
+        show_note(f"without its obstacles: {error.located}")
+        return []
 
 
 def _ways_m(recording: Recording) -> dict[str, list[tuple[float, float]]]:

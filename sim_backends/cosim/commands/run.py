@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from fieldkit.cli.display import show_note, working
+from fieldkit.core.printing import say
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate_all
 from sim_backends.cosim.commands.folder import RunFolder
@@ -45,6 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     words = settings.in_words(policy, scenario)
     build(scenario, policy=policy)  # what cannot be run leaves no folder behind
     folder = None if arguments.out is None else RunFolder(arguments.out, scenario, words, seeds)
+    settings.note_shared_beats(scenario, [policy], [scenario.policy.window], len(seeds))
     with working() as sink:
         results, interrupted = simulate_all(
             scenario, policy, seeds, folder, sink=sink, deadline_s=settings.deadline_s(arguments.deadline)
@@ -76,7 +78,7 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
         sheets["followers"] = _formations(results)
     show_all(sheets, form)
     if form == "table":
-        print(_cost(results))
+        say(_cost(results))
     for result in results:
         if result.stopped:
             # An error is told in full when the command ends.

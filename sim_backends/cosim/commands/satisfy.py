@@ -6,6 +6,7 @@ from typing import Final
 
 from fieldkit.cli.display import show_note, working
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.printing import say
 from fieldkit.core.units import format_count, parse_quantity
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
@@ -27,7 +28,7 @@ _COLUMNS: Final = (
     SheetColumn("loss", "lost (%)", "of packets whose fate is known", 100),
     SheetColumn("fate_disagreement", "fate (%)", "lost here or in the reference, but not in both", 100),
     SheetColumn("delivery_error_mean_s", "time (ms)", "delivery time less the reference's, magnitude, mean", 1e3),
-    SheetColumn("position_error_mean_m", "place (mm)", "how far off the network took the sender to be, mean", 1e3),
+    SheetColumn("position_error_mean_m", "place (mm)", "how wrong the network was about two agents, mean", 1e3),
     SheetColumn("exchanges", "exchanges", "what it cost"),
 )
 
@@ -46,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     seed = scenario.seeds[0] if arguments.seed is None else arguments.seed
     build(scenario)  # what cannot be run is told before anything runs
+    settings.note_shared_beats(scenario, [arguments.policy], [scenario.policy.window], 1)
     with working() as sink:
         told = partial(teller(sink), "satisfy", arguments.rounds + 1)
         runs = _Runs(scenario, seed, told)
@@ -61,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     title = f"{scenario.name}, {scenario.topology}, {arguments.policy}, seed {seed}: the satisfaction loop"
     _sheet(title, found).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        print(_words(found, threshold))
+        say(_words(found, threshold))
     if not found.satisfied:
         show_note(f"no round was satisfactory: {found.reason}")
     return 0 if found.satisfied else MISSED
@@ -79,7 +81,7 @@ class _Runs:
     def __call__(self, policy: SyncPolicy) -> Run:
         self._told(self._done)
         self._done += 1
-        return build(self._scenario, policy=policy, seed=self._seed).run()
+        return build(self._scenario, policy=policy, seed=self._seed, measures_all=True).run()
 
 
 def _sheet(title: str, found: Satisfaction) -> Sheet:

@@ -2,20 +2,24 @@
 
 import argparse
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from fieldkit.cli.display import show_note
 from fieldkit.config import schema
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, typed
-from fieldkit.core.units import parse_duration_s
+from fieldkit.core.units import format_count, parse_duration_s
 from fieldkit.report.theme import Format, format_of
-from sim_backends.cosim.coordinator import DEADLINE_S
 from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.cosim.scenario.phases import other_window_s, shared_beats
 from sim_backends.cosim.scenario.policies import POLICIES, make_policy
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.stalls import DEADLINE_S
+
+ENOUGH_SEEDS: Final = 20
+"""With as many the mean of one drawn phase each is off by 7 % of a window (standard error)."""
 
 
 def scenario(arguments: argparse.Namespace) -> CosimScenario:
@@ -109,7 +113,7 @@ def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], Non
 
 
 def deadline_s(text: str | None) -> float:
-    """Return the wall time in which physics, network and programs have to answer.
+    """Return the longest wait of a federate for an answer, in seconds of wall time.
 
     Raises:
         ConfigurationError: It is no duration above 0.
@@ -131,6 +135,35 @@ def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:
     name = chosen.policy.name if arguments.policy is None else arguments.policy
     make_policy(name, **chosen.policy.parameters)
     return str(name)
+
+
+def note_shared_beats(chosen: CosimScenario, policies: Sequence[str], windows_s: Sequence[float], seeds: int) -> None:
+    """Tell on standard error of windows of which packets meet few phases, and what to take instead.
+
+    Args:
+        chosen: The scenario.
+        policies: Names of the sync policies that run it.
+        windows_s: Windows of those that have one.
+        seeds: How many there are, each of which draws other phases.
+    """
+    if seeds >= ENOUGH_SEEDS:
+        return
+    taken = [one for one in windows_s if any(map(has_window, policies))]
+    for window_s in taken:
+        shared = shared_beats(chosen, [window_s])
+        if not shared:
+            continue
+        beats = ", ".join(
+            f"{one.beat.name} (every {one.beat.period_s * 1e3:.6g} ms: {format_count(one.phases, 'phase')})"
+            for one in shared
+        )
+        other_s = other_window_s(chosen, window_s)
+        instead = f"--seeds {ENOUGH_SEEDS}" if other_s is None else f"--window {other_s * 1e3:.6g}ms"
+        show_note(
+            f"the window of {window_s * 1e3:.6g} ms shares a beat with {beats}; errors and added delays are those of "
+            f"these phases, which the seed draws, and not of the method: take {instead}"
+            + ("" if other_s is None else f", or --seeds {ENOUGH_SEEDS}")
+        )
 
 
 def in_words(name: str, chosen: CosimScenario) -> str:

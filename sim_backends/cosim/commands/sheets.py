@@ -1,6 +1,5 @@
 """Tables for people and programs: columns with a unit and a meaning, printed in four forms."""
 
-import json
 import math
 import re
 import shutil
@@ -12,6 +11,8 @@ from typing import Final
 
 from fieldkit.cli.display import table
 from fieldkit.core.columns import csv_text
+from fieldkit.core.printing import say
+from fieldkit.core.text import json_text
 
 Value = str | int | float | None
 """A cell; nan and None are missing."""
@@ -112,7 +113,7 @@ def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
     """
     if form == "json":
         found = {name: sheet.records() for name, sheet in sheets.items()}
-        print(json.dumps(found, indent=2, allow_nan=False))
+        say(json_text(found, indent=2, allow_nan=False))
         return
     for sheet in list(sheets.values())[: 1 if form == "csv" else None]:
         sheet.show(form)
@@ -139,17 +140,17 @@ def _table(sheet: Sheet) -> None:
         legend = sheet.legend(part, told)
         told |= legend.keys()
         if legend:
-            print(filled(_in_words(legend)))
-        print()
+            say(filled(_in_words(legend)))
+        say()
 
 
 def _markdown(sheet: Sheet) -> None:
     for part in sheet.parts:
         heads, rows = sheet.of_part(part)
         for line in (heads, ["---"] * len(heads), *rows):
-            print(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |")
+            say(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |")
         legend = sheet.legend(part)
-        print("\n" + ". ".join((part.title, *([_in_words(legend)] if legend else []))) + ".\n")
+        say("\n" + ". ".join((part.title, *([_in_words(legend)] if legend else []))) + ".\n")
 
 
 def _in_words(legend: Mapping[str, str]) -> str:
@@ -158,11 +159,11 @@ def _in_words(legend: Mapping[str, str]) -> str:
 
 def _csv(sheet: Sheet) -> None:
     rows = [[None if _is_missing(value) else value for value in row] for row in sheet.rows]
-    print(csv_text([column.name for column in sheet.columns], rows), end="")
+    say(csv_text([column.name for column in sheet.columns], rows), end="")
 
 
 def _json(sheet: Sheet) -> None:
-    print(json.dumps(sheet.records(), indent=2, allow_nan=False))
+    say(json_text(sheet.records(), indent=2, allow_nan=False))
 
 
 def _is_missing(value: Value) -> bool:

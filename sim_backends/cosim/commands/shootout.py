@@ -14,6 +14,7 @@ from sim_backends.cosim.commands.clock import teller
 from sim_backends.cosim.commands.followers import FORMATION, formation_values
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.comparison import Errors
+from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -31,7 +32,7 @@ COLUMNS: Final = (
     SheetColumn("delay_added_s", "added", "what the policy added to the delay, mean, in ms", 1e3),
     SheetColumn("fate_disagreement", "fate (%)", "packets lost here or there, but not in both", 100),
     SheetColumn("causality_violations", "late", "arrivals that their receiver had passed already, per run"),
-    SheetColumn("position_error_mean_m", "place (mm)", "how far off the network took the sender to be, mean", 1e3),
+    SheetColumn("position_error_mean_m", "place (mm)", "how wrong the network was about two agents, mean", 1e3),
     SheetColumn("position_error_p95_m", "p95", "its 95th percentile", 1e3),
     SheetColumn("position_error_max_m", "max", "its maximum", 1e3),
     SheetColumn("path_error_mean_m", "path (mm)", "how far off the agents are, mean over time", 1e3),
@@ -44,6 +45,7 @@ COLUMNS: Final = (
     SheetColumn("real_time_factor", "speed", "simulated time over wall time"),
     *FORMATION,
 )
+_ROUNDING: Final = 1e-6
 _TIME: Final = ("policy", *(column.name for column in COLUMNS[3:9]))
 _PLACE: Final = ("policy", *(column.name for column in COLUMNS[9:14]))
 _COST: Final = ("policy", *(column.name for column in COLUMNS[14:20]))
@@ -64,12 +66,15 @@ def run(arguments: argparse.Namespace) -> int:
     windows_s = settings.windows_s(arguments, scenario)
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
     build(scenario)  # what cannot be run is told before anything runs
+    settings.note_shared_beats(scenario, policies, windows_s, len(seeds))
     with working() as sink:
         found = _all_rows(scenario, policies, seeds, windows_s, sink)
     _sheet(scenario, found, seeds).show(arguments.format)
     for window_s, row in found:
         if row.failure:
             show_note(f"{settings.in_words(row.policy, settings.with_window(scenario, window_s))}: {row.failure}")
+        if (broken := _broken_bound(scenario, row)) is not None:
+            show_note(broken)
     if draw is not None:
         from sim_backends.cosim.commands import figures  # noqa: PLC0415 (matplotlib takes half a second)
 
@@ -97,8 +102,22 @@ def _all_rows(
     return sorted(found, key=lambda one: policies.index(one[1].policy))
 
 
+def _broken_bound(scenario: CosimScenario, row: Row) -> str | None:
+    """Return a note where `error_bounded` did not keep a bound in metres; None if it did, or another one runs."""
+    chosen = scenario.policy
+    if row.policy != ErrorBounded.name or row.errors is None or chosen.bound_db is not None:
+        return None
+    largest_m = row.errors.position_error_m.largest
+    if math.isnan(largest_m) or largest_m <= chosen.bound * (1 + _ROUNDING):
+        return None
+    return (
+        f"{row.policy} was wrong about a place by {largest_m * 1e3:.3g} mm, more than its bound of "
+        f"{chosen.bound * 1e3:.3g} mm: agents changed their velocity by more than the physics' limits_m_s2 say"
+    )
+
+
 def _make(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
-    return build(scenario, policy=policy, seed=seed)
+    return build(scenario, policy=policy, seed=seed, measures_all=True)
 
 
 def _sheet(scenario: CosimScenario, found: Sequence[tuple[float, Row]], seeds: Sequence[int]) -> Sheet:

@@ -6,6 +6,7 @@ from functools import partial
 from typing import Final
 
 from fieldkit.cli.display import working
+from fieldkit.core.printing import say
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import teller
@@ -34,7 +35,8 @@ _REASON: Final = SheetColumn("loss_reason", "mostly", "why most of what did not 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run a table of the paper, or its claims, with all seeds, and print its numbers beside ours."""
-    which, changes, seeds = arguments.which, settings.changes(arguments), range(1, arguments.seeds + 1)
+    which, changes = arguments.which, settings.changes(arguments)
+    seeds = range(1, arguments.seeds + 1) if arguments.seed is None else (arguments.seed,)
     table = None if which == "claims" else paper_table(which, changes)
     setups = claim_setups(changes) if table is None else table.setups
     with working() as sink:
@@ -48,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     rows = table.rows(samples)
     paper_sheet(title, rows, is_ping=which == "emane").show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        print(filled(summary(rows)))
+        say(filled(summary(rows)))
     return 0
 
 
@@ -110,7 +112,7 @@ def summary(rows: Sequence[PaperRow]) -> str:
     by_mean = sum(cell.agrees_by_mean for cell in agree)
     return (
         f"{len(agree)} of {format_count(len(cells), 'cell')} agree: {by_mean} by our mean, {len(agree) - by_mean} "
-        "only because our interval is that wide. What the paper does not say and what was taken for it: docs/paper.md"
+        "only because our interval is that wide. Assumptions where the paper states no value: fieldkit docs paper"
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Vector
 from sim_backends.world.motion import State
 
 Pair = tuple[str, str]
@@ -27,6 +28,8 @@ class Situation:
         next_send_ns: Before when surely no program sends anything; told to policies that look ahead.
         known: Where the network takes the agents to be now, and how to go on; told to policies that look ahead, and
             None for where they are, standing.
+        others: Agents that forward or interfere, or sent without being in `pairs`.
+        fixed_m: Places of what interferes without being an agent.
     """
 
     now_ns: int
@@ -38,6 +41,8 @@ class Situation:
     limits_m_s2: Mapping[str, float]
     next_send_ns: int | None = None
     known: Mapping[str, State] | None = None
+    others: tuple[str, ...] = ()
+    fixed_m: tuple[Vector, ...] = ()
 
     @property
     def next_ns(self) -> int | None:
@@ -89,6 +94,14 @@ class LookingAhead(SyncPolicy, Protocol):
 
     It holds arrivals: as they count from the window's end, nothing before it depends on what the network does.
     """
+
+    def moves_on_every_ns(self, situation: Situation) -> int:
+        """Return in which steps the network lets agents move on in the window that begins now.
+
+        Args:
+            situation: How things are now; `known` tells the velocities at which agents will move on.
+        """
+        ...
 
     def goes_on(self, situation: Situation) -> int:
         """Return until when a window goes on that physics and programs have come to `situation.now_ns` in.

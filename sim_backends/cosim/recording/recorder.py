@@ -1,9 +1,10 @@
 """The recorder: an observer that writes what it sees into a folder, in parts that a kill leaves readable."""
 
 import errno
+import os
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -28,6 +29,10 @@ from sim_backends.world.motion import State
 
 _MOST_WINDOWS: Final = 50_000
 """In a part: until it is written it is in memory."""
+_FULL: Final = {errno.ENOSPC, errno.EDQUOT}
+_RESERVE: Final = ".reserve"
+_RESERVE_BYTES: Final = 1 << 20
+"""Room on the disk that is set aside for the last windows and the end of a run whose disk gets full."""
 _NOT_KEPT: Final[Mapping[str, State]] = {}
 
 
@@ -85,6 +90,7 @@ class RunRecorder:
             for table in tables.TABLES:
                 (self._folder / table).mkdir(parents=True)
             self._lock.enter_context(being_written(self._folder))
+            self._set_reserve_aside()
             write_manifest(self._folder, self._manifest)
         except FileExistsError as error:
             raise ConfigurationError(
@@ -138,8 +144,8 @@ class RunRecorder:
         why = f"{type(error).__name__}: {error}" if ending is RunEnding.FAILED else ""
         if not self._broken:
             self._write_part(last=True)
-        if self._captures is not None:
-            self._captures.close()
+        self._close()
+        self._free_reserve()
         self._manifest = replace(
             self._manifest,
             ending=ending,
@@ -153,30 +159,91 @@ class RunRecorder:
             if not self._broken:  # else it was told already
                 raise self._error(failure) from failure
 
+    def _close(self) -> None:
+        """Close the captures; an error of a disk that refuses to is told once, and hides no other."""
+        try:
+            if self._captures is not None:
+                self._captures.close()
+        except OSError as error:
+            if not self._broken:
+                raise self._error(error) from error
+
     def _write_part(self, *, last: bool = False) -> None:
-        """Write what is not written yet; who interrupts it finds nothing counted twice."""
-        state, windows = self._state.copy(), list(self._windows)
+        """Write what is not written yet; who interrupts it finds nothing counted twice.
+
+        Where the disk is full, tables come before captures: they get the room that was set aside for them, and of the
+        windows as many as that holds.
+
+        Raises:
+            RecordingError: Something of it cannot be written.
+        """
+        failure: OSError | None = None
+        try:
+            if self._captures is not None:
+                self._captures.flush()
+        except OSError as error:
+            failure = error
+            self._free_reserve()
+        many = len(self._windows)
+        while many or last:
+            try:
+                self._write_windows(many, last=last and failure is None)
+                break
+            except OSError as error:
+                failure = failure or error
+                self._free_reserve()
+                if not many:
+                    break
+                many //= 2
+        if failure is not None:
+            raise self._error(failure) from failure
+
+    def _write_windows(self, many: int, *, last: bool) -> None:
+        """Write the first windows that are not written yet as a part of each table."""
+        state, windows = self._state.copy(), self._windows[:many]
         rows = state.take(windows)
         if not state.parts:
             rows["states"] = state_rows(0, self._first_states) + rows["states"]
         if last:
             rows["packets"] += state.end()
+        written: list[Path] = []
         try:
-            if self._captures is not None:
-                self._captures.flush()
             for table, its_rows in rows.items():
-                state.checksums[tables.part_path(table, state.parts)] = tables.write_part(
-                    self._folder, table, state.parts, its_rows
-                )
-        except OSError as error:
-            raise self._error(error) from error
+                path = tables.part_path(table, state.parts)
+                written.append(self._folder / path)
+                state.checksums[path] = tables.write_part(self._folder, table, state.parts, its_rows)
+        except OSError:
+            for unfinished in written:  # the room that they take is needed
+                with suppress(OSError):
+                    unfinished.unlink(missing_ok=True)
+            raise
         state.parts += 1
-        self._state, self._windows = state, self._windows[len(windows) :]
+        self._state, self._windows = state, self._windows[many:]
+
+    def _set_reserve_aside(self) -> None:
+        """Set room aside; not on a file system that cannot, or where no file may be as large.
+
+        Raises:
+            OSError: There is no such room.
+        """
+        descriptor = os.open(self._folder / _RESERVE, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            os.posix_fallocate(descriptor, 0, _RESERVE_BYTES)
+        except OSError as error:
+            self._free_reserve()
+            if error.errno in _FULL:
+                raise
+        finally:
+            os.close(descriptor)
+
+    def _free_reserve(self) -> None:
+        with suppress(OSError):
+            (self._folder / _RESERVE).unlink(missing_ok=True)
 
     def _error(self, error: OSError) -> RecordingError:
         self._broken = True
         return RecordingError(
             f"the recording cannot be written: {error.strerror}; what it had stays readable",
             where=str(self._folder),
-            remedy="free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG} else "mend it",
+            remedy="free some space" if error.errno in {*_FULL, errno.EFBIG} else "choose another folder",
         )

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.coordinator import DEADLINE_S, Coordinator, Progress
+from sim_backends.cosim.coordinator import Coordinator, Progress
 from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
 from sim_backends.cosim.observer import WindowObserver
 from sim_backends.cosim.policies.base import SyncPolicy
@@ -16,7 +16,7 @@ from sim_backends.cosim.scenario.programs import programs
 from sim_backends.cosim.scenario.robots import bodies
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.scenario.steering import controllers, stops
-from sim_backends.cosim.stalls import Stall, stalled
+from sim_backends.cosim.stalls import DEADLINE_S, Stall, stalled
 from sim_backends.physics.bodies import Bodies
 from sim_backends.world.world import load_world
 
@@ -64,6 +64,7 @@ def build(
     deadline_s: float | None = DEADLINE_S,
     physics: PhysicsFederate | None = None,
     network: NetworkFederate | None = None,
+    measures_all: bool = False,
 ) -> Simulation:
     """Return a scenario as a simulation.
 
@@ -72,9 +73,10 @@ def build(
         policy: Its sync policy, or the name of one; None for the scenario's.
         seed: Of all random draws; None for the scenario's first.
         recorder: Is told of every window, and handed every IP packet if it takes them; None for nobody.
-        deadline_s: Wall time in which physics, network and programs have to answer; None for ever.
+        deadline_s: Longest wait of a federate for an answer, in seconds of wall time; None for no deadline.
         physics: Moves the agents in the place of the built-in bodies, of which it gets the commands.
         network: Carries packets in the place of the built-in radio; faults of the radio are then its own.
+        measures_all: As of `Coordinator`.
 
     Raises:
         ConfigurationError: It cannot be run; says why.
@@ -90,11 +92,18 @@ def build(
     carries = network or radio_network(scenario, world, seed, recorder)
     for fault in scenario.faults:
         if isinstance(fault, StalledFederateFault):
-            stall = Stall(fault.begin_ns, fault.stall)
+            stall = Stall(fault.begin_ns, fault.stall, deadline_s)
             if fault.federate == "physics":
                 moves = stalled(moves, stall)
             else:
                 carries = stalled(carries, stall)
     agents = Agents(moves, running)
-    coordinator = Coordinator(agents, carries, policy, scenario.pairs, observer=recorder, deadline_s=deadline_s)
+    coordinator = Coordinator(
+        agents,
+        carries,
+        policy,
+        scenario.pairs,
+        observer=recorder,
+        measures_all=measures_all,
+    )
     return Simulation(scenario, seed, policy, agents, carries, coordinator)

@@ -10,6 +10,7 @@ from sim_backends.cosim.scenario import memory
 from sim_backends.cosim.scenario.motions import FollowPlan, StationKeepingPlan
 from sim_backends.cosim.scenario.robots import antennas, bodies, limits, robots
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.scenario.speeds import beyond_limits
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.quadrotor import QuadrotorLimits
 from sim_backends.world.world import World
@@ -36,6 +37,7 @@ def refusals(scenario: CosimScenario, world: World) -> Iterator[ScenarioRefusal]
     yield from _robots(scenario)
     yield from _radios(scenario)
     yield from _starts(scenario, world)
+    yield from _speeds(scenario, world)
 
 
 def check(scenario: CosimScenario, world: World, where: Callable[[Location], str]) -> None:
@@ -110,6 +112,17 @@ def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioRefusal]:
     except ConfigurationError as error:
         agent = error.what.partition(" ")[0]  # who begins in something, or in somebody
         yield ScenarioRefusal(("agents", agent), error.what, error.remedy)
+
+
+def _speeds(scenario: CosimScenario, world: World) -> Iterator[ScenarioRefusal]:
+    standing = bodies(scenario, world)
+    for name, plan in scenario.agents.items():
+        for place, what, asked, most, unit in beyond_limits(plan.motion, standing[name].place_m, limits(plan.robot)):
+            yield ScenarioRefusal(
+                ("agents", name, "motion", *place),
+                f"{name} is asked for {what} of {asked:.6g} {unit}, and {plan.robot} does {most:.6g} {unit} at most",
+                f"let it be slower, or take a robot that is faster than {plan.robot}",
+            )
 
 
 def _memory(scenario: CosimScenario) -> Iterator[ScenarioRefusal]:

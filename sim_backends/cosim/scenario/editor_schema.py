@@ -3,15 +3,12 @@
 An editor with a YAML language server takes it from a comment in the file's first line, see docs/cosim-api.md.
 """
 
-import inspect
-import re
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Any
 
+from fieldkit.config.meanings import attributes, description, without_links
 from fieldkit.config.schema import Strict
 from sim_backends.cosim.scenario.schema import CosimScenario
-
-_ENTRY: Final = re.compile(r"^    (?P<key>\w+): (?P<said>.*(?:\n {8}.*)*)", re.MULTILINE)
 
 
 def editor_schema() -> dict[str, Any]:
@@ -22,23 +19,14 @@ def editor_schema() -> dict[str, Any]:
         model = models.get(part["title"])
         if model is None:
             continue  # an enumeration
-        part["description"] = inspect.getdoc(model).partition("\n\nAttributes:")[0]  # type: ignore[union-attr]
-        said = meanings(model)
+        part["description"] = without_links(description(model))
+        meanings = attributes(model)
         for key, value in part["properties"].items():
             value.pop("title", None)
-            value["description"] = said[key]
+            value["description"] = without_links(meanings[key])
             if not isinstance(value.get("default"), str) and "string" in _types(value):
                 value.pop("default", None)  # in SI units, and the file has text
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **whole}
-
-
-def meanings(model: type[Strict]) -> dict[str, str]:
-    """Return what each key of a model means, by its docstring and those of the classes that it has keys of."""
-    found: dict[str, str] = {}
-    for kind in reversed(model.__mro__):
-        said = (inspect.getdoc(kind) or "").partition("Attributes:")[2]
-        found |= {match["key"]: " ".join(match["said"].split()) for match in _ENTRY.finditer(said)}
-    return found
 
 
 def _models(base: type[Strict]) -> Iterator[type[Strict]]:

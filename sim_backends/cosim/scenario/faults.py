@@ -2,6 +2,8 @@
 
 from typing import Annotated, Literal
 
+from typing_extensions import override
+
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Strict
 from sim_backends.cosim.scenario.names import Name
@@ -61,8 +63,8 @@ class NodeLossFault(_Lasting):
     agent: Name
 
     @property
+    @override
     def agents(self) -> tuple[tuple[str, str], ...]:
-        """See `_Fault.agents`."""
         return (("agent", self.agent),)
 
 
@@ -84,8 +86,8 @@ class LinkCutFault(_Lasting):
         return self
 
     @property
+    @override
     def agents(self) -> tuple[tuple[str, str], ...]:
-        """See `_Fault.agents`."""
         return tuple(("between", name) for name in self.between)
 
 
@@ -113,8 +115,8 @@ class JammerFault(_Lasting):
         return self
 
     @property
+    @override
     def agents(self) -> tuple[tuple[str, str], ...]:
-        """See `_Fault.agents`."""
         return () if self.agent is None else (("agent", self.agent),)
 
 
@@ -134,8 +136,8 @@ class ClockSkewFault(_Lasting):
     rate_ppm: Annotated[Real, Field(ge=-500_000, le=500_000)] = 0
 
     @property
+    @override
     def agents(self) -> tuple[tuple[str, str], ...]:
-        """See `_Fault.agents`."""
         return (("agent", self.agent),)
 
 

@@ -13,8 +13,9 @@ from sim_backends.cosim.scenario.traffic import QosOptions, Traffic
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
-from sim_backends.network.ros1.options import Ros1Flow
+from sim_backends.network.ros1.options import Ros1Flow, Ros1Options
 from sim_backends.network.ros1.transport import Ros1
+from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.transport import Tcp
 from sim_backends.network.topics.discovery import DiscoveryTiming
 from sim_backends.network.topics.qos import Qos, TopicFlow
@@ -53,6 +54,8 @@ def radio_network(
         disturbances=tuple(_disturbances(scenario, world)),
         relay=scenario.relay if scenario.topology is Topology.MASTER else None,
     )
+    if scenario.relay is not None:  # without an access point it is the host of a ROS 1 master, which talks too
+        found.transmitters |= {scenario.relay}
     if isinstance(observer, IpObserver):
         found.log_ip(observer.log_ip)
     return found
@@ -68,12 +71,13 @@ def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFac
                 topics[flow] = TopicFlow(source, destination, _qos(one), topic=f"rt/{one.title}")
             elif one.transport == "ros1":
                 ros1[flow] = Ros1Flow(source, destination, "udpros" if one.protocol == "ros1-udp" else "tcpros")
-    found: dict[str, TransportFactory] = {"udp": Udp, "tcp": Tcp}
+    tcp = TcpOptions(congestion=scenario.tcp.congestion)
+    found: dict[str, TransportFactory] = {"udp": Udp, "tcp": partial(Tcp, options=tcp)}
     if topics:
         found["topic"] = partial(Topics, flows=topics, discovery=_discovery(topics, seed))
     if ros1:
         assert scenario.relay is not None  # by the schema
-        found["ros1"] = partial(Ros1, flows=ros1, master=scenario.relay)
+        found["ros1"] = partial(Ros1, flows=ros1, master=scenario.relay, options=Ros1Options(tcp=tcp))
     return found
 
 

@@ -1,7 +1,7 @@
 """The programs of a scenario's agents: what they send, how they steer, and what goes wrong with their computers."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Final
 
 from sim_backends.cosim.federates import Program
 from sim_backends.cosim.programs.bags import Playback, pieces, recorded
@@ -14,6 +14,9 @@ from sim_backends.cosim.scenario.faults import ClockSkewFault, NodeLossFault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.scenario.traffic import BagTraffic, FileTraffic, PingTraffic, StreamTraffic, Traffic
 from sim_backends.radio.random_streams import RandomStream
+
+ONCE_WITHIN_S: Final = 0.1
+"""Within which time what has no period begins: as long as the longest usual window (`policy.longest`)."""
 
 
 def programs(
@@ -41,7 +44,7 @@ def programs(
 
 
 def _sender(one: Traffic, flow: str, to: str, seed: int) -> Program:
-    begin_ns = _ns(one.start + RandomStream(seed, flow, "phase").draw(0) * one.period_s)
+    begin_ns = _ns(one.start + RandomStream(seed, flow, "phase").draw(0) * (one.period_s or ONCE_WITHIN_S))
     match one:
         case StreamTraffic():
             return Periodic(

@@ -15,6 +15,7 @@ from sim_backends.cosim.scenario.motions import FollowPlan, MotionPlan, Standing
 from sim_backends.cosim.scenario.names import Name
 from sim_backends.cosim.scenario.policies import POLICIES
 from sim_backends.cosim.scenario.traffic import StreamTraffic, Traffic
+from sim_backends.network.tcp.options import Congestion
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.obstacles import Place, Real
 
@@ -33,7 +34,8 @@ class PolicyChoice(Strict):
         name: Of the policy that a run takes if it is not told another.
         window: Length of a window, or the w of the velocity-aware policies.
         longest: What no window of a policy exceeds whose windows differ.
-        bound: By how much the network may be wrong about where two agents are to each other, for `error_bounded`.
+        bound: By how much the network's relative position of two agents that transmit may be wrong, for
+            `error_bounded`.
         bound_db: Instead: by how much it may be wrong about the path loss between them in the open, in dB.
         exponent: Of the log-distance law by which `bound_db` is told.
     """
@@ -115,8 +117,24 @@ class AgentPlan(Strict):
         return self
 
 
+class TcpChoice(Strict):
+    """The TCP of all agents.
+
+    Attributes:
+        congestion: Congestion control and loss recovery: `cubic` as in Linux, `cubic-rfc9438`, or `newreno`.
+    """
+
+    congestion: Congestion = "cubic"
+
+
 class CosimScenario(Named):
-    """A scenario of the co-simulation: one YAML file in `scenarios/`.
+    """A scenario of the [co-simulation](cosim.md): one YAML file in `scenarios/` of the lab, or a shipped one.
+
+    `fieldkit cosim schema` prints its JSON schema, with which an editor completes and checks it, see [the Python
+    API](cosim-api.md#scenario-files). `robot` is the name of a robot profile, which has a radio. Bodies of `husky`,
+    `iris`, `turtlebot3_burger` and `duckiedrone` are built in; another robot has the body of the TurtleBot, or of the
+    Duckiedrone, with its own top speed. The keys of `radio` are those of `emulated.radio` in the [site
+    file](reference/site-file.md).
 
     Attributes:
         name: The file's name without `.yaml`.
@@ -127,6 +145,7 @@ class CosimScenario(Named):
         seeds: Of the random draws, one for each run.
         physics: The physics.
         radio: The radio.
+        tcp: The TCP of all agents, also under ROS 1 topics.
         topology: `masterless`, or `master`: everything passes the relay, which is also the host of a ROS 1 master.
         relay: Whose access point relays.
         policy: The sync policy.
@@ -141,6 +160,7 @@ class CosimScenario(Named):
     seeds: Annotated[tuple[Annotated[Int, Field(ge=0)], ...], Field(min_length=1)] = (1,)
     physics: PhysicsOptions = PhysicsOptions.defaults()
     radio: RadioOptions = RadioOptions.defaults()
+    tcp: TcpChoice = TcpChoice.defaults()
     topology: Topology = Topology.MASTERLESS
     relay: Name | None = None
     policy: PolicyChoice = PolicyChoice.defaults()

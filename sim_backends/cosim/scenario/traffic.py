@@ -3,6 +3,8 @@
 from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
+from typing_extensions import override
+
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Hertz, Int, Strict
 from sim_backends.cosim.programs.pings import REPLY
@@ -40,10 +42,11 @@ class _Traffic(Strict, ABC):
         name: Of it; `FROM-KIND` if left out. What goes to each receiver is the flow `NAME/RECEIVER`.
         from: Who sends it.
         to: Who gets it, one agent or a list of several.
-        protocol: What carries it: `udp`, `tcp`, `topic` (DDS's publish-subscribe, without a master), `ros1`
-            (TCPROS) or `ros1-udp` (UDPROS).
+        protocol: What carries it: `udp`, `tcp`, `topic` (DDS's publish-subscribe, without a master), `ros1` (TCPROS)
+            or `ros1-udp` (UDPROS).
         qos: Of a topic.
-        start: When it begins; the first packet follows within one period, drawn, as nothing starts robots together.
+        start: When it begins. The first packet follows at a random time within one period (a file: within 100 ms),
+            since nothing starts robots simultaneously.
     """
 
     kind: str
@@ -110,12 +113,12 @@ class StreamTraffic(_Traffic):
     stop: Duration | None = None
 
     @property
+    @override
     def period_s(self) -> float:
-        """See `_Traffic.period_s`."""
         return 1 / self.rate
 
+    @override
     def packets(self, duration_s: float) -> float:
-        """See `_Traffic.packets`."""
         seconds = min(duration_s, duration_s if self.stop is None else self.stop) - self.start
         return len(self.to) * max(seconds, 0.0) * self.rate
 
@@ -152,12 +155,12 @@ class BagTraffic(_Traffic):
         return self
 
     @property
+    @override
     def period_s(self) -> float:
-        """See `_Traffic.period_s`."""
         return 1 / self.rate
 
+    @override
     def packets(self, duration_s: float) -> float:
-        """See `_Traffic.packets`."""
         seconds = min(self.length, duration_s - self.start)
         return len(self.to) * max(seconds, 0.0) * self.rate
 
@@ -176,12 +179,12 @@ class FileTraffic(_Traffic):
     piece_bytes: Bytes = 8192
 
     @property
+    @override
     def period_s(self) -> float:
-        """See `_Traffic.period_s`."""
         return 0.0
 
-    def packets(self, duration_s: float) -> float:  # noqa: ARG002 (see _Traffic)
-        """See `_Traffic.packets`."""
+    @override
+    def packets(self, duration_s: float) -> float:
         return len(self.to) * -(-self.size_bytes // self.piece_bytes)
 
 
@@ -201,17 +204,17 @@ class PingTraffic(_Traffic):
     size_bytes: Bytes = 56
 
     @property
+    @override
     def flow_ends(self) -> tuple[tuple[str, str, str], ...]:
-        """See `_Traffic.flow_ends`."""
         return *super().flow_ends, *((flow + REPLY, to, self.source) for flow, to in self.flows.items())
 
     @property
+    @override
     def period_s(self) -> float:
-        """See `_Traffic.period_s`."""
         return self.interval
 
+    @override
     def packets(self, duration_s: float) -> float:
-        """See `_Traffic.packets`."""
         sent = min(self.count, (duration_s - self.start) / self.interval)
         return 2 * len(self.to) * max(sent, 0.0)
 

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from sim_backends.cosim.comparison import displaced_m
+from sim_backends.cosim.comparison import delay_added_s
+from sim_backends.cosim.geometry import displaced_m
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.scheduled import Scheduled
@@ -22,12 +23,14 @@ class BoundCost:
     Attributes:
         largest_m: The largest error of position in the run by `error_bounded`.
         exchanges: Its exchanges.
+        added_s: What it added to a delay, mean; nan where nothing arrived.
         window_s: The longest fixed window that turns out to keep the bound in this run, to 2 %; nan where none does.
         fixed_exchanges: Its exchanges; 0 for none.
     """
 
     largest_m: float
     exchanges: int
+    added_s: float
     window_s: float
     fixed_exchanges: int
 
@@ -66,7 +69,7 @@ def bound_cost(
     """
     bounded = run(ErrorBounded(bound_m, longest_s))
     window_s, fixed = _longest_fixed(lambda tried_s: fixed_cost(run, tried_s), bound_m, step_s, longest_s)
-    return BoundCost(largest_m(bounded), len(bounded.windows_ns), window_s, fixed.exchanges)
+    return BoundCost(largest_m(bounded), len(bounded.windows_ns), delay_added_s(bounded), window_s, fixed.exchanges)
 
 
 def fixed_cost(run: Callable[[SyncPolicy], Run], window_s: float) -> FixedCost:

@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.errors import FieldkitError
-from sim_backends.cosim.comparison import displaced_m
 from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.geometry import displaced_m
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.run import Fate, Run

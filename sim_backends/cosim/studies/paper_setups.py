@@ -1,6 +1,6 @@
 """What the paper's simulations are run with here: shipped scenarios, and what each row of a table changes in them.
 
-What the paper does not say is as in the scenario's file, and the radio is as it comes; docs/paper.md lists it.
+Values that the paper does not state are those of the scenario's file and of the default radio: docs/studies/paper.md.
 """
 
 from collections.abc import Mapping

@@ -1,27 +1,19 @@
-"""Many runs at once, in processes of their own: the same results in any order, and nothing left behind.
+"""Many runs in parallel processes; results do not depend on the number of processes."""
 
-The processes are plain children that get tasks by a pipe. Those of `multiprocessing` would leave its resource tracker
-behind for as long as the caller lives, and do not end when the caller is killed.
-"""
-
+import multiprocessing
 import os
-import pickle
-import selectors
-import sys
+import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from itertools import islice
-from queue import SimpleQueue
-from subprocess import PIPE, Popen
-from typing import IO, Any, Final, TypeVar
+from multiprocessing.connection import Connection
+from typing import TypeVar
 
 from fieldkit.core.errors import FieldkitError
 
 Result = TypeVar("Result")
-
-_SERVE: Final = f"from {__name__} import serve; serve()"
 
 
 @dataclass(frozen=True)
@@ -81,99 +73,63 @@ def as_they_end(
 
 def _one_by_one(work: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
     for number, task in enumerate(tasks):
+        yield number, _done(work, task)
+
+
+def _side_by_side(
+    work: Callable[[Task], Result], tasks: Sequence[Task], workers: int
+) -> Iterator[tuple[int, Result]]:
+    """Yield results as they come; if the generator ends early, the processes end immediately."""
+    stop_reader, stop_writer = multiprocessing.Pipe(duplex=False)
+    executor = ProcessPoolExecutor(
+        workers, multiprocessing.get_context("spawn"), initializer=_end_with, initargs=(stop_reader,)
+    )
+    futures: list[Future[Result]] = []
+    with stop_reader:
         try:
-            yield number, work(task)
-        except Exception as error:
-            raise _named(error, task) from error
-
-
-def _side_by_side(work: Callable[[Task], Any], tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Any]]:
-    """Yield results as they come."""
-    waiting = iter(enumerate(tasks))
-    with ExitStack() as ends, selectors.DefaultSelector() as ready:
-        for number, task in islice(waiting, workers):
-            process = ends.enter_context(_process())
-            _tell(process, work)
-            _tell(process, task)
-            ready.register(_stream(process.stdout), selectors.EVENT_READ, (process, number))
-        while ready.get_map():
-            for key, _ in ready.select():
-                process, number = key.data
-                yield number, _answer(process, tasks[number])
-                following = next(waiting, None)
-                if following is None:
-                    ready.unregister(process.stdout)
-                else:
-                    _tell(process, following[1])
-                    ready.modify(process.stdout, selectors.EVENT_READ, (process, following[0]))
-
-
-def _answer(process: "Popen[bytes]", task: Task) -> Any:  # noqa: ANN401 (whatever the work returns)
-    try:
-        result, error = pickle.load(_stream(process.stdout))  # noqa: S301 (from a process that we started)
-    except EOFError:
-        remedy = "if memory ran out, use fewer workers"
-        raise FieldkitError("its process was killed", where=str(task), remedy=remedy) from None
-    if error is not None:
-        raise error
-    return result
-
-
-@contextmanager
-def _process() -> Iterator["Popen[bytes]"]:
-    """Start a process that serves, out of reach of the terminal's Ctrl-C, and end it."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-c", _SERVE]
-    with Popen(command, stdin=PIPE, stdout=PIPE, env=environment, start_new_session=True) as process:
-        try:
-            yield process
+            futures.extend(executor.submit(_done, work, task) for task in tasks)
+            numbers = {future: number for number, future in enumerate(futures)}
+            for future in as_completed(futures):
+                yield numbers[future], future.result()
+            executor.shutdown()
+        except BrokenProcessPool:
+            under_way = [str(task) for task, future in zip(tasks, futures, strict=False) if _is_broken(future)]
+            raise FieldkitError(
+                "a process was killed",
+                where=" or ".join(under_way[:workers]),
+                remedy="if memory ran out, use fewer workers",
+            ) from None
         finally:
-            process.kill()
-            with suppress(BrokenPipeError):
-                _stream(process.stdin).close()
+            stop_writer.close()
+            executor.shutdown(cancel_futures=True)
 
 
-def _tell(process: "Popen[bytes]", what: object) -> None:
-    stream = _stream(process.stdin)
-    with suppress(BrokenPipeError):  # it died, which is seen where its answer does not come
-        stream.write(pickle.dumps(what))
-        stream.flush()
+def _is_broken(future: Future[Result]) -> bool:
+    return future.done() and isinstance(future.exception(), BrokenProcessPool)
 
 
-def _stream(pipe: IO[bytes] | None) -> IO[bytes]:
-    assert pipe is not None
-    return pipe
+def _end_with(stop_reader: Connection) -> None:
+    """Let this process ignore Ctrl-C and end when the other end of the pipe closes, as when its caller is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def wait() -> None:
+        stop_reader.poll(None)
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
-def _named(error: Exception, task: Task) -> FieldkitError:
-    """Return an error that names its task."""
-    if isinstance(error, FieldkitError):
-        error.where = f"{task}: {error.where}" if error.where else str(task)
-        return error
-    remedy = "this is a fault of the program; a single worker tells where"
-    return FieldkitError(f"{type(error).__name__}: {error}", where=str(task), remedy=remedy)
+def _done(work: Callable[[Task], Result], task: Task) -> Result:
+    """Return the result of a task.
 
-
-def serve() -> None:
-    """Do tasks that come by the standard input, until it ends: whatever ends the caller ends this process too."""
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what work prints must not get among the answers
-    todo: SimpleQueue[Any] = SimpleQueue()
-    threading.Thread(target=_listen, args=(sys.stdin.buffer, todo), daemon=True).start()
-    work = todo.get()
-    while True:
-        task = todo.get()
-        try:
-            answer = pickle.dumps((work(task), None))
-        except Exception as error:  # noqa: BLE001 (the caller raises it)
-            answer = pickle.dumps((None, _named(error, task)))
-        answers.write(answer)
-        answers.flush()
-
-
-def _listen(told: IO[bytes], todo: "SimpleQueue[Any]") -> None:
+    Raises:
+        FieldkitError: The task failed; the error names it.
+    """
     try:
-        while True:
-            todo.put(pickle.load(told))  # noqa: S301 (from the process that started this one)
-    finally:
-        os._exit(0)
+        return work(task)
+    except FieldkitError as error:
+        error.where = f"{task}: {error.where}" if error.where else str(task)
+        raise
+    except Exception as error:
+        remedy = "this is a fault of the program; a single worker shows where"
+        raise FieldkitError(f"{type(error).__name__}: {error}", where=str(task), remedy=remedy) from error

@@ -4,8 +4,8 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from sim_backends.emulated.autopilot.firmware import Mode
 from sim_backends.emulated.autopilot.mavlink import Message, dialect
+from sim_backends.emulated.autopilot.modes import Mode
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.emulated.autopilot.plan import goal_m
 from sim_backends.emulated.autopilot.vehicle import Refused, Vehicle
@@ -41,6 +41,7 @@ class Commands:
             dialect.MAV_CMD_DO_REPOSITION: self._reposition,
             dialect.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
             dialect.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_current,
+            dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
         }
 
     def run(self, message: Message) -> int:
@@ -66,7 +67,9 @@ class Commands:
 
     def _regret(self, refusal: Refused) -> None:
         if str(refusal):
-            self._vehicle.remarks.append(str(refusal))
+            ardupilot = self._vehicle.firmware.is_ardupilot
+            severity = dialect.MAV_SEVERITY_WARNING if ardupilot else dialect.MAV_SEVERITY_CRITICAL
+            self._vehicle.say(severity, str(refusal))
 
     def _check(self, _: Message) -> int:
         self._vehicle.check()
@@ -111,14 +114,25 @@ class Commands:
         number, sub = int(message.param2), int(message.param3)
         if self._vehicle.firmware.autopilot == dialect.MAV_AUTOPILOT_PX4:
             number = number << 16 | sub << 24
-        return _DONE if self._change(number) else _DENIED
+        return _DONE if self._change(number) else self._vehicle.firmware.unknown_mode
 
     def _change(self, custom_mode: int) -> bool:
         """Change to the mode of a number; return whether it has it."""
         mode = self._vehicle.firmware.mode_of(custom_mode)
         if mode is not None:
             self._vehicle.change_mode(mode)
+        elif self._vehicle.firmware.is_ardupilot:
+            self._vehicle.say(dialect.MAV_SEVERITY_WARNING, f"No such mode {custom_mode}")
         return mode is not None
+
+    def _reboot(self, message: Message) -> int:
+        """Boot again (param1 is 1); refused while armed."""
+        if message.param1 != 1:
+            return int(dialect.MAV_RESULT_UNSUPPORTED)
+        if self._vehicle.armed:
+            return self._vehicle.firmware.refused
+        self._vehicle.boot(self._vehicle.body.now_ns)
+        return _DONE
 
     def _reposition(self, message: Message) -> int:
         """Fly to a place; NaN, or the largest integer, is where it is (MAV_CMD_DO_REPOSITION)."""

@@ -1,30 +1,27 @@
-"""What families of autopilots do each in its own way: modes, parameters, manners; a module each has its facts."""
+"""Differences between families of autopilots: modes, parameters, messages, refusals."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from enum import Enum, auto
 
 from sim_backends.emulated.autopilot.battery import Battery
+from sim_backends.emulated.autopilot.failsafes import Failsafes
+from sim_backends.emulated.autopilot.modes import Mode
 from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameter, Parameters
 
 
-class Mode(Enum):
-    """What it does in a mode, of those in which it flies without a pilot's sticks.
+@dataclass(frozen=True)
+class StreamGroup:
+    """A group of messages whose rate one parameter sets (SRn_* of ArduPilot).
 
-    Each family has its own names for them: OFFBOARD is PX4's, and GUIDED ArduCopter's, for where set-points lead.
+    Attributes:
+        number: MAV_DATA_STREAM of REQUEST_DATA_STREAM.
+        parameter: Name of the parameter, Hz.
+        messages: Ids of the messages.
     """
 
-    TAKEOFF = auto()
-    LOITER = auto()
-    MISSION = auto()
-    RTL = auto()
-    HOMECOMING = auto()
-    """The last piece of RTL: down to where home is."""
-    LAND = auto()
-    OFFBOARD = auto()
-
-
-LANDING = frozenset({Mode.LAND, Mode.HOMECOMING})
+    number: int
+    parameter: str
+    messages: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -33,19 +30,30 @@ class Firmware:
 
     Attributes:
         autopilot: MAV_AUTOPILOT.
-        version: As AUTOPILOT_VERSION has it: major, minor, patch, type.
+        version: AUTOPILOT_VERSION.flight_sw_version: major, minor, patch, type.
         capabilities: MAV_PROTOCOL_CAPABILITY.
-        base: MAV_MODE_FLAG of its heartbeat, whatever it does.
-        modes: The custom mode of each mode.
-        refused: MAV_RESULT of what it does not do now.
-        silent: Whether it says no more than that of a take-off, a landing, a mode that it refuses.
-        prearm: What its texts begin with that say why it may not be armed, when asked, and when it is to be armed.
-        unfit: Says why it may not be armed.
-        parameters: Its parameters, for what a profile lets it do.
-        guided_holds: Whether it stays in the mode of set-points, and where it is, when none comes.
-        lifts_off: Whether set-points lift it off the ground.
-        lands_anywhere: Whether it takes modes that land where it stands.
-        first_item: Number of the first item of a mission: before it is home.
+        base: MAV_MODE_FLAG of its heartbeat that do not change.
+        modes: Custom mode of each mode.
+        names: Name of each mode that AVAILABLE_MODES lists.
+        boot_mode: Mode after power-on.
+        unarmable: Modes in which it cannot be armed.
+        refused: MAV_RESULT of a command that it refuses now.
+        unknown_mode: MAV_RESULT of a change to a mode that it does not have.
+        unknown_rate: MAV_RESULT of MAV_CMD_SET_MESSAGE_INTERVAL for a message that it does not send.
+        unknown_message: MAV_RESULT of MAV_CMD_REQUEST_MESSAGE for one.
+        prearm: Prefixes of the texts with the reasons why it cannot be armed: when asked, and on arming.
+        unfit: Returns the reasons.
+        parameters: Its parameters, within the limits of a profile.
+        failsafes: Its fail-safes.
+        streams_hz: Default rates of messages on a telemetry port.
+        groups: Groups of messages that parameters and REQUEST_DATA_STREAM set; empty where it ignores those.
+        spool_s: Time from arming to the earliest lift-off.
+        landed_s: Time on the ground after which it has detected its landing.
+        fix_type: GPS_FIX_TYPE with a good receiver.
+        guided_holds: Whether it stays in the mode of set-points, and at its place, without set-points.
+        lifts_off: Whether set-points make it lift off.
+        lands_anywhere: Whether it accepts LAND and RTL on the ground.
+        first_item: Number of the first item of a mission that is flown: before it is home.
     """
 
     autopilot: int
@@ -53,15 +61,31 @@ class Firmware:
     capabilities: int
     base: int
     modes: Mapping[Mode, int]
+    names: Mapping[Mode, str]
+    boot_mode: Mode
+    unarmable: frozenset[Mode]
     refused: int
-    silent: bool
+    unknown_mode: int
+    unknown_rate: int
+    unknown_message: int
     prearm: tuple[str, str]
     unfit: Callable[[Parameters, Battery], list[str]]
     parameters: Callable[[FlightLimits], tuple[Parameter, ...]]
+    failsafes: Callable[[Parameters], Failsafes]
+    streams_hz: Mapping[int, float]
+    groups: tuple[StreamGroup, ...]
+    spool_s: float
+    landed_s: float
+    fix_type: int
     guided_holds: bool
     lifts_off: bool
     lands_anywhere: bool
     first_item: int
+
+    @property
+    def is_ardupilot(self) -> bool:
+        """Whether it is ArduPilot's."""
+        return self.guided_holds
 
     def mode_of(self, custom_mode: int) -> Mode | None:
         """Return the mode of a number; None for one that it does not have."""

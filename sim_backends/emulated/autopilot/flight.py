@@ -22,7 +22,7 @@ _APPROACH: Final = 0.5
 goes beyond by 4 % at most where nothing lags (PX4 has 0.95 for MPC_XY_P, and 1.8 for MPC_XY_VEL_P_ACC)."""
 
 _HEADS_M_S: Final = 0.3
-"""Slower than this a drone does not turn to where it flies."""
+"""A slower drone does not turn to its direction of flight."""
 _REST_M: Final = 1e-3
 """Who would come so much deeper, had it its way, stands."""
 _LOOK_M: Final = 2.0
@@ -34,12 +34,13 @@ class Airframe:
 
     Args:
         can: What it can do.
-        home_m: Where it stands in the world: its lowest point.
+        place_m: Place of its lowest point in the world; home is there, too.
         facing_rad: Where its nose points.
         around: What is in its way in the world, the floor too.
         now_ns: When that is.
 
     Attributes:
+        home_m: Place of home in the world; `position_m` is relative to it.
         now_ns: The moment at which it is so.
         driven: Whether its motors turn: without them it stands, or falls.
         on_ground: Whether it stands on something.
@@ -47,25 +48,25 @@ class Airframe:
     """
 
     def __init__(
-        self, can: QuadrotorLimits, home_m: Vector, facing_rad: float, around: Sequence[Footprint], now_ns: int
+        self, can: QuadrotorLimits, place_m: Vector, facing_rad: float, around: Sequence[Footprint], now_ns: int
     ) -> None:
         self.now_ns = now_ns
         self.driven = False
         self.on_ground = True
         self.turn_rad_s = 0.0
-        self._pose = FlightPose(home_m, heading_rad=facing_rad)
-        self._home_m = home_m
+        self._pose = FlightPose(place_m, heading_rad=facing_rad)
+        self.home_m = place_m
         self._around = around
         self._near: Sequence[Footprint] = ()
         self._looked_m: Vector = (math.inf, 0.0, 0.0)
         self._can = can
-        self._quadrotor = Quadrotor(can, home_m)
-        self._dead = Quadrotor(replace(can, thrust_n=(0.0, 0.0)), home_m)
+        self._quadrotor = Quadrotor(can, place_m)
+        self._dead = Quadrotor(replace(can, thrust_n=(0.0, 0.0)), place_m)
 
     @property
     def position_m(self) -> Vector:
         """Where it is, seen from home."""
-        (east, north, up), home = self._pose.place_m, self._home_m
+        (east, north, up), home = self._pose.place_m, self.home_m
         return east - home[0], north - home[1], up - home[2]
 
     @property
@@ -88,14 +89,20 @@ class Airframe:
         """Roll (right side down) and pitch (nose up), as MAVLink has them."""
         return self._pose.roll_rad, -self._pose.pitch_rad
 
-    def step(self, wanted_m_s: Vector, can: QuadrotorLimits) -> None:
-        """Fly for one step towards this velocity, as far as its limits, the ground and what stands on it allow."""
+    def step(self, wanted_m_s: Vector, can: QuadrotorLimits, yaw_rad: float | None = None) -> None:
+        """Fly for one step towards this velocity, within its limits; the ground and obstacles stop it.
+
+        Args:
+            wanted_m_s: The velocity.
+            can: What it can do.
+            yaw_rad: Heading to turn to; None to keep the heading.
+        """
         self.now_ns += STEP_NS
         if can != self._can:
-            self._can, self._quadrotor = can, Quadrotor(can, self._home_m)
+            self._can, self._quadrotor = can, Quadrotor(can, self._pose.place_m)
         body = self._quadrotor if self.driven else self._dead
         before_m = self._pose.place_m
-        pose = body.course(self._pose, Velocity(wanted_m_s, self._heading()), _STEP_S).at(1)
+        pose = body.course(self._pose, Velocity(wanted_m_s, yaw_rad), _STEP_S).at(1)
         around = self._look(before_m)
         stop = move(body, before_m, pose.place_m, around)
         if stop is not None:
@@ -119,8 +126,9 @@ class Airframe:
             self._near = [one for one in self._around if gap_m(one, self._quadrotor, place_m) < _LOOK_M]
         return self._near
 
-    def _heading(self) -> float | None:
-        """Return where to turn the nose: where it flies."""
+    @property
+    def course_rad(self) -> float | None:
+        """Direction in which it flies over the ground; None while it is slow."""
         east, north, _ = self.velocity_m_s
         return math.atan2(north, east) if math.hypot(east, north) > _HEADS_M_S else None
 

@@ -3,6 +3,7 @@
 Constants and messages have the names of the dialect (https://mavlink.io/en/messages/common.html).
 """
 
+import struct
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -13,13 +14,19 @@ Message = Any
 
 __all__ = [
     "AUTOPILOT_COMPONENT",
+    "AVAILABLE_MODES",
     "COMMON_CAPABILITIES",
+    "COMPONENT_METADATA",
     "EKF_STATUS_REPORT",
+    "PROTOCOL_VERSION",
     "Message",
     "Writer",
     "addressee",
+    "available_modes",
+    "component_metadata",
     "dialect",
     "ekf_status_report",
+    "protocol_version",
     "read",
 ]
 
@@ -31,35 +38,79 @@ COMMON_CAPABILITIES: Final[int] = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 )
 EKF_STATUS_REPORT: Final = 193
-"""Of ArduPilot's own dialect."""
+"""Message of ArduPilot's own dialect."""
+PROTOCOL_VERSION: Final = 300
+COMPONENT_METADATA: Final = 397
+AVAILABLE_MODES: Final = 435
+"""Messages of the common dialect that pymavlink's `common` does not have."""
+
+
+class _RawMessage(dialect.MAVLink_message):  # type: ignore[misc]  # pymavlink has no types
+    """A message whose payload is packed here."""
+
+    def __init__(self, number: int, name: str, payload: bytes, crc_extra: int) -> None:
+        super().__init__(number, name)
+        self._packed = payload
+        self._extra = crc_extra
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:  # noqa: ANN401 (of pymavlink)
+        """Return the frame of this message."""
+        packed: bytes = self._pack(mav, self._extra, self._packed, force_mavlink1)
+        return packed
+
+
+def protocol_version() -> Message:
+    """Return PROTOCOL_VERSION: MAVLink 2, at least 1 (https://mavlink.io/en/messages/common.html#PROTOCOL_VERSION)."""
+    payload = struct.pack("<3H8s8s", 200, 100, 200, b"", b"")
+    return _RawMessage(PROTOCOL_VERSION, "PROTOCOL_VERSION", payload, 217)
+
+
+def component_metadata(boot_ms: int, uri: str) -> Message:
+    """Return COMPONENT_METADATA with the place of the general metadata file, whose checksum is not known (0)."""
+    payload = struct.pack("<II100s", boot_ms, 0, uri.encode("ascii"))
+    return _RawMessage(COMPONENT_METADATA, "COMPONENT_METADATA", payload, 182)
+
+
+def available_modes(count: int, index: int, standard: int, custom: int, name: str) -> Message:
+    """Return AVAILABLE_MODES of one mode; indices begin at 1.
+
+    Args:
+        count: Number of modes.
+        index: Index of this one.
+        standard: MAV_STANDARD_MODE, 0 for a mode that is not standard.
+        custom: Custom mode of HEARTBEAT.
+        name: Name to show.
+    """
+    payload = struct.pack("<IIBBB35s", custom, 0, count, index, standard, name.encode("ascii"))
+    return _RawMessage(AVAILABLE_MODES, "AVAILABLE_MODES", payload, 134)
 
 
 def ekf_status_report(flags: int) -> Message:
-    """Return ArduPilot's message of what its estimates are worth, with these flags of what it knows."""
-    from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 (60 ms, and only ArduPilot says it)
+    """Return ArduPilot's EKF_STATUS_REPORT with these flags."""
+    from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 (60 ms, and only ArduPilot sends it)
 
     return ardupilotmega.MAVLink_ekf_status_report_message(flags, *(0.1,) * 5)
 
 
 def read(datagram: bytes) -> Iterator[Message]:
-    """Yield the messages in a datagram; bytes that are none are left out, and so is a frame that is cut off.
+    """Yield the messages in a datagram; other bytes and incomplete frames are left out.
 
-    Each datagram is read for itself: one that was cut does not spoil the next.
+    Each datagram is parsed separately: an incomplete one does not affect the next.
     """
     parser = dialect.MAVLink(None)
-    parser.robust_parsing = True  # bad data is a message of its own, and no error
+    parser.robust_parsing = True  # bad data is a message of its own, not an error
     for message in parser.parse_buffer(datagram) or ():
         if message.get_type() != "BAD_DATA" and not message.get_type().startswith("UNKNOWN"):
             yield message
 
 
 def addressee(message: Message) -> tuple[int, int]:
-    """Return whom a message is for, system and component; 0 is everybody's, and a message without a field for it."""
+    """Return target system and component of a message; 0 is a broadcast, as is a message without these fields."""
     return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
 
 
 class Writer:
-    """Makes the frames for one receiver, who tells by their numbers how many were lost.
+    """Makes the frames of one port, with their sequence numbers.
 
     Args:
         system: Id of the system that sends them.

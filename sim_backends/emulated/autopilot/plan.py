@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.core.model import Vector
+from sim_backends.emulated.autopilot.fence import is_within
 from sim_backends.emulated.autopilot.mavlink import Message, dialect
 from sim_backends.emulated.ros.messages import EAST_RADIUS_M, NORTH_RADIUS_M
 
@@ -101,17 +102,5 @@ def fault(item: Item, home_m: Vector, fence_m: tuple[float, float]) -> int:
         return int(dialect.MAV_MISSION_UNSUPPORTED_FRAME)
     if item.command == dialect.MAV_CMD_NAV_TAKEOFF:  # straight up, wherever it stands
         goal = (0.0, 0.0, goal[2])
-    inside = within_fence(goal, fence_m)
+    inside = is_within(goal, fence_m)
     return int(dialect.MAV_MISSION_ACCEPTED if inside else dialect.MAV_MISSION_DENIED)
-
-
-def within_fence(goal: Vector, fence_m: tuple[float, float]) -> bool:
-    """Return whether a point, seen from home, is one to which the drone may fly."""
-    return math.hypot(*goal[:2]) <= fence_m[0] and 0 <= goal[2] <= fence_m[1]
-
-
-def inside_fence(goal: Vector, fence_m: tuple[float, float]) -> Vector:
-    """Return the point itself, or the one on the fence between home and it."""
-    (east, north, up), (far_m, high_m) = goal, fence_m
-    part = far_m / max(math.hypot(east, north), far_m)
-    return part * east, part * north, min(up, high_m)

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final
 from sim_backends.emulated.ros.helm import Helm
 
 if TYPE_CHECKING:
-    from sim_backends.emulated.autopilot.autopilot import Autopilot, Frame
+    from sim_backends.emulated.autopilot.autopilot import Autopilot
+    from sim_backends.emulated.autopilot.port import Frame
 
 _TICK_NS: Final = 20_000_000
 """How often it flies on while somebody listens, or while it flies."""
@@ -27,7 +28,7 @@ class Drone:
     """What an autopilot is told about the robot that it flies.
 
     Attributes:
-        system: Its MAVLink id.
+        system: Its system id after power-on.
         port: Of UDP, at every address.
         autopilot: `px4` or `ardupilot`.
         profile: The name of its profile, by which its body is known.
@@ -36,6 +37,7 @@ class Drone:
         fence_m: Distance from home that it allows; None as above.
         antenna_m: How far its antenna, which is where the lab says it is, is above its lowest point.
         world: What it flies in, as JSON.
+        boot_s: Time from power-on until its position estimate has an origin.
     """
 
     system: int
@@ -47,6 +49,7 @@ class Drone:
     fence_m: float | None
     antenna_m: float
     world: str
+    boot_s: float = 0.0
 
 
 def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
@@ -65,9 +68,10 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
         endpoint.bind(("", drone.port))
         endpoint.setblocking(False)
         selector.register(endpoint, selectors.EVENT_READ)
+        on_ns = time.monotonic_ns()
         ready.touch()
         selector.select()
-        autopilot, helm = _switch_on(drone, motion, steered)
+        autopilot, helm = _load(drone, motion, steered, on_ns)
         while True:
             helm.look(time.monotonic_ns())
             _turn(autopilot, endpoint)
@@ -75,8 +79,12 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
             selector.select(_wait_s(autopilot))
 
 
-def _switch_on(drone: Drone, motion: Path, steered: Path) -> "tuple[Autopilot, DroneHelm]":
-    # Loading the dialect takes 50 ms and 40 MB, the world as much: most trials never talk with the drone.
+def _load(drone: Drone, motion: Path, steered: Path, on_ns: int) -> "tuple[Autopilot, DroneHelm]":
+    """Return the autopilot, which has been on since `on_ns`.
+
+    It is loaded when a client appears: the dialect takes 50 ms and 40 MB, the world as much, and most trials never
+    connect to the drone.
+    """
     from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER  # noqa: PLC0415
     from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
     from sim_backends.emulated.autopilot.parameters import USUAL_M, FlightLimits  # noqa: PLC0415
@@ -86,16 +94,16 @@ def _switch_on(drone: Drone, motion: Path, steered: Path) -> "tuple[Autopilot, D
     from sim_backends.world.world import World  # noqa: PLC0415
 
     world = World.model_validate_json(drone.world) if drone.world else None
-    now_ns = time.monotonic_ns()
     autopilot = Autopilot(
         firmware={"px4": PX4, "ardupilot": ARDUCOPTER}[drone.autopilot],
         system=drone.system,
         limits=FlightLimits(drone.max_speed_m_s, drone.max_height_m or USUAL_M[0], drone.fence_m or USUAL_M[1]),
         can=quadrotor(drone.profile),
         around=Ground(world, None).around,
-        now_ns=now_ns,
+        now_ns=on_ns,
+        boot_s=drone.boot_s,
     )
-    return autopilot, DroneHelm(autopilot, Helm(motion, steered, now_ns), drone.antenna_m)
+    return autopilot, DroneHelm(autopilot, Helm(motion, steered, time.monotonic_ns()), drone.antenna_m)
 
 
 class DroneHelm:

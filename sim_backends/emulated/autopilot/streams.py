@@ -1,59 +1,33 @@
-"""How often one client hears each message (https://mavlink.io/en/mavgen_python/howto_requestmessages.html)."""
+"""Message rates of one port of the autopilot (https://mavlink.io/en/services/message_intervals.html).
 
-from collections.abc import Iterator
+They belong to the port: all clients receive the same messages, and each client can change their rates for all.
+"""
+
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 from sim_backends.emulated.autopilot.mavlink import dialect
 
 SHORTEST_NS: Final = 20_000_000
-"""Nobody hears a message more often than this."""
-
-_d = dialect
-USUAL_HZ: Final = {
-    _d.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
-    _d.MAVLINK_MSG_ID_SYS_STATUS: 1.0,
-    _d.MAVLINK_MSG_ID_GPS_RAW_INT: 1.0,
-    _d.MAVLINK_MSG_ID_ATTITUDE: 10.0,
-    _d.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 10.0,
-    _d.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 5.0,
-    _d.MAVLINK_MSG_ID_MISSION_CURRENT: 1.0,
-    _d.MAVLINK_MSG_ID_VFR_HUD: 2.0,
-    _d.MAVLINK_MSG_ID_BATTERY_STATUS: 1.0,
-    _d.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
-    _d.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 2.0,
-}
-"""Messages per second, for who asks for nothing."""
-
-_GROUPS: Final = {
-    _d.MAV_DATA_STREAM_EXTENDED_STATUS: (
-        _d.MAVLINK_MSG_ID_SYS_STATUS,
-        _d.MAVLINK_MSG_ID_GPS_RAW_INT,
-        _d.MAVLINK_MSG_ID_MISSION_CURRENT,
-    ),
-    _d.MAV_DATA_STREAM_POSITION: (
-        _d.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-        _d.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-    ),
-    _d.MAV_DATA_STREAM_EXTRA1: (_d.MAVLINK_MSG_ID_ATTITUDE,),
-    _d.MAV_DATA_STREAM_EXTRA2: (_d.MAVLINK_MSG_ID_VFR_HUD,),
-    _d.MAV_DATA_STREAM_EXTRA3: (_d.MAVLINK_MSG_ID_BATTERY_STATUS,),
-}
-"""What REQUEST_DATA_STREAM means by its streams."""
+"""Shortest interval of a message."""
+HEARTBEAT_US: Final = 1_000_000
 
 
 class Streams:
-    """The messages that one client hears, each at its rate.
+    """The messages that a port sends, each at its rate.
 
     Args:
-        now_ns: From when on.
+        usual_hz: Default rates, by message id; others are 0.
+        now_ns: Time of the first messages.
     """
 
-    def __init__(self, now_ns: int) -> None:
-        self._interval_ns = {kind: round(1e9 / rate_hz) for kind, rate_hz in USUAL_HZ.items()}
+    def __init__(self, usual_hz: Mapping[int, float], now_ns: int) -> None:
+        self._usual_hz = {dialect.MAVLINK_MSG_ID_HEARTBEAT: 1e6 / HEARTBEAT_US, **usual_hz}
+        self._interval_ns = {kind: round(1e9 / rate_hz) for kind, rate_hz in self._usual_hz.items() if rate_hz}
         self._due_ns = dict.fromkeys(self._interval_ns, now_ns)
 
     def due(self, now_ns: int) -> Iterator[int]:
-        """Yield the ids of the messages that are due; what was missed meanwhile is not made up for."""
+        """Yield the ids of the messages that are due; messages missed meanwhile are not sent later."""
         for kind, due_ns in self._due_ns.items():
             if due_ns <= now_ns:
                 interval_ns = self._interval_ns[kind]
@@ -62,28 +36,26 @@ class Streams:
 
     @property
     def next_ns(self) -> int:
-        """When the next one is due: there is always the heartbeat."""
+        """Time of the next message: there is always the heartbeat."""
         return min(self._due_ns.values())
 
     def set_interval(self, kind: int, interval_us: float, now_ns: int) -> None:
-        """Set how often a message comes: -1 never, 0 as usual (MAV_CMD_SET_MESSAGE_INTERVAL)."""
-        if interval_us == 0 and kind in USUAL_HZ:
-            interval_us = 1e6 / USUAL_HZ[kind]
+        """Set the interval of a message: -1 is never, 0 the default (MAV_CMD_SET_MESSAGE_INTERVAL)."""
+        if interval_us == 0 and self._usual_hz.get(kind):
+            interval_us = 1e6 / self._usual_hz[kind]
         self._due_ns.pop(kind, None)
         self._interval_ns.pop(kind, None)
         if interval_us > 0:
             self._interval_ns[kind] = max(round(interval_us * 1e3), SHORTEST_NS)
             self._due_ns[kind] = now_ns
         elif kind == dialect.MAVLINK_MSG_ID_HEARTBEAT:
-            self.set_interval(kind, 1e6, now_ns)  # without it nobody knows that there is a vehicle
+            self.set_interval(kind, HEARTBEAT_US, now_ns)  # without it no client recognises a vehicle
 
     def interval_us(self, kind: int) -> int:
-        """Return how often a message comes, -1 for never."""
+        """Return the interval of a message, -1 for never."""
         return self._interval_ns.get(kind, -1000) // 1000
 
-    def request(self, stream: int, rate_hz: int, now_ns: int) -> None:
-        """Do what REQUEST_DATA_STREAM asks for, with rate 0 for its stop; unknown streams change nothing."""
-        everything = stream == dialect.MAV_DATA_STREAM_ALL
-        kinds = [one for group in _GROUPS.values() for one in group] if everything else _GROUPS.get(stream, ())
-        for kind in kinds:
-            self.set_interval(kind, 1e6 / rate_hz if rate_hz else -1, now_ns)
+    def set_usual(self, kind: int, rate_hz: float, now_ns: int) -> None:
+        """Set the default rate of a message, and its rate now; 0 is never."""
+        self._usual_hz[kind] = rate_hz
+        self.set_interval(kind, 1e6 / rate_hz if rate_hz else -1, now_ns)

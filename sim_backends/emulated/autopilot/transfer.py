@@ -49,7 +49,7 @@ class MissionTransfer:
         self._check = check
         self._load = load
         self._upload: _Upload | None = None
-        self._taken: tuple[tuple[int, int], int] | None = None
+        self._ended: tuple[tuple[int, int], int, int] | None = None  # client, last item, result
 
     def handle(self, message: Message, now_ns: int) -> Iterator[Message]:
         """Yield the answers to a message of the protocol; others have none."""
@@ -87,7 +87,7 @@ class MissionTransfer:
     def _begin(self, count: int, client: tuple[int, int], now_ns: int) -> Message:
         if self._upload is not None and self._upload.client != client:
             return _ack(client, dialect.MAV_MISSION_DENIED)
-        self._taken = None
+        self._ended = None
         if count > MOST_ITEMS:
             return _ack(client, dialect.MAV_MISSION_NO_SPACE)
         if count == 0:
@@ -101,15 +101,15 @@ class MissionTransfer:
     def _take(self, message: Message, client: tuple[int, int], now_ns: int) -> Iterator[Message]:
         upload = self._upload
         if upload is None or upload.client != client:
-            if self._taken == (client, message.seq):  # the answer to the last item was lost
-                yield _ack(client, dialect.MAV_MISSION_ACCEPTED)
+            if self._ended is not None and self._ended[:2] == (client, message.seq):  # the answer was lost
+                yield _ack(client, self._ended[2])
             return
         if message.seq != len(upload.items):
             return  # late, or twice
         item = item_of(message)
         wrong = self._check(item)
         if wrong != dialect.MAV_MISSION_ACCEPTED:
-            self._upload = None
+            self._upload, self._ended = None, (client, message.seq, wrong)
             yield _ack(client, wrong)
             return
         upload.items.append(item)
@@ -117,7 +117,7 @@ class MissionTransfer:
         if len(upload.items) < upload.count:
             yield _request(upload)
             return
-        self._upload, self._taken = None, (client, message.seq)
+        self._upload, self._ended = None, (client, message.seq, dialect.MAV_MISSION_ACCEPTED)
         self._load(tuple(upload.items))
         yield _ack(client, dialect.MAV_MISSION_ACCEPTED)
 

@@ -1,49 +1,76 @@
-"""The vehicle: whether its motors may turn, in which mode it flies, and where that takes it.
+"""The vehicle: arming, flight mode, and the motion that follows from them.
 
-It knows of no clock and no socket: `advance` says how late it is.
+It has neither clock nor socket: `advance` receives the time.
 """
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.autopilot.battery import Battery
-from sim_backends.emulated.autopilot.firmware import LANDING, Firmware, Mode
-from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe, stop_m, velocity_to
+from sim_backends.emulated.autopilot.estimate import PositionEstimate
+from sim_backends.emulated.autopilot.failsafes import Reaction, VehicleState
+from sim_backends.emulated.autopilot.fence import Fence
+from sim_backends.emulated.autopilot.firmware import Firmware
+from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe, stop_m
+from sim_backends.emulated.autopilot.guidance import NEAR_M, Guidance, SetPoint
+from sim_backends.emulated.autopilot.mavlink import dialect
 from sim_backends.emulated.autopilot.mission import Mission
+from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode
 from sim_backends.emulated.autopilot.parameters import Parameters
-from sim_backends.emulated.autopilot.plan import Item, inside_fence, within_fence
+from sim_backends.emulated.autopilot.plan import Item
 from sim_backends.physics.collisions import Footprint
 from sim_backends.physics.quadrotor import QuadrotorLimits
 
-NEAR_M: Final = 0.1
-"""As near as this is there."""
+_INFO: Final = dialect.MAV_SEVERITY_INFO
+_CRITICAL: Final = dialect.MAV_SEVERITY_CRITICAL
+
+_PREARM_NS: Final = 30_000_000_000
+"""ArduPilot repeats the reasons why it cannot be armed at this interval (AP_Arming)."""
+_OFFBOARD_LOST: Final = {3: Mode.RTL, 4: Mode.LAND}
+"""Mode without set-points, by COM_OBL_RC_ACT; a pilot's modes need sticks, so that PX4 holds instead."""
+_STARTING_FLAGS: Final = {True: 0xA7, False: 0xA5}
+"""Flags of an estimate without an origin: whether it is ArduPilot's."""
 
 
-class Refused(Exception):  # noqa: N818 (what an autopilot says, and nothing that went wrong)
-    """The vehicle does not do it now; the text is for people, and empty where it says nothing."""
+class Refused(Exception):  # noqa: N818 (an answer of the autopilot, not an error)
+    """The vehicle does not do it now; the text is for people, and empty where the firmware sends none."""
+
+
+class Remark(NamedTuple):
+    """A text for people: STATUSTEXT."""
+
+    severity: int
+    text: str
 
 
 class Vehicle:
     """One drone.
 
     Args:
-        firmware: Of which family its autopilot is.
-        parameters: Its parameters, of which it reads what they are at each moment.
+        firmware: Family of its autopilot.
+        parameters: Its parameters; it reads the current values.
         can: What its body can do.
-        around: What is in its way in the world, the floor too.
+        around: Obstacles in the world, including the floor.
         now_ns: When it is switched on.
+        boot_s: Time from power-on until its position estimate has an origin.
 
     Attributes:
-        body: Where it is and how it moves, seen from home.
+        body: Place and motion, relative to home.
         armed: Whether its motors turn.
-        mode: In which mode it flies.
-        mission: What it flies in mode MISSION.
+        landed: Whether it has detected that it is on the ground.
+        mode: Its flight mode.
+        mission: The mission of mode MISSION.
         battery: Its battery.
-        home_m: Where the lab has put it: its lowest point, metres east, north, up.
-        remarks: What it wants to tell people, to be taken out by whoever does.
+        estimate: Its position estimate.
+        fence: Its own fence.
+        guidance: What it flies to.
+        home_m: Home in the world, metres east, north, up: where it was armed last, before that where it booted.
+        failsafes: Its fail-safes.
+        remarks: Texts that were not sent yet; the reader takes them out.
     """
 
     def __init__(
@@ -53,31 +80,61 @@ class Vehicle:
         can: QuadrotorLimits,
         around: Sequence[Footprint],
         now_ns: int,
+        *,
+        boot_s: float = 0.0,
     ) -> None:
         self.firmware = firmware
         self.battery = Battery(now_ns)
         self._parameters = parameters
         self._can = can
         self._around = around
+        self.estimate = PositionEstimate(boot_s, _STARTING_FLAGS[firmware.is_ardupilot])
+        self.fence = Fence(parameters)
+        self.guidance = Guidance(firmware, parameters)
         self.mission = Mission(firmware.first_item)
-        self.remarks: list[str] = []
-        self.place((0.0, 0.0, 0.0), math.pi / 2, now_ns)
+        self.remarks: list[Remark] = []
+        self.home_m: Vector = (0.0, 0.0, 0.0)
+        self.place(self.home_m, math.pi / 2, now_ns)
+        self.boot(now_ns)
 
-    def place(self, home_m: Vector, facing_rad: float, now_ns: int) -> None:
-        """Stand in another place, wherever it was: somebody has carried it there."""
-        self.home_m = home_m
-        self.body = Airframe(self._can, home_m, facing_rad, self._around, now_ns)
+    def boot(self, now_ns: int) -> None:
+        """Boot: the mode is that after power-on, fail-safes and the origin are reset."""
+        self.estimate.boot(now_ns)
+        self._prearm_ns = now_ns
+        self.mode = self.firmware.boot_mode
         self.armed = False
-        self.mode = Mode.LOITER
-        self._goal_m: Vector = self.body.position_m
-        self._wish: tuple[Vector, bool] = (self.body.position_m, True)
-        self._wished_ns: int | None = None
+        self.failsafes = self.firmware.failsafes(self._parameters)
+
+    def place(self, place_m: Vector, facing_rad: float, now_ns: int) -> None:
+        """Put it on the ground at another place in the world, as a person who carries it. Its mode stays."""
+        self.body = Airframe(self._can, place_m, facing_rad, self._around, now_ns)
+        if self.estimate.origin_m is None:
+            self.home_m = place_m
+        self.body.home_m = self.home_m
+        self.armed = False
+        self.landed = True
+        self.guidance.hold(self.body.position_m)
+        self.guidance.led_ns = None
+        self.fence.reset()
         self._flew = False
-        self._stands_ns = now_ns
+        self._stands_ns = self._armed_ns = now_ns
+
+    @property
+    def local_m(self) -> Vector | None:
+        """Place relative to the origin of its local frame, east, north, up; None before there is one."""
+        return self.estimate.to_local(self.body.place_m)
+
+    def from_local(self, place_m: Vector) -> Vector | None:
+        """Return a place of its local frame relative to home; None before there is such a frame."""
+        world_m = self.estimate.to_world(place_m)
+        if world_m is None:
+            return None
+        east, north, up = (place - home for place, home in zip(world_m, self.home_m, strict=True))
+        return east, north, up
 
     @property
     def can(self) -> QuadrotorLimits:
-        """What its body can do, as far as its parameters let it."""
+        """What its body can do, within its parameters."""
         get = self._parameters
         return replace(
             self._can,
@@ -88,240 +145,312 @@ class Vehicle:
         )
 
     @property
-    def fence_m(self) -> tuple[float, float]:
-        """How far from home it flies, over the ground and up."""
-        return self._parameters["GF_MAX_HOR_DIST"], self._parameters["GF_MAX_VER_DIST"]
-
-    @property
     def unfit(self) -> list[str]:
-        """Why it may not be armed; empty where it may."""
-        return self.firmware.unfit(self._parameters, self.battery)
+        """Reasons why it cannot be armed; empty if it can."""
+        found = self.firmware.unfit(self._parameters, self.battery) + self.failsafes.unfit
+        if self.estimate.origin_m is None:
+            found.append("Need Position Estimate" if self.firmware.is_ardupilot else "ekf2 missing data")
+        return found
+
+    def say(self, severity: int, text: str) -> None:
+        """Add a text for people."""
+        self.remarks.append(Remark(severity, text))
 
     def check(self) -> None:
-        """Say why it may not be armed.
+        """Report why it cannot be armed.
 
         Raises:
             Refused: It is armed.
         """
         if self.armed:
             raise self._refusal("Prearm checks denied: armed")
-        self.remarks += [self.firmware.prearm[0] + why for why in self.unfit]
+        for why in self.unfit:
+            self.say(_CRITICAL, self.firmware.prearm[0] + why)
 
     def arm(self) -> None:
-        """Let the motors turn; once more does nothing.
+        """Start the motors; does nothing if they run.
 
         Raises:
-            Refused: It is to come down, or not fit.
+            Refused: It falls, or cannot be armed now.
         """
         if self.armed:
             return
         if not self.body.on_ground:
             raise self._refusal("Arming denied: it falls")
-        if unfit := self.unfit:
-            self.remarks += [self.firmware.prearm[1] + why for why in unfit]
+        unfit = self.unfit
+        if self.mode in self.firmware.unarmable:
+            unfit.append(f"{self.firmware.names[_shown(self.mode)]} mode not armable")
+        for why in unfit:
+            self.say(_CRITICAL, self.firmware.prearm[1] + why)
+        if unfit:
             raise self._refusal("Arming denied: Resolve system health failures first")
-        self.armed, self._flew, self._stands_ns = True, False, self.body.now_ns
-        self._goal_m = self.body.position_m
+        self.home_m = self.body.home_m = self.body.place_m
+        self.armed, self._flew = True, False
+        self.fence.reset()
+        self._stands_ns = self._armed_ns = self.body.now_ns
+        self.guidance.hold(self.body.position_m)
+        self.say(_INFO, "Arming motors" if self.firmware.is_ardupilot else "Armed by external command")
 
     def disarm(self, *, force: bool = False) -> None:
         """Stop the motors.
 
         Args:
-            force: In the air, too: it falls.
+            force: Also in the air: it falls.
 
         Raises:
             Refused: It flies.
         """
         if self.armed and not self.body.on_ground and not force:
             raise self._refusal("Disarming denied: not landed")
+        if self.armed and self.firmware.is_ardupilot:
+            self.say(_INFO, "Disarming motors")
         self.armed = False
-        if not self.firmware.guided_holds:  # ArduCopter stays in the mode that it is in
+        self.failsafes.mode_changed(self.body.now_ns)
+        if not self.firmware.is_ardupilot:  # ArduCopter's mode stays
             self.mode = Mode.LOITER
 
     def take_off(self, height_m: float | None = None) -> None:
-        """Rise; asked once more on the way, as after an answer that was lost, it goes on.
+        """Rise; a repeated command, as after a lost answer, has no further effect until it lifts off.
 
         Args:
             height_m: Above home; None for the parameter's.
 
         Raises:
-            Refused: The motors stand, it flies already, or not so high.
+            Refused: The motors are off, it flies already, or the height is not allowed.
         """
-        if self.mode is Mode.TAKEOFF:
+        if self.mode is Mode.TAKEOFF and (self.landed or not self.firmware.is_ardupilot):
             return
         height_m = self._parameters["MIS_TAKEOFF_ALT"] if height_m is None else height_m
         if not self.armed:
             raise self._refusal("Takeoff denied: not armed")
         if not self.body.on_ground:
             raise self._refusal("Takeoff denied: already in the air")
-        if self.firmware.guided_holds and (self.mode is not Mode.OFFBOARD or height_m <= self.body.position_m[2]):
+        if self.firmware.is_ardupilot and (self.mode is not Mode.OFFBOARD or height_m <= self.body.position_m[2]):
             raise self._refusal("Takeoff denied: not in GUIDED, or not upwards")
         self._go(Mode.TAKEOFF, (*self.body.position_m[:2], height_m))
 
     def go_to(self, goal_m: Vector) -> None:
-        """Fly to a point, seen from home, and stay there.
+        """Fly to a point relative to home, and stay there.
 
         Raises:
-            Refused: It does not fly, or not there.
+            Refused: It does not fly, or the point is not allowed.
         """
         if self.body.on_ground:
             raise self._refusal("Reposition denied: not in the air")
-        if self.firmware.guided_holds:
+        if self.firmware.is_ardupilot:
             self.change_mode(Mode.OFFBOARD)
-            self.wish(goal_m, place=True)
+            self.lead(SetPoint(goal_m, is_place=True))
         else:
             self._go(Mode.LOITER, goal_m)
+            self.failsafes.mode_changed(self.body.now_ns)
 
-    def wish(self, vector: Vector, *, place: bool) -> None:
-        """Take a set-point for mode OFFBOARD: a place seen from home, or a velocity.
+    def lead(self, set_point: SetPoint) -> None:
+        """Take a set-point for mode OFFBOARD.
 
         ArduCopter takes none in another mode, none on the ground, and no place beyond its fence; one ends a take-off.
         """
-        if self.firmware.guided_holds:
+        if self.firmware.is_ardupilot:
             if self.mode not in {Mode.OFFBOARD, Mode.TAKEOFF} or self.body.on_ground:
                 return
-            if place and not within_fence(vector, self.fence_m):
+            if set_point.is_place and not self.fence.contains(set_point.vector):
                 return
             self.mode = Mode.OFFBOARD
-        self._wish, self._wished_ns = (vector, place), self.body.now_ns
+        self.guidance.set_point, self.guidance.led_ns = set_point, self.body.now_ns
 
     def change_mode(self, mode: Mode) -> None:
-        """Fly in another mode; the one that it is in goes on.
+        """Change the mode as a client asks; the current mode goes on.
 
         Raises:
-            Refused: There is nothing to fly: no mission, no set-points, or it stands.
+            Refused: There is nothing to fly: no mission, no set-points, no position, or it is on the ground.
         """
+        self._switch(mode)
+        self.failsafes.mode_changed(self.body.now_ns)
+
+    def load(self, items: tuple[Item, ...]) -> None:
+        """Take a new mission; a mission in flight is given up, and the vehicle waits at its place."""
+        if self.mode is Mode.MISSION and self.armed:
+            self._switch(Mode.LOITER)
+        self.mission.load(items)
+
+    def advance(self, now_ns: int) -> None:
+        """Fly until this time, by whole steps."""
+        get = self._parameters
+        battery = self.battery
+        battery.full_v, battery.flight_s = get["SIM_BATT_VOLTAGE"], get["SIM_BAT_DRAIN"]
+        battery.least = get["SIM_BAT_MIN_PCT"] / 100
+        battery.advance(now_ns, driven=self.armed)
+        while self.body.now_ns + STEP_NS <= now_ns:
+            if not self.armed and self.body.on_ground:
+                self.body.now_ns += (now_ns - self.body.now_ns) // STEP_NS * STEP_NS
+                self.landed = True
+                break
+            self._watch()
+            self.body.driven = self.armed
+            wanted_m_s = self._wanted_m_s()  # it may change the mode
+            self.body.step(wanted_m_s, self.can, self.guidance.yaw_rad(self.mode, self.body))
+        self._watch_boot()
+        self._watch_failsafes()
+
+    def _watch_boot(self) -> None:
+        """Set the origin once the position estimate is good; until then report why it cannot be armed."""
+        now_ns, estimate = self.body.now_ns, self.estimate
+        if self.firmware.is_ardupilot and not self.armed and now_ns >= self._prearm_ns:
+            self._prearm_ns = now_ns + _PREARM_NS
+            if estimate.is_starting(now_ns) or estimate.origin_m is not None:
+                self.check()
+        if not estimate.advance(now_ns, self.body.place_m):
+            return
+        if not self.armed:
+            self.home_m = self.body.home_m = self.body.place_m
+            self.guidance.hold(self.body.position_m)
+        if self.firmware.is_ardupilot and not estimate.is_instant:
+            self.say(_INFO, "EKF3 IMU0 origin set")
+            self.say(_INFO, "EKF3 IMU0 is using GPS")
+
+    @property
+    def _state(self) -> VehicleState:
+        return VehicleState(self.body.now_ns, self.armed, self.landed, self.mode, self.battery)
+
+    def _watch_failsafes(self) -> None:
+        for reaction in self.failsafes.advance(self._state):
+            self._react(reaction)
+
+    def _react(self, reaction: Reaction) -> None:
+        if reaction.text:
+            self.say(reaction.severity, reaction.text)
+        if reaction.disarm:
+            self.disarm(force=True)
+        if reaction.mode is not None:
+            self._switch_itself(reaction.mode)
+
+    def _switch_itself(self, mode: Mode) -> None:
+        """Change the mode without a client; where it cannot, on the ground for example, the mode stays."""
+        with suppress(Refused):
+            self._switch(mode)
+
+    def _switch(self, mode: Mode) -> None:
+        """Change the mode; errors as `change_mode`."""
         if mode is self.mode:
             return
         if mode is Mode.TAKEOFF:
             self.take_off()
             return
-        stands = not self.armed or self.body.on_ground
-        if mode in {Mode.LAND, Mode.RTL} and stands and not self.firmware.lands_anywhere:
-            raise self._refusal(f"{mode.name} denied: not in the air")
-        if mode is Mode.OFFBOARD and not self.firmware.guided_holds and not self._wished_lately():
-            raise self._refusal("OFFBOARD denied: no set-points")
+        if self.firmware.is_ardupilot:
+            self._demand_copter(mode)
+        else:
+            self._demand_px4(mode)
         if mode is Mode.MISSION:
-            if len(self.mission.items) <= self.firmware.first_item:
-                raise self._refusal("MISSION denied: no mission")
             self.mission.begin()
-        self._goal_m = self._rest_m()
+        self.guidance.goal_m = self._rest_m()
         if mode is Mode.OFFBOARD and self.firmware.guided_holds:
-            self._wish = (self._goal_m, True)
+            self.guidance.hold(self.guidance.goal_m)
         self.mode = mode
 
-    def load(self, items: tuple[Item, ...]) -> None:
-        """Take a new mission; the one that it flies is given up, and it waits where it is."""
-        if self.mode is Mode.MISSION:
-            self.change_mode(Mode.LOITER)
-        self.mission.load(items)
+    def _demand_copter(self, mode: Mode) -> None:
+        """Raise `Refused` if ArduCopter does not change to a mode now; unarmed it accepts any (Copter::set_mode)."""
+        if not self.armed:
+            return
+        items, first = self.mission.items, self.firmware.first_item
+        if mode is Mode.MISSION and len(items) <= first:
+            raise self._failed_mode(mode)
+        if mode is Mode.MISSION and self.landed and items[first].command != dialect.MAV_CMD_NAV_TAKEOFF:
+            self.say(_CRITICAL, "Auto: Missing Takeoff Cmd")
+            raise self._failed_mode(mode)
 
-    def advance(self, now_ns: int) -> None:
-        """Fly until this moment, as far as whole steps go."""
-        while self.body.now_ns + STEP_NS <= now_ns:
-            if not self.armed and self.body.on_ground:
-                self.body.now_ns += (now_ns - self.body.now_ns) // STEP_NS * STEP_NS
-                return
-            self._watch()
-            self.body.driven = self.armed
-            self.body.step(self._wanted_m_s(), self.can)
+    def _failed_mode(self, mode: Mode) -> Refused:
+        return Refused(f"Mode change to {self.firmware.names[mode]} failed: init failed")
+
+    def _demand_px4(self, mode: Mode) -> None:
+        """Raise `Refused` if PX4 does not change to a mode now."""
+        stands = not self.armed or self.body.on_ground
+        if mode in {Mode.LAND, Mode.RTL} and stands:
+            raise self._refusal(f"{mode.name} denied: not in the air")
+        if mode is Mode.OFFBOARD and not self.guidance.is_led(self.body.now_ns):
+            raise self._refusal("OFFBOARD denied: no set-points")
+        if mode is Mode.MISSION and not self.mission.items:
+            raise self._refusal("MISSION denied: no mission")
 
     def _go(self, mode: Mode, goal_m: Vector) -> None:
-        if not all(map(math.isfinite, goal_m)) or not within_fence(goal_m, self.fence_m):
+        if not all(map(math.isfinite, goal_m)) or not self.fence.contains(goal_m):
             raise self._refusal(f"{mode.name} denied: beyond the fence")
-        self.mode, self._goal_m = mode, goal_m
+        self.mode, self.guidance.goal_m = mode, goal_m
 
     def _refusal(self, why: str) -> Refused:
-        """Return what is raised where it does not do something; ArduCopter's answer is all that it says."""
-        return Refused("" if self.firmware.silent else why)
+        """Return what is raised when it does not do something; ArduCopter answers without a text."""
+        return Refused("" if self.firmware.is_ardupilot else why)
 
     def _watch(self) -> None:
-        """Stop the motors of one that stands, and hold one that nobody leads, or that is led beyond the fence."""
-        now_ns = self.body.now_ns
+        """Detect take-off and landing; stop motors that idle; react to missing set-points and to the fence."""
+        now_ns, ardupilot = self.body.now_ns, self.firmware.is_ardupilot
         if not self.body.on_ground:
-            self._flew, self._stands_ns = True, now_ns
-        landed = self._flew or self.mode in LANDING
-        patience_s = self._parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]
-        if self.armed and now_ns - self._stands_ns > patience_s * 1e9:
-            self.remarks.append("Disarmed by landing" if self._flew else "Disarmed by auto preflight disarming")
+            self._flew, self.landed, self._stands_ns = True, False, now_ns
+        elif now_ns - self._stands_ns >= self.firmware.landed_s * 1e9:
+            self.landed = True
+        if self.armed and now_ns - self._stands_ns > self._idle_s() * 1e9:
+            if not ardupilot:
+                self.say(_INFO, "Disarmed by landing" if self._flew else "Disarmed by auto preflight disarming")
             self.disarm()
-        if self.mode is Mode.OFFBOARD and self.firmware.guided_holds:
-            self._watch_guided()
-        elif self.mode is Mode.OFFBOARD:
-            if not self._wished_lately():
-                self.remarks.append("Offboard control lost: hold")
-                self.change_mode(Mode.LOITER)
-            elif self._leaves():
-                self.remarks.append("Geofence: hold")
-                self.change_mode(Mode.LOITER)
+        if ardupilot and (breach := self.fence.advance(self._state, self.body.position_m)):
+            self._react(breach)
+        if self.mode is Mode.OFFBOARD:
+            self._watch_set_points()
 
-    def _watch_guided(self) -> None:
-        """Hold one whose last velocity is long ago; bring home one that it leads over the fence (FENCE_ACTION)."""
-        if self._wish[1]:
-            return
-        if self._leaves():
-            self.remarks.append("Fence Breached")
-            self.change_mode(Mode.RTL)
-        elif not self._wished_lately():
-            self._wish = (self._rest_m(), True)
+    def _idle_s(self) -> float:
+        """Return after which time on the ground its motors stop; ArduCopter stops them soon in landing modes only."""
+        ends = self.mode is Mode.MISSION or not self.firmware.is_ardupilot
+        landed = (self._flew and ends) or self.mode in LANDING
+        return self._parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]
+
+    def _watch_set_points(self) -> None:
+        """Hold, or do what COM_OBL_RC_ACT requires, without set-points; hold if they lead beyond PX4's fence."""
+        is_led = self.guidance.is_led(self.body.now_ns)
+        if self.firmware.is_ardupilot:
+            if not self.guidance.set_point.is_place and not is_led:
+                self.guidance.set_point = SetPoint(self._rest_m(), is_place=True)
+        elif not is_led:
+            self.say(_CRITICAL, "Failsafe activated")
+            self._switch_itself(_OFFBOARD_LOST.get(int(self._parameters["COM_OBL_RC_ACT"]), Mode.LOITER))
+            self.failsafes.set_points_lost()
+        elif self.fence.is_crossed(self.body.position_m, stop_m(self.body, self.can)):
+            self.say(_CRITICAL, "Geofence: hold")
+            self._switch_itself(Mode.LOITER)
 
     def _rest_m(self) -> Vector:
-        """Return where it waits if it brakes now; who brakes again and again comes no farther than the fence."""
-        return inside_fence(stop_m(self.body, self.can), self.fence_m)
+        """Return where it comes to rest if it brakes now, moved to the fence if that is beyond it."""
+        return self.fence.nearest_inside(stop_m(self.body, self.can))
 
-    def _wished_lately(self) -> bool:
-        since_ns = self._wished_ns
-        return since_ns is not None and self.body.now_ns - since_ns <= self._parameters["COM_OF_LOSS_T"] * 1e9
-
-    def _leaves(self) -> bool:
-        """Whether it would come to stand beyond the fence, farther out than it is."""
-        stands_m, here_m = stop_m(self.body, self.can), self.body.position_m
-        far_m, high_m = self.fence_m
-        out = math.hypot(*stands_m[:2])
-        return out > max(far_m, math.hypot(*here_m[:2])) or stands_m[2] > max(high_m, here_m[2])
+    def _stays_down(self) -> bool:
+        """Return whether nothing can make it lift off now: its motors spool up, or its mode does not."""
+        spools = self.body.now_ns - self._armed_ns < self.firmware.spool_s * 1e9
+        led = self.mode is Mode.OFFBOARD and not self.firmware.lifts_off
+        return self.body.on_ground and (spools or led or self.mode in PILOTED)
 
     def _wanted_m_s(self) -> Vector:
-        """Return how it would like to fly now."""
-        if self.mode is Mode.OFFBOARD:
-            if self.body.on_ground and not self.firmware.lifts_off:
-                return 0.0, 0.0, 0.0
-            vector, place = self._wish
-            return velocity_to(vector, self.body, self.can) if place else vector
-        if self.mode is Mode.MISSION:
-            return self._on_mission_m_s()
-        if self.mode is Mode.RTL:
-            return self._home_m_s()
-        if self.mode in LANDING:
-            return self._down_m_s()
-        if self.mode is Mode.TAKEOFF and math.dist(self.body.position_m, self._goal_m) < NEAR_M:
-            self.mode = Mode.OFFBOARD if self.firmware.guided_holds else Mode.LOITER
-            self._wish = (self._goal_m, True)
-        return velocity_to(self._goal_m, self.body, self.can)
-
-    def _on_mission_m_s(self) -> Vector:
-        order = self.mission.fly(self.body, self.home_m, self._parameters["NAV_ACC_RAD"])
-        if isinstance(order, str):
-            self.change_mode(Mode[order])
-            return self._wanted_m_s()
-        if order[2] < 0:
-            self._goal_m = order
-            return self._down_m_s()
+        """Return the velocity that it wants now, after the changes of mode that are due."""
+        if not self._stays_down():
+            self._advance_mode()
+        if self._stays_down():
+            return 0.0, 0.0, 0.0
         can = self.can
-        speed_m_s = min(can.speed_m_s, self.mission.speed_m_s or can.speed_m_s)
-        return velocity_to(order, self.body, replace(can, speed_m_s=speed_m_s))
+        if self.mode is Mode.MISSION:
+            can = replace(can, speed_m_s=min(can.speed_m_s, self.mission.speed_m_s or can.speed_m_s))
+        return self.guidance.velocity_m_s(self.mode, self.body, can, self.fence.limits_m[1])
 
-    def _home_m_s(self) -> Vector:
-        """Rise, fly home and land there (PX4's return mode)."""
-        east, north, up = self.body.position_m
-        if math.hypot(east, north) < self._parameters["NAV_ACC_RAD"]:
-            self.mode, self._goal_m = Mode.HOMECOMING, (0.0, 0.0, 0.0)
-            return self._down_m_s()
-        height_m = min(max(self._goal_m[2], self._parameters["RTL_RETURN_ALT"]), self.fence_m[1])
-        rises = up < height_m - NEAR_M and math.hypot(east, north) > self._parameters["NAV_ACC_RAD"]
-        return velocity_to((*self._goal_m[:2], height_m) if rises else (0.0, 0.0, height_m), self.body, self.can)
+    def _advance_mode(self) -> None:
+        """Go on to the next item of a mission, and to the mode that follows a take-off, a mission or a way home."""
+        if self.mode is Mode.MISSION:
+            order = self.mission.fly(self.body, self.home_m, self._parameters["NAV_ACC_RAD"])
+            if isinstance(order, str):
+                self._switch_itself(Mode[order])
+            else:
+                self.guidance.goal_m = order
+        if self.mode is Mode.RTL and self.guidance.is_home(self.body):
+            self.mode, self.guidance.goal_m = Mode.HOMECOMING, (0.0, 0.0, 0.0)
+        if self.mode is Mode.TAKEOFF and math.dist(self.body.position_m, self.guidance.goal_m) < NEAR_M:
+            self.mode = Mode.OFFBOARD if self.firmware.is_ardupilot else Mode.LOITER
+            self.guidance.hold(self.guidance.goal_m)
 
-    def _down_m_s(self) -> Vector:
-        fast = self.body.position_m[2] > self._parameters["MPC_LAND_ALT2"]
-        speed_m_s = self._parameters["MPC_Z_VEL_MAX_DN" if fast else "MPC_LAND_SPEED"]
-        east, north, _ = velocity_to(self._goal_m, self.body, self.can)
-        return east, north, -speed_m_s
+
+def _shown(mode: Mode) -> Mode:
+    """Return the mode that a phase belongs to."""
+    return Mode.RTL if mode is Mode.HOMECOMING else mode

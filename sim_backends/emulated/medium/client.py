@@ -156,6 +156,10 @@ class MediumClient:
         reply, _ = self._worker.ask({"do": "links", "go_on": go_on})
         return unpack_links(reply)
 
+    def demand_up(self) -> None:
+        """Return if the medium runs; raises as `Worker.demand_up`."""
+        self._worker.demand_up()
+
     def close(self) -> None:
         """End the medium and wait until it is gone; does nothing the second time."""
         self._worker.close()

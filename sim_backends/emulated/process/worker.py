@@ -1,21 +1,26 @@
 """Worker processes of the lab: each ends with its owner, however that ends, and serves one request at a time."""
 
 import os
+import signal
 import socket
 import subprocess
 import tempfile
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
+from fieldkit.core.errors import ConfigurationError, LinkError, RobotError, TestbedLostError
 from sim_backends.emulated.process import interpreter, ipc
 from sim_backends.emulated.process.ipc import Message
 
 REPLY_S: Final = 15.0
 
 _END_S: Final = 2.0
+_ENDING_S: Final = 0.5
+"""From when a process has closed its descriptors until it can be waited for."""
+_ENDED: Final = "it ended"
 PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
@@ -82,8 +87,9 @@ class Worker:
         """Send a request; return the reply and the descriptors that came with it, the caller's to close.
 
         Raises:
-            LinkError: It ended or did not answer in time.
+            LinkError: It is busy.
             RobotError: It answered that it could not.
+            TestbedLostError: It ended or did not answer in time; it answers nobody any more.
         """
         if not self._turn.acquire(timeout=timeout_s):
             raise LinkError("is busy with another request", where=self.name, remedy="try again")
@@ -94,15 +100,24 @@ class Worker:
             received = ipc.receive(self._channel, deadline)
         except (OSError, ValueError) as error:
             self._channel.close()
-            raise self._gone(str(error)) from error
+            raise self._gone(_ENDED if isinstance(error, ConnectionError) else str(error)) from error
         finally:
             self._turn.release()
         if received is None:
-            raise self._gone("it ended")
+            raise self._gone(_ENDED)
         reply, _ = received
         if "error" in reply:
             raise RobotError(reply["error"], where=self.name, remedy=reply.get("remedy", ""))
         return received
+
+    def demand_up(self) -> None:
+        """Return if it runs.
+
+        Raises:
+            TestbedLostError: It ended, or did not answer a request in time.
+        """
+        if self._channel.fileno() == -1 or self._process.poll() is not None:
+            raise self._gone(_ENDED)
 
     def hang_up(self) -> None:
         """Let it end, without waiting for it; requests under way fail at once."""
@@ -121,13 +136,17 @@ class Worker:
             self._process.wait()
         self._log.close()
 
-    def _gone(self, cause: str) -> LinkError:
+    def _gone(self, cause: str) -> TestbedLostError:
         if self._log.closed:
             cause, said = "it was ended", ""
         else:
             said = os.pread(self._log.fileno(), 1 << 16, 0).decode(errors="replace").strip().rsplit("\n", 1)[-1]
-        return LinkError(
+        with suppress(subprocess.TimeoutExpired):
+            if (code := self._process.wait(_ENDING_S if cause == _ENDED else 0)) < 0:
+                cause = f"it was killed by {signal.Signals(-code).name}"
+        return TestbedLostError(
             f"does not answer: {cause}" + (f"; it said: {said}" if said else ""),
             where=f"{self.name}, pid {self.pid}",
-            remedy="start the lab again",
+            remedy="start it again: a trial by fieldkit resume TRIAL, a campaign by its command, a lab by "
+            "fieldkit lab down and fieldkit lab up",
         )

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +23,7 @@ from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
 from sim_backends.emulated.robot.supervisor import Supervisor
 from sim_backends.emulated.ros import own_motion
+from sim_backends.emulated.ros.neighbours import Neighbourhood
 from sim_backends.emulated.ros.own_motion import OwnWay
 
 START_S: Final = 30.0
@@ -45,6 +47,7 @@ class Init:
         self._channel = channel
         self._wake_fd = wake_fd
         self._supervisor = Supervisor()
+        self._neighbourhood: Neighbourhood | None = None
 
     def run(self) -> None:
         """Return when the lab has hung up."""
@@ -62,25 +65,28 @@ class Init:
         received = ipc.receive(self._channel, Deadline.after(_MESSAGE_S))
         if received is None:
             return False
-        request, _ = received
+        request, handed = received
         descriptors: list[int] = []
         try:
-            descriptors = self._answer(request)
+            descriptors = self._answer(request, handed)
             reply: Message = {}
         except FieldkitError as error:
             reply = {"error": error.what, "remedy": error.remedy}
         except (OSError, subprocess.SubprocessError) as error:
             reply = {"error": f"{request['do']}: {error}", "remedy": ""}
         ipc.send(self._channel, reply, Deadline.after(_MESSAGE_S), descriptors)
-        for fd in descriptors:
+        for fd in (*handed, *descriptors):
             os.close(fd)
         return True
 
-    def _answer(self, request: Message) -> list[int]:
-        """Do what `request` asks; return the descriptors to hand over."""
+    def _answer(self, request: Message, handed: Sequence[int]) -> list[int]:
+        """Do what `request` asks, with the descriptors that came with it; return those to hand over."""
         match request["do"]:
             case "build":
-                _build(RobotSpec.from_json(request["robot"]))
+                spec = RobotSpec.from_json(request["robot"])
+                _build(spec)
+                # The sensors process is a fork of this one: it inherits the memory, and no descriptor.
+                self._neighbourhood = Neighbourhood(handed[0], len(spec.hosts)) if handed else None
                 return [os.open(services.STEERED, os.O_RDONLY | os.O_CREAT, 0o600)]
             case "open radio":
                 return [_open_radio(request)]
@@ -118,7 +124,7 @@ class Init:
     def _spawn(self, spec: RobotSpec) -> list[Service]:
         """Start the robot's services without waiting for them: requests are served strictly in turn."""
         Path(services.READY_FOLDER).mkdir(exist_ok=True)
-        found = services.services(spec)
+        found = services.services(spec, self._neighbourhood)
         for service in found:
             self._supervisor.start(service)
         return found

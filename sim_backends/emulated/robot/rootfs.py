@@ -46,6 +46,15 @@ NETCATS: Final[dict[Netcat, str]] = {
 }
 """Debian's program per netcat."""
 
+# On a real robot `python3` is Debian's own, which has these behind PYTHONPATH. Appended, so that the packages of the
+# Python that runs fieldkit come first.
+_SITE_CUSTOMIZE: Final = """\
+import sys
+
+if "/usr/lib/python3/dist-packages" not in sys.path:
+    sys.path.append("/usr/lib/python3/dist-packages")
+"""
+
 BUSYBOX: Final = "/usr/bin/busybox"
 SFTP_FOLDER: Final = "/usr/lib/openssh"
 
@@ -109,6 +118,8 @@ def write_setup(spec: RobotSpec) -> None:
         files[_ros_programs(path) / "fieldkit"] = module_command("fieldkit"), 0o755
         if spec.ros == "builtin":
             files[_ros_programs(path) / program] = module_command(module), 0o755
+        else:
+            files[_ros_packages(path) / "sitecustomize.py"] = _SITE_CUSTOMIZE, 0o644
     beside: dict[Path, list[Path]] = {}
     for path in files:
         folder = next(parent for parent in path.parents if parent.is_dir())
@@ -145,6 +156,8 @@ def setup_script(spec: RobotSpec, path: Path) -> str:
         variables |= spec.ros1_environment
     lines = [f"export {name}={value}" for name, value in variables.items()]
     lines.append(f'export PATH={shlex.quote(str(_ros_programs(path)))}:"$PATH"')
+    if spec.ros == "debian":
+        lines.append(f'export PYTHONPATH={shlex.quote(str(_ros_packages(path)))}"${{PYTHONPATH:+:$PYTHONPATH}}"')
     return "\n".join(lines) + "\n"
 
 
@@ -156,6 +169,11 @@ def module_command(module: str) -> str:
 
 def _ros_programs(setup: Path) -> Path:
     return setup.parent / "bin"
+
+
+def _ros_packages(setup: Path) -> Path:
+    """Return the folder of Python packages beside a setup file, as Noetic has it."""
+    return setup.parent / "lib" / "python3" / "dist-packages"
 
 
 def _etc(spec: RobotSpec) -> dict[str, str]:

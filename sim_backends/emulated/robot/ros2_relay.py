@@ -1,9 +1,10 @@
 """Publishes an emulated robot's sensors over DDS or Zenoh, as nodes of ROS 2 do; or routes for those of Zenoh.
 
 Its words are `route` and the robot's address; or `relay`, that, the node's name, the topic of velocities that its
-base listens to, which may be empty, and as JSON how it takes part, the type of each topic, and which frames lie in
-which. The sensors process makes each message; here it is turned into CDR as the robot's distribution defines the
-type, and published while somebody subscribes, wherever on the radio. Velocities go the other way.
+base listens to, which may be empty, and as JSON how it takes part, and the type of each topic. The sensors process
+makes each message; here it is turned into CDR as the robot's distribution defines the type, and published while it
+has subscribers anywhere on the radio; `/tf_static` always, for those that come later. Velocities
+go the other way. The node logs on `/rosout`.
 """
 
 import contextlib
@@ -13,7 +14,6 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 from rosbags.convert.converter import migrate_bytes
@@ -22,24 +22,20 @@ from rosbags.serde import SerdeError
 from fieldkit.agent import middleware
 from fieldkit.agent.middleware import Network, Publisher, Topic
 from fieldkit.ros import topics
-from fieldkit.ros.qos import PROFILES, Durability, QosProfile
+from fieldkit.ros.qos import PROFILES, QosProfile
 from fieldkit.ros.types import Distribution, MessageTypes
 from sim_backends.emulated.robot import services, twists
 from sim_backends.emulated.robot.spec import Ros2Spec
-from sim_backends.emulated.ros import static_frames
+from sim_backends.emulated.ros import offered_qos, static_frames
 from sim_backends.emulated.ros.listener import Listener
-
-QOS: Final[Mapping[str, QosProfile]] = {
-    f"sensor_msgs/{name}": PROFILES["sensor_data"]
-    for name in ("LaserScan", "Image", "CompressedImage", "PointCloud2")
-}
-"""Quality of service by type where it is not ROS 2's default: as drivers publish large messages."""
-
-LATCHED: Final = replace(PROFILES["default"], depth=1, durability=Durability.TRANSIENT_LOCAL)
-"""As tf2 says what does not change (tf2_ros, qos.hpp, StaticBroadcasterQoS)."""
 
 _LOOKS_S: Final = 0.1
 """How often the relay looks who subscribes; ROS 2's own recorder looks as often for new publishers."""
+
+
+_LOG: Final = "rcl_interfaces/msg/Log"
+_INFO: Final = 20
+"""`rcl_interfaces/msg/Log.INFO`."""
 
 
 class Ros2Relay:
@@ -60,9 +56,10 @@ class Ros2Relay:
         self._publishers: dict[str, Publisher] = {}
         self._conversions: dict[str, Callable[[bytes], bytes]] = {}
         self._ends = 0
-        self._frames: Publisher | None = None
+        self._heard: set[str] = set()
+        self._rosout = self._middleware.publisher(self._topic("/rosout", _LOG, offered_qos.ROSOUT))
         for topic, kind in types.items():
-            described = self._topic(topic, kind, QOS.get(kind, PROFILES["default"]))
+            described = self._topic(topic, kind, offered_qos.of_topic(topic, kind))
             self._publishers[topic] = self._middleware.publisher(described)
             self._conversions[topic] = self._conversion(described.type)
 
@@ -72,6 +69,15 @@ class Ros2Relay:
         domain, node = self._network.domain, self._network.node
         described = topics.describe(self._known, name, kind, quality, domain=domain, node=node, number=self._ends)
         return Topic.from_json(described)
+
+    def log(self, text: str) -> None:
+        """Publish a line of level INFO on `/rosout`, as rclcpp and rclpy do; file, function and line are empty."""
+        known, now_ns = self._known.ros2, time.time_ns()
+        stamp = known.types["builtin_interfaces/msg/Time"](*divmod(now_ns, 10**9))
+        line = known.types[_LOG](
+            stamp=stamp, level=_INFO, name=self._network.node, msg=text, file="", function="", line=0
+        )
+        self._rosout.write(bytes(known.serialize_cdr(line, _LOG)))
 
     def _conversion(self, kind: str) -> Callable[[bytes], bytes]:
         defaults: dict[str, Any] = {}
@@ -91,12 +97,6 @@ class Ros2Relay:
 
         self._middleware.subscribe(self._topic(topic, kind, PROFILES["default"]), hand_on)
 
-    def say_frames(self, found: Sequence[static_frames.Link]) -> None:
-        """Say which frames lie in which, once for all who come."""
-        described = self._topic(static_frames.TOPIC, static_frames.TYPE, LATCHED)
-        self._frames = self._middleware.publisher(described)
-        self._frames.write(self._conversion(described.type)(static_frames.message(found, time.time_ns())))
-
     def run(self) -> None:
         """Hand on until a signal ends it."""
         listener, next_look_s = self._listener, 0.0
@@ -110,10 +110,14 @@ class Ros2Relay:
         self._middleware.close()
 
     def _look(self) -> None:
-        """Hear the topics that somebody subscribes to, and no others: those are not made."""
+        """Receive the topics that have subscribers, and `/tf_static`; the others are not made."""
         listener = self._listener
         for topic, publisher in self._publishers.items():
-            if publisher.matched():
+            heard = publisher.matched() > 0
+            if heard != (topic in self._heard):
+                self.log(f"{topic} has {'a subscriber' if heard else 'no subscriber any more'}")
+                self._heard ^= {topic}
+            if topic == static_frames.TOPIC or heard:
                 listener.wanted.add(topic)
             else:
                 listener.wanted.discard(topic)
@@ -149,13 +153,12 @@ def _route(address: str) -> None:
 
 def _relay(address: str, node: str, velocities: str, *told: str) -> None:
     services.name_process(services.ROS2_RELAY)
-    how, types, frames = map(json.loads, told)
+    how, types = map(json.loads, told)
     spec = Ros2Spec.from_json(how)
     relay = Ros2Relay(_network(address, node, spec), spec.over, Distribution.of(spec.distribution), types)
     if velocities:
         relay.hear_velocities(velocities)
-    if frames:
-        relay.say_frames(frames)
+    relay.log(f"publishing {', '.join(types)}" + (f"; driven by {velocities}" if velocities else ""))
     services.ready_file(services.ROS2_RELAY).touch()
     relay.run()
 

@@ -30,7 +30,7 @@ _CHUNK: Final = 1 << 16
 
 
 class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no types
-    """Hands on one topic while it has subscribers.
+    """Publishes one topic of the sensors process: while it has subscribers, or always where it is latched.
 
     Args:
         topic: Its name.
@@ -44,23 +44,30 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
         self._busy = threading.Lock()
         stream, packets = _subscribe(topic)
         with stream:
-            self._message = _message_class(tcpros.unpack_header(_next(stream, packets)))
+            header = tcpros.unpack_header(_next(stream, packets))
+        self._message = _message_class(header)
+        self._latched = header["latching"] == "1"
         with self._busy:
             self._publisher = rospy.Publisher(
-                topic, self._message, subscriber_listener=self, queue_size=_QUEUE_MESSAGES
+                topic, self._message, subscriber_listener=self, queue_size=_QUEUE_MESSAGES, latch=self._latched
             )
+        if self._latched:
+            self._start()
 
     def peer_subscribe(self, *_: object) -> None:
         """Begin with the first subscriber."""
+        self._start()
+
+    def _start(self) -> None:
         with self._busy:
             if self._stream is None:
                 self._stream, packets = _subscribe(self._topic)
                 threading.Thread(target=self._hand_on_for_ever, args=(self._stream, packets), daemon=True).start()
 
     def peer_unsubscribe(self, _topic: str, subscribers: int) -> None:
-        """End with the last."""
+        """End with the last; rospy keeps the message of a latched topic, whose subscribers come and go."""
         with self._busy:
-            if subscribers == 0 and self._stream is not None:
+            if subscribers == 0 and self._stream is not None and not self._latched:
                 with contextlib.suppress(OSError):  # the sensors ended
                     self._stream.shutdown(socket.SHUT_RDWR)
                 self._stream = None

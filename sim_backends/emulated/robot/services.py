@@ -1,10 +1,11 @@
 """Services of an emulated robot: which ones there are, and how they start, by a program or a fork."""
 
+import gc
 import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ from sim_backends.emulated.process import interpreter
 from sim_backends.emulated.robot import babeld, base, network, ssh_server
 from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, static_frames, tcpros
+from sim_backends.emulated.ros.neighbours import Neighbourhood
 
 _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 _LOG_MODE: Final = 0o600
@@ -65,6 +67,7 @@ def fork(name: str, work: Callable[[], None], log: Path) -> int:
 
     It shares the memory of this process, and no descriptor. Call it from a process of one thread.
     """
+    gc.freeze()  # a collection in the fork would write to, and so copy, every page of objects from here
     pid = os.fork()
     if pid == 0:
         os._exit(_run(name, work, log))
@@ -116,9 +119,17 @@ class Service:
     ready: Callable[[], bool]
 
 
-def services(spec: RobotSpec) -> list[Service]:
-    """Return what runs in the robot that `spec` describes."""
-    publish = partial(sensors.publish, spec.sensors, spec.definitions)
+def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> list[Service]:
+    """Return what runs in the robot that `spec` describes.
+
+    Args:
+        spec: The robot.
+        neighbourhood: Where the lab's robots are; None for a robot that is alone.
+    """
+    frames = static_frames.links(spec.sensors)
+    publish = partial(sensors.publish, spec.sensors, spec.definitions, frames=frames, targets=spec.laser_targets)
+    if neighbourhood is not None and spec.neighbours:
+        publish = partial(publish, moving=partial(neighbourhood.targets, spec.neighbours))
     found = [
         _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
         _moving("sensors", publish),
@@ -131,16 +142,17 @@ def services(spec: RobotSpec) -> list[Service]:
         argv = babeld.command(spec.interface, spec.address, spec.mesh_hello_s)
         found.append(_program("babeld", argv, {}, babeld.PID.exists))
     if spec.ros == "debian":
-        found += _debian_ros(spec)
+        found += _debian_ros(spec, (*spec.registered, *([static_frames.TOPIC] if frames else [])))
     if spec.bridge:
         argv = ("/usr/bin/env", *with_environment(spec.bridge, setup=spec.setup))
         found.append(_program(BRIDGE, argv, {}, _bridge_is_up))
     if spec.routes_zenoh:
         found.append(_ros2_program(ZENOH_ROUTER, "route", spec.ip))
     if spec.ros2 is not None:
-        types = json.dumps({sensor.topic: sensor.type for sensor in spec.sensors})
-        frames = json.dumps(static_frames.links(spec.sensors))
-        words = (spec.ip, ros_node(spec), _velocities(spec), json.dumps(asdict(spec.ros2)), types, frames)
+        types = {sensor.topic: sensor.type for sensor in spec.sensors}
+        if frames:
+            types[static_frames.TOPIC] = static_frames.TYPE
+        words = (spec.ip, ros_node(spec), _velocities(spec), json.dumps(asdict(spec.ros2)), json.dumps(types))
         found.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return found
 
@@ -152,13 +164,13 @@ def _moving(name: str, serve: Callable[..., None]) -> Service:
     return Service(name, partial(fork, name, work), ready.exists)
 
 
-def _debian_ros(spec: RobotSpec) -> Iterator[Service]:
-    """Yield the robot's ROS master, if it has one of its own, and what publishes its sensors there."""
+def _debian_ros(spec: RobotSpec, topics: Sequence[str]) -> Iterator[Service]:
+    """Yield the robot's ROS master, if it has one of its own, and the node that publishes `topics` there."""
     # Python as a script would find it: rospy is made for Debian's own interpreter.
     variables = spec.ros1_environment | {"PYTHONPATH": str(interpreter.PROJECT)}
     if spec.runs_master:
         yield _master(spec, variables)
-    relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), _velocities(spec), *spec.registered)
+    relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), _velocities(spec), *topics)
     yield _program("ros_relay", relay, variables, ready_file("ros_relay").exists)
 
 
@@ -169,7 +181,7 @@ def _velocities(spec: RobotSpec) -> str:
 
 def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:
     return autopilot.Drone(
-        system=int(spec.ip.rpartition(".")[2]),  # one of its own in the lab
+        system=spec.system,
         port=port,
         autopilot=spec.autopilot,
         profile=spec.profile,
@@ -178,6 +190,7 @@ def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:
         fence_m=spec.fence_m,
         antenna_m=ANTENNA_M,
         world=spec.world,
+        boot_s=spec.boot_s,
     )
 
 

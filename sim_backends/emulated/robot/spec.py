@@ -1,10 +1,12 @@
 """Specification of an emulated robot: plain data that crosses from the lab to its init process as JSON."""
 
+from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import ROS_MASTER_PORT
+from sim_backends.emulated.ros.laser import LaserTarget
 from sim_backends.emulated.ros.messages import Definition, Sensor, Template
+from sim_backends.emulated.ros.neighbours import Neighbour
 
 SshServer = Literal["openssh", "dropbear"]
 Userland = Literal["gnu", "busybox"]
@@ -89,11 +91,15 @@ class RobotSpec:
         definitions: Those of its sensors' message types.
         mavlink_port: UDP port of its autopilot; None without.
         autopilot: `px4` or `ardupilot`, as which that answers.
+        system: MAVLink system id of that autopilot.
+        boot_s: Boot time of that autopilot.
         max_speed_m_s: How fast it is at most.
         max_height_m: How high it may fly; None where its profile does not say.
         fence_m: How far from home it may fly; None as above.
         profile: The name of its profile, by which its body is known.
         world: What a drone flies in, as JSON; empty for any other robot.
+        laser_targets: What its laser sees of its world; empty without a laser.
+        neighbours: The bodies of the other robots, which reflect its laser; empty without a laser.
         base: Its base controller; None where nothing in it drives it.
         ssh: Its SSH server.
         sftp: Whether that server offers SFTP.
@@ -126,7 +132,11 @@ class RobotSpec:
     fence_m: float | None
     profile: str
     world: str
+    laser_targets: tuple[LaserTarget, ...] = ()
+    neighbours: tuple[Neighbour, ...] = ()
     autopilot: str = "px4"
+    system: int = 1
+    boot_s: float = 0.0
     base: Base | None = None
     ssh: SshServer = "openssh"
     sftp: bool = True
@@ -177,8 +187,15 @@ class RobotSpec:
         words = {name: tuple(data[name]) for name in ("setup", "registered", "bridge")}
         base = data["base"] and Base(**data["base"])
         ros2 = data["ros2"] and Ros2Spec.from_json(data["ros2"])
-        parts = {"sensors": sensors, "definitions": definitions, "base": base, "ros2": ros2}
-        return cls(**{**data, **words, **parts})
+        targets = tuple(_laser_target(target) for target in data["laser_targets"])
+        neighbours = tuple(Neighbour(*body) for body in data["neighbours"])
+        parts = {"laser_targets": targets, "sensors": sensors, "definitions": definitions, "base": base, "ros2": ros2}
+        return cls(**{**data, **words, **parts, "neighbours": neighbours})
+
+
+def _laser_target(data: dict[str, Any]) -> LaserTarget:
+    outline_m = tuple((east_m, north_m) for east_m, north_m in data["outline_m"])
+    return LaserTarget(**{**data, "outline_m": outline_m})
 
 
 def _sensor(data: dict[str, Any]) -> Sensor:

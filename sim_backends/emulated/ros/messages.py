@@ -6,23 +6,25 @@ standard library alone: the libraries that know every type would take each robot
 
 The robot goes its way through the world (`own_motion`). Frames and units are those of REP 103 and REP 105: metres,
 radians, x ahead, y to the left; what is fixed to the world has x east and y north, as the orientation of an IMU has
-by REP 145. Covariances are those that the driver of such a robot states. The laser sees rooms, wall to wall, in the
-first of which the robot was switched on. Numbers that a real sensor would jitter carry noise, so that nothing
-compresses better than it would in the field.
+by REP 145. Covariances are those that the driver of such a robot states. The laser casts its beams at the world.
+Numbers that a real sensor would jitter carry noise, so that nothing compresses better than it would in the field.
 """
 
 import math
 import struct
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from random import Random
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.lazy import dataclass
+from sim_backends.emulated.ros.laser import LaserTarget, ranges_m
 from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
 
 GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
-ROOM_HALF_M: Final = (2.0, 1.5)
+LASER_SCAN: Final = "sensor_msgs/LaserScan"
 LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
 # Of x, y, z (m^2) and of turns about them (rad^2), of the pose and per second: as a Husky's controller states them
@@ -114,15 +116,21 @@ class Source:
 
     Args:
         sensor: Which.
+        targets: What is in the robot's world, for a laser.
+        moving: Returns what else is there at this moment: other robots.
 
     Raises:
         ConfigurationError: There is no generator for its type, or it lacks what its type needs.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(
+        self, sensor: Sensor, targets: Sequence[LaserTarget] = (), moving: Callable[[], Sequence[LaserTarget]] = tuple
+    ) -> None:
         check(sensor)
         self._sensor = sensor
         self._generate = _filled(sensor.template) if sensor.template else GENERATORS[sensor.type]
+        if sensor.type == LASER_SCAN:
+            self._generate = partial(_laser_scan, targets=targets, moving=moving)
         self._stamped = sensor.template is None or sensor.template.stamped
         self._lead = _ONE_TRANSFORM if sensor.type == "tf2_msgs/TFMessage" else b""
         # Equal robots say equal things, whenever they start.
@@ -153,7 +161,7 @@ def check(sensor: Sensor) -> None:
         raise ConfigurationError(
             "a topic with rate 0Hz says nothing", where=f"topic {sensor.topic}", remedy="write 5Hz"
         )
-    if sensor.type == "sensor_msgs/LaserScan" and sensor.points is None:
+    if sensor.type == LASER_SCAN and sensor.points is None:
         raise ConfigurationError(
             "a laser scan needs `points`, beams per turn", where=f"topic {sensor.topic}", remedy="write points: 360"
         )
@@ -208,21 +216,6 @@ def _heading(yaw_rad: float) -> tuple[float, float, float, float]:
     return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
 
 
-def _wall_m(along: float, half_m: float, at_m: float) -> float:
-    """Return how far a ray goes to a wall across an axis: `along` is its share of that, `at_m` where it begins."""
-    if along == 0.0:
-        return math.inf
-    in_room_m = math.remainder(at_m, 2 * half_m)
-    return (math.copysign(half_m, along) - in_room_m) / along
-
-
-def _seen_m(angle: float, now: OwnMotion) -> float:
-    """Return how far a ray goes that leaves at an angle to the left of ahead."""
-    towards = angle + now.yaw_rad
-    across_x = _wall_m(math.cos(towards), ROOM_HALF_M[0], now.x_m)
-    return min(across_x, _wall_m(math.sin(towards), ROOM_HALF_M[1], now.y_m))
-
-
 def _within(value_m: float, low_m: float, high_m: float) -> float:
     """Return a distance as a sensor of this reach tells it (REP 117)."""
     if value_m < low_m:
@@ -230,16 +223,24 @@ def _within(value_m: float, low_m: float, high_m: float) -> float:
     return math.inf if value_m > high_m else value_m
 
 
-def _laser_scan(sensor: Sensor, noise: Random, now: OwnMotion) -> bytes:
+def _laser_scan(
+    sensor: Sensor,
+    noise: Random,
+    now: OwnMotion,
+    targets: Sequence[LaserTarget] = (),
+    moving: Callable[[], Sequence[LaserTarget]] = tuple,
+) -> bytes:
     points = sensor.points or 0
     step = 2 * math.pi / points
     low_m, high_m = LASER_RANGE_M
-    seen_m = (noise.gauss(_seen_m(step * beam, now), LASER_NOISE_M) for beam in range(points))
+    true_m = ranges_m(chain(targets, moving()), now.place_m, now.heading_rad, points, high_m)
     turn_s = 1 / sensor.rate_hz
     angles = (0.0, step * (points - 1), step)
     scalars = struct.pack("<7f", *angles, turn_s / points, turn_s, low_m, high_m)
-    ranges = [_within(range_m, low_m, high_m) for range_m in seen_m]
-    return scalars + _float32s(ranges) + _float32s(noise.choices(LASER_INTENSITIES, k=points))
+    ranges = [_within(noise.gauss(range_m, LASER_NOISE_M), low_m, high_m) for range_m in true_m]
+    intensities = noise.choices(LASER_INTENSITIES, k=points)
+    echoes = [0 if range_m == math.inf else echo for range_m, echo in zip(ranges, intensities, strict=True)]
+    return scalars + _float32s(ranges) + _float32s(echoes)
 
 
 def _imu(_: Sensor, noise: Random, now: OwnMotion) -> bytes:

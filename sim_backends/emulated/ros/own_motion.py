@@ -8,12 +8,11 @@ is, from the place where the lab put it last.
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.lazy import dataclass
 from fieldkit.core.model import Vector
 from sim_backends.emulated.ros.steered import SteeredRecord
 from sim_backends.world.motion import STILL, WayPoints

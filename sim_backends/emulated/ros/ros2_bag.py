@@ -1,8 +1,9 @@
 """The `ros2` command of an emulated robot without ROS: `ros2 bag record` writes the bag that ROS 2's own writes.
 
 There is no DDS behind it: it hears the robot's sensors as the built-in `rosbag` does, turns each message into CDR,
-and stores it by the rosbag2 plugin asked for. Like the original it has no duration and ends on SIGINT or SIGTERM;
-options of the original that no trial uses are refused as unknown.
+and stores it by the rosbag2 plugin asked for, with the quality of service that the publisher offers. Like the
+original it has no duration and ends on SIGINT or SIGTERM; options of the original that no trial uses are refused as
+unknown.
 """
 
 import argparse
@@ -14,24 +15,34 @@ import time
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 from rosbags.convert.converter import migrate_bytes
-from rosbags.interfaces import Connection
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
+from fieldkit.ros.qos import QosProfile
 from fieldkit.ros.types import Distribution, MessageTypes
-from sim_backends.emulated.ros import tcpros
+from sim_backends.emulated.ros import offered_qos, tcpros
 from sim_backends.emulated.ros.listener import Header, Listener, type_of
 
 # The original looks this often for new publishers.
 _TICK_S: Final = 0.1
-_FORMAT: Final = 9
-
 # rosbag2 writes MCAP unless told otherwise since Iron (ros2/rosbag2#1160).
 _SQLITE3_ALONE: Final = {"dashing", "eloquent", "foxy"}
 _SQLITE3_IS_DEFAULT: Final = _SQLITE3_ALONE | {"galactic", "humble"}
+# Format 9, Jazzy's, has qualities of service as lists with names. An older rosbag2 reads them as text with numbers,
+# as in format 8, the oldest that rosbags writes (rosbags.rosbag2.metadata).
+_BEFORE_JAZZY: Final = _SQLITE3_IS_DEFAULT | {"iron"}
 # Until rosbag2 0.10 the KeyboardInterrupt reached the command line, which made it code 2 (ros2/rosbag2#787).
 _SIGINT_IS_2: Final = _SQLITE3_ALONE | {"galactic"}
 
@@ -51,6 +62,7 @@ class Rosbag2Recorder:
         self._topics = frozenset(topics)
         self._folder = folder
         self._storage = storage
+        self._format: Literal[8, 9] = 8 if distribution in _BEFORE_JAZZY else 9
         known = MessageTypes(Distribution.of(distribution))
         self._sensors, self._types = known.ros1, known.ros2
         self._defaults: dict[str, object] = {}
@@ -64,7 +76,7 @@ class Rosbag2Recorder:
             OSError: The bag cannot be written.
         """
         listener = self._listener
-        with Writer(self._folder, version=_FORMAT, storage_plugin=self._storage) as writer:
+        with Writer(self._folder, version=self._format, storage_plugin=self._storage) as writer:
             _say("rosbag2_storage", f"Opened database '{_number(writer)}' for READ_WRITE.")
             _say("rosbag2_recorder", "Listening for topics...")
             complete = False
@@ -84,7 +96,10 @@ class Rosbag2Recorder:
         if kind not in self._types.fielddefs or kind not in self._sensors.fielddefs:
             return  # of no package that is installed, which the original says and goes on
         if topic not in self._connections:
-            self._connections[topic] = writer.add_connection(topic, kind, typestore=self._types)
+            offered = (_discovered(offered_qos.of_topic(topic, header["type"])),)
+            self._connections[topic] = writer.add_connection(
+                topic, kind, typestore=self._types, offered_qos_profiles=offered
+            )
             _say("rosbag2_recorder", f"Subscribed to topic '{topic}'")
         if message is not None:
             try:
@@ -94,6 +109,25 @@ class Rosbag2Recorder:
             except Exception:  # noqa: BLE001 (whatever it raises, the publisher's bytes are no such message)
                 return
             writer.write(self._connections[topic], time.time_ns(), data)
+
+
+def _discovered(profile: QosProfile) -> Qos:
+    """Return a quality of service as a recorder gets it by DDS: without the history, which DDS does not announce.
+
+    Times that are not limited are RMW_DURATION_INFINITE, and `automatic` is DDS's default liveliness (rmw/types.h).
+    """
+    endless = QosTime(*divmod(2**63 - 1, 10**9))
+    return Qos(
+        QosHistory.UNKNOWN,
+        0,
+        QosReliability[profile.reliability.name],
+        QosDurability[profile.durability.name],
+        endless,
+        endless,
+        QosLiveliness.AUTOMATIC,
+        endless,
+        avoid_ros_namespace_conventions=False,
+    )
 
 
 def _number(writer: Writer) -> Path:

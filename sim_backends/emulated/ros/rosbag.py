@@ -231,7 +231,10 @@ def main() -> int:
         return _COMMANDS[command](sys.argv[2:])
     known = "".join(f"   {name}  \t{run.__doc__}\n" for name, run in _COMMANDS.items())
     if command in {"-h", "--help", "help"}:
-        sys.stdout.write(f"Usage: rosbag <subcommand> [options] [args]\n\nAvailable subcommands:\n{known}\n")
+        sys.stdout.write(
+            "This is fieldkit's own rosbag, not that of ROS (emulated: ros: builtin).\n"
+            f"Usage: rosbag <subcommand> [options] [args]\n\nAvailable subcommands:\n{known}\n"
+        )
     else:
         sys.stderr.write(f"Unknown command: {command!r}\nAvailable subcommands:\n{known}\n")
     return 0

@@ -9,11 +9,12 @@ import math
 import selectors
 import socket
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from sim_backends.emulated.ros import tcpros
+from sim_backends.emulated.ros import static_frames, tcpros
+from sim_backends.emulated.ros.laser import LaserTarget
 from sim_backends.emulated.ros.messages import Definition, Sensor, Source
 from sim_backends.emulated.ros.own_motion import Odometer
 
@@ -28,7 +29,7 @@ class Subscriber:
 
     Args:
         stream: Its socket.
-        header: What it is told of the topic before all messages: a packet.
+        greeting: Packets that every subscriber gets first: the connection header, and the message of a latched topic.
         selector: Waits for the socket; it is told to call `serve` with the events.
 
     Attributes:
@@ -36,11 +37,11 @@ class Subscriber:
         gone: Whether it has left, which one that breaks off or speaks another protocol has.
     """
 
-    def __init__(self, stream: socket.socket, header: bytes, selector: selectors.BaseSelector) -> None:
+    def __init__(self, stream: socket.socket, greeting: bytes, selector: selectors.BaseSelector) -> None:
         self.hears = False
         self.gone = False
         self._stream = stream
-        self._header = header
+        self._greeting = greeting
         self._selector = selector
         self._packets = tcpros.PacketSplitter()
         self._unsent = bytearray()
@@ -89,13 +90,50 @@ class Subscriber:
         for packet in self._packets:
             tcpros.unpack_header(packet)
             self.hears = True
-            self.send(self._header)
+            self.send(self._greeting)
             return
 
     def _leave(self) -> None:
         self.gone = True
         self._selector.unregister(self._stream)
         self._stream.close()
+
+
+class TopicSocket:
+    """The socket of one topic, and its subscribers.
+
+    Args:
+        topic: Name of the topic.
+        header: Fields of the connection header.
+        selector: Waits for its sockets, each with the function to call with what one is ready for.
+        latched: The message that each new subscriber gets at once; empty for a topic that is not latched.
+
+    Raises:
+        OSError: The socket cannot be made.
+    """
+
+    def __init__(
+        self, topic: str, header: Mapping[str, str], selector: selectors.BaseSelector, latched: bytes = b""
+    ) -> None:
+        self._greeting = tcpros.pack(tcpros.pack_header(header)) + (tcpros.pack(latched) if latched else b"")
+        self._selector = selector
+        self._subscribers: list[Subscriber] = []
+        path = tcpros.socket_path(topic)
+        path.unlink(missing_ok=True)  # left by sensors that were killed
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.bind(str(path))
+        self._socket.listen()
+        selector.register(self._socket, selectors.EVENT_READ, self._welcome)
+
+    def subscribers(self) -> list[Subscriber]:
+        """Return the subscribers that have requested the topic and are still connected."""
+        self._subscribers = [subscriber for subscriber in self._subscribers if not subscriber.gone]
+        return [subscriber for subscriber in self._subscribers if subscriber.hears]
+
+    def _welcome(self, _events: int) -> None:
+        stream, _ = self._socket.accept()
+        self._subscribers = [subscriber for subscriber in self._subscribers if not subscriber.gone]
+        self._subscribers.append(Subscriber(stream, self._greeting, self._selector))
 
 
 class Publication:
@@ -107,6 +145,8 @@ class Publication:
         start_s: When message 0 was due, on the monotonic clock.
         odometer: Says how the robot moves.
         selector: Waits for its sockets, each with the function to call with what one is ready for.
+        targets: What is in the robot's world, for a laser.
+        moving: Returns what else is there at this moment: other robots.
     """
 
     def __init__(
@@ -116,27 +156,21 @@ class Publication:
         start_s: float,
         odometer: Odometer,
         selector: selectors.BaseSelector,
+        *,
+        targets: Sequence[LaserTarget] = (),
+        moving: Callable[[], Sequence[LaserTarget]] = tuple,
     ) -> None:
         self._odometer = odometer
         self._sensor = sensor
-        self._source = Source(sensor)
-        self._header = tcpros.pack(tcpros.pack_header(_header(sensor, definition)))
+        self._source = Source(sensor, targets, moving)
         self._start_s = start_s
-        self._selector = selector
         self._number: int | None = None
-        self._subscribers: list[Subscriber] = []
-        path = tcpros.socket_path(sensor.topic)
-        path.unlink(missing_ok=True)  # left by sensors that were killed
-        self._socket = socket.socket(socket.AF_UNIX)
-        self._socket.bind(str(path))
-        self._socket.listen()
-        selector.register(self._socket, selectors.EVENT_READ, self._welcome)
+        self._topic_socket = TopicSocket(sensor.topic, _header(sensor.topic, sensor.type, definition), selector)
 
     def publish(self) -> float:
         """Publish the next message if it is due; return in how many seconds the one after it is, never if unheard."""
-        self._subscribers = [one for one in self._subscribers if not one.gone]
-        heard = [one for one in self._subscribers if one.hears]
-        if not heard:
+        subscribers = self._topic_socket.subscribers()
+        if not subscribers:
             self._number = None
             return math.inf
         elapsed_s, rate_hz = time.monotonic() - self._start_s, self._sensor.rate_hz
@@ -145,24 +179,31 @@ class Publication:
         elif self._number <= elapsed_s * rate_hz:
             now = self._odometer.at(time.monotonic_ns())
             packet = tcpros.pack(self._source.message(self._number, time.time_ns(), now))
-            for subscriber in heard:
+            for subscriber in subscribers:
                 subscriber.send(packet)
             self._number += 1
         return self._number / rate_hz - elapsed_s
 
-    def _welcome(self, _events: int) -> None:
-        stream, _ = self._socket.accept()
-        self._subscribers.append(Subscriber(stream, self._header, self._selector))
-
 
 def publish(
-    sensors: Iterable[Sensor], definitions: Mapping[str, Definition], *, motion: Path, steered: Path, ready: Path
+    sensors: Sequence[Sensor],
+    definitions: Mapping[str, Definition],
+    *,
+    frames: Sequence[static_frames.Link],
+    targets: Sequence[LaserTarget] = (),
+    moving: Callable[[], Sequence[LaserTarget]] = tuple,
+    motion: Path,
+    steered: Path,
+    ready: Path,
 ) -> None:
     """Publish for ever.
 
     Args:
         sensors: What is published.
-        definitions: Those of its message types.
+        definitions: Those of its message types, and of `static_frames.TYPE` where there are frames.
+        frames: What `/tf_static` joins, published once and latched; empty for a robot without it.
+        targets: What is in the robot's world, for its laser.
+        moving: Returns what else is there at this moment: other robots.
         motion: The file in which the lab says how the robot moves (`own_motion.say`).
         steered: The file in which the robot says how it steers itself (`helm.Helm`).
         ready: Made when every topic can be subscribed to.
@@ -174,7 +215,13 @@ def publish(
     Path(tcpros.FOLDER).mkdir(exist_ok=True)
     selector = selectors.DefaultSelector()
     odometer = Odometer(motion, time.monotonic_ns(), steered)
-    publications = [Publication(sensor, definitions[sensor.type], start_s, odometer, selector) for sensor in sensors]
+    publications = [
+        Publication(sensor, definitions[sensor.type], start_s, odometer, selector, targets=targets, moving=moving)
+        for sensor in sensors
+    ]
+    if frames:
+        header = _header(static_frames.TOPIC, static_frames.TYPE, definitions[static_frames.TYPE], latching=True)
+        TopicSocket(static_frames.TOPIC, header, selector, static_frames.message(frames, time.time_ns()))
     ready.touch()
     while True:
         next_s = min((publication.publish() for publication in publications), default=math.inf)
@@ -182,12 +229,12 @@ def publish(
             key.data(events)
 
 
-def _header(sensor: Sensor, definition: Definition) -> dict[str, str]:
+def _header(topic: str, kind: str, definition: Definition, *, latching: bool = False) -> dict[str, str]:
     return {
         "callerid": tcpros.CALLER,
-        "latching": "0",
+        "latching": str(int(latching)),
         "md5sum": definition.md5,
         "message_definition": definition.text,
-        "topic": sensor.topic,
-        "type": sensor.type,
+        "topic": topic,
+        "type": kind,
     }

@@ -1,6 +1,6 @@
-"""Frames of an emulated robot that stay where they are on it: what `/tf_static` says (REP 105).
+"""Static transforms of an emulated robot: the content of `/tf_static` (REP 105, tf2_ros.StaticTransformBroadcaster).
 
-Its sensors measure from where the robot is, whatever their frame is called, so every frame lies in the robot's own.
+Its sensors measure from the robot's own position, whatever their frame is called: every transform is the identity.
 """
 
 import struct
@@ -22,8 +22,13 @@ _IN_PLACE: Final = struct.pack("<7d", *[0.0] * 6, 1.0)
 
 
 def links(sensors: Iterable[Sensor]) -> tuple[Link, ...]:
-    """Return what joins the frames of sensors to the frame whose motion odometry tells, by way of `base_link`."""
+    """Return the links from the frames of sensors to the child frame of odometry, by way of `base_link`.
+
+    Nothing for a robot whose profile lists `/tf_static` among its topics.
+    """
     sensors = tuple(sensors)
+    if any(sensor.topic == TOPIC for sensor in sensors):
+        return ()
     moving = [sensor.child_frame for sensor in sensors if sensor.child_frame]
     base = moving[0] if moving else BASE
     known = {base, BASE, *_WORLDS, *(sensor.frame for sensor in sensors if sensor.child_frame)}
@@ -33,7 +38,7 @@ def links(sensors: Iterable[Sensor]) -> tuple[Link, ...]:
 
 
 def message(found: Sequence[Link], stamp_ns: int) -> bytes:
-    """Return the message that says so, a `tf2_msgs/TFMessage` as ROS 1 serializes it."""
+    """Return a `tf2_msgs/TFMessage` with these links, as ROS 1 serializes it, stamped in ns since the epoch."""
     stamp = struct.pack("<3I", 0, *divmod(stamp_ns, 10**9))
     return struct.pack("<I", len(found)) + b"".join(
         stamp + packed_string(parent) + packed_string(child) + _IN_PLACE for parent, child in found

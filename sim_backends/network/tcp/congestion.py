@@ -1,4 +1,6 @@
-"""The congestion window: slow start and congestion avoidance of RFC 5681; what CUBIC does otherwise is in `cubic`."""
+"""The congestion window: slow start and congestion avoidance of RFC 5681. For CUBIC see `cubic`, `linux_cubic`."""
+
+from typing import ClassVar
 
 from sim_backends.network.tcp.options import TcpOptions
 
@@ -12,7 +14,10 @@ class NewReno:
     Attributes:
         window_bytes: The congestion window (cwnd).
         threshold_bytes: Where slow start ends (ssthresh); None while it is as high as can be.
+        reduces_in_recovery: Whether a timeout within a recovery lowers the threshold again (RFC 5681, 3.1).
     """
+
+    reduces_in_recovery: ClassVar[bool] = True
 
     def __init__(self, options: TcpOptions) -> None:
         self._options = options

@@ -2,6 +2,8 @@
 
 from typing import Final
 
+from typing_extensions import override
+
 from sim_backends.network.tcp.congestion import NewReno
 from sim_backends.network.tcp.options import TcpOptions
 
@@ -41,13 +43,14 @@ class Cubic(NewReno):
         self._before_bytes: int | None = None
         self._forget()
 
+    @override
     def idled(self, idle_ns: int) -> None:
-        """See `NewReno.idled`; that time does not count (RFC 9438, 5.8)."""
+        """That time does not count (RFC 9438, 5.8)."""
         if self._begun_ns is not None:
             self._begun_ns += idle_ns
 
+    @override
     def lost(self, flight_bytes: int) -> None:
-        """See `NewReno.lost`."""
         before_bytes = self.window_bytes
         self._before_bytes = before_bytes
         if self._highest_bytes is not None and before_bytes < self._highest_bytes:
@@ -58,16 +61,16 @@ class Cubic(NewReno):
         super().lost(flight_bytes)
         self._forget()
 
+    @override
     def timed_out(self, flight_bytes: int, *, again: bool) -> None:
-        """See `NewReno.timed_out`."""
         if not again:
             self._before_bytes = self.window_bytes
         super().timed_out(flight_bytes, again=again)
         self._highest_bytes = None
         self._forget()
 
+    @override
     def restarted(self) -> None:
-        """See `NewReno.restarted`."""
         super().restarted()
         self._forget()
 

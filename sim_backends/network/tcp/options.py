@@ -1,4 +1,4 @@
-"""Options of TCP; without any it is Linux as robots run it."""
+"""Options of TCP; the defaults are those of Linux."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -10,6 +10,11 @@ _MS: Final = 1_000_000
 _SECOND: Final = 1_000_000_000
 
 
+Congestion = Literal["cubic", "cubic-rfc9438", "newreno"]
+"""Congestion control and loss recovery: Linux's `tcp_cubic` with RACK (RFC 8985); CUBIC of RFC 9438, or NewReno (RFC
+5681, 6582), both with the loss recovery of RFC 6675."""
+
+
 @dataclass(frozen=True)
 class TcpOptions:
     """What can be chosen.
@@ -17,7 +22,7 @@ class TcpOptions:
     Attributes:
         mtu_bytes: The largest IP packet; 1500 leaves segments of 1448 bytes beside the headers.
         initial_window_segments: Congestion window at the beginning (RFC 6928).
-        congestion: `cubic` (RFC 9438; Linux's default) or `newreno` (RFC 5681, 6582).
+        congestion: Congestion control and loss recovery; `cubic` is Linux's default.
         receive_window_bytes: What a receiver holds that waits for what is missing. 3 MiB is what Linux grows to: half
             of `tcp_rmem`'s largest 6 MiB, by `tcp_adv_win_scale`.
         least_timeout_ns: The shortest retransmission timeout: 200 ms in Linux, 1 s in RFC 6298.
@@ -41,7 +46,7 @@ class TcpOptions:
 
     mtu_bytes: int = 1500
     initial_window_segments: int = 10
-    congestion: Literal["cubic", "newreno"] = "cubic"
+    congestion: Congestion = "cubic"
     receive_window_bytes: int = 3 << 20
     least_timeout_ns: int = 200 * _MS
     longest_timeout_ns: int = 120 * _SECOND

@@ -23,6 +23,7 @@ class SentSegment:
         first: Sequence number of its first byte.
         end: The one after its last.
         number: Which it is of the stream, for random draws.
+        sent_ns: When it was last sent.
         times: How often it was sent.
         copies: How many of these are taken to be under way.
         arrived: Whether a SACK says that it arrived.
@@ -32,6 +33,7 @@ class SentSegment:
     first: int
     end: int
     number: int
+    sent_ns: int
     times: int = 1
     copies: int = 1
     arrived: bool = False
@@ -71,27 +73,28 @@ class Scoreboard:
     def __len__(self) -> int:
         return len(self._sent) - self._gone
 
-    def send(self, length: int, number: int) -> SentSegment:
-        """Take note of a new segment that is sent, and return it."""
-        segment = SentSegment(self.next, self.next + length, number)
+    def send(self, now_ns: int, length: int, number: int) -> SentSegment:
+        """Record a new segment that is sent, and return it."""
+        segment = SentSegment(self.next, self.next + length, number, now_ns)
         self._sent.append(segment)
         self.next = segment.end
         self.pipe_bytes += length
         return segment
 
-    def send_again(self, segment: SentSegment) -> None:
-        """Take note of a segment that is sent again."""
+    def send_again(self, now_ns: int, segment: SentSegment) -> None:
+        """Record a segment that is sent again."""
+        segment.sent_ns = now_ns
         segment.times += 1
         segment.copies += 1
         self.pipe_bytes += segment.end - segment.first
 
-    def acknowledge(self, upto: int) -> None:
+    def acknowledge(self, now_ns: int, upto: int) -> None:
         """Take an ACK of everything before `upto`."""
         self.acknowledged = upto
         while self._gone < len(self._sent) and self._sent[self._gone].end <= upto:
             segment = self._sent[self._gone]
             if not segment.arrived:
-                self.delivered_bytes += segment.end - segment.first
+                self._deliver(now_ns, segment)
             self._land(segment)
             self._gone += 1
         self._arrived.forget_before(upto)
@@ -100,15 +103,27 @@ class Scoreboard:
             self._dropped += self._gone
             self._gone = 0
 
-    def arrive(self, sacks: Iterable[Range]) -> None:
-        """Take what a SACK says has arrived, and count as lost what three later ones overtook."""
+    def arrive(self, now_ns: int, sacks: Iterable[Range]) -> None:
+        """Take what a SACK reports as arrived."""
         for block in sacks:
             first = max(block[0], self.acknowledged)
             if first < block[1]:
                 for new in self._arrived.add(first, block[1]):
-                    self._mark(new)
+                    self._mark(now_ns, new)
+
+    def detect_losses(self, now_ns: int, *, recovering: bool) -> int | None:  # noqa: ARG002 (see RackScoreboard)
+        """Count as lost the segments that the arrived ones show to be lost: those that three later ones overtook.
+
+        Args:
+            now_ns: Now.
+            recovering: Whether a recovery is under way.
+
+        Returns:
+            When to call this again even if no ACK arrives before; None if only an ACK can show a further loss.
+        """
         if len(self._latest) == DUPLICATE_THRESHOLD:
             self._judge(self._latest[0])
+        return None
 
     def lose_all(self) -> None:
         """Count as lost whatever has not arrived, as after a timeout."""
@@ -136,18 +151,22 @@ class Scoreboard:
                 return segment
         return None
 
-    def _mark(self, block: Range) -> None:
+    def _mark(self, now_ns: int, block: Range) -> None:
         sent = self._sent
         place = bisect_left(sent, block[0], lo=self._gone, key=lambda segment: segment.first)
         while place < len(sent) and sent[place].end <= block[1]:
             segment = sent[place]
             self._land(segment)
             segment.arrived = True
-            self.delivered_bytes += segment.end - segment.first
+            self._deliver(now_ns, segment)
             heapq.heappush(self._latest, self._dropped + place)
             if len(self._latest) > DUPLICATE_THRESHOLD:
                 heapq.heappop(self._latest)
             place += 1
+
+    def _deliver(self, now_ns: int, segment: SentSegment) -> None:  # noqa: ARG002 (see RackScoreboard)
+        """Count a segment that an ACK or a SACK reports for the first time."""
+        self.delivered_bytes += segment.end - segment.first
 
     def _judge(self, before: int) -> None:
         """Count as lost what has not arrived of the segments before this place, each once."""

@@ -1,12 +1,14 @@
 """The sending end of a connection: opens it, sends the stream, and sends again what is lost."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from sim_backends.network.tcp.congestion import NewReno
 from sim_backends.network.tcp.cubic import Cubic
+from sim_backends.network.tcp.linux_cubic import LinuxCubic
 from sim_backends.network.tcp.messages import MessageStream
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.options import Congestion, TcpOptions
+from sim_backends.network.tcp.rack import RackScoreboard
 from sim_backends.network.tcp.reduction import ProportionalReduction
 from sim_backends.network.tcp.round_trips import RoundTrips
 from sim_backends.network.tcp.scoreboard import Scoreboard, SentSegment
@@ -14,15 +16,20 @@ from sim_backends.network.tcp.segments import Segment
 from sim_backends.network.timer import WireTimer
 from sim_backends.network.wire import Wire
 
-_CONTROLS: Final = {"newreno": NewReno, "cubic": Cubic}
+_CONTROLS: Final[Mapping[Congestion, tuple[type[NewReno], type[Scoreboard]]]] = {
+    "cubic": (LinuxCubic, RackScoreboard),
+    "cubic-rfc9438": (Cubic, Scoreboard),
+    "newreno": (NewReno, Scoreboard),
+}
 
 
 class Sender:
     """Sends a stream and hears ACKs; the connection is opened as it is made, unless it is open already.
 
-    After a loss that SACK shows it recovers by RFC 6675: the window closes once, and what is lost is sent again, then
-    new data, as far as the reduction of RFC 6937 lets it. After a timeout everything that has not arrived is lost,
-    and slow start begins (RFC 5681, 3.1). What arrived by SACK stays so, as the receiver never gives it up again.
+    Losses are detected by RFC 6675, or by RFC 8985 where the congestion control is Linux's. A loss begins a recovery:
+    the window closes once, and what is lost is sent again, then new data, as far as the reduction of RFC 6937 allows.
+    After a timeout everything that has not arrived is lost, and slow start begins (RFC 5681, 3.1). What arrived by
+    SACK stays so, as the receiver never discards it.
 
     Args:
         wire: Its clock.
@@ -59,6 +66,7 @@ class Sender:
         self._give_up = give_up
         self._log = log
         self._timer = WireTimer(wire, host, self._expire)
+        self._reordering_timer = WireTimer(wire, host, self._reordering_expired)
         self._open = False
         self._echoes_ns: int | None = None
         self._receive_window_bytes = 0
@@ -73,8 +81,9 @@ class Sender:
         self._full = False
         self._sent_ns = 0
         self._heard_ns = 0
-        self.control = _CONTROLS[options.congestion](options)
-        self.board = Scoreboard()
+        control, board = _CONTROLS[options.congestion]
+        self.control = control(options)
+        self.board = board()
         self.round_trips = RoundTrips(options)
         if round_trip_ns is None:
             self._synchronize()
@@ -104,6 +113,7 @@ class Sender:
         """Do nothing any more."""
         self._open = False
         self._timer.stop()
+        self._reordering_timer.stop()
 
     def _synchronize(self) -> None:
         self._emit(0, 0, number=0, times=self._expired, syn=True)
@@ -129,21 +139,20 @@ class Sender:
         self.round_trips.sample(self._wire.now_ns - segment.echoes_ns)
 
     def _acknowledged(self, segment: Segment) -> None:
-        board, upto = self.board, segment.acknowledges
+        board, upto, now_ns = self.board, segment.acknowledges, self._wire.now_ns
         assert upto is not None
         self._receive_window_bytes = segment.window_bytes
         self._echoes_ns = segment.sent_ns
         delivered_bytes, losses = board.delivered_bytes, board.losses
-        board.arrive(segment.sacks)
+        board.arrive(now_ns, segment.sacks)
         advances = upto > board.acknowledged
         if advances:
-            board.acknowledge(upto)
+            board.acknowledge(now_ns, upto)
             self._expired = 0
             self._heard(segment)
             self._restart_timer()
             self._grow(board.delivered_bytes - delivered_bytes)
-        if self._recovery_end is None and (lost := board.lost()) is not None:
-            self._recover(lost)
+        self._detect_losses()
         if self._reduction is not None:
             self._window_bytes = self._reduction.window_bytes(
                 board.pipe_bytes,
@@ -152,6 +161,24 @@ class Sender:
             )
         self._send()
         self._log("ack")
+
+    def _detect_losses(self) -> None:
+        """Find what is lost, and begin a recovery if there is none."""
+        due_ns = self.board.detect_losses(self._wire.now_ns, recovering=self._recovery_end is not None)
+        if due_ns is None:
+            self._reordering_timer.stop()
+        else:
+            self._reordering_timer.set(due_ns)
+        if self._recovery_end is None and (lost := self.board.lost()) is not None:
+            self._recover(lost)
+
+    def _reordering_expired(self) -> None:
+        """Find what is lost now that the reordering window has passed (RFC 8985, 6.3)."""
+        if self._open:
+            self._detect_losses()
+            if self._reduction is not None:
+                self._window_bytes = self._reduction.window_bytes(self.board.pipe_bytes, 0, safe=False)
+            self._send()
 
     def _grow(self, delivered_bytes: int) -> None:
         """Open the window by an ACK of new data, or end the recovery that it completes.
@@ -197,7 +224,8 @@ class Sender:
             self._give_up(f"tcp: not acknowledged, sent {self._expired} times")
             return
         board = self.board
-        self.control.timed_out(self._flight_bytes(), again=self._expired > 1)
+        again = self._expired > 1 or (self._reduction is not None and not self.control.reduces_in_recovery)
+        self.control.timed_out(self._flight_bytes(), again=again)
         board.lose_all()
         self._recovery_end = board.next
         self._reduction = None
@@ -245,7 +273,7 @@ class Sender:
         return length
 
     def _send_new(self, length: int) -> None:
-        segment = self.board.send(length, self._stream.number(self.board.next))
+        segment = self.board.send(self._wire.now_ns, length, self._stream.number(self.board.next))
         self._emit(segment.first, length, number=segment.number, times=0)
         self._note_sent(length)
         if self._timer.due_ns is None:
@@ -253,7 +281,7 @@ class Sender:
 
     def _send_again(self, segment: SentSegment) -> None:
         self._emit(segment.first, segment.end - segment.first, number=segment.number, times=segment.times)
-        self.board.send_again(segment)
+        self.board.send_again(self._wire.now_ns, segment)
         self._note_sent(segment.end - segment.first)
         # RFC 6675, 6: each one starts the timer anew, so that a long recovery ends in no needless timeout.
         self._restart_timer()

@@ -4,10 +4,10 @@ What a program sends is written to the stream of its flow's connection, which th
 stays open. A message is delivered when its last byte has been read, in order, at its destination. A connection that
 is given up drops what was not delivered; the next message opens another one.
 
-Standards: RFC 9293 with 2018, 3042, 5681, 6298, 6582, 6675, 6928, 6937, 7323 and 9438. It is Linux but for what is
-left out: RACK and tail loss probes (RFC 8985), undoing what a needless timeout did (RFC 5682), HyStart++ (RFC 9406),
+Standards: RFC 9293 with 2018, 3042, 5681, 6298, 6582, 6675, 6928, 6937, 7323, 8985 and 9438. By default it is that of
+Linux, without tail loss probes (RFC 8985, 7), undoing what a needless timeout did (RFC 5682), HyStart (RFC 9406),
 duplicate SACKs (RFC 2883), ECN, pacing, full send buffers, keep-alive, and closing. A receiver does not send its
-SYN-ACK again by itself: the sender asks again. As in the RFCs and not in Linux, windows count bytes, not segments.
+SYN-ACK again by itself: the sender asks again. Windows count bytes; those of Linux's CUBIC are whole segments.
 """
 
 from fieldkit.core.errors import ConfigurationError

@@ -76,6 +76,23 @@ def test_expectations_of_trials_under_one_condition_are_judged_together(
     assert "expected" not in said(capsys, str(tmp_path), "--format", "csv")
 
 
+@pytest.mark.parametrize("form", ["table", "csv", "json", "markdown", "latex"])
+def test_a_figure_that_some_valid_repeats_lack_says_of_how_many_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
+) -> None:
+    rows = repeats(ROW, 10)
+    write(tmp_path, [*rows[:7], *(replace(row, rtt_median_s=None) for row in rows[7:])])
+    shown = said(capsys, str(tmp_path), "--format", form, "--quantity", "rtt_median_s")
+    if form == "csv":
+        (record,) = records(shown)
+        assert (record["n"], record["n_valid"]) == ("7", "10")
+    elif form == "json":
+        (cell,) = json.loads(shown)["cells"]
+        assert (cell["estimates"]["rtt_median_s"]["n"], cell["n_valid"]) == (7, 10)
+    else:
+        assert "7 of 10" in shown
+
+
 def test_what_differs_behind_one_name_is_told_beside_the_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,10 +151,12 @@ def test_the_table_says_what_all_have_in_common_and_tells_cells_apart(
     assert re.search(r"^repeats, field\n *distance +protocol +valid +void +failed$", text, re.MULTILINE)
     assert re.search(r"^ *5m +udp +16 +4 +0$", text, re.MULTILINE)
     assert re.search(
-        r"^IP packet loss \(%\), udp\n *distance +n +share +95 % interval +Wilson +median +p95$", text, re.MULTILINE
+        r"^IP packet loss \(%\), udp\n *distance +n +sent +share +95 % interval +Wilson +median +p95$",
+        text,
+        re.MULTILINE,
     )
     assert re.search(
-        r"^ *30ft +16 +5.32 +\[\d\.\d\d, \d\.\d\d\] +\[\d\.\d\d, \d\.\d\d\] +5.32 +6.02$", text, re.MULTILINE
+        r"^ *30ft +16 +3456 +5.32 +\[\d\.\d\d, \d\.\d\d\] +\[\d\.\d\d, \d\.\d\d\] +5.32 +6.02$", text, re.MULTILINE
     )
     assert max(map(len, text.splitlines())) <= 80
 
@@ -209,7 +228,7 @@ def test_latex_has_distances_down_and_scenarios_across(campaign: Path, capsys: p
     text = said(capsys, str(campaign), "--format", "latex", "--by", by)
     columns, lines = latex(text)
     assert {len(line) for line in lines} == {len(columns)}
-    quantities = ["RTT, median (ms)"] * 2 + [r"IP packet loss (\%)", r"TCP bytes lost and repaired (\%)"]
+    quantities = ["RTT, median (ms)"] * 2 + [r"IP packet loss (\%)", r"TCP byte loss before retransmission (\%)"]
     assert lines[:3] == [
         ["", *["LOS"] * 4, *["NLOS"] * 4],
         ["", *quantities * 2],

@@ -72,7 +72,7 @@ def answered(lab: Path, line: str) -> list[str]:
         ("fieldkit report trials/", ["trials/campaign/", "trials/one"]),
         ("fieldkit compare trials/one r", ["rows.csv"]),
         ("fieldkit aggregate --quantity rtt", ["rtt_loss", "rtt_median_s"]),
-        ("fieldkit columns show rtt_med", ["rtt_median_s"]),
+        ("fieldkit columns show rtt_mea", ["rtt_mean_s"]),
         ("fieldkit campaign n", ["notes.txt"]),
     ],
 )

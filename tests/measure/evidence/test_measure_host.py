@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,12 +27,14 @@ UdpLite: 0 0 0 0 77 0 0 0 0
 
 
 def test_counters_come_from_their_own_section_and_group() -> None:
-    assert host.parse(STATE.format(reassembly=3, buffer=17)) == Counters(17, 3)
+    found = host.parse(STATE.format(reassembly=3, buffer=17))
+    assert (found.udp_buffer_errors, found.reassembly_failures) == (17, 3)
 
 
 def test_the_difference_is_after_less_before() -> None:
     before, after = (host.parse(STATE.format(reassembly=n, buffer=10 * n)) for n in (3, 5))
-    assert host.difference(before, after) == Counters(20, 2)
+    moved = host.difference(before, after)
+    assert (moved.udp_buffer_errors, moved.reassembly_failures) == (20, 2)
 
 
 def test_a_counter_that_is_missing_or_went_back_says_nothing() -> None:
@@ -49,3 +53,19 @@ def test_a_state_without_the_counters_says_nothing(text: str) -> None:
 def test_garbage_never_raises(text: str, near: str) -> None:
     host.parse(text)
     host.parse("==> /proc/net/snmp <==\n" + near)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("==> /proc/sys/net/ipv4/tcp_congestion_control <==\ncubic\n==> ip -s link <==\n", "cubic"),
+        ("==> /proc/sys/net/ipv4/tcp_congestion_control <==\n", None),
+        ("==> /proc/sys/net/ipv4/tcp_congestion_control <==\nbbr\x1b[31m\n", None),
+        ("==> /proc/sys/net/ipv4/tcp_congestion_control <==\ncat: permission denied\n", None),
+        ("==> /proc/net/snmp <==\ncubic\n", None),
+    ],
+)
+def test_the_congestion_control_of_a_robot(text: str, name: str | None, tmp_path: Path) -> None:
+    file = tmp_path / "sender-before.txt"
+    file.write_text(text, encoding="utf-8")
+    assert host.congestion_control(file) == name

@@ -1,12 +1,17 @@
+import math
+from itertools import groupby
 from pathlib import Path
+from statistics import fmean
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from fieldkit.core.columns import Measured
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import ping
-from fieldkit.measure.evidence.ping import Ping, Problem, Reply
+from fieldkit.measure.evidence.ping import AnswerGap, Ping, Problem, Reply
+from fieldkit.measure.evidence.survivors import quantile_of_sent
 from tests.helpers.paths import DATA
 
 OUTPUTS = DATA / "ping" / "20221126"
@@ -61,6 +66,7 @@ def test_a_normal_run() -> None:
         transmitted=3,
         received=3,
         unknown=(),
+        summary_s=(0.052 / 1e3, 0.088 / 1e3, 0.159 / 1e3),
     )
 
 
@@ -174,18 +180,83 @@ def answered(*seqs_ms: tuple[int, int], sent: int) -> Ping:
     return Ping(56, replies, (), sent, len(replies), ())
 
 
-def test_the_longest_gap_is_told_with_what_was_lost_in_it() -> None:
-    assert ping.longest_gap(answered((1, 100), (2, 201), (6, 640), (7, 700), (9, 900), sent=10)) == (0.439, 3)
-    assert ping.longest_gap(answered((1, 100), (2, 200), (3, 350), sent=3)) == (0.15, 0)
-    # Who answers late is no gap of its own: the answer to 2 came after that to 3.
-    assert ping.longest_gap(answered((1, 100), (3, 300), (2, 310), sent=3)) == (0.21, 0)
+INTERVAL_S = 0.1
 
 
-def test_a_gap_that_does_not_end_is_none() -> None:
-    assert ping.longest_gap(answered((1, 100), (3, 300), sent=5)) is None
-    assert ping.longest_gap(answered((1, 100), (4, 400), sent=5)) == (0.3, 2)
-    assert ping.longest_gap(answered((1, 100), sent=1)) is None
-    assert ping.longest_gap(ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt")) is None
-    missing = ping.measure_gap(None).missing
-    assert missing.keys() == {"rtt_gap_s", "rtt_gap_lost"}
-    assert ping.measure_gap(answered((1, 0), (2, 100), sent=2)).values == {"rtt_gap_s": 0.1, "rtt_gap_lost": 0}
+def test_the_longest_gap_has_the_number_of_lost_requests() -> None:
+    gap = ping.longest_gap(answered((1, 100), (2, 201), (6, 640), (7, 700), (9, 900), sent=10), INTERVAL_S)
+    assert gap == AnswerGap(0.439, 3, is_open=False)
+    assert ping.longest_gap(answered((1, 100), (2, 200), (3, 350), sent=3), INTERVAL_S) == AnswerGap(
+        0.15, 0, is_open=False
+    )
+    # A late answer makes no gap of its own: the answer to 2 came after that to 3.
+    assert ping.longest_gap(answered((1, 100), (3, 300), (2, 310), sent=3), INTERVAL_S) == AnswerGap(
+        0.21, 0, is_open=False
+    )
+
+
+@pytest.mark.parametrize(
+    ("ping_", "lasted_s", "lost", "is_open"),
+    [
+        pytest.param(answered((1, 100), (3, 300), sent=5), 0.2, 2, True, id="as long at the end as within"),
+        pytest.param(answered((1, 100), (4, 400), sent=5), 0.3, 2, False, id="a lost echo at the end"),
+        pytest.param(answered((1, 100), (2, 200), (3, 300), sent=26), 2.3, 23, True, id="down at the end"),
+        pytest.param(answered((24, 100), (25, 200), sent=25), 2.3, 23, True, id="down at the start"),
+        pytest.param(answered(sent=30), 3.0, 30, True, id="no answer at all"),
+        pytest.param(answered((1, 100), sent=12), 1.1, 11, True, id="a single answer"),
+        pytest.param(answered((1, 100), (31, 3100), sent=42), 3.0, 29, True, id="1 s down at the end, longer within"),
+        pytest.param(answered((65535, 100), (0, 200), (1, 300), sent=65537), 6553.4, 65534, True, id="16 bits"),
+    ],
+)
+def test_a_gap_that_the_ping_began_or_ended_in_is_a_lower_bound(
+    ping_: Ping, lasted_s: float, lost: int, is_open: bool
+) -> None:
+    found = ping.longest_gap(ping_, INTERVAL_S)
+    assert found == AnswerGap(pytest.approx(lasted_s), lost, is_open)  # type: ignore[arg-type]
+    values = ping.measure_gap(ping_, INTERVAL_S).values
+    suffix = ("_at_least_s", "_lost_at_least") if is_open else ("_s", "_lost")
+    assert values == {
+        f"rtt_gap{name}": pytest.approx(value) for name, value in zip(suffix, (lasted_s, lost), strict=True)
+    }
+
+
+def test_the_numbers_of_a_long_ping_begin_again() -> None:
+    answers = [(seq & 0xFFFF, 100 * seq) for seq in range(1, 70_001) if not 66_000 < seq <= 66_010]
+    assert ping.longest_gap(answered(*answers, sent=70_000), INTERVAL_S) == AnswerGap(1.1, 10, is_open=False)
+
+
+def test_without_time_stamps_there_is_no_gap() -> None:
+    assert ping.longest_gap(answered((1, 100), sent=1), INTERVAL_S) is None
+    assert ping.longest_gap(ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt"), INTERVAL_S) is None
+    columns = {column.name for column in (*ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS)}
+    assert ping.measure_gap(None, INTERVAL_S).missing.keys() == columns
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=60))
+def test_every_ping_has_either_a_gap_or_its_lower_bound(came: list[bool]) -> None:
+    found = answered(*((seq, 100 * seq) for seq, arrived in enumerate(came, 1) if arrived), sent=len(came))
+    measured = ping.measure_gap(found, INTERVAL_S)
+    longest_run = max((len(list(run)) for arrived, run in groupby(came) if not arrived), default=0)
+    if len(came) == 1 and came[0]:
+        assert not measured.values
+    else:
+        (lost,) = (value for name, value in measured.values.items() if "lost" in name)
+        assert len(measured.values) == 2
+        assert lost == longest_run
+
+
+@given(st.lists(st.floats(0, 1, width=32), max_size=30), st.integers(0, 30))
+def test_the_median_of_all_requests_counts_a_lost_one_as_later_than_all(rtt_s: list[float], lost: int) -> None:
+    padded = sorted([*rtt_s, *[math.inf] * lost])
+    middle = padded[(len(padded) - 1) // 2 : len(padded) // 2 + 1]
+    expected = fmean(middle) if middle and math.inf not in middle else None
+    assert quantile_of_sent(rtt_s, len(padded), 0.5) == (expected if expected is None else pytest.approx(expected))
+
+
+def test_a_ping_with_half_of_its_echoes_lost_has_no_median_of_all_requests() -> None:
+    def measured(sent: int) -> Measured:
+        return ping.measure(answered((1, 100), (2, 200), (3, 300), sent=sent))
+
+    assert measured(3).values["rtt_median_sent_s"] == measured(3).values["rtt_median_s"]
+    assert measured(5).values["rtt_median_sent_s"] == 1e-3
+    assert "rtt_median_sent_s" in measured(6).missing

@@ -72,8 +72,13 @@ def test_without_the_cause_s_time_there_is_an_outage_and_no_recovery_time(tmp_pa
 @pytest.mark.parametrize("sent", [20, 600])
 def test_a_robot_that_stays_away_has_no_times(tmp_path: Path, sent: int) -> None:
     text = pings(list(range(1, 11)), sent)
-    found = recovery.read(folder(tmp_path, FaultKind.LINK_DOWN, text), FaultKind.LINK_DOWN)
-    assert found == Recovery(None, None, recovered=False)
+    kind = FaultKind.LINK_DOWN
+    found = recovery.read(folder(tmp_path, kind, text), kind)
+    lasted_s = 2.0  # of the cause
+    bound_s = max(0.0, (sent - 10) * 0.1 - lasted_s)
+    assert found == Recovery(None, None, recovered=False, recovery_at_least_s=pytest.approx(bound_s))  # type: ignore[arg-type]
+    values = recovery.measure(kind, found).values
+    assert values.keys() == {"link_down_recovered", "link_down_recovery_at_least_s"}
 
 
 def test_a_robot_that_came_and_went_again_has_not_recovered(tmp_path: Path) -> None:
@@ -97,7 +102,7 @@ def test_a_process_is_gone_between_the_last_sight_of_one_and_the_first_of_anothe
 def test_a_process_that_never_comes_back(tmp_path: Path) -> None:
     text = watched((1.0, ""), (4.9, "31"), (5.0, "31"), *((5.1 + n / 10, "") for n in range(20)))
     found = recovery.read(folder(tmp_path, FaultKind.KILL, text, lasted="0.000"), FaultKind.KILL)
-    assert found == Recovery(None, None, recovered=False)
+    assert found == Recovery(None, None, recovered=False, recovery_at_least_s=pytest.approx(2.0))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

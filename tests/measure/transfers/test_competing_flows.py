@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.transfers import contradictions, figures
+from fieldkit.measure.checks import contradictions
+from fieldkit.measure.transfers import figures
 from fieldkit.measure.transfers.transfer import Transfer
 from tests.helpers.captures import RECEIVER, SENDER, Frame, file_bytes, ipv4, transfer
 

@@ -29,14 +29,16 @@ Wrong = tuple[float, float]  # offset in seconds, drift in seconds per second
 CLOCKS: list[Wrong] = [(0, 0), (3600, 0), (-3600, 0), (0, 100e-6), (0, -100e-6), (3600, -100e-6), (-3600, 100e-6)]
 
 
-def _measured(sender: Packets, receiver: Packets, what: Transfer) -> Measures:
+def _measured(sender: Packets, receiver: Packets, what: Transfer, sent: int | None = None) -> Measures:
     if what.protocol is Protocol.UDP:
         own = delay.udp_packets(udp.cross(sender, receiver, what))
     else:
         own = delay.tcp_frames(tcp.cross(sender, receiver, what))
-    found = delay.measure(own, sender, receiver, what)
+    found = delay.measure(own, sender, receiver, what, sent=len(own) if sent is None else sent)
     assert not found.values.keys() & found.missing.keys(), "no column is told twice"
-    assert found.values.keys() | found.missing.keys() == {column.name for column in delay.COLUMNS}
+    assert found.values.keys() | found.missing.keys() == {
+        column.name for column in (*delay.COLUMNS, *delay.SENT_COLUMNS)
+    }
     return Measures(**found.values)
 
 
@@ -172,6 +174,15 @@ def test_closed_forms_on_two_clocks() -> None:
     assert found.delay_variation_p95_s == pytest.approx(0.010)
     assert found.jitter_s == pytest.approx(0.010 * (1 - (15 / 16) ** 100))
     assert found.clock_offset_s == pytest.approx(-3600, abs=1e-5)
+
+
+def test_a_lost_packet_is_later_than_all_in_the_median_of_what_was_sent() -> None:
+    sender, receiver = _exchange([50.0 * n for n in range(101)], [100.0 + n for n in range(101)], (0, 0))
+    found = {sent: _measured(sender, receiver, transfer(Protocol.UDP), sent) for sent in (101, 151, 202, 203)}
+    assert all(delays.one_way_median_s == pytest.approx(0.150, abs=1e-5) for delays in found.values())
+    assert found[101].one_way_median_sent_s == found[101].one_way_median_s
+    assert found[151].one_way_median_sent_s == pytest.approx(0.175, abs=1e-5)
+    assert found[202].one_way_median_sent_s is found[203].one_way_median_sent_s is None
 
 
 def test_packets_that_overtake_others_and_ones_of_another_transfer() -> None:

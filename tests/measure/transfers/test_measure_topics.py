@@ -61,7 +61,7 @@ def captures(ahead_ns: int = 0, one_way_ns: int = MS // 100) -> tuple[Packets, P
 
 
 def measured(sent: TopicLog, came: TopicLog, *captured: Packets | None) -> dict[str, object]:
-    found = topics.measure(FLOW, sent, came, *(captured or (None, None)))
+    found = topics.measure(FLOW, sent, came, *(captured or (None, None))) | topics.withheld_mark("")
     assert found.values.keys() | found.missing.keys() == {column.name for column in topics.COLUMNS}
     return dict(found.values)
 
@@ -74,6 +74,19 @@ def test_losses_are_samples_that_never_came(lost: set[int], again: list[int]) ->
     assert (found["topic_sent"], found["topic_received"]) == (50, 50 - len(lost))
     assert found["topic_loss"] == pytest.approx(len(lost) / 50)
     assert found["topic_repeated"] == len(repeated)
+
+
+@pytest.mark.parametrize(
+    ("lost", "median_s", "p95_s"), [(0, 2e-3, 2e-3), (2, 2e-3, 2e-3), (3, 2e-3, None), (25, None, None)]
+)
+def test_a_lost_sample_is_later_than_all_in_the_delays_of_what_was_sent(
+    lost: int, median_s: float | None, p95_s: float | None
+) -> None:
+    found = measured(published(50), arrived(range(lost, 50)), *captures())
+    assert found["topic_delay_median_s"] == pytest.approx(2e-3, rel=1e-3)
+    for name, expected in (("median", median_s), ("p95", p95_s)):
+        value = found.get(f"topic_delay_{name}_sent_s")
+        assert value == (None if expected is None else pytest.approx(expected, rel=1e-3))
 
 
 def test_discovery_is_timed_by_the_publishers_clock() -> None:
@@ -210,8 +223,11 @@ def test_each_of_two_streams_of_one_pair_has_its_own_fragments(seed: int) -> Non
         assert found["topic_packet_loss"] == pytest.approx(1 - len(here) / len(there))
 
 
-def test_samples_of_another_stream_are_noticed() -> None:
-    came = arrived([0, 1, 2])
-    assert topics.contradiction(published(3), came) is None
-    foreign = replace(came, samples=replace(came.samples, sent_ns=came.samples.sent_ns + 1))
-    assert "another stream" in (topics.contradiction(published(3), foreign) or "")
+def test_only_columns_that_need_the_captures_are_withheld() -> None:
+    without = topics.measure(FLOW, published(10), arrived(range(10)), None, None)
+    reasons = topics.without_captures(without, "packets were dropped")
+    assert set(reasons) == without.missing.keys() - {"topic_deadline_misses"}
+    assert set(reasons.values()) == {"packets were dropped"}
+    assert without.values.keys() >= {"topic_loss", "topic_jitter_s", "topic_delay_variation_p95_s"}
+    assert topics.without_captures(without, "") == {}
+    assert topics.withheld_mark("packets were dropped").values == {"topic_capture_withheld": "packets were dropped"}

@@ -3,15 +3,21 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action
+from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.scenario.policies import POLICIES, make_policy
+from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Received
 from sim_backends.world.motion import State
 
 NAMES = ("a", "b", "c")
+MS = 1_000_000
 END_NS = 100
 MAIL_AT_NS = range(0, END_NS, 10)
 
@@ -73,3 +79,29 @@ def test_each_wakes_when_it_said_last_and_when_it_has_mail(
         assert woke == expected
         planned_ns = [wake_ns for one in programs.values() if (wake_ns := one.next_wake_ns()) is not None]
         assert agents.next_wake_ns() == min(planned_ns, default=None)
+
+
+class Growing(Still):
+    """An agent appears within a window."""
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+        late = {"late": State((3.0, 4.0, 0.0))} if to_ns >= 12 * MS else {}
+        return {**super().advance(to_ns, commands), **late}
+
+
+@pytest.mark.parametrize("extrapolates", [False, True])
+@pytest.mark.parametrize("policy", POLICIES)
+def test_an_agent_that_appears_during_a_run_is_sent_to_with_every_policy(policy: str, *, extrapolates: bool) -> None:
+    physics = Growing()
+    physics.step_ns = MS
+    programs = {
+        "a": Periodic("to late", "late", period_ns=7 * MS, first_ns=13 * MS),
+        "b": Periodic("to a", "a", period_ns=MS),
+    }
+    network = Disc(10.0, 1000, extrapolates=extrapolates)
+    make = make_policy(policy, window_s=0.005, longest_s=0.02)
+    run = Coordinator(Agents(physics, programs), network, make, [("b", "a")]).advance(60 * MS)
+    to_late = [fate for fate in run.fates.values() if fate.packet.destination == "late"]
+    assert len(to_late) >= 5
+    assert all(fate.known[1].position_m == (3.0, 4.0, 0.0) for fate in to_late)
+    assert not any(fate.reason for fate in run.fates.values())

@@ -6,7 +6,9 @@ import re
 import pytest
 
 from fieldkit.report.theme import FORMATS, Format
+from sim_backends.cosim.from_above import ObstacleOutline, last_heading, outlines
 from sim_backends.cosim.plots import Curve, FlowTrace, LogPanel, log_figure, run_figure
+from sim_backends.world.world import load_world
 
 MAGIC = {"svg": b"<?xml", "pdf": b"%PDF", "png": b"\x89PNG"}
 PANEL = LogPanel(
@@ -51,6 +53,31 @@ def test_each_curve_is_named_once_and_zero_has_a_line_of_its_own() -> None:
     assert said.count("0") == 2
     without = LogPanel("x", "x", "y", PANEL.curves[:2])
     assert "0" not in texts(log_figure([without], "svg"))
+
+
+def test_what_stands_around_is_drawn_and_ways_have_an_arrow() -> None:
+    plain = run_figure("a run", WAYS_M, FLOWS, "svg").decode()
+    wall = ObstacleOutline([(0.0, 1.0), (2.0, 1.0), (2.0, 1.2), (0.0, 1.2)], is_light=False)
+    around = run_figure("a run", WAYS_M, FLOWS, "svg", [wall]).decode()
+    assert around.count("<path") == plain.count("<path") + 1
+    assert texts(around.encode()) == texts(plain.encode()), "it changes no axis"
+    standing = run_figure("a run", {name: way[:1] for name, way in WAYS_M.items()}, FLOWS, "svg").decode()
+    assert plain.count("<path") > standing.count("<path"), "who stands heads nowhere"
+
+
+def test_arrows_point_where_agents_go_at_last() -> None:
+    there_and_back = [(0.0, 0.0), (0.0, 5.0), (0.0, 10.0), (0.0, 9.0), (0.0, 6.0)]
+    assert last_heading(there_and_back) == ((0.0, 9.0), (0.0, 6.0))
+    assert last_heading([*there_and_back, (0.0, 6.0)]) == ((0.0, 9.0), (0.0, 6.0)), "it stands at the end"
+    assert last_heading([(1.0, 1.0)]) is last_heading([(1.0, 1.0)] * 3) is None
+
+
+def test_the_park_has_its_house_light_below_the_roof_and_its_boxes_dark() -> None:
+    found = list(outlines(load_world("baylands")))
+    assert any(one.is_light for one in found)
+    assert any(not one.is_light for one in found)
+    park = load_world("baylands")
+    assert len(found) == sum(1 for obstacle in park.obstacles for _ in obstacle.parts())
 
 
 def test_labels_at_the_right_leave_the_axis_its_numbers() -> None:

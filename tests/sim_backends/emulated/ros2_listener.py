@@ -10,7 +10,7 @@ import time
 from typing import Any
 
 import rclpy
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import qos_profile_rosout_default, qos_profile_sensor_data
 
 LIMIT_S = 60.0
 DRIVEN_M = 0.1
@@ -49,10 +49,15 @@ def main(count: int, kinds: dict[str, str]) -> None:
             into.append(plain(message))
 
         node.create_subscription(message_type, topic, take, qos_profile_sensor_data)
+    logged: list[Any] = []
+    log_type = importlib.import_module("rcl_interfaces.msg").Log
+    node.create_subscription(log_type, "/rosout", lambda line: logged.append(plain(line)), qos_profile_rosout_default)
     deadline_s = time.monotonic() + LIMIT_S
 
     def missing() -> bool:
-        return min(map(len, heard.values())) < count or len(node.get_node_names()) < 2
+        about = {line["msg"] for line in logged}
+        lines = {f"{topic} has a subscriber" for topic in kinds}
+        return min(map(len, heard.values())) < count or len(node.get_node_names()) < 2 or not lines <= about
 
     while missing() and time.monotonic() < deadline_s:
         rclpy.spin_once(node, timeout_sec=0.1)
@@ -60,6 +65,11 @@ def main(count: int, kinds: dict[str, str]) -> None:
     nodes = [name for name in node.get_node_names() if name != "listener"]
     types = dict(node.get_topic_names_and_types())
     told = {
+        "logged": logged,
+        "rosout": [
+            (end.qos_profile.durability.name, end.qos_profile.lifespan.nanoseconds)
+            for end in node.get_publishers_info_by_topic("/rosout")
+        ],
         "heard": {topic: found[:count] for topic, found in heard.items()},
         "types": types,
         "hashes": {
@@ -69,6 +79,11 @@ def main(count: int, kinds: dict[str, str]) -> None:
         "latched": [one.qos_profile.durability.name for one in node.get_publishers_info_by_topic("/tf_static")],
         "driven_m": heard["/odom"][-1]["pose"]["pose"]["position"]["x"],
         "nodes": nodes,
+        "services_of_node": {
+            name: [service for service, _ in node.get_service_names_and_types_by_node(name, "/")]
+            for name in ("listener", *nodes)
+        },
+        "own_topics": [topic for topic, _ in node.get_publisher_names_and_types_by_node("listener", "/")],
         "of_node": {name: node.get_publisher_names_and_types_by_node(name, "/") for name in nodes},
     }
     sys.stdout.write(json.dumps(told) + "\n")

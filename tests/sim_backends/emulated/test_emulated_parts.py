@@ -28,6 +28,7 @@ from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_optio
 from sim_backends.emulated.provisioning import KeyPair, definition, robot_spec
 from sim_backends.emulated.robot import mounts, rootfs
 from sim_backends.emulated.ros import messages, tcpros
+from sim_backends.emulated.ros.laser import LaserTarget
 from sim_backends.emulated.ros.messages import Sensor
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
@@ -212,6 +213,10 @@ class TestRequirements:
             requirements.ros_in_use(RosChoice.DEBIAN)
 
 
+ROOM = LaserTarget(((2.0, 1.5), (-2.0, 1.5), (-2.0, -1.5), (2.0, -1.5)), 0.0, 0.0, 2.0)
+"""Around a robot in the origin, facing east."""
+
+
 class TestMessages:
     @pytest.mark.parametrize("kind", messages.GENERATORS)
     def test_every_type_reads_back_to_the_last_byte(self, kind: str) -> None:
@@ -239,7 +244,7 @@ class TestMessages:
         assert statistics.mean(imu.linear_acceleration.z for imu in imus) == pytest.approx(9.80665, abs=0.005)
 
     def test_a_scan_is_of_the_walls_of_the_room(self) -> None:
-        source = messages.Source(sensor(points=4))
+        source = messages.Source(sensor(points=4), [ROOM])
         scans = [read_back(source.message(number, 0), "sensor_msgs/LaserScan") for number in range(200)]
         means_m = [statistics.mean(float(scan.ranges[beam]) for scan in scans) for beam in range(4)]
         assert means_m == pytest.approx([2.0, 1.5, 2.0, 1.5], abs=0.01)
@@ -256,7 +261,7 @@ class TestMessages:
             messages.check(Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points))
 
     def test_a_scan_is_of_the_real_size_and_within_the_laser_s_range(self) -> None:
-        data = messages.Source(sensor()).message(0, 0)
+        data = messages.Source(sensor(), [ROOM]).message(0, 0)
         assert len(data) == 57 + 4 + 8 * 360  # facts, section 1: 57 + 8 per beam with a frame of 5 letters
         scan = read_back(data, "sensor_msgs/LaserScan")
         low_m, high_m = messages.LASER_RANGE_M

@@ -245,3 +245,13 @@ def test_who_drives_stays_on_the_ground_and_one_that_is_silent_stands(told: Told
     with mobility.watching():
         wait(lambda: told.now(Role.SENDER) == (7.5, 8.0, place[2]))
     assert told.calls[-1][1][CAST[Role.SENDER].name] == STILL
+
+
+def test_lasers_see_who_is_in_place_and_not_who_is_away(told: Told) -> None:
+    shown: list[Mapping[str, Vector]] = []
+    mobility = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None, show=shown.append)
+    mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
+    assert shown[-1] == told.calls[-1][0]
+    mobility.put_away(Role.RELAY)  # no radio reaches another one, but the others are where they were
+    assert told.calls[-1][0] == {}
+    assert shown[-1] == {name: place_m for name, place_m in shown[0].items() if name != CAST[Role.RELAY].name}

@@ -29,8 +29,8 @@ from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot import services
-from sim_backends.emulated.robot.ros2_relay import LATCHED
-from sim_backends.emulated.ros.messages import GRAVITY_M_S2, LASER_NOISE_M, ODOMETRY_VARIANCES, ROOM_HALF_M
+from sim_backends.emulated.ros import offered_qos
+from sim_backends.emulated.ros.messages import GRAVITY_M_S2, ODOMETRY_VARIANCES
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
@@ -96,7 +96,7 @@ def inside(up: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
 def listening(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Iterator[Iterator[Any]]:
     """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone hears."""
     told = {"address": up.robots[Role.RELAY].spec.ip, "node": "ears", **network}
-    quality = LATCHED if topic == "/tf_static" else PROFILES["sensor_data"]
+    quality = offered_qos.LATCHED if topic == "/tf_static" else PROFILES["sensor_data"]
     described = topics.describe(shipped(), topic, kind, quality, domain=0, node="ears")
     command = (sys.executable, str(WIRE_END), "hear", over, json.dumps(told), json.dumps(described))
     with subprocess.Popen(inside(up, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ears:
@@ -142,7 +142,33 @@ def test_a_real_ros_2_lists_the_topics_with_their_types_and_hashes(told: Mapping
 def test_a_real_ros_2_lists_the_node_and_what_is_its_own(told: Mapping[str, Any]) -> None:
     assert NODES[Role.SENDER] in told["nodes"]
     topics_of_node = {topic for topic, _ in told["of_node"][NODES[Role.SENDER]]}
-    assert topics_of_node == {*HEARD, "/tf", "/tf_static"}
+    assert topics_of_node == {*HEARD, "/tf", "/tf_static", "/rosout"}
+
+
+@pytest.mark.emulated
+def test_a_real_ros_2_reads_the_node_s_log(told: Mapping[str, Any]) -> None:
+    of_robot = NODES[Role.SENDER]
+    lines = [line for line in told["logged"] if line["name"] == of_robot]
+    assert {f"{topic} has a subscriber" for topic in HEARD} <= {line["msg"] for line in lines}
+    assert {line["level"] for line in lines} == {20}, "rcl_interfaces/msg/Log.INFO"
+    assert all(0 <= time.time() - line["stamp"]["sec"] < LONG_S for line in lines)
+    # Of the robot, and of the listener, which is rclpy's own.
+    assert told["rosout"] == [["TRANSIENT_LOCAL", 10_000_000_000]] * 2
+
+
+@pytest.mark.emulated
+def test_the_page_names_all_that_the_node_lacks(told: Mapping[str, Any]) -> None:
+    """Of what the node of rclpy that listens has by itself; a name of its own begins with that of the node."""
+    of_robot = NODES[Role.SENDER]
+    services_of_rclpy = {service.rpartition("/")[2] for service in told["services_of_node"]["listener"]}
+    assert {"list_parameters", "get_type_description"} <= services_of_rclpy
+    assert told["services_of_node"][of_robot] == []
+    topics_of_robot = {topic for topic, _ in told["of_node"][of_robot]}
+    lacking = services_of_rclpy | (set(told["own_topics"]) - topics_of_robot - {"/cmd_vel"})
+    page = (ROOT / "docs" / "add-a-robot.md").read_text(encoding="utf-8")
+    section = page.partition("### What its node lacks")[2].partition("\n## ")[0]
+    assert [name for name in sorted(lacking) if f"`{name}`" not in section] == []
+    assert "`/rosout`" in section
 
 
 @pytest.mark.emulated
@@ -156,7 +182,7 @@ def test_a_real_ros_2_hears_right_values_across_the_medium(
         assert all(0 <= time.time() - stamp_s < LONG_S for stamp_s in stamps_s), topic
     scan = heard["/scan"][0]
     assert scan["header"]["frame_id"] == "base_scan"
-    assert scan["ranges"][::90] == pytest.approx([*ROOM_HALF_M, *ROOM_HALF_M], abs=6 * LASER_NOISE_M)
+    assert scan["ranges"] == [math.inf] * 360, "the lawn has nothing within 3.5 m of the line"
     odom = heard["/odom"][0]
     assert (odom["header"]["frame_id"], odom["child_frame_id"]) == ("odom", "base_footprint")
     assert odom["pose"]["covariance"][:: 6 + 1] == list(ODOMETRY_VARIANCES)
@@ -236,7 +262,8 @@ def test_a_router_on_the_relay_brings_zenoh_together() -> None:
     with lab(cast(sender="zenoh"), ROUTER) as up:
         relay = up.robots[Role.RELAY].spec.ip
         scan = hears(up, "zenoh", "/scan", "sensor_msgs/LaserScan", discovery="router", server=relay)
-        assert np.isfinite(scan.ranges).all()
+        assert np.isinf(scan.ranges).all()
+        assert len(scan.ranges) == 360
 
 
 @pytest.mark.emulated

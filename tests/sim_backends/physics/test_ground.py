@@ -6,7 +6,7 @@ import pytest
 
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import GRAVITY_M_S2, Twist
-from sim_backends.physics.differential_drive import DifferentialDrive, DriveLimits
+from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive, DriveLimits
 from sim_backends.world.motion import State
 from tests.helpers.worlds import world
 
@@ -92,3 +92,22 @@ def test_the_sides_of_a_ramp_are_walls_and_edges() -> None:
     assert off.position_m == pytest.approx((10.0, 2.0, 1.0), abs=1e-6)
     against = driven(rover(10.0, -4.0, heading_deg=90.0), 5000, Twist(1.0))
     assert against.position_m == pytest.approx((10.0, -2.0 - 0.3, 0.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("off", [0.0, -1e-15, -1e-12, -1e-6, -0.01])
+@pytest.mark.parametrize("twist", [Twist(1.0), Twist(-1.0), Twist(0.5, 0.5), Twist(0.0, 1.0)])
+@pytest.mark.parametrize("heading_rad", [0.0, math.pi, 1.0])
+def test_a_ramp_that_takes_all_of_the_friction_is_driven_without_an_error(
+    off: float, twist: Twist, heading_rad: float
+) -> None:
+    """With nothing left of friction a speed cannot be changed; it may roll on."""
+    grade = HUSKY_A200.friction + off
+    hill = world({"name": "hill", "kind": "ramp", "centre_m": (5, 0), "size_m": (10, 10, 10 * grade)})
+    bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (5.0, 0.0), heading_rad)}, hill)
+    place_m = bodies.advance(0, {})["a"].position_m
+    for number in range(1, 20):
+        state = bodies.advance(number * 50_000_000, {"a": twist})["a"]
+        assert all(map(math.isfinite, (*state.position_m, *state.velocity_m_s)))
+        assert math.hypot(*state.velocity_m_s) <= 1.0 + 1e-9
+    if not off and not twist.turn_rad_s and heading_rad == 0.0 and twist.forward_m_s > 0:
+        assert state.position_m == place_m, "up it does not get away"

@@ -12,10 +12,10 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol
 from fieldkit.core.prompts import DONE, NOBODY, UNKNOWN, Answer, Question
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.steps.base import View
 from fieldkit.steps.kinds.ask import AskStep
 from fieldkit.steps.kinds.wait import WaitStep
 from fieldkit.steps.scene import Scene
+from fieldkit.steps.view import View
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
 
@@ -117,17 +117,17 @@ def test_every_number_that_is_possible_is_read_again(value: float, unit: str) ->
 def test_an_answer_becomes_a_column_with_its_unit(tmp_path: Path) -> None:
     step = ask(WIND)
     view = answered(step, tmp_path / "a", Talkative("3.5"))
-    (column,) = step.declared()
+    (column,) = step.output_columns()
     assert (column.name, column.unit, column.possible) == ("wind", "m/s", (0.0, 40.0))
     assert step.measure(view).values == {"wind": 3.5}
-    assert list(step.in_words({"wind": 3.5})) == ["wind 3.5 m/s"]
-    assert not list(step.problems(view))
+    assert list(step.summary({"wind": 3.5})) == ["wind 3.5 m/s"]
+    assert not list(step.check(view))
 
 
 def test_a_word_stays_a_word(tmp_path: Path) -> None:
     step = ask(GRASS)
     assert step.measure(answered(step, tmp_path / "a", Talkative("2"))).values == {"grass": "wet"}
-    assert step.declared()[0].unit == "text"
+    assert step.output_columns()[0].unit == "text"
 
 
 def test_who_does_not_know_leaves_the_column_empty_and_the_repeat_valid(tmp_path: Path) -> None:
@@ -135,7 +135,7 @@ def test_who_does_not_know_leaves_the_column_empty_and_the_repeat_valid(tmp_path
         step = ask(WIND)
         view = answered(step, tmp_path / str(operator is None), operator)
         assert step.measure(view).missing == {"wind": "the operator did not know"}
-        assert not list(step.problems(view))
+        assert not list(step.check(view))
 
 
 def test_where_nobody_is_asked_the_usual_answer_stands(tmp_path: Path) -> None:
@@ -157,7 +157,7 @@ def test_a_question_is_asked_once_per_trial_or_in_each_repeat(tmp_path: Path, ea
 def test_a_file_that_answers_nothing_voids_the_repeat(tmp_path: Path, text: str) -> None:
     (tmp_path / "answer-wind.txt").write_text(text, encoding="utf-8")
     step, view = ask(WIND), View(SCENE, AttemptEvidence(tmp_path))
-    assert list(step.problems(view)) == ["answer-wind.txt does not say what the operator answered"]
+    assert list(step.check(view)) == ["answer-wind.txt does not say what the operator answered"]
     assert step.measure(view).missing
 
 
@@ -179,4 +179,4 @@ def test_a_wait_ends_with_its_time_or_with_the_operator_s_word() -> None:
     phases: list[tuple[str, float | None]] = []
     wait("duration: 1ms").run(SCENE, testbed, lambda *phase: phases.append(phase))
     assert phases == [("wait", 0.001)]
-    assert list(wait("duration: 2s").beside(SCENE)) == ["wait 2 s"]
+    assert list(wait("duration: 2s").dry_run_notes(SCENE)) == ["wait 2 s"]

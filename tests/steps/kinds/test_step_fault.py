@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.cli.commands.trial import in_shell
+from fieldkit.cli.dry_run import in_shell
 from fieldkit.config import schema
 from fieldkit.core import model
 from fieldkit.core.errors import ConfigurationError
@@ -46,7 +46,7 @@ def fault(text: str) -> FaultStep:
 
 
 def lines(step: FaultStep, scene: Scene = SCENE) -> list[tuple[Role, str]]:
-    return [(one.role, in_shell(one.job)) for one in step.commands(scene)]
+    return [(one.role, in_shell(one.job)) for one in step.jobs(scene)]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
-from fieldkit.steps.kinds import fly
+from fieldkit.steps import arming_need
 from fieldkit.steps.kinds.fly import FlyStep
 from fieldkit.steps.scene import Said, Scene
 from fieldkit.trial.procedure import Procedure
@@ -80,6 +80,14 @@ def test_who_cannot_fly_is_refused() -> None:
     assert "its profile does not say how high it may fly" in said
 
 
+def test_the_log_of_a_longer_flight_is_larger_and_is_on_the_drone_alone() -> None:
+    short, long = (step(f"robot: {DRONE}, height: 2m, path: [{{away: {far}m}}]") for far in (10, 910))
+    assert [role for role in CAST if long.bytes_left(SCENE, role)] == [DRONE]
+    # The way back takes 900 s more, and the log has ten lines a second, each of 100 to 250 bytes.
+    grown_bytes = long.bytes_left(SCENE, DRONE) - short.bytes_left(SCENE, DRONE)
+    assert 100 * 9000 < grown_bytes < 250 * 9000
+
+
 def test_a_real_one_needs_leave() -> None:
     (refusal,) = step(f"robot: {DRONE}, height: 1m").refusals(Scene(Protocol.TCP, CAST, "f"))
     assert refusal.what == "it is real, and fieldkit is to fly it"
@@ -112,7 +120,7 @@ def test_the_shipped_drones_say_their_limits() -> None:
     ],
 )
 def test_what_preflight_makes_of_the_answer(text: str, code: int, verdict: Verdict) -> None:
-    found, detail, remedy = fly._judged(Said(text, code))
+    found, detail, remedy = arming_need._judged(Said(text, code))
     assert found is verdict
     assert detail
     assert bool(remedy) == (verdict is not Verdict.OK)
@@ -121,11 +129,13 @@ def test_what_preflight_makes_of_the_answer(text: str, code: int, verdict: Verdi
 
 @given(st.text(max_size=200))
 def test_no_answer_ends_preflight(text: str) -> None:
-    assert fly._judged(Said(text, 0))[0] in Verdict
+    assert arming_need._judged(Said(text, 0))[0] in Verdict
 
 
 def test_its_autopilot_is_asked_for_what_it_flies() -> None:
-    (need,) = list(step(f"robot: {DRONE}, height: 2m, path: [{{away: 3m, left: 4m, up: 1m}}]").needs(SCENE))
+    link, need = step(f"robot: {DRONE}, height: 2m, path: [{{away: 3m, left: 4m, up: 1m}}]").needs(SCENE)
+    assert link.name == "MAVLink"
+    assert json.loads(link.argv[-1])["connection"] == json.loads(need.argv[-1])["connection"]
     told = json.loads(need.argv[-1])
     assert need.agent
     assert told["needs"] == {
@@ -160,9 +170,9 @@ steps: [{ping: {from: sender, to: receiver}}]
 
 def test_what_becomes_of_it_where_it_is_stopped_at_once_is_told() -> None:
     flight = step(f"robot: {DRONE}, height: 2m")
-    assert list(flight.cut_short(SCENE)) == [
+    assert list(flight.abort_notes(SCENE)) == [
         f"{CAST[DRONE].name} lands, if it is in the air: for up to about 37 s, also when fieldkit has ended"
     ]
     returns = Scene(Protocol.TCP, FREE, "f", on_abort={DRONE: OnAbort.RETURN})
-    (said,) = flight.cut_short(returns)
+    (said,) = flight.abort_notes(returns)
     assert "returns by itself" in said

@@ -15,15 +15,15 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import tlog_reader
 from fieldkit.measure.evidence.track import Apart
+from fieldkit.measure.motion import tlog_reader
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions import accounts, trajectories, where
 from fieldkit.measure.positions.accounts import Account, Accounts
 from fieldkit.measure.positions.samples import WGS84
-from fieldkit.steps.base import View
 from fieldkit.steps.kinds.mavlink import MavlinkStep
 from fieldkit.steps.scene import Flow, Scene
+from fieldkit.steps.view import View
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
 from tests.helpers.drones import START_US, Sender, beat, flight, stamped
@@ -63,11 +63,11 @@ def test_what_does_not_fit_is_refused_with_a_sentence(more: str, complaint: str)
 
 def test_a_robot_without_an_autopilot_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="has no mavlink"):
-        list(mavlink().commands(replace(SCENE, cast=CAST)))
+        list(mavlink().jobs(replace(SCENE, cast=CAST)))
 
 
 def told(step: MavlinkStep, scene: Scene = SCENE) -> tuple[Role, dict[str, object]]:
-    recording, _ = step.commands(scene)
+    recording, _ = step.jobs(scene)
     return recording.role, json.loads(recording.job.argv[-2])
 
 
@@ -131,7 +131,7 @@ LOCAL = "positions: local, facing: left"
 def test_its_own_frame_is_turned_into_that_of_the_placement(tmp_path: Path) -> None:
     """It looks north and to the left, and flies ahead: at 10 m, then along a line that is square to the link."""
     view = attempt(tmp_path, mavlink(LOCAL), flight(10, 1.0))
-    assert not list(mavlink(LOCAL).problems(view))
+    assert not list(mavlink(LOCAL).check(view))
     found = apart(view, 1, 9)
     assert found.distance_start_m == pytest.approx(math.hypot(10, 1), abs=1e-3)
     assert found.distance_max_m == pytest.approx(math.hypot(10, 9), abs=1e-3)
@@ -165,7 +165,7 @@ def test_degrees_stand_beside_a_place_on_the_earth(tmp_path: Path) -> None:
         place = d.MAVLink_global_position_int_message(at_ms, north, 0, 30_000, 3_000, 100, 0, 0, 0)
         frames.append((at_ms * 1_000, sender.frame(place)))
     view = attempt(tmp_path, step, stamped(frames), said={"frames": 102})
-    assert not list(step.problems(view))
+    assert not list(step.check(view))
     told = Account(place=(0.0, 0.0, 0.0), frame=WGS84)
     robots = {**accounts.read(tmp_path / accounts.FILE).robots, Role.SENDER: told}
     (tmp_path / accounts.FILE).write_text(accounts.text(Accounts(robots, heights=True)), encoding="utf-8")
@@ -189,7 +189,7 @@ def test_a_log_that_is_not_whole_voids_the_repeat(
     log: bytes, said: dict[str, object], problem: str, tmp_path: Path
 ) -> None:
     step = mavlink(f"{LOCAL}, rates: {{SYS_STATUS: 1Hz}}")
-    problems = list(step.problems(attempt(tmp_path, step, log, said=said)))
+    problems = list(step.check(attempt(tmp_path, step, log, said=said)))
     assert any(problem in one for one in problems), problems
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.backends.protocols import Cast, Testbed
-from fieldkit.cli.commands.trial import in_shell, print_commands
+from fieldkit.cli.dry_run import in_shell, print_commands
 from fieldkit.config import schema
 from fieldkit.config.profiles import load_profile
 from fieldkit.core import geometry, model
@@ -87,8 +87,8 @@ def test_the_lab_is_asked_for_metres_and_seconds() -> None:
     assert geometry.length_m(step.motion) == pytest.approx(2005.0)
     assert geometry.in_words(step.motion) == "2000 m towards, then 3 m away and 4 m right, at 1 m/s"
     assert step.roles() == {Role.SENDER, Role.RECEIVER}
-    assert [in_shell(one.job) for one in step.commands(SCENE)] == [
-        in_shell(one.job) for one in step.during[0].step.commands(SCENE)
+    assert [in_shell(one.job) for one in step.jobs(SCENE)] == [
+        in_shell(one.job) for one in step.during[0].step.jobs(SCENE)
     ]
 
 
@@ -133,7 +133,7 @@ def test_steps_run_while_the_robot_moves_and_their_error_ends_it() -> None:
 
 def test_the_dry_run_shows_what_no_command_does(capsys: pytest.CaptureFixture[str]) -> None:
     shipped = load_procedure("driveaway")
-    print_commands(los_plan().model_copy(update={"procedure": shipped.fitted(CAST)}))
+    print_commands(los_plan().model_copy(update={"procedure": shipped.resolved(CAST)}))
     said = capsys.readouterr().out.splitlines()
     assert "# while steps run: turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.1 s" in said
     assert not any("refused" in line for line in said)
@@ -144,7 +144,7 @@ def test_the_dry_run_shows_what_no_command_does(capsys: pytest.CaptureFixture[st
 
 
 def fitted(text: str, cast: Cast = CAST) -> MoveStep:
-    return move(text).fitted(cast)
+    return move(text).resolved(cast)
 
 
 def test_a_robot_within_its_limits_goes_as_fast_and_as_far_as_it_may() -> None:
@@ -191,22 +191,22 @@ def test_the_one_that_ships_runs_with_what_a_lab_has(
 
 def test_who_names_no_speed_goes_at_the_top_speed() -> None:
     step = move(f"robot: receiver, path: [{{away: 1m}}], {PING}")
-    assert step.fitted(CAST).motion.speed_m_s == 0.22
+    assert step.resolved(CAST).motion.speed_m_s == 0.22
     with pytest.raises(ValueError, match="not fitted"):
         _ = step.motion
 
 
 def test_what_is_made_less_is_said() -> None:
     text = f"robot: receiver, path: [{{away: 40m}}], within_limits: true, {PING}"
-    assert list(move(text).shortened(CAST)) == [
+    assert list(move(text).adjustments(CAST)) == [
         "turtlebot-2 moves 29.5 m away, at 0.22 m/s; 40 m away, at 0.22 m/s is beyond its limits"
     ]
-    assert not list(move(text.replace("40m", "30m")).shortened(CAST))
-    assert not list(move(text.replace("within_limits: true, ", "")).shortened(CAST))
+    assert not list(move(text.replace("40m", "30m")).adjustments(CAST))
+    assert not list(move(text.replace("within_limits: true, ", "")).adjustments(CAST))
 
 
 def test_a_plan_reads_back_what_it_says() -> None:
-    plan = los_plan().model_copy(update={"procedure": load_procedure("driveaway").fitted(CAST)})
+    plan = los_plan().model_copy(update={"procedure": load_procedure("driveaway").resolved(CAST)})
     again = schema.validate(schema.parse(schema.dump(plan.procedure), source="trial.yaml"), Procedure)
     assert again == plan.procedure
     assert "within_limits" not in schema.dump(again)
@@ -249,6 +249,10 @@ def test_a_robot_that_drives_has_columns_of_it_and_its_way_back_takes_time() -> 
     text = f"robot: receiver, path: [{{away: 2m}}], speed: 0.2m/s, {PING}"
     drives = {role: robot.model_copy(update={"drives": True}) for role, robot in CAST.items()}
     by_itself, moved = fitted(text, drives), fitted(text)
-    assert {column.name for column in by_itself.declared()} >= {"drive_out_m", "drive_back_off_m", "drive_ended"}
-    assert not moved.declared()
+    assert {column.name for column in by_itself.output_columns()} >= {
+        "drive_out_m",
+        "drive_back_off_m",
+        "drive_ended",
+    }
+    assert not moved.output_columns()
     assert by_itself.expected_s(Protocol.UDP) == moved.expected_s(Protocol.UDP) + 10.0

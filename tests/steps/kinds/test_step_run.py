@@ -1,25 +1,27 @@
 """A step `run`: what the robot is told, what of it is refused, what its output is worth."""
 
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fieldkit.cli.commands.trial import in_shell
+from fieldkit.cli.dry_run import in_shell
 from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.model import Distance, Placement, Protocol, Role, Scenario, Topology
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import printed
 from fieldkit.remote import jobs
 from fieldkit.remote.shell import Completed
-from fieldkit.steps.base import View
 from fieldkit.steps.kinds.run import RunStep
 from fieldkit.steps.scene import Scene
+from fieldkit.steps.view import View
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.paths import ROOT
 from tests.helpers.userlands import USERLANDS, LocalShell, path_of
 
 SCENE = Scene(Protocol.TCP, CAST, "folder")
@@ -42,25 +44,50 @@ def run_step(text: str) -> RunStep:
 
 
 def test_words_are_those_of_a_shell_and_addresses_are_filled_in() -> None:
-    (planned,) = run_step(BATTERY).commands(SCENE)
+    (planned,) = run_step(BATTERY).jobs(SCENE)
     assert planned.role == Role.RECEIVER
     assert planned.program == "vendorctl"
-    assert planned.job.argv[3:] == ("sh", "1048576", "vendorctl", "of the", "10.42.0.1", "--json")
+    assert planned.job.argv == ("vendorctl", "of the", "10.42.0.1", "--json")
     assert (planned.job.stdout, planned.job.log, planned.job.limit_s) == ("battery.json", "receiver-run.log", 5.0)
-    assert in_shell(planned.job).endswith(
-        "sh 1048576 vendorctl 'of the' 10.42.0.1 --json > battery.json 2> receiver-run.log"
+    assert in_shell(planned.job) == (
+        "vendorctl 'of the' 10.42.0.1 --json > battery.json 2> receiver-run.log  # at most 1048576 bytes of each"
     )
     assert run_step(BATTERY).roles() == {Role.RECEIVER, Role.SENDER}
 
 
 def test_a_shell_has_no_say_in_words() -> None:
-    (planned,) = run_step("{robot: sender, argv: [echo, '$HOME; rm *', '{print}', '|']}").commands(SCENE)
+    (planned,) = run_step("{robot: sender, argv: [echo, '$HOME; rm *', '{print}', '|']}").jobs(SCENE)
     assert planned.job.argv[-4:] == ("echo", "$HOME; rm *", "{print}", "|")
+
+
+def test_distance_repeat_and_the_copied_program_are_filled_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "probe").write_text("x", encoding="utf-8")
+    (tmp_path / "probe").chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    step = run_step(
+        "{robot: sender, put: probe, name: a, command: '{put} --at={distance} {repeat} {address.sender}'}"
+    )
+    placement = Placement(Scenario.LOS, Topology.MASTERLESS, Distance(9.144, "30ft"))
+    (planned,) = step.jobs(replace(SCENE, placement=placement, repeat=7))
+    assert planned.job.argv == (".put/a.run/probe", "--at=30ft", "7", "10.42.0.1")
+    assert planned.program == "sh", "preflight cannot find what is not copied yet"
+    assert planned.put is not None
+    assert (planned.put.role, planned.put.at, planned.put.program) == (Role.SENDER, ".put/a.run/probe", step.put)
+    assert step.files() == ("a.run.txt", "a.sender-run.log"), "the copy is not fetched"
 
 
 @pytest.mark.parametrize(
     ("text", "line", "why"),
     [
+        ("robot: sender\ncommand: a {distanse}", 2, "no variable {distanse}; did you mean '{distance}'"),
+        ("robot: sender\nargv:\n- a\n- '{repeats}'", 4, "no variable {repeats}; did you mean '{repeat}'"),
+        ("robot: sender\ncommand: 'a-{repeat} b'", 2, "the program cannot depend on a variable"),
+        ("robot: sender\ncommand: 'sh {put}'", 2, "there is no put:"),
+        ("robot: sender\ncommand: sh\nput: LICENSE", 3, "nothing runs LICENSE: write {put} in the command"),
+        ("robot: sender\ncommand: '{put}'\nput: LICENSE", 3, "LICENSE is not executable: chmod"),
+        ("robot: sender\ncommand: '{put}'\nput: no-such", 3, "there is no file 'no-such'"),
         ("robot: sender", 1, "one of them"),
         ("robot: sender\ncommand: a\nargv: [a]", 1, "one of them"),
         ("robot: sender\ncommand: echo 'a", 2, "cannot be split into words"),
@@ -79,14 +106,17 @@ def test_a_shell_has_no_say_in_words() -> None:
         ("robot: sender\ncommand: a\nexpect: {code: []}", 3, "at least 1"),
     ],
 )
-def test_what_cannot_be_run_or_read_is_refused_at_its_line(text: str, line: int, why: str) -> None:
+def test_what_cannot_be_run_or_read_is_refused_at_its_line(
+    text: str, line: int, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
     with pytest.raises(ConfigurationError, match=why) as caught:
         run_step(text)
     assert caught.value.where == f"run.yaml:{line}"
 
 
 def test_its_columns_are_those_that_the_procedure_declares() -> None:
-    volts, mode = run_step(BATTERY).declared()
+    volts, mode = run_step(BATTERY).output_columns()
     assert (volts.name, volts.unit, volts.meaning) == ("volts", "V", "Of the battery.")
     assert (mode.unit, mode.type) == ("text", str)
     assert RunStep.columns == (), "no other trial has them"
@@ -97,18 +127,18 @@ def judged(folder: Path, output: str | None, *, after: str = "") -> tuple[dict[s
         (folder / "battery.json").write_text(output, encoding="utf-8")
     (folder / "receiver-after.txt").write_text(after, encoding="utf-8")
     view, step = View(SCENE, AttemptEvidence(folder)), run_step(BATTERY)
-    return dict(step.measure(view).values), list(step.problems(view))
+    return dict(step.measure(view).values), list(step.check(view))
 
 
 def test_values_are_read_and_told(tmp_path: Path) -> None:
     values, problems = judged(tmp_path, '{"cells": [{"V": 3.75}], "mode": "auto"}')
     assert (values, problems) == ({"volts": 3.75, "mode": "auto"}, [])
-    assert list(run_step(BATTERY).in_words(values)) == ["battery 3.75 V", "mode auto"]
+    assert list(run_step(BATTERY).summary(values)) == ["battery 3.75 V", "mode auto"]
 
 
 def test_what_is_true_or_false_is_said_as_it_stands_in_the_table() -> None:
     step = run_step("{robot: sender, command: a, columns: [{name: up, unit: bool, json: up}]}")
-    assert list(step.in_words({"up": False})) == ["up false"]
+    assert list(step.summary({"up": False})) == ["up false"]
 
 
 @pytest.mark.parametrize(
@@ -152,9 +182,9 @@ def test_an_exit_code_that_nobody_expects_fails_the_attempt(monkeypatch: pytest.
 
 
 def ran(home: Path, userland: str, script: str) -> Completed:
-    (planned,) = RunStep.model_validate({"robot": "sender", "argv": ["sh", "-c", script]}).commands(SCENE)
+    (planned,) = RunStep.model_validate({"robot": "sender", "argv": ["sh", "-c", script]}).jobs(SCENE)
     robot = LocalShell(home, path_of(userland, home / "bin"))
-    return robot.run(planned.job.argv, deadline=Deadline.after(60.0), check=False)
+    return robot.run(jobs.limited_argv(planned.job), deadline=Deadline.after(60.0), check=False)
 
 
 @pytest.mark.parametrize("userland", USERLANDS)

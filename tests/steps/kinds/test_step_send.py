@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.cli.commands.trial import in_shell
+from fieldkit.cli.dry_run import in_shell
 from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
@@ -44,14 +44,14 @@ def test_the_generator_is_the_minimal_standard() -> None:
 @pytest.mark.parametrize("userland", USERLANDS)
 @pytest.mark.parametrize(("seed", "size"), [(1, 1), (1, 64), (7, 1000), (2**31 - 2, 1_234), (42, 100_001)])
 def test_bytes_made_up_are_the_same_on_every_robot(tmp_path: Path, userland: str, seed: int, size: int) -> None:
-    make = next(send(f"size: {size}B, seed: {seed}").commands(SCENE))
+    make = next(send(f"size: {size}B, seed: {seed}").jobs(SCENE))
     robot = LocalShell(tmp_path, path_of(userland, tmp_path / "bin"))
     done = robot.run(make.job.argv, deadline=Deadline.after(60.0))
     assert done.stdout == park_miller(seed, size)
 
 
 def test_what_both_robots_are_told() -> None:
-    make, listen, netcat = send("size: 2MB, port: 4000").commands(SCENE)
+    make, listen, netcat = send("size: 2MB, port: 4000").jobs(SCENE)
     assert (make.role, make.program, make.job.stdout) == (Role.SENDER, "awk", "send.bin")
     assert make.job.argv[:5] == ("awk", "-v", "seed=1", "-v", "bytes=2000000")
     assert in_shell(listen.job) == "nc.traditional -u -l -p 4000 -w 2 > recv.bin 2> receiver-listen.log"
@@ -60,7 +60,7 @@ def test_what_both_robots_are_told() -> None:
 
 def test_a_name_stands_before_all_that_it_leaves() -> None:
     step = send("size: 2MB, name: up")
-    assert [one.job.name for one in step.commands(SCENE)] == ["up.make", "up.listen", "up.send"]
+    assert [one.job.name for one in step.jobs(SCENE)] == ["up.make", "up.listen", "up.send"]
     assert all(name.startswith("up.") for name in step.files())
     assert {"up.send.bin", "up.recv.bin", "up.sender-make.log"} < set(step.files())
 
@@ -71,7 +71,7 @@ def test_a_name_stands_before_all_that_it_leaves() -> None:
 )
 def test_a_file_is_copied_from_where_it_lies(tmp_path: Path, file: str, copied: str) -> None:
     step = send(f"size: 1kB, file: '{file}'")
-    make = next(step.commands(SCENE))
+    make = next(step.jobs(SCENE))
     assert make.job.argv[3:] == ("sh", copied, "send.bin")
     assert make.program == "cp"
     if not copied.startswith("/"):
@@ -129,7 +129,7 @@ def test_room_is_reserved_on_both_robots_and_packets_are_as_many() -> None:
     (flow,) = step.flows(SCENE)
     assert flow.port == 1234
     assert flow.frames == pytest.approx(6 * 3e6 / 8192)
-    assert step.declared() == COLUMNS
+    assert step.output_columns() == COLUMNS
     assert not list(step.refusals(SCENE))
 
 

@@ -13,9 +13,10 @@ from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import Nest, Step, StepEntry
+from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.kinds.together import MOST, TogetherStep
 from fieldkit.steps.kinds.transfer import TransferStep
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Planned, RecordedFile, Scene
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
@@ -34,14 +35,14 @@ class Says(Step):
 
     says: str
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         argv = ("sh", "-c", self.says)
         yield Planned(
             Role.SENDER, Job(scene.folder, self.own_name("says"), argv, limit_s=60, log=self.files()[0]), "sh"
         )
 
     def run(self, scene: Scene, testbed: IdleTestbed, announce: Announce) -> None:  # type: ignore[override]
-        (planned,) = self.commands(scene)
+        (planned,) = self.jobs(scene)
         announce(self.name, None)
         if code := jobs.run(testbed.shells[Role.SENDER], planned.job):
             raise RobotError(f"{self.name} ended with {code}")
@@ -52,7 +53,7 @@ class Says(Step):
     def expected_s(self, protocol: Protocol) -> float:
         return float(len(self.name))
 
-    def claims(self) -> tuple[str, ...]:
+    def exclusive_resources(self) -> tuple[str, ...]:
         return ()
 
     def files(self) -> tuple[str, ...]:
@@ -64,7 +65,7 @@ class Quiet(Nest):
 
     during: tuple[StepEntry, ...]
 
-    def commands(self, scene: Scene) -> Iterator[Planned]:
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
         return self.inside(scene)
 
     def run(self, scene: Scene, testbed: IdleTestbed, announce: Announce) -> None:  # type: ignore[override]
@@ -77,7 +78,7 @@ class Quiet(Nest):
     def expected_s(self, protocol: Protocol) -> float:
         return self.inside_s(protocol)
 
-    def claims(self) -> tuple[str, ...]:
+    def exclusive_resources(self) -> tuple[str, ...]:
         return ()
 
     def files(self) -> tuple[str, ...]:
@@ -222,7 +223,7 @@ def test_an_interrupt_ends_a_wait_that_another_thread_is_in(robots: IdleTestbed)
 def test_it_takes_as_long_as_the_longest_and_says_what_it_does() -> None:
     step = together(a="", long="", longest="")
     assert step.expected_s(Protocol.TCP) == len("longest")
-    assert list(step.beside(Scene(Protocol.TCP, CAST, FOLDER))) == [
+    assert list(step.dry_run_notes(Scene(Protocol.TCP, CAST, FOLDER))) == [
         "at the same time: says a, says long, says longest"
     ]
     assert step.roles() == {Role.SENDER}

@@ -65,7 +65,7 @@ def test_nobody_sends_to_himself() -> None:
 
 
 def test_what_robots_are_told() -> None:
-    subscribe, publish = topics("name: a, bytes: 500B, rate: 20Hz, qos: {profile: sensor_data}").commands(SCENE)
+    subscribe, publish = topics("name: a, bytes: 500B, rate: 20Hz, qos: {profile: sensor_data}").jobs(SCENE)
     head = ("bash", "-c", '. /opt/ros/noetic/setup.bash && exec "$@"', "bash", "python3", agent.path_from_job())
     for one, verb, role in ((subscribe, "subscribe", Role.RECEIVER), (publish, "publish", Role.SENDER)):
         assert (one.role, one.program, one.job.name) == (role, "python3", f"a.{verb}")
@@ -82,9 +82,9 @@ def test_what_robots_are_told() -> None:
 
 
 def test_who_serves_comes_first() -> None:
-    serve, *_ = topics("over: zenoh, discovery: router").commands(SCENE)
+    serve, *_ = topics("over: zenoh, discovery: router").jobs(SCENE)
     assert (serve.role, serve.job.argv[6]) == (Role.RELAY, "route")
-    master, subscribe, _ = topics("over: ros1").commands(SCENE)
+    master, subscribe, _ = topics("over: ros1").jobs(SCENE)
     relay = CAST[Role.RELAY].address
     words = ("env", f"ROS_IP={relay}", f"ROS_HOSTNAME={relay}", "rosmaster", "--core", "-p", "11626")
     assert master.job.argv[4:] == words
@@ -93,7 +93,7 @@ def test_who_serves_comes_first() -> None:
 
 def test_a_capture_takes_what_goes_to_everybody_too() -> None:
     text = "{robots: [sender], during: [topics: {from: sender, to: receiver, over: zenoh}]}"
-    capture, *_ = schema.validate(schema.parse(text, source="x"), CaptureStep).commands(SCENE)
+    capture, *_ = schema.validate(schema.parse(text, source="x"), CaptureStep).jobs(SCENE)
     one, other = (CAST[role].address for role in (Role.SENDER, Role.RECEIVER))
     assert capture.job.argv[-1] == (
         f"((host {one} and host {other}) or (src host {other} and dst host 224.0.0.224) or "
@@ -125,7 +125,7 @@ def test_every_domain_has_ports_of_its_own() -> None:
 
 
 def settings(keys: str) -> dict[str, str]:
-    *_, publish = topics(keys).commands(SCENE)
+    *_, publish = topics(keys).jobs(SCENE)
     told: dict[str, str] = json.loads(publish.job.argv[7])["network"]["settings"]
     return told
 
@@ -148,7 +148,7 @@ def test_one_datagram_of_what_is_tuned_is_one_packet() -> None:
 
 
 def ros2(keys: str) -> tuple[str, ...]:
-    *_, publish = topics(f"over: ros2, {keys}").commands(SCENE)
+    *_, publish = topics(f"over: ros2, {keys}").jobs(SCENE)
     return publish.job.argv
 
 
@@ -160,7 +160,7 @@ def test_ros_2_runs_with_the_robots_own_environment_and_the_settings() -> None:
     scene = Scene(Protocol.UDP, {**CAST, Role.SENDER: robot}, ".fieldkit/t/a")
     step = topics("over: ros2, discovery: peers, settings: {RMW_IMPLEMENTATION: rmw_b}")
     need, _ = step.needs(scene)
-    *_, publish = step.commands(scene)
+    *_, publish = step.jobs(scene)
     for words in (need.argv, publish.job.argv):
         assert words[4:8] == ("env", "RMW_IMPLEMENTATION=rmw_b", "A=b c", "python3")
     network = json.loads(publish.job.argv[10])["network"]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.core import runtime
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, LockLostError, RobotError
 from fieldkit.core.events import Event, Note
@@ -372,7 +373,7 @@ def test_a_robot_that_cannot_be_reached_keeps_no_other_from_being_aborted(cast: 
 
 
 def test_the_user_of_this_machine_has_a_name() -> None:
-    user, _, machine = locks.me().partition("@")
+    user, _, machine = runtime.me().partition("@")
     assert user
     assert machine
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from fieldkit.backends.protocols import Cast, Testbed
+from fieldkit.core import runtime
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError
 from fieldkit.core.events import Event, Note, Sink
 from fieldkit.core.model import Topology
@@ -102,7 +103,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
             made.note(f"run_{plan.distance}")
             return Outcome(out / plan.trial, (), 2, 0)
 
-        def resume_trial(folder: Path, testbed: Testbed, sink: Sink, stop: Stop) -> Outcome:
+        def resume_trial(folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, failed: bool) -> Outcome:
             assert testbed is TESTBED
             made.note("resume")
             return Outcome(folder, (), 2, 0)
@@ -133,7 +134,7 @@ def test_trials_run_one_after_the_other_on_robots_opened_once(
     begun = ["open", "meet", "hold", "run_10ft", "run_20ft", "run_30ft"]
     assert made.done == [*begun, "hold ends", "open ends"]
     assert [one and one.valid for one in ended] == [2, 2, 2]
-    assert made.holder == Holder(plans()[0].session, locks.me(), plans()[0].trial)
+    assert made.holder == Holder(plans()[0].session, runtime.me(), plans()[0].trial)
     assert out.is_dir()
     assert notes(made) == []
 
@@ -182,7 +183,7 @@ def test_nothing_is_opened_for_a_folder_that_cannot_be_written(
 
 
 def resume(made: Recorder, folder: Path, backend: str = "field") -> Outcome | None:
-    return opening.resume(folder, backend, made, sink=made.told.append, operator=Nobody(), stop=Stop())
+    return opening.resume(folder, backend, made, failed=False, sink=made.told.append, operator=Nobody(), stop=Stop())
 
 
 def test_a_trial_is_resumed_by_the_same_way(recorder: Callable[..., Recorder], tmp_path: Path) -> None:
@@ -190,7 +191,7 @@ def test_a_trial_is_resumed_by_the_same_way(recorder: Callable[..., Recorder], t
     folder = store.create(tmp_path, plan)
     assert resume(made, folder) == Outcome(folder, (), 2, 0)
     assert made.done == ["open", "meet", "hold", "resume", "hold ends", "open ends"]
-    assert made.holder == Holder(plan.session, locks.me(), plan.trial)
+    assert made.holder == Holder(plan.session, runtime.me(), plan.trial)
 
 
 def test_a_trial_of_another_backend_is_refused_before_anything_is_opened(

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.model import Role
 from fieldkit.trial import store
-from fieldkit.trial.procedure import load_procedure
+from fieldkit.trial.procedure import Procedure, load_procedure
 from fieldkit.trial.running import resumption
 from tests.helpers.stored_trials import TRIALS
 
@@ -56,3 +57,21 @@ def test_a_robot_that_drove_by_itself_needs_leave_again() -> None:
     # What the lab lets it do is no matter where nobody moves it, or a person did.
     resumption.demand_cast(PLAN.model_copy(update={"cast": driving}), by_hand)
     resumption.demand_cast(plan.model_copy(update={"cast": by_hand}), driving)
+
+
+def test_a_trial_whose_program_has_changed_does_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    program = tmp_path / "probe"
+    program.write_bytes(b"1")
+    text = "{name: p, summary: x, scenario: los, topology: master, protocols: [udp], repeats: 1, steps: [together: {"
+    text += "during: [run: {robot: sender, put: probe, command: 'sh {put}'}, ping: {from: sender, to: receiver}]}]}"
+    procedure = schema.validate(schema.parse(text, source="p.yaml"), Procedure)
+    folder = tmp_path / "trial"
+    folder.mkdir()
+    plan = PLAN.model_copy(update={"procedure": procedure})
+    (folder / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
+    monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
+    assert [put.at for put in resumption.resumable(folder).puts()] == [".put/run/probe"]
+    program.write_bytes(b"2")
+    with pytest.raises(ConfigurationError, match="probe: the program has changed since the procedure was read"):
+        resumption.resumable(folder)

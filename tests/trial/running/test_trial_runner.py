@@ -10,8 +10,8 @@ import pytest
 
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError, LockLostError, RobotError
-from fieldkit.core.events import Event, Note, RepeatEnded
-from fieldkit.core.model import RepeatId, Role, Status
+from fieldkit.core.events import Event, ExpectationJudged, Note, RepeatEnded, TrialEnded
+from fieldkit.core.model import Protocol, RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, manifest, store
 from fieldkit.trial.gates import Judged
@@ -23,6 +23,7 @@ from fieldkit.trial.running.robots import Robots, unfetched_file
 from fieldkit.trial.running.runner import resume_trial, run_trial
 from fieldkit.trial.running.stop import Stop
 from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.plans import write_states
 from tests.trial.test_trial_crash import PING, plan, robots_with_evidence
 
 STEP_S = 100.0
@@ -51,7 +52,7 @@ def only(folder: Path) -> Path:
     return found.parent
 
 
-def test_a_void_attempt_says_nothing_of_how_long_the_others_take(
+def test_the_time_left_is_that_of_repeats_that_are_over(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def clock() -> Iterator[float]:
@@ -63,8 +64,9 @@ def test_a_void_attempt_says_nothing_of_how_long_the_others_take(
     monkeypatch.setattr("fieldkit.trial.running.runner.time.monotonic", lambda: next(ticks))
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     void, first, second = ended(events)
-    assert (void.status, void.left_s) == (Status.VOID, of_two().expected_s())
-    assert (first.status, first.left_s) == (Status.VALID, STEP_S)
+    assert (void.status, void.left_s) == (Status.VOID, 2 * of_two().procedure.expected_s(Protocol.TCP))
+    assert first.status is Status.VALID
+    assert first.left_s == first.left_most_s >= STEP_S, "as long as the one that is over, void attempts included"
     assert second.left_s == 0
 
 
@@ -244,6 +246,7 @@ def test_an_attempt_that_is_stopped_while_it_is_fetched_is_fetched_by_who_goes_o
     def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
         fetched.append(remote)
         (into / "ping.txt").write_text(PING, encoding="utf-8")
+        write_states(into)
         return []
 
     monkeypatch.setattr(Robots, "fetch", fetch)
@@ -364,3 +367,22 @@ def test_a_trial_begun_with_another_version_of_a_package_that_adds_steps_is_not_
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.1"})
     with pytest.raises(ConfigurationError, match=r"begun by other code \(lab-steps 1\.0\)"):
         resumable(folder)
+
+
+def test_each_expectation_is_judged_before_the_trial_ends(tmp_path: Path, events: list[Event]) -> None:
+    expect = ("rtt_loss < 20 % of all packets", "udp rtt_loss < 1 %")
+    procedure = plan().procedure.model_copy(update={"expect": expect})
+    outcome = run_trial(of_two().model_copy(update={"procedure": procedure}), IdleTestbed(), tmp_path, events.append)
+    assert outcome is not None
+    *_, first, second, last = events
+    assert isinstance(first, ExpectationJudged)
+    assert isinstance(second, ExpectationJudged)
+    assert isinstance(last, TrialEnded)
+    assert (first.expectation, first.protocol, first.ruling) == (expect[0], "tcp", outcome.judgements[0].ruling)
+    assert (first.n, first.n_valid, first.n_censored) == (2, 2, 0)
+    assert (second.protocol, second.ruling, second.why, second.n_valid) == (
+        "udp",
+        "undecided",
+        "no repeat has ended",
+        0,
+    )

@@ -1,6 +1,8 @@
 """A recording is the run that it was, whenever and however that ended."""
 
+import errno
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -19,6 +21,7 @@ from scapy.utils import RawPcapReader
 
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from sim_backends.cosim.comparison import errors
+from sim_backends.cosim.federate_errors import FederateError
 from sim_backends.cosim.policies.base import Situation, SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -28,12 +31,11 @@ from sim_backends.cosim.policies.velocity_aware import VelocityAware
 from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
 from sim_backends.cosim.recording import tables
 from sim_backends.cosim.recording.manifest import RunEnding, read_manifest, write_manifest
-from sim_backends.cosim.recording.recorder import RunRecorder
+from sim_backends.cosim.recording.recorder import RecordingError, RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
-from sim_backends.cosim.watchdog import FederateError
 from tests.helpers.passing_robots import ABOUT, MS, passing_robots
 from tests.helpers.paths import ROOT
 
@@ -165,6 +167,41 @@ def test_a_disk_that_is_full_ends_the_run_and_leaves_what_was_there(tmp_path: Pa
     found = read_recording(tmp_path / "run")
     assert found.manifest.ending is RunEnding.FAILED
     assert "File too large" in found.manifest.why
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("size", ["1300k", "3m"])
+def test_a_full_disk_is_named_and_what_it_holds_is_kept(tmp_path: Path, size: str, untouched: object) -> None:
+    """Captures fill it; packets, which come after them, get what was set aside."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "full", disk], check=True)
+    try:
+        command = [sys.executable, "-m", "fieldkit", "cosim", "run", "baylands", "--out", str(disk / "run")]
+        changes = [f"traffic.{number}.rate=1000Hz" for number in (0, 1)]
+        options = [option for change in changes for option in ("--set", change)]
+        done = subprocess.run(
+            [*command, *options], cwd=ROOT, capture_output=True, text=True, check=False, timeout=300
+        )
+        assert done.returncode == 2, done.stdout
+        assert "the recording cannot be written: No space left on device" in " ".join(done.stderr.split())
+        assert "Traceback" not in done.stderr
+        found = read_recording(disk / "run")
+        assert found.run.fates
+        assert found.manifest.ending is RunEnding.FAILED
+        assert "No space left on device" in found.manifest.why
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def test_a_disk_without_room_is_refused_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int, offset: int, length: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(RecordingError, match="No space left on device") as raised:
+        record(tmp_path / "run")
+    assert raised.value.remedy == "free some space"
 
 
 def test_who_fails_is_named_in_the_recording(tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ import jsonschema
 import pytest
 
 from fieldkit.config import schema
-from sim_backends.cosim.scenario.editor_schema import editor_schema, meanings
+from fieldkit.config.meanings import attributes
+from sim_backends.cosim.scenario.editor_schema import editor_schema
 from sim_backends.cosim.scenario.faults import JammerFault
 from sim_backends.cosim.scenario.loading import scenario_files
 
@@ -54,4 +55,4 @@ def test_every_key_says_what_it_means() -> None:
     for part in (SCHEMA, *SCHEMA["$defs"].values()):
         for key, value in part.get("properties", {}).items():
             assert value["description"].endswith("."), key
-    assert meanings(JammerFault)["to"] == "When it ends; left out, not before the run does."
+    assert attributes(JammerFault)["to"] == "When it ends; left out, not before the run does."

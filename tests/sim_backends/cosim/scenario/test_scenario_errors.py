@@ -43,7 +43,7 @@ WRONG = [
     ("name: sliding_window", "name: sliding", 5, "no sync policy 'sliding'; did you mean 'sliding_window'"),
     ("name: sliding_window", "name: best", 5, "policies: event_driven, .*, error_bounded"),
     ("window: 5ms", "window: 0ms", 5, "greater than 0"),
-    ("window: 5ms", "window: -5ms", 5, "'-5ms' is not a duration; write for example 15s or 15ms"),
+    ("window: 5ms", "window: -5ms", 5, "duration '-5ms' is below zero; write for example 15s or 15ms"),
     ("window: 5ms", "window: 5", 5, "'5' has no unit; write for example 5s or 5ms"),
     ("window: 5ms", "window: 0.5ms", 5, "window of 0.0005 s is shorter than the physics' own step of 0.001 s"),
     (
@@ -164,6 +164,37 @@ def test_a_scenario_that_is_not_there_is_told_with_those_that_are() -> None:
         load_scenario("xyz")
     with pytest.raises(ConfigurationError, match=r"nowhere.yaml: cannot be read"):
         load_scenario("nowhere.yaml")
+
+
+ASKED_TOO_MUCH = [
+    ("husky", "kind: way-points, points_m: [[20, 10]], speed: 1.01m/s", "a speed of 1.01 m/s, and husky does 1 m/s"),
+    ("husky", "kind: velocity-profile, legs: [{duration: 1s, speed: 20m/s}]", "a speed of 20 m/s, .* does 1 m/s"),
+    (
+        "husky",
+        "kind: velocity-profile, legs: [{duration: 1s, turn_deg_s: -120}]",
+        "turn of 120 deg/s, .* 114.592 deg",
+    ),
+    ("iris", "kind: way-points, points_m: [[20, 10]], speed: 12.5m/s", "a speed of 12.5 m/s, .* does 12 m/s"),
+    ("iris", "kind: way-points, points_m: [[11, 10, 90]], speed: 4m/s", "a climb rate of 3.91.* m/s, .* does 3 m/s"),
+    ("iris", "kind: velocity-profile, legs: [{duration: 1s, climb_m_s: -2}]", "a sink rate of 2 m/s, .* 1.5 m/s"),
+]
+
+
+@pytest.mark.parametrize(("robot", "motion", "said"), ASKED_TOO_MUCH)
+def test_what_a_body_cannot_do_is_refused_and_not_clipped(robot: str, motion: str, said: str, tmp_path: Path) -> None:
+    text = SCENARIO.replace(
+        "robot: cart, at_m: [30, 10]", f"robot: {robot}, at_m: [30, 10],\n    motion: {{{motion}}}"
+    )
+    error = refused(text, tmp_path)
+    assert re.search(f"three is asked for .*{said}", error.what), error.what
+    assert error.where.endswith(":17"), error.where
+    assert error.remedy == f"let it be slower, or take a robot that is faster than {robot}"
+
+
+def test_what_a_body_can_just_do_is_run(tmp_path: Path) -> None:
+    motion = "kind: way-points, points_m: [[20, 10]], speed: 1m/s"
+    text = SCENARIO.replace("robot: cart, at_m: [30, 10]", f"robot: husky, at_m: [30, 10], motion: {{{motion}}}")
+    build(load_scenario(_written(text, tmp_path)))
 
 
 def test_a_labs_own_scenario_comes_before_one_that_ships(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

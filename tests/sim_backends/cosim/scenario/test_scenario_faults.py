@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from sim_backends.cosim.columns import NEVER, columns, round_trips_s
+from sim_backends.cosim.federate_errors import UnansweredError
 from sim_backends.cosim.recording import tables
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.recovery import recoveries
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.watchdog import UnansweredError
 
 SCENARIO = """\
 name: line

@@ -44,7 +44,8 @@ def test_exact_policies_agree_on_the_radio_and_a_window_does_not() -> None:
     assert lost_share(reference) > 0.03, "losses that could differ"
     merged = errors(reference, three(VariableStepped()).advance(600 * MS))
     assert merged.packets == len(reference.fates) - sum(not fate.is_known for fate in reference.fates.values())
-    assert merged.delivery_error_s == merged.position_error_m == merged.late_s == Spread(0, 0, 0)
+    assert merged.delivery_error_s == merged.late_s == Spread(0, 0, 0)
+    assert merged.position_error_m == errors(reference, reference).position_error_m, "held for the same steps"
     assert (merged.fate_disagreement, merged.causality_violations) == (0, 0)
     windowed = errors(reference, three(Scheduled(0.02)).advance(600 * MS))
     assert windowed.delivery_error_s.mean > 0.005

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import common as d
 
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
-from sim_backends.emulated.autopilot.firmware import Mode
+from sim_backends.emulated.autopilot.modes import Mode
 from tests.helpers import drones
 from tests.helpers.ground_station import SYSTEM, GroundStation
 from tests.helpers.mavproxy_flight import mavproxy
@@ -26,6 +26,8 @@ PLACE_ALONE, VELOCITY_ALONE = 0b110111111000, 0b110111000111
 def gcs() -> GroundStation:
     station = GroundStation(firmware=ARDUCOPTER)
     station.wait(1)
+    station.ask(10, d.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    station.ask(1, d.MAVLINK_MSG_ID_SYS_STATUS)
     return station
 
 
@@ -42,28 +44,28 @@ def take_off(gcs: GroundStation, height_m: float = 3.0) -> None:
     assert change(gcs, "GUIDED") == OK
     assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
     assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height_m) == OK
-    gcs.wait(10)
+    gcs.wait(13)
 
 
-def lead(gcs: GroundStation, mask: int, vector: tuple[float, float, float]) -> None:
+def lead(gcs: GroundStation, mask: int, vector: tuple[float, float, float], yaw_rad: float = 0.0) -> None:
     zeros = (0.0, 0.0, 0.0)
     place, speed = (vector, zeros) if mask == PLACE_ALONE else (zeros, vector)
     gcs.say(
         d.MAVLink_set_position_target_local_ned_message(
-            *(0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, mask, *place, *speed, *zeros, 0, 0)
+            *(0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, mask, *place, *speed, *zeros, yaw_rad, 0)
         )
     )
 
 
 def texts(gcs: GroundStation) -> list[str]:
     gcs.wait(0.1)
-    return [one.text for one in gcs.heard if one.get_type() == "STATUSTEXT"]
+    return [text for severity, text in gcs.texts() if severity <= d.MAV_SEVERITY_NOTICE]
 
 
 def test_it_says_what_it_is(gcs: GroundStation) -> None:
     assert gcs.last("HEARTBEAT").autopilot == d.MAV_AUTOPILOT_ARDUPILOTMEGA
     assert mavutil.mode_mapping_bynumber(gcs.last("HEARTBEAT").type) == mavutil.mode_mapping_acm
-    assert mode(gcs) == "LOITER"
+    assert mode(gcs) == "STABILIZE"
 
 
 def test_up_along_and_down(gcs: GroundStation) -> None:
@@ -76,7 +78,7 @@ def test_up_along_and_down(gcs: GroundStation) -> None:
     assert math.dist((here.x, here.y, -here.z), (2.0, 1.0, 3.0)) < 0.15
     assert mode(gcs) == "GUIDED"
     assert change(gcs, "LAND") == OK
-    gcs.wait(12)
+    gcs.wait(14)
     assert not gcs.last("HEARTBEAT").base_mode & d.MAV_MODE_FLAG_SAFETY_ARMED
     assert mode(gcs) == "LAND"
 
@@ -107,11 +109,13 @@ def test_what_it_refuses_has_an_answer_and_no_more(gcs: GroundStation) -> None:
     assert change(gcs, "GUIDED") == OK
     assert gcs.command(d.MAV_CMD_NAV_TAKEOFF) == FAILED, "to no height"
     assert rise() == OK
-    gcs.wait(8)
+    gcs.wait(2)
+    assert rise() == OK, "it has not lifted off yet"
+    gcs.wait(6)
     assert rise() == FAILED, "it flies"
     assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 0) == FAILED
     assert change(gcs, "AUTO") == FAILED, "it has no mission"
-    assert texts(gcs) == []
+    assert texts(gcs) == ["Mode change to AUTO failed: init failed"]
 
 
 def test_no_set_point_lifts_it_and_none_leads_beyond_its_fence(gcs: GroundStation) -> None:
@@ -137,7 +141,7 @@ def test_a_velocity_lapses_and_over_the_fence_it_returns(gcs: GroundStation) -> 
         lead(gcs, VELOCITY_ALONE, (2.0, 0.0, 0.0))
         gcs.wait(1)
     assert mode(gcs) == "RTL"
-    assert "Fence Breached" in texts(gcs)
+    assert (d.MAV_SEVERITY_NOTICE, "Circle fence breached") in gcs.texts()
 
 
 @pytest.mark.parametrize("seconds", [0, 200])
@@ -161,7 +165,7 @@ def test_mavproxy_flies_it_in_its_own_modes(tmp_path: Path) -> None:
             type_line(line)
             wait_until(done, Deadline.after(60))
 
-        wait_until(lambda: b"LOITER>" in said, Deadline.after(60))
+        wait_until(lambda: b"STABILIZE>" in said, Deadline.after(60))
         typed("mode guided", lambda: drone.mode is Mode.OFFBOARD and b"GUIDED>" in said)
         typed("param set RTL_ALT 100", lambda: b"RTL_ALT" in said)
         typed("arm throttle", lambda: drone.armed)

@@ -20,7 +20,8 @@ from fieldkit.ros.types import shipped
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.provisioning import _sensor
 from sim_backends.emulated.ros import own_motion
-from sim_backends.emulated.ros.messages import GENERATORS, GRAVITY_M_S2, ROOM_HALF_M, Sensor, Source
+from sim_backends.emulated.ros.laser import LaserTarget
+from sim_backends.emulated.ros.messages import GENERATORS, GRAVITY_M_S2, Sensor, Source
 from sim_backends.emulated.ros.own_motion import AT_REST, Odometer, OwnMotion
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST, ros_of
@@ -168,17 +169,28 @@ def test_ranges_are_within_the_sensor_s_reach_or_infinite(now: OwnMotion) -> Non
 
 
 def test_walls_come_nearer_and_turn_as_the_robot_drives_and_turns() -> None:
+    """By its place in the world, wherever its odometry began to count."""
     (one, *_) = sensors("sensor_msgs/LaserScan")
-    half_x_m, half_y_m = ROOM_HALF_M
+    room = LaserTarget(((8.0, 4.0), (12.0, 4.0), (12.0, 7.0), (8.0, 7.0)), 0.0, 0.0, 2.0)
+    source = Source(one, [room])
     ahead, left = 0, (one.points or 0) // 4
-    driven = said(one, OwnMotion(x_m=0.5, speed_m_s=0.2))
-    assert driven.ranges[ahead] == pytest.approx(half_x_m - 0.5, abs=0.1)
-    assert driven.ranges[2 * left] == pytest.approx(half_x_m + 0.5, abs=0.1)
-    turned = said(one, OwnMotion(x_m=0.5, yaw_rad=math.pi / 2))
-    assert turned.ranges[ahead] == pytest.approx(half_y_m, abs=0.1)
-    assert turned.ranges[left] == pytest.approx(half_x_m + 0.5, abs=0.1)
-    next_room = said(one, OwnMotion(x_m=2 * half_x_m + 0.5))
-    assert next_room.ranges[ahead] == pytest.approx(driven.ranges[ahead], abs=0.1)
+    driven = said(one, OwnMotion(x_m=70.0, yaw_rad=1.0, place_m=(10.5, 5.5, 0.2)), source=source)
+    assert driven.ranges[ahead] == pytest.approx(1.5, abs=0.1)
+    assert driven.ranges[left] == pytest.approx(1.5, abs=0.1)
+    assert driven.ranges[2 * left] == pytest.approx(2.5, abs=0.1)
+    turned = said(one, OwnMotion(place_m=(10.5, 5.0, 0.2), heading_rad=math.pi / 2), source=source)
+    assert turned.ranges[ahead] == pytest.approx(2.0, abs=0.1)
+    assert turned.ranges[left] == pytest.approx(2.5, abs=0.1)
+    assert (driven.intensities > 0).all()
+
+
+def test_no_echo_is_infinitely_far_and_of_no_intensity_in_as_many_bytes() -> None:
+    (one, *_) = sensors("sensor_msgs/LaserScan")
+    room = LaserTarget(((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)), 0.0, 0.0, 2.0)
+    assert len(Source(one).message(1, 2)) == len(Source(one, [room]).message(1, 2))
+    scan = said(one)
+    assert np.isposinf(scan.ranges).all()
+    assert not scan.intensities.any()
 
 
 def test_batteries_are_shares_volts_and_ampere_hours_or_not_a_number() -> None:

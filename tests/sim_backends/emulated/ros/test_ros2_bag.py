@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import pytest
+from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -141,6 +142,17 @@ def test_a_recording_is_a_whole_ros2_bag(
     information = metadata["rosbag2_bagfile_information"]
     assert information["relative_file_paths"] == [file]
     assert information["message_count"] == len(messages)
+    (topic,) = information["topics_with_message_count"]
+    offered = topic["topic_metadata"]["offered_qos_profiles"]
+    # As a text with rmw's numbers until Iron, as names from Jazzy on (rosbag2_storage/yaml.hpp).
+    if distribution == "jazzy":
+        assert information["version"] == 9
+        assert [(one["reliability"], one["durability"]) for one in offered] == [("best_effort", "volatile")]
+    else:
+        assert information["version"] == 8
+        (one,) = parse(offered, source="offered_qos_profiles").data
+        assert (one["reliability"], one["durability"], one["history"], one["depth"]) == (2, 2, 3, 0)
+        assert one["deadline"] == {"sec": 9223372036, "nsec": 854775807}
     content = (tmp_path / "scan" / file).read_bytes()
     if file.endswith(".mcap"):
         assert content.startswith(b"\x89MCAP0\r\n")
@@ -149,6 +161,9 @@ def test_a_recording_is_a_whole_ros2_bag(
         with closing(sqlite3.connect(tmp_path / "scan" / file)) as database:
             topics = "SELECT name, type, serialization_format FROM topics"
             assert database.execute(topics).fetchall() == [("/scan", "sensor_msgs/msg/LaserScan", "cdr")]
+            ((stored,),) = database.execute("SELECT offered_qos_profiles FROM topics")
+            written = parse(stored, source="topics").data
+            assert written == (offered if distribution == "jazzy" else parse(offered, source="metadata").data)
             assert database.execute("SELECT count(*) FROM messages").fetchone() == (len(messages),)
 
 
@@ -164,6 +179,12 @@ def test_the_exit_code_is_that_of_the_distribution(
         assert reader.message_count == 0, "nobody publishes it"
 
 
+def offered_by(connection: Connection) -> tuple[QosReliability, QosDurability]:
+    assert isinstance(connection.ext, ConnectionExtRosbag2)
+    (profile,) = connection.ext.offered_qos_profiles
+    return profile.reliability, profile.durability
+
+
 @pytest.mark.emulated
 @pytest.mark.parametrize("words", [["-a"], ["--topics", "/scan", "odom", "tf", "imu", "battery_state"]])
 def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Path, words: list[str]) -> None:
@@ -171,8 +192,15 @@ def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Pa
     assert left.code == 0, left.said
     with Reader(tmp_path / "all") as reader:
         counts = {one.topic: one.msgcount for one in reader.connections}
+        offered = {one.topic: offered_by(one) for one in reader.connections}
     rates_hz = {topic.name: topic.rate for topic in ros_of(ros2_profile("jazzy")).topics}
+    if "-a" in words:
+        rates_hz["/tf_static"] = 1  # in all: it is latched
+        assert counts["/tf_static"] == 1
+        assert offered["/tf_static"] == (QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL)
     assert counts.keys() == rates_hz.keys()
+    assert offered["/scan"] == (QosReliability.BEST_EFFORT, QosDurability.VOLATILE), "sensor_data"
+    assert offered["/odom"] == (QosReliability.RELIABLE, QosDurability.VOLATILE)
     assert all(counts[topic] >= rate_hz for topic, rate_hz in rates_hz.items()), f"in five seconds: {counts}"
 
 

@@ -4,13 +4,16 @@ import math
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import Literal
+from itertools import pairwise
+from typing import Literal, get_args
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sim_backends.network.packets import Packet
 from sim_backends.network.tcp.connection import TcpSample
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.options import Congestion, TcpOptions
 from sim_backends.network.tcp.segments import Segment
 from sim_backends.network.tcp.transport import Tcp
 from sim_backends.network.wire import IpPacket
@@ -178,8 +181,10 @@ def test_what_is_lost_again_waits_for_the_timer_again() -> None:
     assert max(Counter(number for _, number in transfer.sent(times=1)).values()) == 1
 
 
-@pytest.mark.parametrize("congestion", ["newreno", "cubic"])
-def test_after_a_timeout_what_a_sack_told_of_before_opens_no_window(congestion: Literal["newreno", "cubic"]) -> None:
+@pytest.mark.parametrize("congestion", ["newreno", "cubic-rfc9438"])
+def test_after_a_timeout_what_a_sack_reported_before_opens_no_window(
+    congestion: Literal["newreno", "cubic-rfc9438"],
+) -> None:
     """RFC 3465, 2.3: the ACK that fills the gap covers 20 segments, of which 19 had left the network before."""
     options = replace(EVERY, congestion=congestion, initial_window_segments=20)
     transfer = Transfer(200, options, script=losing_data({0}, times=2))
@@ -297,9 +302,10 @@ def test_renos_sawtooth_carries_what_mathis_says(period: int) -> None:
     assert 0.9 * expected < carried < expected
 
 
-def test_cubic_follows_its_curve_by_the_acks_it_gets() -> None:
+@pytest.mark.parametrize("congestion", ["cubic", "cubic-rfc9438"])
+def test_cubic_follows_its_curve_by_the_acks_it_gets(congestion: Literal["cubic", "cubic-rfc9438"]) -> None:
     # A receive window of 200 segments lets the window stand at that until a loss.
-    options = TcpOptions(segments_per_ack=1, receive_window_bytes=200 * MSS)
+    options = TcpOptions(segments_per_ack=1, receive_window_bytes=200 * MSS, congestion=congestion)
     delay_ns, until_ns = 50 * MS, 6 * SECOND
     transfer = Transfer(20_000, options, script=losing_data({1500}), delay_ns=delay_ns, until_ns=until_ns)
     (loss,) = transfer.events("loss")
@@ -312,4 +318,62 @@ def test_cubic_follows_its_curve_by_the_acks_it_gets() -> None:
         # The ACKs of a round trip bring the window to where the curve is a round trip later (RFC 9438, 4.2).
         at_s = (at_ns + 2 * delay_ns - begun_ns) / SECOND
         if 1 < at_s < plateau_s - 0.5:
-            assert window == pytest.approx(0.4 * (at_s - plateau_s) ** 3 + 200, rel=0.01)
+            assert window == pytest.approx(
+                0.4 * (at_s - plateau_s) ** 3 + 200, rel=0.01 if congestion == "cubic-rfc9438" else 0.02
+            )
+
+
+def whole_segments_sawtooth(period: int) -> float:
+    """Return segments per round trip of a window that opens by 8/15 of a segment per round trip and closes to 0.7."""
+    window, credit, carried, rounds = 10, 0.0, 0, 0
+    for _ in range(100):
+        acknowledged = 0
+        while acknowledged < period:
+            acknowledged += window
+            rounds += 1
+            credit += 8 / 15
+            if credit >= 1:
+                window, credit = window + 1, credit - 1
+        # The window rests in the round trip of the recovery, and is whole segments.
+        window, credit = math.floor(0.7 * window), 0.0
+        carried, rounds = carried + acknowledged + window, rounds + 1
+    return carried / rounds
+
+
+@pytest.mark.parametrize("period", [30, 100, 200])
+def test_linux_cubic_carries_what_its_estimate_of_reno_does(period: int) -> None:
+    def script(packet: IpPacket, *_: object) -> Sequence[int]:
+        segment: Segment = packet.body[1]
+        first = segment.length and not segment.times
+        return () if first and segment.number % period == period - 1 else (0,)
+
+    transfer = Transfer(100 * period, TcpOptions(segments_per_ack=1), script=script, delay_ns=20 * MS)
+    begun_ns, ended_ns = (transfer.wire.delivered[losses * period] for losses in (20, 90))
+    carried = 70 * period * 40 * MS / (ended_ns - begun_ns)
+    # The estimate is looked at every 1/32 s, three quarters of the round trip here, so that each step comes late.
+    assert 0.75 < carried / whole_segments_sawtooth(period) < 0.95
+
+
+def test_linux_finds_a_segment_that_is_lost_again_within_a_round_trip() -> None:
+    # RFC 8985: what was sent after it has arrived, a round trip later. RFC 6675 waits for the timer.
+    transfer = Transfer(2000, TcpOptions(segments_per_ack=1), script=losing_data({70}, times=3))
+    assert not transfer.events("timeout")
+    assert len(transfer.events("loss")) == 1
+    sent_ns = [at_ns for at_ns, number in transfer.sent() if number == 70]
+    assert len(sent_ns) == 4
+    assert all(later - earlier <= 2 * ROUND_TRIP_NS for earlier, later in pairwise(sent_ns))
+
+
+def test_linux_finds_a_loss_that_two_later_segments_show_after_a_quarter_of_a_round_trip() -> None:
+    # RFC 8985, 6.2: the reordering window is a quarter of the shortest round trip while fewer than three arrived.
+    transfer = Transfer(10, TcpOptions(segments_per_ack=1), script=losing_data({7}))
+    sent_ns = [at_ns for at_ns, number in transfer.sent() if number == 7]
+    assert sent_ns == [ROUND_TRIP_NS, 2 * ROUND_TRIP_NS + ROUND_TRIP_NS // 4]
+    assert not transfer.events("timeout")
+
+
+@given(lost=st.sets(st.integers(0, 90), max_size=30), control=st.sampled_from(get_args(Congestion)))
+def test_in_order_nothing_is_sent_again_that_was_not_lost(lost: set[int], control: Congestion) -> None:
+    options = TcpOptions(segments_per_ack=1, congestion=control)
+    transfer = Transfer(100, options, script=losing_data(lost), rate_bit_s=20_000_000)
+    assert {number for _, number in transfer.sent(times=1)} == lost

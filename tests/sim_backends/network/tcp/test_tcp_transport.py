@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 from hypothesis import given, settings
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.packets import Packet
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.options import Congestion, TcpOptions
 from sim_backends.network.tcp.transport import Tcp
 from sim_backends.network.wire import IpPacket
 from tests.helpers.scripted_wire import Script, ScriptedWire, losing
@@ -208,7 +209,7 @@ def following(forth: Sequence[Sequence[int]], back: Sequence[Sequence[int]]) -> 
     pauses=st.lists(st.integers(0, 400 * MS), min_size=30, max_size=30),
     options=st.builds(
         TcpOptions,
-        congestion=st.sampled_from(["cubic", "newreno"]),
+        congestion=st.sampled_from(get_args(Congestion)),
         nagle=st.booleans(),
         mtu_bytes=st.sampled_from([576, 1500]),
         receive_window_bytes=st.sampled_from([1448, 5000, 3 << 20]),
@@ -239,6 +240,7 @@ def test_whatever_is_lost_reordered_or_doubled_the_stream_arrives_in_order_once_
         board = connection._sender.board
         assert (len(board), board.pipe_bytes, len(board._arrived)) == (0, 0, 0)
         assert connection._sender._timer.due_ns is None
+        assert connection._sender._reordering_timer.due_ns is None
     assert list(wire.delivered) == sorted(wire.delivered)
     assert all(reason.startswith("tcp: not ") for reason in wire.dropped.values())
     if options.retries == 15:  # 60 losses at most, and the longest silence is 15 of them

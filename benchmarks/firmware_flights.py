@@ -1,0 +1,252 @@
+"""Fly and record a drone by fieldkit's programs for the drone's computer, and print a table with a row per case.
+
+    python -m benchmarks.firmware_flights --connection tcp:127.0.0.1:5760
+
+The connection is that of a simulated autopilot which the user has started, for example ArduPilot's SITL
+(`sim_vehicle.py -v ArduCopter`) or PX4's SIH (`make px4_sitl sihsim_quadx`, `udpin:0.0.0.0:14540`). Never connect a
+real drone: it takes off. The exit code is 1 if a case failed.
+"""
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+from fieldkit.agent.flight_plan import FlightPlan
+from fieldkit.remote import agent
+
+HEIGHT_M: Final = 3.0
+AHEAD_M: Final = 6.0
+_RECORD_S: Final = 5.0
+_BOOT_S: Final = 90.0
+"""A real autopilot takes about 30 s until its position estimate is good."""
+_FLIGHT_S: Final = 240.0
+_RATES_US: Final = {"32": 100_000, "30": 100_000}
+"""LOCAL_POSITION_NED and ATTITUDE at 10 Hz."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Result of a case: its name, whether it passed, what was measured, and how long it took."""
+
+    case: str
+    passed: bool
+    seen: str
+    lasted_s: float
+
+
+class CaseFailed(Exception):  # noqa: N818 (a result)
+    """A case failed; the text is what was seen."""
+
+
+class Bench:
+    """Runs the programs of the agent against one connection.
+
+    Args:
+        connection: As `mavlink.connection` of a profile.
+        program: The agent.
+        folder: For orders and logs.
+    """
+
+    def __init__(self, connection: str, program: Path, folder: Path) -> None:
+        self._connection = connection
+        self._program = program
+        self._folder = folder
+        self._orders = 0
+
+    def check(self) -> str:
+        """Ask whether it can be armed, until it can."""
+        needs = {
+            "highest_m": HEIGHT_M,
+            "farthest_m": AHEAD_M,
+            "ceiling_m": 20.0,
+            "least_charge": 0.2,
+            "returns": False,
+        }
+        asked, end_s = json.dumps({"connection": self._connection, "needs": needs}), time.monotonic() + _BOOT_S
+        while True:
+            done = self._run("arming", asked)
+            lines = [json.loads(line) for line in done.stdout.splitlines()]
+            faults = [line["what"] for line in lines if line.get("grave")]
+            if done.returncode == 0 and lines and not faults:
+                return f"{lines[-1]['autopilot']}, battery {lines[-1]['charge']}"
+            if time.monotonic() > end_s:
+                raise CaseFailed("; ".join(faults) or done.stderr.strip())
+            time.sleep(1.0)
+
+    def record(self) -> str:
+        """Record its telemetry, and count its frames."""
+        log = self._folder / "flight.tlog"
+        told = json.dumps({"connection": self._connection, "intervals_us": _RATES_US})
+        with self._started("mavlink", told, str(log)) as process:
+            time.sleep(_RECORD_S)
+            process.terminate()
+            _, errors = process.communicate(timeout=30)
+        counted = _messages(log)
+        if process.returncode or not counted.get("LOCAL_POSITION_NED") or not counted.get("ATTITUDE"):
+            raise CaseFailed(f"code {process.returncode}, {counted}, {errors.strip()}")
+        return ", ".join(f"{name} {number}" for name, number in sorted(counted.items()))
+
+    def out_and_back(self) -> str:
+        """Fly out and back, and land; see that the log agrees with the plan."""
+        with self._flight(end="return") as process:
+            self._order("climb")
+            self._phase(process, "up")
+            self._order("go")
+            self._phase(process, "there")
+            self._order("home")
+            code = process.wait(_FLIGHT_S)
+        high_m, far_m = self._flown()
+        if code or abs(high_m - HEIGHT_M) > 0.7 or abs(far_m - AHEAD_M) > 0.7:
+            raise CaseFailed(f"code {code}, {high_m:.1f} m high, {far_m:.1f} m far, {self._last_words()}")
+        return f"{high_m:.1f} m high, {far_m:.1f} m far, landed"
+
+    def lapses(self) -> str:
+        """Stop renewing the orders in the air; see that it lands."""
+        with self._flight() as process:
+            self._order("climb", lease_s=60.0)
+            self._phase(process, "up")
+            self._order("stay", lease_s=1.0)
+            began_s = time.monotonic()
+            code = process.wait(_FLIGHT_S)
+        if not code or "landed" not in self._words():
+            raise CaseFailed(f"code {code}, {self._last_words()}")
+        return f"landed {time.monotonic() - began_s:.0f} s after the last order"
+
+    def called_off(self) -> str:
+        """End the program in the air by SIGTERM; see that it lands."""
+        with self._flight() as process:
+            self._order("climb")
+            self._phase(process, "up")
+            process.terminate()
+            code = process.wait(_FLIGHT_S)
+        if not code or "landed" not in self._words():
+            raise CaseFailed(f"code {code}, {self._last_words()}")
+        return "landed"
+
+    @contextmanager
+    def _flight(self, end: str = "land") -> "Iterator[subprocess.Popen[str]]":
+        (self._folder / "orders").unlink(missing_ok=True)
+        plan: dict[str, Any] = {
+            "connection": self._connection,
+            "orders": str(self._folder / "orders"),
+            "abort": "land",
+            "lease_s": 60.0,
+            "end": end,
+            "height_m": HEIGHT_M,
+            "legs": [[AHEAD_M, 0.0, 0.0]],
+            "ceiling_m": 20.0,
+            "log": str(self._folder / "fly.jsonl"),
+        }
+        if "fence_m" in {field.name for field in fields(FlightPlan)}:
+            plan["fence_m"] = 50.0
+        with self._started("fly", json.dumps(plan)) as process:
+            yield process
+
+    @contextmanager
+    def _started(self, *words: str) -> "Iterator[subprocess.Popen[str]]":
+        with (self._folder / "words").open("w", encoding="utf-8") as said:
+            argv = (sys.executable, str(self._program), *words)
+            process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=said, text=True)
+            try:
+                yield process
+            finally:
+                process.kill()
+                process.communicate()
+
+    def _run(self, *words: str) -> "subprocess.CompletedProcess[str]":
+        argv = (sys.executable, str(self._program), *words)
+        return subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
+
+    def _order(self, what: str, lease_s: float = 120.0) -> None:
+        self._orders += 1
+        beside = self._folder / "orders.new"
+        beside.write_text(f"{self._orders} {what} {lease_s:g}\n", encoding="ascii")
+        beside.replace(self._folder / "orders")
+
+    def _words(self) -> str:
+        return (self._folder / "words").read_text(encoding="utf-8")
+
+    def _last_words(self) -> str:
+        return (self._words().splitlines() or ["it printed nothing"])[-1]
+
+    def _phase(self, process: "subprocess.Popen[str]", phase: str) -> None:
+        """Wait until the program reports a phase of the flight."""
+        end_s = time.monotonic() + _FLIGHT_S
+        while phase not in (line.partition(" ")[2] for line in self._words().splitlines()):
+            if process.poll() is not None or time.monotonic() > end_s:
+                raise CaseFailed(f"not {phase}: {self._last_words()}")
+            time.sleep(0.1)
+
+    def _flown(self) -> tuple[float, float]:
+        """Return the largest height and distance in the log of positions."""
+        lines = (self._folder / "fly.jsonl").read_text(encoding="ascii").splitlines()
+        places = [place for line in lines if (place := _place(json.loads(line))) is not None]
+        if not places:
+            raise CaseFailed("no position in its log")
+        return max(up for _, _, up in places), max(math.hypot(ahead, left) for ahead, left, _ in places)
+
+
+def _place(line: dict[str, Any]) -> tuple[float, float, float] | None:
+    """Return the position in a line of the log, metres ahead, to the left and up; None for another line."""
+    return (line["ahead_m"], line["left_m"], line["up_m"]) if "up_m" in line else None
+
+
+def _messages(log: Path) -> dict[str, int]:
+    """Return how many messages of each kind are in a telemetry log."""
+    from pymavlink import mavutil  # noqa: PLC0415 (0.3 s)
+
+    counted: dict[str, int] = {}
+    reader = mavutil.mavlink_connection(str(log))
+    while (message := reader.recv_match()) is not None:
+        counted[message.get_type()] = counted.get(message.get_type(), 0) + 1
+    return counted
+
+
+def rows(connection: str) -> Iterator[Row]:
+    """Yield the results of the cases, as they end."""
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(folder, "agent.pyz")
+        program.write_bytes(agent.content())
+        bench = Bench(connection, program, Path(folder))
+        cases: dict[str, Callable[[], str]] = {
+            "can be armed": bench.check,
+            "telemetry is recorded": bench.record,
+            "out and back": bench.out_and_back,
+            "orders lapse in the air": bench.lapses,
+            "program ended in the air": bench.called_off,
+        }
+        for name, case in cases.items():
+            began_s = time.monotonic()
+            try:
+                seen, passed = case(), True
+            except (CaseFailed, subprocess.TimeoutExpired) as failure:
+                seen, passed = str(failure), False
+            yield Row(name, passed, seen, time.monotonic() - began_s)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the cases and print the table; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--connection", required=True, help="as mavlink.connection of a profile")
+    connection = parser.parse_args(arguments).connection
+    sys.stdout.write("| case | result | seen | s |\n| --- | --- | --- | --- |\n")
+    failed = False
+    for row in rows(connection):
+        failed = failed or not row.passed
+        result = "passed" if row.passed else "FAILED"
+        sys.stdout.write(f"| {row.case} | {result} | {row.seen} | {row.lasted_s:.0f} |\n")
+        sys.stdout.flush()
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,120 @@
+"""Time until a moving robot stops: `python -m benchmarks.stop`, as root; needs Debian's ROS 1.
+
+An emulated robot, which is a real one for fieldkit, drives at 0.6 m/s. In each round these run in turn, each from a
+new process to its end: OpenSSH's `ssh ROBOT true` and `fieldkit stop` of a robot that nothing moves, both against the
+other robot; then `fieldkit stop` of the robot that drives. Times are from the start of the process; the motion of the
+robot is from the record that its base writes 50 times a second, and not from what fieldkit reports.
+"""
+
+import argparse
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.model import Role
+from tests.helpers.motion_truth import MotionSampler, stopped_s
+from tests.helpers.rovers import RoverLab, rover_lab
+from tests.helpers.runs import finish, start
+
+_WAY_M: Final = 25.0
+_BRAKES: Final = 0.9
+"""A robot below this share of its speed brakes: it has received a velocity of zero."""
+_LONG_S: Final = 60.0
+FIGURES: Final = {
+    "ssh": "`ssh box-1 true` (OpenSSH)",
+    "idle": "`fieldkit stop box-1`, which nothing moves",
+    "brakes": "`fieldkit stop rover-1`, until the base brakes",
+    "stands": "until the robot is stationary",
+    "said": "until `stopped (standing)` is printed",
+    "ended": "until the command has ended",
+}
+
+
+def measure(lab: RoverLab, out: str) -> dict[str, float]:
+    """Return the times of one round, in seconds, by the names of `FIGURES`."""
+    lab.put("5m")
+    with MotionSampler(lab.outside.testbed.robots[Role.SENDER].steered, lab.place_m) as sampler:
+        trial = start(lab.folder, "trial", "drive", "5m", "--yes", "--allow-motion", "--out", out)
+        try:
+            lab.wait_until_it_drives()
+            times = {"ssh": _took_s(ssh_words(lab)), "idle": _took_s(_stop_words("box-1"))}
+            before_m_s = sampler.samples[-1].speed_m_s
+            began_s = time.monotonic()
+            with subprocess.Popen(_stop_words("rover-1"), stdout=subprocess.PIPE, text=True) as stop:
+                assert stop.stdout is not None
+                line = stop.stdout.readline()
+                times["said"] = time.monotonic() - began_s
+                code = stop.wait(_LONG_S)
+                times["ended"] = time.monotonic() - began_s
+            if code != 0 or line != "rover-1: stopped (standing)\n":
+                raise SystemExit(f"fieldkit stop ended with {code}: {line!r}")
+            finish(trial)
+        finally:
+            trial.kill()
+            trial.wait()
+        samples = list(sampler.samples)
+    stands_s = stopped_s(samples, began_s)
+    brakes_s = next(
+        sample.at_s - began_s
+        for sample in samples
+        if sample.at_s > began_s and sample.speed_m_s < _BRAKES * before_m_s
+    )
+    return times | {"brakes": brakes_s, "stands": stands_s if stands_s is not None else float("nan")}
+
+
+def ssh_words(lab: RoverLab) -> tuple[str, ...]:
+    """Return OpenSSH's command to a robot with the key and the pinned host key of the site file."""
+    site = (lab.folder / "fieldkit.yaml").read_text(encoding="utf-8")
+    entry = re.search(r"box-1: .*port: (\d+), .*key: (\S+), host_key: ([^}]+)}", site)
+    assert entry is not None
+    port, key, host_key = entry.groups()
+    known = lab.folder / "known_hosts"
+    known.write_text(f"[127.0.0.1]:{port} {host_key}\n", encoding="ascii")
+    options = ("BatchMode=yes", "IdentitiesOnly=yes", "StrictHostKeyChecking=yes", f"UserKnownHostsFile={known}")
+    words = [word for option in options for word in ("-o", option)]
+    return ("ssh", "-F", "none", *words, "-i", key, "-p", port, "root@127.0.0.1", "true")
+
+
+def _stop_words(robot: str) -> tuple[str, ...]:
+    return (sys.executable, "-m", "fieldkit", "stop", robot)
+
+
+def _took_s(words: Sequence[str]) -> float:
+    began_s = time.monotonic()
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL, timeout=_LONG_S)
+    return time.monotonic() - began_s
+
+
+def main() -> int:
+    """Print a table of medians, lowest and highest values."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="single values")
+    parser.add_argument("--rounds", type=int, default=9)
+    options = parser.parse_args()
+    load = os.getloadavg()[0]
+    with tempfile.TemporaryDirectory(prefix="fieldkit-stop-") as folder, rover_lab(Path(folder)) as lab:
+        os.chdir(lab.folder)  # where the site file is
+        lab.write_procedure(Role.SENDER, _WAY_M)
+        rounds = [measure(lab, f"round-{number}") for number in range(options.rounds)]
+        os.chdir("/")
+    if options.json:
+        print(json.dumps(rounds))
+        return 0
+    print(f"load {load:.1f} before, {os.getloadavg()[0]:.1f} after, {options.rounds} rounds\n")
+    print("| seconds from the start of the command | median | lowest | highest |\n| --- | --- | --- | --- |")
+    for name, text in FIGURES.items():
+        values = [times[name] for times in rounds]
+        print(f"| {text} | {statistics.median(values):.2f} | {min(values):.2f} | {max(values):.2f} |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

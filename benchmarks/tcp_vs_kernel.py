@@ -1,0 +1,111 @@
+"""TCP of the co-simulation beside this machine's kernel: `python -m benchmarks.tcp_vs_kernel`, as root.
+
+One station sends to another as fast as TCP lets it, over links of one rate, delay and loss each way: the kernel by
+iperf3 between two namespaces on the emulated backend's medium, the co-simulation over the same link model. Each pair
+of runs has its own seed. A row has the mean goodputs, and the ratio of ours to the kernel's with its 95 % interval.
+"""
+
+import argparse
+import math
+import os
+import platform
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, get_args
+
+import numpy as np
+from scipy.stats import t as student
+
+from benchmarks.medium import iperf, listening_iperf, medium_path
+from sim_backends.network.packets import Packet
+from sim_backends.network.radio import RadioNetwork
+from sim_backends.network.tcp.options import Congestion, TcpOptions
+from sim_backends.network.tcp.transport import Tcp
+from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.options import RadioOptions
+from sim_backends.world.motion import State
+
+LOSSES: Final = ("0.1%", "1%", "5%")
+DELAYS: Final = ("10ms", "50ms")
+"""Of each link, so that a round trip takes twice that."""
+RATE: Final = "100Mbit/s"
+KERNEL: Final = "cubic"
+MESSAGE_BYTES: Final = 10 * TcpOptions().segment_bytes
+_SAFELY_BIT_S: Final = 100_000_000
+
+
+@dataclass(frozen=True)
+class Link:
+    """What a link does in both directions: share of packets lost and delay, as a site file has them."""
+
+    loss: str
+    delay: str
+
+    @property
+    def options(self) -> RadioOptions:
+        """The link as the option `radio` of a site file."""
+        return RadioOptions.model_validate({"loss": self.loss, "delay": self.delay, "rate": RATE})
+
+
+def ours(link: Link, congestion: Congestion, seconds: float, seed: int) -> float:
+    """Return the goodput of the co-simulation's TCP in bit/s."""
+    network = RadioNetwork(
+        UniformLinks(seed, link.options),
+        ("near", "far"),
+        transports={"tcp": partial(Tcp, options=TcpOptions(congestion=congestion))},
+    )
+    count = math.ceil(_SAFELY_BIT_S * seconds / (8 * MESSAGE_BYTES))
+    stream = [Packet(number, "near", "far", MESSAGE_BYTES, ("s", number), 0, 0, "tcp") for number in range(count)]
+    states = {"near": State((0.0, 0.0, 0.0)), "far": State((9.0, 0.0, 0.0))}
+    arrivals, _ = network.advance(round(seconds * 1e9), stream, states)
+    return len(arrivals) * MESSAGE_BYTES * 8 / seconds
+
+
+def kernels(link: Link, control: str, seconds: float, seed: int) -> float:
+    """Return the goodput of the kernel's TCP in bit/s."""
+    with medium_path(link.options, seed=seed) as (near, far), listening_iperf(far):
+        return iperf(near, seconds, "--congestion", control)["sum_received"]["bits_per_second"]
+
+
+def ratio(mine: np.ndarray, peers: np.ndarray) -> tuple[float, float]:
+    """Return the ratio of two means of independent runs, and half of its 95 % interval (delta method, Welch's df)."""
+    value = float(mine.mean() / peers.mean())
+    shares = [float(runs.var(ddof=1) / len(runs) / runs.mean() ** 2) for runs in (mine, peers)]
+    total = sum(shares)
+    freedom = total**2 / sum(share**2 / (len(runs) - 1) for share, runs in zip(shares, (mine, peers), strict=True))
+    return value, float(student.ppf(0.975, freedom)) * value * math.sqrt(total)
+
+
+def row(link: Link, kernel_runs: Sequence[float], controls: Sequence[Congestion], seconds: float) -> Iterator[str]:
+    """Yield the parts of a row of the table."""
+    peers = np.array(kernel_runs)
+    yield f"{link.loss:>5} {link.delay:>5}  kernel {peers.mean() / 1e6:6.3f} Mbit/s ({len(peers)} runs)"
+    for control in controls:
+        mine = np.array([ours(link, control, seconds, seed) for seed in range(2 * len(peers))])
+        value, half = ratio(mine, peers)
+        yield f"{control} {mine.mean() / 1e6:6.3f} {value:.2f} [{value - half:.2f}, {value + half:.2f}]"
+
+
+def main() -> None:
+    """Measure and print a row per link."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=12, help="of the kernel per link; ours has twice as many")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--together", type=int, default=4, help="runs of the kernel at the same time")
+    parser.add_argument("--kernel", default=KERNEL, help="congestion control of the kernel")
+    parser.add_argument("--loss", nargs="+", default=LOSSES)
+    parser.add_argument("--delay", nargs="+", default=DELAYS)
+    options = parser.parse_args()
+    load = os.getloadavg()[0]
+    print(f"Linux {platform.release()}, {options.kernel}; {RATE}; runs of {options.seconds:g} s; load {load:.1f}")
+    with ThreadPoolExecutor(options.together) as pool:
+        for link in (Link(loss, delay) for loss in options.loss for delay in options.delay):
+            run = partial(kernels, link, options.kernel, options.seconds)
+            kernel_runs = list(pool.map(run, range(options.runs)))
+            print(" | ".join(row(link, kernel_runs, get_args(Congestion), options.seconds)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,230 @@
+"""Whether two recorded outputs are the same, differ in words alone, or differ.
+
+What programs read (commands of dry runs, tables, exports, hashes, exit codes) must be equal byte by byte. What people
+read (help, messages, tables on a terminal, reports) may differ in words, which are listed as labels; numbers and
+options must be the same ones, in the same order.
+"""
+
+import difflib
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.unchanged.items import Class, Item
+from benchmarks.unchanged.trees import Tree
+
+_VARYING: Final = (
+    (re.compile(r"\d{8}T\d{6}\.\d{6}Z"), "STAMP"),
+    (re.compile(r'"utc_ns": \d+'), '"utc_ns": 0'),
+    (re.compile(r'"free_bytes": \d+'), '"free_bytes": 0'),
+    # The name of a program on robots has the hash of its text, comments included.
+    (re.compile(r"(job|agent|fieldkit)-[0-9a-f]{12}\b"), r"\1-HASH"),
+)
+_FIXED: Final = re.compile(r"--[a-z][a-z-]+|\d+(?:\.\d+)?")
+"""What may not change in a text for people: options and numbers."""
+
+_WORDS_IN_EVENTS: Final = frozenset(
+    ("text", "how", "note", "detail", "remedy", "reason", "summary", "question", "why")
+)
+"""Fields of JSON events that are sentences."""
+
+_MASKED_IN_TRIALS: Final = re.compile(r"\d+(?:\.\d+)?")
+_TEXTS: Final = frozenset((".html", ".md", ".txt", ""))
+_SHOWN_LINES: Final = 12
+
+
+@dataclass
+class Differences:
+    """What differs between two outputs.
+
+    Attributes:
+        labels: Pairs of words before and after, and how often.
+        real: Differences that are not labels, each with the lines that differ.
+    """
+
+    labels: Counter[tuple[str, str]] = field(default_factory=Counter)
+    real: list[str] = field(default_factory=list)
+
+    def add(self, other: "Differences") -> None:
+        """Add the differences of another output."""
+        self.labels += other.labels
+        self.real += other.real
+
+
+def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
+    """Compare what an item printed and wrote with both trees.
+
+    Args:
+        item: The item.
+        number: Its place in the list of items.
+        base: The tree before, with recorded results.
+        head: The tree after, with recorded results.
+    """
+    found = Differences()
+    before, after = (tree.results / str(number) for tree in (base, head))
+    code = (before / "exit_code").read_text(encoding="ascii").strip()
+    if item.succeeds and code != "0":
+        error = (before / "stderr").read_text(encoding="utf-8", errors="replace").strip()
+        found.real.append(f"proves nothing: exit code {code} with the base\n{error}")
+    names = [{str(path.relative_to(top)) for path in top.rglob("*") if path.is_file()} for top in (before, after)]
+    if item.kind is Class.TRIALS:
+        found.add(_trials(before, after))
+        return found
+    if names[0] != names[1]:
+        found.real.append(
+            f"files: {sorted(names[0] - names[1])} only before, {sorted(names[1] - names[0])} only after"
+        )
+    for name in sorted(names[0] & names[1]):
+        contents = [(top / name).read_bytes() for top in (before, after)]
+        texts = [_stable(content, tree) for content, tree in zip(contents, (base, head), strict=True)]
+        if contents[0] == contents[1] or (None not in texts and texts[0] == texts[1]):
+            continue
+        if texts[0] is None or texts[1] is None:
+            found.real.append(f"{name}: other bytes")
+        else:
+            found.add(_texts(name, texts[0], texts[1], exact=_exact(item, name)))
+    return found
+
+
+def _stable(content: bytes, tree: Tree) -> str | None:
+    """Return a text without what varies from run to run; None if it is no text."""
+    try:
+        text = content.decode()
+    except UnicodeDecodeError:
+        return None
+    text = text.replace(str(tree.folder), "FOLDER")
+    for pattern, replacement in _VARYING:
+        text = pattern.sub(replacement, text)
+    return text
+
+
+def _exact(item: Item, name: str) -> bool:
+    if name == "exit_code" or item.simulation is not None:
+        return True
+    if name == "stdout":
+        return "csv" in item.arguments
+    return name != "stderr" and Path(name).suffix not in _TEXTS | {".svg"} and "junit" not in item.arguments
+
+
+def _texts(name: str, before: str, after: str, *, exact: bool) -> Differences:
+    if not exact and (pairs := _json_lines(before, after)) is not None:
+        found = Differences()
+        for old, new in pairs:
+            found.add(_values(name, old, new))
+        return found
+    if exact or _FIXED.findall(before) != _FIXED.findall(after):
+        return Differences(real=[f"{name}:\n{_diff(before, after)}"])
+    return Differences(labels=Counter(labels(before, after)))
+
+
+def _json_lines(before: str, after: str) -> list[tuple[Any, Any]] | None:
+    """Return the JSON values of two texts in pairs: of each line, or the whole; None if either is something else."""
+    values = [_json_values(text) for text in (before, after)]
+    if values[0] is None or values[1] is None or len(values[0]) != len(values[1]):
+        return None
+    return list(zip(values[0], values[1], strict=True))
+
+
+def _json_values(text: str) -> list[Any] | None:
+    try:
+        return [json.loads(text)]
+    except ValueError:
+        pass
+    try:
+        return [json.loads(line) for line in text.splitlines()]
+    except ValueError:
+        return None
+
+
+def _values(where: str, old: Any, new: Any) -> Differences:  # noqa: ANN401 (any JSON value)
+    """Compare two JSON values: sentences may differ in words, everything else must be equal."""
+    if old == new:
+        return Differences()
+    found = Differences()
+    if isinstance(old, dict) and isinstance(new, dict) and list(old) == list(new):
+        for key in old:
+            if key in _WORDS_IN_EVENTS and isinstance(old[key], str) and isinstance(new[key], str):
+                if old[key] != new[key]:
+                    found.add(_texts(f"{where}, {key}", old[key], new[key], exact=False))
+            else:
+                found.add(_values(f"{where}, {key}", old[key], new[key]))
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for one, other in zip(old, new, strict=True):
+            found.add(_values(where, one, other))
+    else:
+        found.real.append(f"{where}:\n- {_short(old)}\n+ {_short(new)}")
+    return found
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 300 else f"{text[:300]}..."
+
+
+def _trials(before: Path, after: Path) -> Differences:
+    """Compare two runs of an emulated trial, whose numbers differ: events, their fields, files, and CSV headers."""
+    found = Differences()
+    for name, shapes in {"exit code": _codes, "events": _event_shapes, "files": _file_shapes}.items():
+        old, new = ("\n".join(sorted(shapes(top))) for top in (before, after))
+        if old != new:
+            found.real.append(f"{name}:\n{_diff(old, new)}")
+    return found
+
+
+def _codes(result: Path) -> Iterator[str]:
+    yield (result / "exit_code").read_text(encoding="ascii")
+
+
+def _event_shapes(result: Path) -> Iterator[str]:
+    """Yield each event with its fields: the types of sentences and numbers, and the other values."""
+    for line in (result / "stdout").read_text(encoding="utf-8").splitlines():
+        event = json.loads(line)
+        shown = {
+            key: type(value).__name__
+            if key in _WORDS_IN_EVENTS or isinstance(value, int | float) or value is None
+            else _MASKED_IN_TRIALS.sub("N", str(value))
+            for key, value in event.items()
+        }
+        # A time left is a float, an integer or unknown, as it happens.
+        yield json.dumps(
+            {key: "number" if shown[key] in {"int", "float", "NoneType"} else shown[key] for key in shown}
+        )
+
+
+def _file_shapes(result: Path) -> Iterator[str]:
+    """Yield each file of the trial, numbers masked, with the header of its tables."""
+    folder = result / "trials"
+    for path in folder.rglob("*"):
+        if path.is_file():
+            name = _MASKED_IN_TRIALS.sub("N", str(path.relative_to(folder)))
+            header = path.read_text(encoding="utf-8").partition("\n")[0] if path.suffix == ".csv" else ""
+            yield f"{name} {header if path.name in {'trial.csv', 'summary.csv'} else ''}".strip()
+
+
+def labels(before: str, after: str) -> Iterator[tuple[str, str]]:
+    """Yield the passages that differ between two texts, as words before and after."""
+    old_lines, new_lines = before.splitlines(), after.splitlines()
+    for tag, i1, i2, j1, j2 in difflib.SequenceMatcher(None, old_lines, new_lines, autojunk=False).get_opcodes():
+        if tag == "equal":
+            continue
+        old, new = (" ".join(" ".join(lines).split()).split(" ") for lines in (old_lines[i1:i2], new_lines[j1:j2]))
+        start = 0
+        while start < min(len(old), len(new)) and old[start] == new[start]:
+            start += 1
+        end = 0
+        while end < min(len(old), len(new)) - start and old[-1 - end] == new[-1 - end]:
+            end += 1
+        pair = " ".join(old[start : len(old) - end]), " ".join(new[start : len(new) - end])
+        if pair[0] != pair[1]:
+            yield pair
+
+
+def _diff(before: str, after: str) -> str:
+    lines = list(difflib.unified_diff(before.splitlines(), after.splitlines(), n=0, lineterm=""))[2:]
+    shown = [line[:300] for line in lines if not line.startswith("@@")]
+    more = [f"... and {len(shown) - _SHOWN_LINES} lines more"] if len(shown) > _SHOWN_LINES else []
+    return "\n".join(shown[:_SHOWN_LINES] + more)

@@ -1,0 +1,123 @@
+"""Numbers of the structure of a tree: lines, files, methods, words, and sizes of pages."""
+
+import ast
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from benchmarks.unchanged.trees import Tree
+
+PACKAGES: Final = ("fieldkit", "sim_backends")
+MOST_METHODS: Final = 12
+MOST_PAGE_BYTES: Final = 20_000
+MOST_NAMESAKES: Final = 2
+
+DIALECT: Final = {
+    "tell, told": r"\b(tells?|told|telling)\b",
+    "who, whoever": r"\bwho(ever|se|m)?\b",
+    "nobody, somebody, anybody": r"\b(nobody|somebody|anybody)\b",
+    "mend": r"\bmend(s|ed|ing)?\b",
+    "stand": r"\bst(ands?|ood)\b",
+    "is none": r"\b(is|are|was|were|where) none\b",
+    "so long, so much, so many": r"\bso (long|much|many)\b",
+    "at once": r"\bat once\b",
+    "goes on": r"\b(goes?|went|gone|going) on\b",
+    "is to": r"\b(is|are|was|were) to\b",
+    "return what, whether, how": r"(?i:\breturns? (what|whether|how)\b)",
+}
+"""Words and phrases that plain technical English does not need, with the expression that finds them."""
+
+
+def table(base: Tree, head: Tree) -> str:
+    """Return the numbers of two trees, a line each."""
+    olds, news = ({**imported(tree), **dict(numbers(tree.code))} for tree in (base, head))
+    lines = [f"{'structure':40} {'base':>9} {'head':>9}  target"]
+    for name, new in news.items():
+        value, _, target = new.partition("; ")
+        old = olds[name].partition("; ")[0]
+        lines.append(f"{name:40} {old:>9} {value:>9}  {target}".rstrip())
+    return "\n".join([*lines, *_details(head.code)])
+
+
+def imported(tree: Tree) -> dict[str, str]:
+    """Return how many own lines the emulated trial imported, by package and together."""
+    path = tree.results / "imported_lines.json"
+    lines = json.loads(path.read_text(encoding="ascii")) if path.exists() else {}
+    shown = {f"lines of {package} in `trial los 30ft`": f"{lines.get(package, 'unknown')}" for package in PACKAGES}
+    return shown | {"own lines in `trial los 30ft`": f"{sum(lines.values()) or 'unknown'}; at most 25000"}
+
+
+def numbers(tree: Path) -> Iterator[tuple[str, str]]:
+    """Yield the name of each number, and the number with its target behind a semicolon."""
+    paths = modules(tree)
+    texts = [path.read_text(encoding="utf-8") for path in paths]
+    count = sum(text.count("\n") for text in texts)
+    yield "lines of code", f"{count}"
+    yield "files per 1,000 lines", f"{1000 * len(paths) / count:.2f}; below 6"
+    yield "file names used more than twice", f"{len(namesakes(tree))}; 0"
+    yield "classes with over 12 public methods", f"{len(large_classes(tree))}"
+    pages = sorted((tree / "docs").rglob("*.md"))
+    sizes = [path.stat().st_size for path in pages]
+    yield "documentation, kB", f"{sum(sizes) / 1000:.0f}; at most 300"
+    yield "pages over 20 kB", f"{sum(size > MOST_PAGE_BYTES for size in sizes)}; 0"
+    prose = [page.read_text(encoding="utf-8") for page in pages]
+    for name, expression in DIALECT.items():
+        pattern = re.compile(expression)
+        in_code, in_docs = (sum(len(pattern.findall(text)) for text in group) for group in (texts, prose))
+        yield f"'{name}' in code", f"{in_code}"
+        yield f"'{name}' in documentation", f"{in_docs}"
+    bound = Counter(name for text in texts for name in bound_names(text))
+    yield "loop variables named one", f"{bound['one']}; 0"
+    yield "assignments to found", f"{bound['found']}; 0"
+
+
+def _details(tree: Path) -> Iterator[str]:
+    for name, count in sorted(namesakes(tree).items(), key=lambda pair: -pair[1]):
+        yield f"  {count} files named {name}"
+    yield from (f"  {methods} public methods: {name}" for name, methods in large_classes(tree).items())
+
+
+def modules(tree: Path) -> list[Path]:
+    """Return the modules of the shipped packages."""
+    return sorted(path for package in PACKAGES for path in (tree / package).rglob("*.py"))
+
+
+def namesakes(tree: Path) -> dict[str, int]:
+    """Return file names that are used too often, and how often."""
+    names = Counter(path.name for path in modules(tree) if path.name != "__init__.py")
+    return {name: count for name, count in names.items() if count > MOST_NAMESAKES}
+
+
+def large_classes(tree: Path) -> dict[str, int]:
+    """Return the classes with too many public methods, and how many."""
+    found = {}
+    for path in modules(tree):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                methods = {
+                    part.name
+                    for part in node.body
+                    if isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef) and not part.name.startswith("_")
+                }
+                if len(methods) > MOST_METHODS:
+                    found[f"{path.relative_to(tree)}: {node.name}"] = len(methods)
+    return found
+
+
+def bound_names(source: str) -> Iterator[str]:
+    """Yield `one` for each loop variable of this name, and `found` for each assignment to that name."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.For | ast.AsyncFor | ast.comprehension):
+            yield from (name for name in _names(node.target) if name == "one")
+        elif isinstance(node, ast.Assign | ast.AnnAssign | ast.NamedExpr):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (name for target in targets for name in _names(target) if name == "found")
+
+
+def _names(target: ast.expr) -> Iterator[str]:
+    for node in ast.walk(target):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id

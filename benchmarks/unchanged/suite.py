@@ -1,0 +1,295 @@
+"""Whether the tests of two commits are the same but for imports, names and labels.
+
+Functions are compared by their shape: the syntax tree without names, docstrings, annotations and imports, where a
+string counts by its digits alone. A function is matched with one of the same shape anywhere in the other tests, so it
+may move; what is left is matched by its name. Inside an assertion the same name must stay the same name, so that
+`assert a == b` is not `assert a == a`. Limit: outside of assertions, a name in place of another one is not noticed.
+"""
+
+import ast
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+_SKIPPED: Final = frozenset(("ctx", "annotation", "returns", "type_comment", "type_params", "type_ignores"))
+_CHECKS: Final = frozenset(("raises", "warns", "fail", "approx"))
+"""Functions of pytest that check something, or say how exactly."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A function or method, or the statements of a module outside of both.
+
+    Attributes:
+        file: Its file, relative to the folder of tests.
+        name: Its name, behind that of its class.
+        shape: Its syntax tree without names.
+        assertions: The shape of each assertion.
+        sources: The source of each assertion and its line, by its shape.
+        numbers: Its numbers, those in strings included.
+    """
+
+    file: str
+    name: str
+    shape: str
+    assertions: Counter[str] = field(compare=False)
+    sources: dict[str, str] = field(compare=False)
+    numbers: Counter[str] = field(compare=False)
+
+    @property
+    def is_test(self) -> bool:
+        """Whether pytest runs it."""
+        return self.name.rpartition(".")[2].startswith("test")
+
+    def __str__(self) -> str:
+        return f"{self.file}::{self.name}"
+
+
+@dataclass
+class Changes:
+    """What differs between the tests of two commits, beyond names.
+
+    Attributes:
+        same: Tests that are the same.
+        added: Tests that the second commit adds.
+        removed: Tests that it no longer has, and helpers with assertions.
+        assertions: Assertions that it no longer has in a function that it still has.
+        bodies: Functions with the same assertions, but other statements or numbers around them.
+    """
+
+    same: int = 0
+    added: int = 0
+    removed: list[str] = field(default_factory=list)
+    assertions: list[str] = field(default_factory=list)
+    bodies: list[str] = field(default_factory=list)
+
+    @property
+    def found(self) -> bool:
+        """Whether anything differs; an added test is no difference."""
+        return bool(self.removed or self.assertions or self.bodies)
+
+    def summary(self) -> str:
+        """Return one line with counts."""
+        return (
+            f"{'tests:':40} {self.same:5} the same but for names, {self.added:4} added,"
+            f" {len(self.removed):4} removed,"
+            f" {len(self.assertions):4} assertions and {len(self.bodies):4} bodies changed"
+        )
+
+    def lines(self) -> Iterator[str]:
+        """Yield a line for each difference."""
+        yield from (f"removed: {line}" for line in self.removed)
+        yield from (f"assertion: {line}" for line in self.assertions)
+        yield from (f"body: {line}" for line in self.bodies)
+
+
+def compare(before: Path, after: Path) -> Changes:
+    """Compare two folders of tests.
+
+    Raises:
+        SyntaxError: A file in them is no Python.
+    """
+    olds, news = list(units(before)), list(units(after))
+    pairs, olds, news = _of_the_same_shape(olds, news)
+    changes = Changes(same=sum(old.is_test for old in pairs))
+    named, olds, news = _of_the_same_name(olds, news)
+    for old, new in named:
+        _add(changes, old, new)
+    changes.removed = [str(old) for old in olds if old.is_test or old.assertions]
+    changes.added = sum(new.is_test for new in news)
+    return changes
+
+
+def _of_the_same_shape(olds: Sequence[Unit], news: Sequence[Unit]) -> tuple[list[Unit], list[Unit], list[Unit]]:
+    """Return the old units that have a partner of the same shape, and the units of both that have none."""
+    # Those of the same name go first: a copy that is left over must be the one that was removed. A test has a test as
+    # its partner: pytest does not run it under a name that begins otherwise.
+    partners: defaultdict[tuple[str, bool], list[Unit]] = defaultdict(list)
+    for new in news:
+        partners[new.shape, new.is_test].append(new)
+    matched: list[Unit] = []
+    rest = olds
+    for alike in (lambda a, b: str(a) == str(b), lambda a, b: a.name == b.name, lambda *_: True):
+        left = []
+        for old in rest:
+            partner = next((new for new in partners[old.shape, old.is_test] if alike(old, new)), None)
+            if partner is None:
+                left.append(old)
+            else:
+                partners[old.shape, old.is_test].remove(partner)
+                matched.append(old)
+        rest = left
+    return matched, list(rest), [new for group in partners.values() for new in group]
+
+
+def _of_the_same_name(
+    olds: Sequence[Unit], news: Sequence[Unit]
+) -> tuple[list[tuple[Unit, Unit]], list[Unit], list[Unit]]:
+    """Return pairs of units of the same file and name, or of the same name alone, and the units of both without."""
+    pairs = []
+    rest_news = list(news)
+    rest: list[Unit] = list(olds)
+    for key in (str, lambda unit: unit.name if unit.is_test else None):
+        left = []
+        for old in rest:
+            partner = next((new for new in rest_news if key(old) is not None and key(old) == key(new)), None)
+            if partner is None:
+                left.append(old)
+            else:
+                rest_news.remove(partner)
+                pairs.append((old, partner))
+        rest = left
+    return pairs, rest, rest_news
+
+
+def _add(changes: Changes, old: Unit, new: Unit) -> None:
+    lost = old.assertions - new.assertions
+    if lost:
+        gained = [new.sources[shape] for shape in new.assertions - old.assertions]
+        changes.assertions += [f"{old}: {old.sources[shape]}" for shape in lost.elements()]
+        changes.assertions += [f"  now {new}: {source}" for source in gained]
+    else:
+        fewer, more = old.numbers - new.numbers, new.numbers - old.numbers
+        numbers = f"numbers {sorted(fewer.elements())} -> {sorted(more.elements())}"
+        changes.bodies.append(f"{old}: {numbers if fewer or more else 'other statements'}")
+
+
+def units(folder: Path) -> Iterator[Unit]:
+    """Yield the units of all modules in a folder of tests."""
+    for path in sorted(folder.rglob("*.py")):
+        yield from module_units(path.read_text(encoding="utf-8"), str(path.relative_to(folder)))
+
+
+def module_units(source: str, file: str) -> Iterator[Unit]:
+    """Yield the units of a module."""
+    module = ast.parse(source, file)
+    imports = {
+        (alias.asname or alias.name).partition(".")[0]
+        for node in ast.walk(module)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in node.names
+    }
+    yield from _units_in(module.body, "", file, imports)
+
+
+def _units_in(body: Sequence[ast.stmt], prefix: str, file: str, imports: set[str]) -> Iterator[Unit]:
+    rest: list[ast.stmt] = []
+    for node in body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield _unit([node], f"{prefix}{node.name}", file, imports)
+        elif isinstance(node, ast.ClassDef):
+            yield from _units_in(node.body, f"{prefix}{node.name}.", file, imports)
+            rest += [ast.Expr(value) for value in (*node.bases, *node.decorator_list)]
+        else:
+            rest.append(node)
+    if rest := [
+        node for node in rest if not isinstance(node, ast.Import | ast.ImportFrom) and not _is_docstring(node)
+    ]:
+        yield _unit(rest, f"{prefix}(statements)", file, imports)
+
+
+def _is_docstring(node: ast.stmt) -> bool:
+    """Return whether a statement is a string alone: a docstring, of a constant too."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+
+
+def _unit(nodes: Sequence[ast.stmt], name: str, file: str, imports: set[str]) -> Unit:
+    shaper = _Shaper(imports)
+    shape = ";".join(shaper.shape(node) for node in nodes)
+    assertions: Counter[str] = Counter()
+    sources = {}
+    for top in nodes:
+        for node in ast.walk(top):
+            if _is_assertion(node):
+                of_one = _Shaper(imports).shape(node)
+                assertions[of_one] += 1
+                sources[of_one] = f"line {getattr(node, 'lineno', '?')}: {' '.join(ast.unparse(node).split())[:200]}"
+    return Unit(file, name, shape, assertions, sources, shaper.numbers)
+
+
+def _is_assertion(node: ast.AST) -> bool:
+    if isinstance(node, ast.Call):
+        called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        return called in _CHECKS or called.startswith("assert_")
+    return isinstance(node, ast.Assert)
+
+
+class _Shaper:
+    """Writes syntax trees without names, and collects numbers.
+
+    Args:
+        imports: Names that imports bind: `module.name` of these counts as one name, because imports may change.
+    """
+
+    def __init__(self, imports: set[str]) -> None:
+        self.numbers: Counter[str] = Counter()
+        self._imports = imports
+        self._known: dict[str, int] | None = None
+
+    def shape(self, node: ast.AST) -> str:
+        """Return the shape of a tree."""
+        if isinstance(node, ast.Assert) and self._known is None:
+            self._known = {}
+            try:
+                return self._shape(node)
+            finally:
+                self._known = None
+        return self._shape(node)
+
+    def _shape(self, node: ast.AST) -> str:
+        if isinstance(node, ast.Constant):
+            return self._constant(node.value)
+        if isinstance(node, ast.Name):
+            return self._name(node.id)
+        if isinstance(node, ast.Attribute):
+            dotted = self._dotted(node)
+            return self._name(dotted) if dotted else f"{self.shape(node.value)}.{self._name(node.attr)}"
+        if isinstance(node, ast.AnnAssign) and node.value is not None:
+            return self._shape(ast.Assign([node.target], node.value))
+        return f"{type(node).__name__}({','.join(self._fields(node))})"
+
+    def _fields(self, node: ast.AST) -> Iterator[str]:
+        for name, value in ast.iter_fields(node):
+            if name in _SKIPPED:
+                continue
+            if isinstance(value, ast.AST):
+                yield self.shape(value)
+            elif isinstance(value, list):
+                parts = [
+                    self.shape(part)
+                    for part in value
+                    if isinstance(part, ast.AST)
+                    and not isinstance(part, ast.Import | ast.ImportFrom)
+                    and not (isinstance(part, ast.stmt) and _is_docstring(part))
+                ]
+                yield f"[{','.join(parts)}]"
+            elif not isinstance(value, str):
+                yield repr(value)
+
+    def _constant(self, value: object) -> str:
+        if isinstance(value, str | bytes):
+            text = value.decode("latin-1") if isinstance(value, bytes) else value
+            digits = "".join(character if character.isdigit() else " " for character in text).split()
+            self.numbers.update(digits)
+            return f"'{' '.join(digits)}'"
+        if isinstance(value, int | float | complex) and not isinstance(value, bool):
+            self.numbers[repr(value)] += 1
+        return repr(value)
+
+    def _dotted(self, node: ast.Attribute) -> str:
+        """Return `module.name` where the module is imported, else an empty text."""
+        parts = [node.attr]
+        inner: ast.expr = node.value
+        while isinstance(inner, ast.Attribute):
+            parts.append(inner.attr)
+            inner = inner.value
+        if isinstance(inner, ast.Name) and inner.id in self._imports and len(parts) == 1:
+            return f"{inner.id}.{node.attr}"
+        return ""
+
+    def _name(self, name: str) -> str:
+        if self._known is None:
+            return "n"
+        return f"n{self._known.setdefault(name, len(self._known))}"

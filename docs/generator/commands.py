@@ -1,0 +1,161 @@
+"""The page of all commands, from the argument parser."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from docs.generator.markdown import page, table
+from fieldkit import cli
+from fieldkit.cli.commands import COMMANDS
+from fieldkit.cli.parser import Parser
+
+_WIDTH: Final = 100
+DOCS: Final = Path(__file__).resolve().parents[1]
+
+GUIDES: Final = {
+    "trial": "field.md",
+    "check": "checks.md",
+    "campaign": "campaign.md",
+    "resume": "campaign.md",
+    "stop": "motion.md",
+    "abort": "field.md",
+    "enroll": "field.md",
+    "init": "field.md",
+    "lab": "lab.md",
+    "aggregate": "analyse.md",
+    "compare": "compare.md",
+    "report": "analyse.md",
+    "export": "export.md",
+    "bag": "bags.md",
+    "bridge": "bridge.md",
+    "middleware": "studies/middleware-link.md",
+    "robots": "add-a-robot.md",
+    "procedures": "add-a-procedure.md",
+    "columns": "trial-folder.md",
+    "positions": "positions.md",
+    "rebuild": "trial-folder.md",
+    "verify": "trial-folder.md",
+    "cosim": "cosim-commands.md",
+}
+"""The page that explains a command."""
+
+
+def commands() -> str:
+    """Return the page."""
+    top = cli.parser()
+    names = top.subcommands()
+    summaries = {name: COMMANDS.get(name) or _foreign(top, name) for name in names}
+    overview = table(("command", "purpose"), ((f"[`{name}`](#fieldkit-{name})", summaries[name]) for name in names))
+    blocks = [
+        (
+            "`fieldkit COMMAND --help` prints the same. `fieldkit --version` prints the version. "
+            "[Exit codes](exit-codes.md), [quantities](../values.md)."
+        ),
+        overview,
+    ]
+    for name in names:
+        parser = top.command(name)
+        assert parser is not None
+        parser.complete()
+        blocks += [f"## fieldkit {name}", *_command(parser)]
+        if name in GUIDES:
+            blocks.append(f"More: [{_title(GUIDES[name])}](../{GUIDES[name]}).")
+        blocks += list(_inner(parser, 3))
+    return page("Commands", *blocks)
+
+
+def _foreign(top: Parser, name: str) -> str:
+    """Return the description of a command that an entry point adds."""
+    parser = top.command(name)
+    assert parser is not None
+    parser.complete()
+    return (parser.description or "").rstrip(".")
+
+
+def _title(name: str) -> str:
+    """Return the title of a page of `docs/`."""
+    text = (DOCS / name).read_text(encoding="utf-8")
+    return text.partition("# ")[2].partition("\n")[0]
+
+
+def _inner(parser: Parser, level: int) -> Iterator[str]:
+    for name in parser.subcommands():
+        inner = parser.command(name)
+        assert inner is not None
+        if name == "show":
+            continue  # its only argument is in the usage of the command
+        yield f"{'#' * level} {inner.prog}"
+        yield from _command(inner, _help(parser, name))
+        yield from _inner(inner, level + 1)
+
+
+def _help(parser: Parser, name: str) -> str:
+    """Return the help line of a subcommand."""
+    for action in parser._actions:  # noqa: SLF001 (argparse has no public list)
+        if isinstance(action, argparse._SubParsersAction):  # noqa: SLF001 (as above)
+            for choice in action._choices_actions:  # noqa: SLF001 (as above)
+                if choice.dest == name:
+                    return choice.help or ""
+    return ""
+
+
+def _command(parser: Parser, summary: str = "") -> Iterator[str]:
+    yield f"```text\n{_usage(parser)}\n```"
+    text = parser.description or (f"{summary[:1].upper()}{summary[1:]}." if summary else "")
+    yield _prose(parser, text)
+    arguments = [action for action in parser._actions if _is_listed(action)]  # noqa: SLF001 (argparse has no public list)
+    if arguments:
+        yield table(
+            ("argument", "meaning"), ((f"`{_invocation(action)}`", _meaning(parser, action)) for action in arguments)
+        )
+    if parser.epilog:
+        yield _epilog(_expanded(parser, parser.epilog))
+
+
+def _usage(parser: Parser) -> str:
+    formatter = argparse.HelpFormatter(parser.prog, width=_WIDTH)
+    formatter.add_usage(parser.usage, parser._actions, parser._mutually_exclusive_groups, prefix="")  # noqa: SLF001
+    return formatter.format_help().strip()
+
+
+def _is_listed(action: argparse.Action) -> bool:
+    return not isinstance(action, argparse._HelpAction | argparse._SubParsersAction) and (  # noqa: SLF001
+        action.help is not argparse.SUPPRESS
+    )
+
+
+def _invocation(action: argparse.Action) -> str:
+    metavar = action.metavar or ("" if action.nargs == 0 else (action.dest if not action.choices else ""))
+    value = metavar if isinstance(metavar, str) else " ".join(metavar)
+    if action.choices and not action.metavar:
+        value = "{" + ",".join(map(str, action.choices)) + "}"
+    if not action.option_strings:
+        return value + (" ..." if action.nargs in {"+", "*", argparse.REMAINDER} else "")
+    many = " ..." if action.nargs in {"+", "*"} else ""
+    return ", ".join(action.option_strings) + (f" {value}{many}" if action.nargs != 0 and value else "")
+
+
+def _meaning(parser: Parser, action: argparse.Action) -> str:
+    words = {**vars(action), "prog": parser.prog}
+    return _plain((action.help or "") % words)
+
+
+def _prose(parser: Parser, text: str) -> str:
+    return _plain(_expanded(parser, text))
+
+
+def _expanded(parser: Parser, text: str) -> str:
+    """Return a description or epilog as argparse prints it."""
+    return text % {"prog": parser.prog} if "%(prog)" in text else text
+
+
+def _plain(text: str) -> str:
+    """Return a text in which no character is Markdown by accident: names in capitals, stars, angle brackets."""
+    return text.replace("<", "&lt;").replace("*", "\\*").replace("_", "\\_") if "`" not in text else text
+
+
+def _epilog(text: str) -> str:
+    if text.startswith("example: "):
+        return f"```text\n{text.removeprefix('example: ')}\n```"
+    return f"```text\n{text.strip()}\n```"

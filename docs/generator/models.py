@@ -1,0 +1,97 @@
+"""Tables of the keys of YAML files, from their pydantic models."""
+
+import inspect
+from collections.abc import Iterator
+from enum import Enum
+from typing import Annotated, Any, Literal, cast, get_args, get_origin
+
+from pydantic import TypeAdapter
+from pydantic.fields import FieldInfo
+
+from docs.generator.markdown import relative, table
+from fieldkit.config.meanings import attributes, description
+from fieldkit.config.schema import Strict
+
+HEAD = ("key", "default", "meaning")
+
+
+def describe(model: type) -> str:
+    """Return the description of a model, as its docstring has it."""
+    return relative(description(model))
+
+
+def keys_table(model: type[Strict], prefix: str = "", without: frozenset[str] = frozenset()) -> str:
+    """Return a table of every key of a file of `model`.
+
+    Args:
+        model: The model.
+        prefix: What all keys begin with.
+        without: Beginnings of keys that another table has.
+    """
+    skipped = tuple(without)
+    return table(HEAD, (row for row in rows(model, prefix) if not row[0].strip("`").startswith(skipped or "\0")))
+
+
+def rows(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield key, default and meaning of every key, nested ones behind their parent."""
+    meanings = attributes(model)
+    for name, field in model.model_fields.items():
+        key = field.alias or name
+        meaning = meanings.get(key) or meanings[name]
+        yield f"`{prefix}{key}`", default(model, name), relative(meaning)
+        if field.discriminator:
+            continue  # each kind has a table of its own
+        for mark, inner in _models_in(field.annotation):
+            yield from rows(inner, f"{prefix}{key}{mark}.")
+
+
+def _models_in(annotation: object) -> Iterator[tuple[str, type[Strict]]]:
+    """Yield the models in an annotation, each with what is between its key and that of its field."""
+    if inspect.isclass(annotation) and issubclass(annotation, Strict):
+        yield "", annotation
+        return
+    if any(isinstance(part, FieldInfo) and part.discriminator for part in get_args(annotation)):
+        return
+    origin = get_origin(annotation)
+    mark = "[]" if origin is tuple else ".*" if origin is dict else ""
+    for part in get_args(annotation):
+        yield from ((mark + inner, model) for inner, model in _models_in(part))
+
+
+def default(model: type[Strict], name: str) -> str:
+    """Return the default of a field as a file has it, `required` or `none`."""
+    field = model.model_fields[name]
+    if field.is_required():
+        return "required"
+    value = field.get_default(call_default_factory=True)
+    if value is None:
+        return "none"
+    if isinstance(value, Strict):
+        return "all defaults"
+    # Without its alias, which has no meaning outside of its model.
+    bare = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+    adapter: TypeAdapter[Any] = TypeAdapter(cast("Any", bare))
+    return f"`{_yaml(adapter.dump_python(value, mode='json'))}`"
+
+
+def _yaml(value: object) -> str:
+    """Return a scalar, list or mapping in YAML's flow style."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_yaml, value))}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key}: {_yaml(one)}' for key, one in value.items())}}}"
+    return '""' if value == "" else str(value)
+
+
+def kinds(union: Any) -> dict[str, type[Strict]]:  # noqa: ANN401 (an annotated union of models)
+    """Return the models of a discriminated union by their `kind`."""
+    members = get_args(get_args(union)[0])
+    return {_literal(model.model_fields["kind"].annotation): model for model in members}
+
+
+def _literal(annotation: Any) -> str:  # noqa: ANN401 (as above)
+    assert get_origin(annotation) is Literal
+    (value,) = get_args(annotation)
+    return str(value.value if isinstance(value, Enum) else value)

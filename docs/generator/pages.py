@@ -1,0 +1,208 @@
+"""All reference pages."""
+
+import inspect
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Final
+
+from docs.generator.commands import commands
+from docs.generator.markdown import page, relative, table
+from docs.generator.models import HEAD, describe, keys_table, kinds, rows
+from fieldkit import cli
+from fieldkit.analysis.quantities import DEFAULT_BY
+from fieldkit.campaign.plan import CampaignFile
+from fieldkit.config import loops
+from fieldkit.config.meanings import attributes, description
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.config.site import Site
+from fieldkit.core import errors, events
+from fieldkit.core.columns import Column, DifferenceRow, EstimateRow, declared
+from fieldkit.steps.base import Step, step_types
+from fieldkit.trial.columns import installed
+from fieldkit.trial.procedure import Procedure
+from sim_backends.cosim.scenario.faults import Fault
+from sim_backends.cosim.scenario.motions import MotionPlan
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.scenario.traffic import Traffic
+from sim_backends.emulated.options import EmulatedOptions
+
+FOLDER: Final = Path(__file__).resolve().parents[1] / "reference"
+_MARKS: Final = (
+    "`[]` stands for each item of a list, `*` for each name of a mapping. Values: [quantities](../values.md)."
+)
+
+
+def pages() -> dict[str, str]:
+    """Return the text of every reference page by its file name."""
+    makers: dict[str, Callable[[], str]] = {
+        "commands.md": commands,
+        "exit-codes.md": exit_codes,
+        "site-file.md": site_file,
+        "robot-profile.md": lambda: page("Robot profile", describe(RobotProfile), _MARKS, keys_table(RobotProfile)),
+        "procedure.md": procedure,
+        "steps.md": steps,
+        "campaign-file.md": lambda: page("Campaign file", describe(CampaignFile), _MARKS, keys_table(CampaignFile)),
+        "scenario-file.md": scenario_file,
+        "columns.md": columns,
+        "events.md": json_events,
+    }
+    return {"index.md": index()} | {name: make() for name, make in makers.items()}
+
+
+def index() -> str:
+    """Return the first page of the reference."""
+    entries = (
+        ("[Commands](commands.md)", "every command with its arguments"),
+        ("[Exit codes](exit-codes.md)", "of all commands"),
+        ("[Site file](site-file.md)", "`fieldkit.yaml`: robots and roles of a lab"),
+        ("[Robot profile](robot-profile.md)", "`robots/NAME.yaml`"),
+        ("[Procedure](procedure.md)", "`procedures/NAME.yaml`"),
+        ("[Steps](steps.md)", "the kinds of step of a procedure"),
+        ("[Campaign file](campaign-file.md)", "the file of `fieldkit campaign`"),
+        ("[Scenario file](scenario-file.md)", "`scenarios/NAME.yaml` of the co-simulation"),
+        ("[World file](../world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
+        ("[Values in files](../values.md)", "quantities with units, YAML, expectations"),
+        ("[Trial folder](../trial-folder.md)", "files that a trial leaves"),
+        ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
+        ("[JSON events](events.md)", "output of `--json`"),
+        ("[Errors](../errors.md)", "messages and remedies"),
+    )
+    return page("Reference", table(("page", "content"), entries))
+
+
+def exit_codes() -> str:
+    """Return the page of exit codes, from the families of errors."""
+    families: list[type[errors.FieldkitError]] = [errors.FieldkitError]
+    for family in families:  # which grows meanwhile
+        families += family.__subclasses__()
+    meanings: dict[int, list[str]] = {}
+    for family in families:
+        if "exit_code" in vars(family) and family.__module__ == errors.__name__:
+            meanings.setdefault(family.exit_code, []).append(description(family).partition("\n")[0])
+    codes = {code: relative(" ".join(texts)) for code, texts in meanings.items()} | dict(cli.EXIT_CODES)
+    lines = ((str(code), meaning) for code, meaning in sorted(codes.items()))
+    return page(
+        "Exit codes",
+        table(("code", "meaning"), lines),
+        "An error message has three parts: what happened, where, and what to do about it (`remedy:`). "
+        "[Errors](../errors.md) lists the messages.",
+    )
+
+
+def site_file() -> str:
+    """Return the page of the site file, with the options of the emulated backend."""
+    return page(
+        "Site file",
+        describe(Site),
+        _MARKS,
+        keys_table(Site),
+        "## Emulated backend",
+        describe(EmulatedOptions),
+        keys_table(EmulatedOptions, "emulated."),
+    )
+
+
+def procedure() -> str:
+    """Return the page of procedures, without the kinds of step."""
+    return page(
+        "Procedure",
+        describe(Procedure),
+        _MARKS,
+        keys_table(Procedure),
+        "## Keys of every step",
+        table(HEAD, rows(Step)),
+        "With a `name`, a step works as without one, but the names of its jobs, its files and its columns begin with "
+        "it: `up.listen`, `up.recv.bag`, `up.file_loss`. The `paper_*` columns of a transfer use the ping that has "
+        "the same name. [Kinds of step](steps.md).",
+        "## for",
+        _dedented(loops.__doc__),
+        table(
+            HEAD,
+            (
+                ("`each`", "required", "Lists of values, texts or numbers, by variable."),
+                ("`during`", "required", "Steps to write out for each combination of values."),
+            ),
+        ),
+        f"A file is written out to at most {loops.MOST:,} steps.",
+    )
+
+
+def _dedented(docstring: str | None) -> str:
+    return inspect.cleandoc(docstring or "")
+
+
+def steps() -> str:
+    """Return the page of all kinds of step that fieldkit has."""
+    own = {kind: model for kind, model in step_types().items() if model.__module__.startswith("fieldkit.")}
+    blocks = [
+        (
+            "The keys of each kind of step, besides those of [every step](procedure.md#keys-of-every-step). "
+            f"Packages can add kinds: [add a procedure](../add-a-procedure.md). {_MARKS}"
+        ),
+        table(
+            ("step", "purpose"),
+            ((f"[`{kind}`](#{kind})", _first_sentence(model)) for kind, model in own.items()),
+        ),
+    ]
+    every = {row[0]: row for row in rows(Step)}
+    for kind, model in own.items():
+        keys = (row for row in rows(model) if row[0] not in every or row[1] != every[row[0]][1])
+        blocks += [f"## {kind}", describe(model), table(HEAD, keys)]
+    return page("Steps", *blocks)
+
+
+def _first_sentence(model: type) -> str:
+    return relative(description(model)).partition("\n")[0]
+
+
+def scenario_file() -> str:
+    """Return the page of scenario files of the co-simulation."""
+    radio = frozenset({"radio."})
+    blocks = ["## Keys", keys_table(CosimScenario, without=radio)]
+    for title, union in {"Motion": MotionPlan, "Traffic": Traffic, "Fault": Fault}.items():
+        for kind, model in kinds(union).items():
+            blocks += [f"## {title}: {kind}", describe(model), keys_table(model)]
+    return page("Scenario file", describe(CosimScenario), _MARKS, *blocks)
+
+
+def columns() -> str:
+    """Return the page of columns of `trial.csv`, `summary.csv` and comparisons."""
+    trial = installed()
+    summary = (*(column for column in trial if column.name in DEFAULT_BY), *declared(EstimateRow))
+    files = {"trial.csv": trial, "summary.csv": summary, "fieldkit compare": declared(DifferenceRow)}
+    blocks = [
+        (
+            "`fieldkit columns` prints the same; `fieldkit columns PROCEDURE` the columns that a procedure fills. "
+            "A missing value is empty, never 0. More: [trial folder](../trial-folder.md#columns)."
+        ),
+    ]
+    for name, own in files.items():
+        blocks += [f"## {name}", table(("column", "unit", "repeats give", "meaning"), _column_rows(own))]
+    return page("Columns", *blocks)
+
+
+def _column_rows(own: tuple[Column, ...]) -> Iterator[tuple[str, str, str, str]]:
+    for column in own:
+        figure = str(column.figure.kind) if column.figure else ""
+        yield f"`{column.name}`", column.unit, figure, column.meaning.replace("<", "&lt;").replace("*", "\\*")
+
+
+def json_events() -> str:
+    """Return the page of the events of `--json`."""
+    blocks = [
+        (
+            "`fieldkit trial`, `resume`, `campaign` and `check` with `--json` print one JSON object per line, with "
+            "`event`, `utc_ns` and the fields below. How a program answers requests: [automation](../automation.md)."
+        ),
+    ]
+    for name, record in vars(events).items():
+        if inspect.isclass(record) and is_dataclass(record) and record.__module__ == events.__name__:
+            meanings = attributes(record)
+            lines = ((f"`{field.name}`", meanings.get(field.name, "")) for field in fields(record))
+            blocks += [f"## {_snake(name)}", description(record), table(("field", "meaning"), lines)]
+    return page("JSON events", *blocks)
+
+
+def _snake(name: str) -> str:
+    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).lstrip("_")

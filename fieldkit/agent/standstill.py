@@ -1,0 +1,39 @@
+"""Detect from its odometry that a ground robot is stationary."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from fieldkit.agent.drive_plan import wrapped
+from fieldkit.agent.steering import OdometryPose
+
+WITHIN_S = 0.2
+"""Poses over this time are compared."""
+_MOVED_M, _TURNED_RAD = 0.005, 0.02
+"""A change of pose above these in `WITHIN_S` is motion, below it noise: 0.025 m/s and 0.1 rad/s."""
+
+
+class Standstill:
+    """Compares the newest pose with those of the last `WITHIN_S`."""
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[float, OdometryPose]] = deque()
+
+    def odometry(self, at_s: float, pose: OdometryPose) -> None:
+        """Take in a pose, with the time of a monotonic clock at which it was received."""
+        self._poses.append((at_s, pose))
+        while len(self._poses) > 1 and at_s - self._poses[1][0] >= WITHIN_S:
+            self._poses.popleft()
+
+    @property
+    def stationary(self) -> bool:
+        """Whether the poses cover `WITHIN_S` and show no motion."""
+        if not self._poses or self._poses[-1][0] - self._poses[0][0] < WITHIN_S:
+            return False
+        newest = self._poses[-1][1]
+        return all(
+            math.hypot(pose.x_m - newest.x_m, pose.y_m - newest.y_m) <= _MOVED_M
+            and abs(wrapped(pose.yaw_rad - newest.yaw_rad)) <= _TURNED_RAD
+            for _, pose in self._poses
+        )

@@ -1,0 +1,47 @@
+"""Attempts that several tables hold: each is counted once, and tables that contradict each other are refused."""
+
+from collections import Counter
+
+import numpy as np
+
+from fieldkit.analysis.repeats import SOURCE, Repeats
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.units import format_count
+
+
+def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
+    """Return each attempt once, where it is first, and a note on each source of which something was left out.
+
+    Raises:
+        ConfigurationError: Two sources say different things of an attempt.
+    """
+    attempts = repeats.codes(("trial", "protocol", "repeat", "attempt"))
+    # An attempt of no named trial cannot be distinguished from another.
+    unnamed = repeats.texts["trial"] == ""
+    attempts[unnamed] = len(repeats) + np.flatnonzero(unnamed)
+    _, index, inverse = np.unique(attempts, return_index=True, return_inverse=True)
+    firsts = index[inverse]
+    again = np.flatnonzero(firsts != np.arange(len(repeats)))
+    if not len(again):
+        return repeats, ()
+    _demand_equal(repeats.where(firsts[again]), repeats.where(again))
+    pairs = Counter(zip(repeats.texts[SOURCE][again], repeats.texts[SOURCE][firsts[again]], strict=True))
+    notes = tuple(
+        f"{source}: {format_count(rows, 'row')} of {kept} again, counted once"
+        for (source, kept), rows in pairs.items()
+    )
+    return repeats.where(np.setdiff1d(firsts, again)), notes
+
+
+def _demand_equal(kept: Repeats, other: Repeats) -> None:
+    differ = {name: column != other.texts[name] for name, column in kept.texts.items() if name != SOURCE}
+    for name, column in kept.numbers.items():
+        differ[name] = (column != other.numbers[name]) & ~(np.isnan(column) & np.isnan(other.numbers[name]))
+    for name, column in differ.items():
+        for index in np.flatnonzero(column)[:1]:
+            raise ConfigurationError(
+                f"{kept.name(index)} of {kept.texts['trial'][index]} has another {name} "
+                f"than in {kept.texts[SOURCE][index]}",
+                where=other.texts[SOURCE][index],
+                remedy="name one of the two",
+            )

@@ -1,0 +1,90 @@
+"""SSH connections to the robots of the field; imports neither pydantic nor profiles, for `fieldkit stop`."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+from fieldkit.remote import passwords
+from fieldkit.remote.keys import read_private_key
+from fieldkit.remote.link import over_tcp
+from fieldkit.remote.ssh import PATIENCE_S, SshShell
+
+
+class SshAccess(Protocol):
+    """How a robot is reached: a `SiteRobot`, or a `RobotAccess`."""
+
+    @property
+    def host(self) -> str | None:
+        """Name or address."""
+        ...
+
+    @property
+    def port(self) -> int:
+        """SSH port."""
+        ...
+
+    @property
+    def user(self) -> str | None:
+        """Login name."""
+        ...
+
+    @property
+    def host_key(self) -> str | None:
+        """Pinned host key."""
+        ...
+
+    @property
+    def key(self) -> str | None:
+        """Path of the private key; None for the SSH agent."""
+        ...
+
+    @property
+    def password(self) -> str | None:
+        """Source of the password: `ask` or `keyring`; None without a password."""
+        ...
+
+
+def find_password(name: str, access: SshAccess, ask: passwords.Ask = passwords.at_terminal) -> str | None:
+    """Return the password of a robot from its source; None if it has none. Raises as `passwords`."""
+    source = access.password
+    if source is None:
+        return None
+    find = ask if source == "ask" else passwords.in_keyring
+    return find(access.user or "", access.host or "", name)
+
+
+def open_shell(
+    name: str,
+    access: SshAccess,
+    password: str | None,
+    *,
+    patience_s: float = PATIENCE_S,
+    notice: Callable[[str], None] = lambda _: None,
+    on_air: bool = False,
+) -> SshShell:
+    """Return the connection to a robot, which is made when it is first used.
+
+    Args:
+        name: Name of the robot.
+        access: How it is reached.
+        password: Its password, if it has one.
+        patience_s: See `SshShell`, as for the others.
+        notice: Receives a line when the connection is lost or back.
+        on_air: Whether it crosses the radio under test.
+
+    Raises:
+        ConfigurationError: The private key cannot be used, or the host key is not valid.
+    """
+    host = access.host or ""
+    return SshShell(
+        name,
+        connect=over_tcp(host, access.port),
+        user=access.user or "",
+        host_key=access.host_key or "",
+        private_key=None if access.key is None else read_private_key(access.key, where=name),
+        password=password,
+        host=host,
+        port=access.port,
+        patience_s=patience_s,
+        notice=notice,
+        on_air=on_air,
+    )

@@ -1,0 +1,43 @@
+"""Trials of a campaign that have no attempt yet, for reports: a condition without data must not be overlooked."""
+
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
+
+from fieldkit.campaign.plan import CAMPAIGN_FILE, CampaignPlan
+from fieldkit.config import schema
+from fieldkit.core.errors import FieldkitError
+from fieldkit.trial import store
+from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.sources import Note
+
+
+def unmeasured(paths: Iterable[Path], sources: Collection[str], note: Note) -> Iterator[str]:
+    """Yield the name of each planned trial without an attempt: `nlos 60m masterless`.
+
+    Args:
+        paths: Folders of campaigns, or of the folder above: `trials`.
+        sources: Folders of the trials that have attempts.
+        note: Where a sentence goes about a campaign whose plan cannot be read.
+    """
+    for folder in dict.fromkeys(each for path in paths for each in (path, *_below(path))):
+        if (folder / CAMPAIGN_FILE).is_file():
+            try:
+                yield from _unmeasured(folder, sources)
+            except FieldkitError as error:
+                note(f"which trials are missing is not known: {error.located}")
+
+
+def _below(path: Path) -> list[Path]:
+    return sorted(each for each in path.iterdir() if each.is_dir()) if path.is_dir() else []
+
+
+def _unmeasured(folder: Path, sources: Collection[str]) -> Iterator[str]:
+    plans = [
+        store.read_plan(Path(source))
+        for source in sources
+        if Path(source).absolute().parent == folder.absolute() and (Path(source) / PLAN_FILE).is_file()
+    ]
+    measured = {(plan.procedure.name, plan.topology, plan.distance_m) for plan in plans}
+    for trial in schema.load(folder / CAMPAIGN_FILE, CampaignPlan).trials():
+        if (trial.procedure, trial.topology, trial.distance.metres) not in measured:
+            yield str(trial)

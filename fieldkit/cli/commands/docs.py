@@ -1,0 +1,40 @@
+"""`fieldkit docs`: open the installed documentation."""
+
+import argparse
+import webbrowser
+
+from fieldkit.cli.display import table
+from fieldkit.cli.parser import Parser
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.printing import say
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit docs` takes."""
+    parser.description = (
+        "Open the documentation of this version in a browser. It is installed with fieldkit and needs no network. "
+        "TOPIC is the name of a page, such as field, steps or errors, or of a command, such as trial."
+    )
+    parser.epilog = "example: fieldkit docs errors"
+    parser.add_argument(
+        "topic", metavar="TOPIC", nargs="?", default="index", help="a page or a command (default: index)"
+    )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--path", action="store_true", help="print the path of the page in place of opening it")
+    where.add_argument("--list", action="store_true", help="list all topics with their pages")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Open a page, print its path, or list all pages."""
+    from fieldkit.config import documentation
+
+    if arguments.list:
+        table(("topic", "page"), [(topic, str(path)) for topic, path in documentation.topics().items()])
+        return 0
+    page = documentation.find(arguments.topic)
+    if arguments.path:
+        say(str(page.path))
+    elif not webbrowser.open(page.uri):
+        raise ConfigurationError("this machine has no browser", remedy=f"open it elsewhere: {page.path}")
+    return 0

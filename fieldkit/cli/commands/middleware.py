@@ -1,0 +1,130 @@
+"""`fieldkit middleware recommend`: the configuration that passed on the measured link."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fieldkit.analysis.quantities import parse_amount
+from fieldkit.cli import shared_arguments as shared
+from fieldkit.cli.display import show_note
+from fieldkit.cli.parser import Parser
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.printing import say
+from fieldkit.core.text import harmless
+from fieldkit.core.units import BYTES_PER_UNIT, parse_quantity
+from fieldkit.ros import configurations
+
+if TYPE_CHECKING:
+    from fieldkit.trial.link_cells import LinkCriterion
+    from fieldkit.trial.recommendation import Assessment
+
+
+_EPILOG = """\
+exit codes: 0 if a file was written for at least one middleware; 1 if nothing passed or the
+evidence does not suffice, so that nothing was written.
+
+example: fieldkit middleware recommend trials/ -o config/ --max-loss 1% --max-delay 200ms"""
+
+
+def add(parser: Parser) -> None:
+    """Declare what `fieldkit middleware` takes."""
+    parser.description = "Configurations of middlewares by what was measured."
+    actions = parser.add_commands(title="commands", metavar="COMMAND")
+    action = actions.add_parser(
+        "recommend",
+        help="write the configuration that passed on the measured link",
+        description="Write the configuration of CycloneDDS, Fast DDS or Zenoh that passed on the measured link, with "
+        "the evidence in its comment. Exit code 0: a file was written; 1: no configuration passed, or the evidence "
+        "does not suffice, and nothing was written.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    action.add_argument("trials", type=Path, nargs="+", metavar="TRIALS", help=shared.PATH_HELP)
+    action.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="where files are written")
+    action.add_argument(
+        "--max-loss", default="1%", metavar="SHARE", help="most samples lost in each repeat (default 1%%)"
+    )
+    action.add_argument("--max-delay", metavar="TIME", help="most delay of 95 %% of the samples sent: 200ms")
+    action.add_argument("--size", metavar="BYTES", help="only samples of this size: 100kB (default: all)")
+    action.add_argument("--repeats", type=int, default=5, metavar="N", help="valid repeats needed (default 5)")
+    action.add_argument(
+        "--share",
+        metavar="SHARE",
+        help="share of all repeats that must keep it, shown with 95 %% confidence (default: each measured one)",
+    )
+    action.set_defaults(run=recommend)
+
+
+NOTHING: int = 1
+
+
+def recommend(arguments: argparse.Namespace) -> int:
+    """Write a file for each middleware of which settings passed."""
+    from fieldkit.analysis.expectations import MOST_SHARE
+    from fieldkit.trial import recommendation, sources
+    from fieldkit.trial.link_cells import LinkCriterion
+    from fieldkit.trial.recommendation import Assessment
+
+    if arguments.repeats < 2:
+        raise ConfigurationError("--repeats: one repeat shows nothing of the spread", remedy="write 2 or more")
+    criterion = LinkCriterion(
+        max_loss=_share(arguments.max_loss, "--max-loss"),
+        max_delay_s=None if arguments.max_delay is None else parse_amount(arguments.max_delay, "s", "--max-delay"),
+        size_bytes=None if arguments.size is None else parse_quantity(arguments.size, BYTES_PER_UNIT, "size"),
+        repeats=arguments.repeats,
+        share=None if arguments.share is None else _share(arguments.share, "--share", most=MOST_SHARE),
+    )
+    found = sources.find(arguments.trials, show_note)
+    judged = recommendation.assess(found.read(undeclared=True), criterion)
+    if not judged:
+        say("no trial there has a step topics of this size; how to run one: fieldkit docs topics")
+        return NOTHING
+    best: dict[str, Assessment] = {}
+    for assessment in judged:
+        word = "passed" if assessment.passed else "failed" if assessment.failed else "undecided"
+        say(harmless(f"{word}: {assessment.candidate}"))
+        for reason in (*assessment.failed, *assessment.lacking):
+            say(harmless(f"  {reason}"))
+        known = best.get(assessment.candidate.over)
+        if assessment.passed and (known is None or assessment.rank < known.rank):
+            best[assessment.candidate.over] = assessment
+    wrote = [_write(arguments, assessment, criterion) for assessment in best.values()]
+    if any(wrote):
+        return 0
+    say("nothing was written: no settings passed. Measure the undecided ones with more repeats, or other settings")
+    return NOTHING
+
+
+def _share(text: str, option: str, most: float = 1.0) -> float:
+    """Return a share that an option gives.
+
+    Raises:
+        ConfigurationError: It is not a share, or above `most`; or 0, which shows nothing, if `most` is below 1.
+    """
+    share = parse_amount(text, "share", option)
+    if share > most or (most < 1 and not share):
+        least = "above 0" if most < 1 else "0"
+        raise ConfigurationError(
+            f"{option}: {text[:40]!r} is not a share that repeats can keep",
+            remedy=f"write {least} to {100 * most:g} %",
+        )
+    return share
+
+
+def _write(arguments: argparse.Namespace, judged: "Assessment", criterion: "LinkCriterion") -> bool:
+    """Write the file of settings that passed; return whether the middleware has one that can hold them."""
+    from fieldkit.trial import recommendation
+
+    over = judged.candidate.over
+    comment = list(recommendation.evidence(judged, criterion))
+    try:
+        text = configurations.written(over, judged.candidate.transport, judged.candidate.by_path, comment)
+    except ConfigurationError as error:
+        show_note(str(error))
+        return False
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / configurations.FILES[over]
+    files.write(path, text.encode())
+    say(f"wrote {path}; name it in {configurations.VARIABLES[over]}")
+    return True

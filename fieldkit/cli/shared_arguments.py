@@ -1,0 +1,171 @@
+"""Arguments that several commands take. Nothing here imports what a command runs."""
+
+import argparse
+from pathlib import Path
+from typing import Final
+
+from fieldkit.cli.parser import Parser
+from fieldkit.config.locations import SITE_FILE
+from fieldkit.core import plugins
+from fieldkit.core.model import MOST_REPEATS, Protocol, Topology
+from fieldkit.core.text import harmless
+
+TABLES: Final = ("table", "csv", "json", "markdown")
+PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
+CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,protocol"
+"""`analysis.quantities.DEFAULT_BY`, which a test compares."""
+
+_MOST_DIGITS: Final = 15
+
+_PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
+
+
+def add_site(parser: Parser) -> None:
+    """Add the options that say which robots."""
+    names = ", ".join(point.name for point in plugins.points(plugins.BACKENDS))
+    parser.add_argument(
+        "--backend", metavar="NAME", help=f"one of: {names} (default: the site file's; without one, emulated)"
+    )
+    parser.add_argument(
+        "--site",
+        type=Path,
+        metavar="FILE",
+        help=f"site file of the lab (default: {SITE_FILE}, if there is one)",
+    )
+
+
+def add_operator(parser: Parser) -> None:
+    """Add the options that say who is asked."""
+    answers = parser.add_mutually_exclusive_group()
+    answers.add_argument("--yes", action="store_true", help="do not ask: the robots stand where they should")
+    answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: from standard input")
+    parser.add_argument(
+        "--allow-motion",
+        action="store_true",
+        help="let fieldkit itself drive real robots where steps move them (safety: `fieldkit docs motion`)",
+    )
+    parser.add_argument(
+        "--allow-motion-after-fault",
+        action="store_true",
+        help="after a fault stopped a robot, let robots move again from where they are, without asking anybody",
+    )
+
+
+def add_junit(parser: Parser) -> None:
+    """Add the option for CI servers."""
+    parser.add_argument(
+        "--junit",
+        type=file_to_write,
+        metavar="FILE",
+        help="write repeats and expectations as JUnit XML for CI servers, too",
+    )
+
+
+BAG_HELP: Final = "a .bag, .db3 or .mcap file, or the folder of a bag of ROS 2"
+
+
+def add_bag(parser: Parser) -> None:
+    """Add the bag that a command reads."""
+    parser.add_argument("bag", type=Path, metavar="BAG", help=BAG_HELP)
+
+
+def add_json(parser: Parser) -> None:
+    """Add the option for programs that read along."""
+    parser.add_argument("--json", action="store_true", help="one event a line instead of the display")
+
+
+def add_all(parser: Parser) -> None:
+    """Add the option that shows every quantity."""
+    parser.add_argument(
+        "--all", action="store_true", help="show every quantity in the table, not only those for an operator"
+    )
+
+
+def add_out(parser: Parser, what: str) -> None:
+    """Add the option for where results go."""
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", default=Path("trials"), help=f"where {what} (default: trials/)"
+    )
+
+
+def add_changes(parser: Parser) -> None:
+    """Add the options that change what the procedure says."""
+    parser.add_choice("--topology", map(str, Topology), help="default: the procedure's")
+    parser.add_choice("--protocol", map(str, Protocol), action="append", help=_PROTOCOL_HELP)
+    parser.add_argument("--repeats", type=repeats, metavar="N", help="per protocol (default: the procedure's)")
+    parser.add_argument("--record", metavar="DURATION", help="length of every recording, for example 2s")
+
+
+def add_robots(parser: Parser) -> None:
+    """Add the options that say which robots a lab has."""
+    add_site(parser)
+    parser.add_argument(
+        "--robots", type=int, metavar="N", help="robots robot-1 to robot-N instead of those in the site file"
+    )
+    profile = "turtlebot3_burger"
+    parser.add_argument("--profile", metavar="NAME", default=profile, help=f"what they are (default {profile})")
+
+
+def add_trial(parser: Parser, help_line: str = "folder of a trial") -> None:
+    """Add the folder of one trial."""
+    parser.add_argument("trial", type=Path, metavar="TRIAL", help=help_line)
+
+
+def add_paths(parser: Parser) -> None:
+    """Add PATH... and `--rebuild`, which `sources.find` takes."""
+    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help=PATH_HELP)
+    add_rebuild(parser)
+
+
+def add_rebuild(parser: Parser) -> None:
+    """Add `--rebuild`."""
+    parser.add_argument(
+        "--rebuild", action="store_true", help="measure the raw evidence again instead of reading trial.csv"
+    )
+
+
+def add_cells(parser: Parser, default: str = CONDITION) -> None:
+    """Add `--by`, which `Sources.condition` reads."""
+    parser.add_argument(
+        "--by",
+        default=default,
+        metavar="COLUMN,...",
+        help=f"columns that distinguish conditions, or `source`, the folder or file of a row; cells are sorted by "
+        f"them in this order (default {default})",
+    )
+
+
+def add_show(parser: Parser, dest: str, what: str) -> None:
+    """Let a listing command take `show NAME`, which is None where all are listed."""
+    parser.usage = "%(prog)s [-h] [show NAME]"
+    show = parser.add_commands(metavar="show NAME", prog=parser.prog).add_parser("show", help=f"show one {what}")
+    show.add_argument(dest, metavar="NAME", help=f"name of the {what}")
+    parser.set_defaults(**{dest: None})
+
+
+def file_to_write(text: str) -> Path:
+    """Return a file whose folder is there; argparse tells of one that is not, before anybody walks."""
+    if not Path(text).parent.is_dir():
+        raise argparse.ArgumentTypeError(f"there is no folder {str(Path(text).parent)!r}")
+    return Path(text)
+
+
+def natural(text: str) -> int:
+    """Return a whole number from 0 that a plan can hold; argparse tells what is none."""
+    if not text.isascii() or not text.isdigit():
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number from 0")
+    if len(text) > _MOST_DIGITS:
+        raise argparse.ArgumentTypeError(f"a number of {len(text)} digits is too large")
+    return int(text)
+
+
+def repeats(text: str) -> int:
+    """Return a number of repeats; argparse tells what is none."""
+    if not 1 <= natural(text) <= MOST_REPEATS:
+        raise argparse.ArgumentTypeError(f"must be at least 1, and at most {MOST_REPEATS}")
+    return int(text)
+
+
+def free_text(text: str) -> str:
+    """Return what was typed as a file can hold it: bytes that are no UTF-8, and what moves a cursor, become `?`."""
+    return harmless(text)

@@ -1,0 +1,29 @@
+"""The site file that a command line chooses; imports little, for commands that must start quickly."""
+
+import argparse
+from pathlib import Path
+from typing import Final
+
+from fieldkit.config.locations import SITE_FILE
+from fieldkit.config.schema import Document
+from fieldkit.config.site import Site, load_site
+
+DEFAULT_BACKEND: Final = "emulated"
+
+
+def lab_site(arguments: argparse.Namespace) -> tuple[Site, Document] | tuple[None, None]:
+    """Return the site file that the options choose, with its document; none where there is none.
+
+    Raises:
+        ConfigurationError: As `load_site`.
+    """
+    path: Path | None = arguments.site
+    if path is None and Path(SITE_FILE).is_file():
+        path = Path(SITE_FILE)
+    return (None, None) if path is None else load_site(path)
+
+
+def backend_name(arguments: argparse.Namespace, site: Site | None) -> str:
+    """Return the name of the backend that the options or the site file choose."""
+    name: str | None = arguments.backend
+    return name or (DEFAULT_BACKEND if site is None else site.backend)

@@ -1,0 +1,120 @@
+"""Programs of a lab that a procedure copies to robots: found beside the procedure, frozen by their SHA-256.
+
+A procedure names a file. When the procedure is read, the file is searched first in the folder of the procedure file,
+then in the lab's folder (the current directory), and its hash is kept. `trial.yaml` holds the result.
+"""
+
+import hashlib
+import os
+import stat
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Final
+
+from fieldkit.config import schema
+from fieldkit.config.schema import BeforeValidator, Bool, Field, Int, Strict
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.units import format_bytes
+
+MOST_BYTES: Final = 8 << 20
+"""Largest program. It crosses the control connection before each attempt, and that may be a slow radio."""
+
+
+class LabProgram(Strict):
+    """A program of the lab, as it was when its procedure was read.
+
+    Attributes:
+        file: Where it was found, written by fieldkit into `trial.yaml`.
+        sha256: SHA-256 of its content, which is checked for each attempt.
+        size_bytes: Its size in bytes.
+        executable: Whether the copy has the right to be executed.
+    """
+
+    file: Annotated[str, Field(pattern=r"^[^\x00]+$")]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    size_bytes: Annotated[Int, Field(ge=0, le=MOST_BYTES)]
+    executable: Bool
+
+    @property
+    def name(self) -> str:
+        """The name of the file without its folders."""
+        return PurePosixPath(self.file).name
+
+    def content(self) -> bytes:
+        """Return the content, which is as it was.
+
+        Raises:
+            ConfigurationError: The file is missing, cannot be read, or has changed.
+        """
+        remedy = f"restore it (SHA-256 {self.sha256}), or start a new trial"
+        try:
+            content = files.read(_target(Path(self.file)), MOST_BYTES)
+        except OSError as error:
+            raise ConfigurationError(
+                f"the program that the trial copies to robots cannot be read: {error.strerror}",
+                where=self.file,
+                remedy=f"change to the folder of the lab (cd); {remedy}",
+            ) from error
+        if hashlib.sha256(content).hexdigest() != self.sha256:
+            raise ConfigurationError(
+                "the program has changed since the procedure was read", where=self.file, remedy=remedy
+            )
+        return content
+
+
+def _found(value: object) -> object:
+    """Return what freezes the program that a procedure names; what is frozen stays as it is."""
+    if isinstance(value, dict | LabProgram):
+        return value
+    if not isinstance(value, str):
+        raise schema.complaint("the path of a file is needed here, tools/probe.py for example")
+    _demand_name(value)
+    tried = list(dict.fromkeys((schema.folder(), Path())))
+    for folder in tried:
+        if os.path.lexists(path := folder / value):
+            return _frozen(value, path, folder)
+    where = " and ".join(f"{typed(folder.absolute())}" for folder in tried)
+    raise schema.complaint(f"there is no file {value!r}; searched in {where}")
+
+
+def _target(path: Path) -> Path:
+    """Return where a path leads, links followed; OSError where it leads nowhere."""
+    return Path(os.path.realpath(path, strict=True))
+
+
+def _demand_name(name: str) -> None:
+    path = PurePosixPath(name)
+    if not path.name or path.is_absolute() or ".." in path.parts:
+        raise schema.complaint(
+            f"{name!r} is not the relative path of a file in the folder of the procedure or of the lab (without ..)"
+        )
+    if not path.name.isprintable():
+        raise schema.complaint(f"{name!r} has a character in its name that cannot be printed")
+
+
+def _frozen(name: str, path: Path, folder: Path) -> dict[str, object]:
+    lab, folder = Path.cwd().resolve(), folder.resolve()
+    inside = lab if folder.is_relative_to(lab) else folder
+    try:
+        whole = _target(path)
+        status = whole.stat()
+        if not whole.is_relative_to(inside):
+            raise schema.complaint(f"{name!r} is a link that leads out of {inside}; copy the file there")
+        if whole.is_dir():
+            raise schema.complaint(f"{name!r} is a folder; name one file")
+        if status.st_size > MOST_BYTES:
+            sizes = f"{format_bytes(status.st_size)}, more than {format_bytes(MOST_BYTES)}"
+            raise schema.complaint(f"{name!r} has {sizes}; install it on the robot")
+        content = files.read(whole, MOST_BYTES)
+    except OSError as error:
+        raise schema.complaint(f"{name!r} cannot be read: {error.strerror}") from None
+    return {
+        "file": str(whole.relative_to(lab) if whole.is_relative_to(lab) else whole),
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "size_bytes": len(content),
+        "executable": bool(status.st_mode & stat.S_IXUSR),
+    }
+
+
+NamedProgram = Annotated[LabProgram, BeforeValidator(_found)]
+"""A program as a procedure names it, `tools/probe.py`, or as `trial.yaml` freezes it."""

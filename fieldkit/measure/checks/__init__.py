@@ -1,0 +1,1 @@
+"""Contradictions between independent sources of evidence: files, captures, logs and counters."""

@@ -1,0 +1,38 @@
+"""Let rosbags open SQLite databases at any path.
+
+It puts the path into a URI as it is, where `?`, `#` and `%` have a meaning (sqlite.org/uri.html), and where bytes
+that are not UTF-8 are impossible. `allow_any` makes its storage plugins encode the path first.
+"""
+
+import os
+from pathlib import Path, PosixPath
+from urllib.parse import quote
+
+from rosbags import rosbag2
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader, Sqlite3Writer
+
+
+class _UriPath(PosixPath):
+    """A path whose text is the path of a URI."""
+
+    def __str__(self) -> str:
+        return quote(os.fsencode(super().__str__()))
+
+
+class _AnyPathReader(Sqlite3Reader):
+    def __init__(self, path: Path) -> None:
+        super().__init__(_UriPath(path))  # it opens the URI alone
+
+
+class _AnyPathWriter(Sqlite3Writer):
+    def __init__(self, path: Path, compression: rosbag2.CompressionMode) -> None:
+        super().__init__(_UriPath(path), compression)
+        self.path = path / f"{path.name}.db3"
+
+
+def allow_any() -> None:
+    """Open databases at any path in this process from now on."""
+    rosbag2.Reader.STORAGE_PLUGINS = {**rosbag2.Reader.STORAGE_PLUGINS, ".db3": _AnyPathReader}
+    DirectoryReader.STORAGE_PLUGINS = {**DirectoryReader.STORAGE_PLUGINS, "sqlite3": _AnyPathReader}
+    rosbag2.Writer.STORAGE_PLUGINS = {**rosbag2.Writer.STORAGE_PLUGINS, rosbag2.StoragePlugin.SQLITE3: _AnyPathWriter}

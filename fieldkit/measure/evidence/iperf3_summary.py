@@ -1,0 +1,95 @@
+"""What iperf3's JSON says beside its intervals: parameters of the test (`start`) and totals (`end`).
+
+Versions 3.1 to 3.17 differ: only the client's `end` describes both ends, a server has 0 for the other end, versions
+before 3.8 have one `sum` for both ends of a UDP test. 0 in `end` therefore means unknown.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fieldkit.measure.evidence.json_fields import count, items, mapping, number
+
+
+@dataclass(frozen=True)
+class IperfStart:
+    """Parameters of a test; None, or an empty text, if the JSON does not say.
+
+    Attributes:
+        cookie: Random text that both ends of one test have.
+        began_utc_s: Start, in seconds since 1970 UTC.
+        protocol: `tcp` or `udp`.
+        streams: Number of parallel streams.
+        block_bytes: Bytes per write; of UDP, the payload of a datagram.
+        reverse: Whether the server sends.
+    """
+
+    cookie: str = ""
+    began_utc_s: int | None = None
+    protocol: str = ""
+    streams: int | None = None
+    block_bytes: int | None = None
+    reverse: bool | None = None
+
+
+@dataclass(frozen=True)
+class IperfTotals:
+    """Totals in `end`; None if unknown.
+
+    Attributes:
+        sent_bytes: Payload sent.
+        received_bytes: Payload received.
+        datagrams: UDP datagrams that the receiver expected.
+        lost: Of these, the ones that it missed.
+        jitter_s: Jitter at the receiver, in seconds.
+        retransmits: Segments sent again.
+        out_of_order: Datagrams out of order, duplicates included, of all streams.
+        ends_s: Every end of a summary, in seconds from the start.
+    """
+
+    sent_bytes: int | None = None
+    received_bytes: int | None = None
+    datagrams: int | None = None
+    lost: int | None = None
+    jitter_s: float | None = None
+    retransmits: int | None = None
+    out_of_order: int = 0
+    ends_s: tuple[float, ...] = ()
+
+
+def parse_start(document: Mapping[str, Any]) -> IperfStart:
+    """Return the parameters of a test."""
+    start = mapping(document, "start")
+    test = mapping(start, "test_start")
+    cookie, protocol, reverse = start.get("cookie"), test.get("protocol"), number(test, "reverse")
+    return IperfStart(
+        cookie=cookie if isinstance(cookie, str) else "",
+        began_utc_s=count(mapping(start, "timestamp"), "timesecs"),
+        protocol=protocol.lower() if isinstance(protocol, str) else "",
+        streams=count(test, "num_streams"),
+        block_bytes=count(test, "blksize"),
+        reverse=None if reverse is None else bool(reverse),
+    )
+
+
+def parse_totals(document: Mapping[str, Any]) -> IperfTotals:
+    """Return the totals of a test."""
+    end = mapping(document, "end")
+    both, sent, received = (mapping(end, name) for name in ("sum", "sum_sent", "sum_received"))
+    of_udp = received if count(received, "packets") else both
+    return IperfTotals(
+        sent_bytes=count(sent or both, "bytes") or None,
+        received_bytes=count(received, "bytes") or None,
+        datagrams=count(of_udp, "packets") or None,
+        lost=count(of_udp, "lost_packets") if count(of_udp, "packets") else None,
+        jitter_s=next((ms / 1e3 for part in (received, both) if (ms := number(part, "jitter_ms"))), None),
+        retransmits=count(sent, "retransmits"),
+        out_of_order=sum(count(mapping(stream, "udp"), "out_of_order") or 0 for stream in items(end, "streams")),
+        ends_s=tuple(_ends_s(end)),
+    )
+
+
+def _ends_s(end: Mapping[str, Any]) -> Iterator[float]:
+    sums = [mapping(end, name) for name in ("sum", "sum_sent", "sum_received")]
+    parts = [mapping(stream, name) for stream in items(end, "streams") for name in ("udp", "sender", "receiver")]
+    yield from (end_s for part in (*sums, *parts) if (end_s := number(part, "end")) is not None)

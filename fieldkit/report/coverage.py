@@ -1,0 +1,185 @@
+"""How many repeats under a condition have a figure, and why the others have none."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.quantities import Quantity
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.core.columns import plain_name, prefixed
+from fieldkit.core.model import ENDED, Status
+from fieldkit.report import wording
+from fieldkit.report.evidence import Evidence
+
+Rows = NDArray[np.bool_]
+
+_LOSSES: Final = {
+    "rtt": ("rtt_loss",),
+    "topic": ("topic_loss",),
+    "iperf3": ("iperf3_loss", "iperf3_captured_loss"),
+}
+"""By the first part of a column's name, the losses of what it is measured on."""
+_OF_TRANSFERS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "file_loss")
+_EVERY_LOSS: Final = frozenset((*_OF_TRANSFERS, *(name for names in _LOSSES.values() for name in names)))
+
+NOTHING_ARRIVED: Final = "nothing arrived"
+NO_VALUE: Final = "no value"
+NO_VALID_REPEAT: Final = "no valid repeat"
+
+
+@dataclass(frozen=True)
+class RepeatCounts:
+    """What became of the repeats under one condition.
+
+    Attributes:
+        planned: How many there were to be, by the plans at hand; without a plan those that were begun.
+        valid: Those with a valid attempt.
+        void: Those whose last attempt is void.
+        failed: Those whose last attempt failed.
+        silent: Valid ones in which nothing arrived.
+    """
+
+    planned: int
+    valid: int
+    void: int
+    failed: int
+    silent: int
+
+    @property
+    def missing(self) -> int:
+        """Planned repeats without any attempt."""
+        return self.planned - self.valid - self.void - self.failed
+
+
+@dataclass(frozen=True)
+class Absence:
+    """Repeats under one condition that have no value of a quantity.
+
+    Attributes:
+        cell: The condition.
+        reason: `nothing arrived`, `no value`, or `no valid repeat`.
+        count: How many repeats have no value for this reason; attempts if none is valid.
+        of: Of how many.
+    """
+
+    cell: Cell
+    reason: str
+    count: int
+    of: int
+
+    @property
+    def is_total(self) -> bool:
+        """Whether the condition has no value at all."""
+        return self.count == self.of
+
+    @property
+    def share(self) -> str:
+        """How many repeats of how many, `3 of 5`; how the attempts ended if none is valid, `2 failed`."""
+        if self.cell.n_valid:
+            return f"{self.count} of {self.of}"
+        ways = (("void", self.cell.n_void), ("failed", self.cell.n_failed))
+        return ", ".join(f"{count} {status}" for status, count in ways if count)
+
+    @property
+    def text(self) -> str:
+        """The absence in words: `nothing arrived: 3 of 5`."""
+        return f"{self.reason}: {self.share}"
+
+
+def repeat_counts(cell: Cell, evidence: Evidence, silent: Rows) -> RepeatCounts:
+    """Return what became of the repeats under one condition; `silent` as `everything_lost`."""
+    texts, rows = evidence.repeats.texts, evidence.rows(cell)
+    last: dict[tuple[str, str, float], str] = {}
+    for row in rows.tolist():  # in the order of time
+        key = texts["source"][row], texts["trial"][row], float(evidence.repeats.numbers["repeat"][row])
+        if last.get(key) != Status.VALID:
+            last[key] = texts["status"][row]
+    ended = list(last.values())
+    planned = 0
+    for source in {source for source, *_ in last}:
+        plan = evidence.plans.get(source)
+        begun = sum(key[0] == source for key in last)
+        planned += max(begun, plan.repeats) if plan else begun
+    valid, void, failed = (ended.count(status) for status in ENDED)
+    is_silent = silent[rows] & (texts["status"][rows] == Status.VALID)
+    return RepeatCounts(planned, valid, void, failed, int(is_silent.sum()))
+
+
+def everything_lost(repeats: Repeats) -> Rows:
+    """Return for each row whether every loss that it has is total; shape (n,)."""
+    names = [name for name in repeats.numbers if plain_name(name) in _EVERY_LOSS]
+    return _all_lost([repeats.numbers[name] for name in names], len(repeats))
+
+
+def nothing_arrived(repeats: Repeats, quantity: Quantity, rows: NDArray[np.int64]) -> Rows:
+    """Return for each of some rows whether nothing arrived of what a quantity is measured on; shape of `rows`.
+
+    A row that has no loss of that is judged by all its losses.
+    """
+    kind = plain_name(quantity.name).partition("_")[0]
+    own = {prefixed(quantity.step, loss) for loss in _LOSSES.get(kind, _OF_TRANSFERS)}
+    losses = {name: column[rows] for name, column in repeats.numbers.items() if plain_name(name) in _EVERY_LOSS}
+    mine = [column for name, column in losses.items() if name in own]
+    is_known = np.any([np.isfinite(column) for column in mine], axis=0) if mine else np.zeros(len(rows), np.bool_)
+    is_lost = np.any([column >= 1 for column in mine], axis=0) if mine else is_known
+    lost: Rows = np.where(is_known, is_lost, _all_lost(list(losses.values()), len(rows)))
+    return lost
+
+
+def _all_lost(columns: Sequence[NDArray[np.float64]], count: int) -> Rows:
+    """Return for each row whether it has a loss, and none that is partial."""
+    if not columns:
+        return np.zeros(count, dtype=np.bool_)
+    is_known = np.any([np.isfinite(column) for column in columns], axis=0)
+    is_partial = np.any([column < 1 for column in columns], axis=0)  # false for a missing one
+    lost: Rows = is_known & ~is_partial
+    return lost
+
+
+def absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> Iterator[Absence]:
+    """Yield what is missing of a quantity under conditions in which it should have been measured.
+
+    Args:
+        cells: Conditions; of each protocol and topology those count that have the quantity under some condition.
+        quantity: Which.
+        evidence: The table and the plans at hand.
+    """
+    having = {_group(cell) for cell in cells if quantity.name in cell.estimates}
+    for cell in cells:
+        if _group(cell) in having and _is_measured(cell, quantity, cells, evidence):
+            yield from _absent(cell, quantity, evidence)
+
+
+def _group(cell: Cell) -> tuple[str, str]:
+    return wording.text(cell, "protocol"), wording.text(cell, "topology")
+
+
+def _is_measured(cell: Cell, quantity: Quantity, cells: Iterable[Cell], evidence: Evidence) -> bool:
+    """Return whether the repeats of a cell measure a quantity, by their plan, else by what is known of others."""
+    if quantity.name in cell.estimates:
+        return True
+    if (declared := evidence.declared(cell)) is not None:
+        return quantity.name in declared
+    same = ("procedure", "scenario", "topology", "backend", "protocol")
+    alike = (one for one in cells if all(one.key[name] == cell.key[name] for name in same))
+    if not cell.n_valid or any(quantity.name in one.estimates for one in alike):
+        return True
+    return bool(nothing_arrived(evidence.repeats, quantity, evidence.rows(cell)).any())
+
+
+def _absent(cell: Cell, quantity: Quantity, evidence: Evidence) -> Iterator[Absence]:
+    if not cell.n_valid:
+        attempts = cell.n_void + cell.n_failed
+        yield Absence(cell, NO_VALID_REPEAT, attempts, attempts)
+        return
+    rows = evidence.rows(cell)
+    rows = rows[evidence.repeats.texts["status"][rows] == Status.VALID]
+    lacking = rows[~np.isfinite(evidence.repeats.observed(quantity)[0][rows])]
+    silent = int(nothing_arrived(evidence.repeats, quantity, lacking).sum())
+    for reason, count in ((NOTHING_ARRIVED, silent), (NO_VALUE, len(lacking) - silent)):
+        if count:
+            yield Absence(cell, reason, count, len(rows))

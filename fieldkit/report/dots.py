@@ -1,0 +1,185 @@
+"""Dot plots of quantities that were measured at one distance: a lane per quantity, a panel per unit."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Final
+
+from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.quantities import Quantity
+from fieldkit.analysis.wording import Scale, measured, scale_of
+from fieldkit.core.columns import Kind
+from fieldkit.report import distance, wording
+from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
+from fieldkit.report.conditions import Identities, Identity, panels
+from fieldkit.report.coverage import absences
+from fieldkit.report.evidence import Evidence
+from fieldkit.report.points import Point, ends, needs_log, point
+from fieldkit.report.ranking import Ranking
+
+_DODGE: Final = 0.7
+"""Share of a lane over which the conditions of one quantity are spread."""
+_ASIDE: Final = 0.12
+"""Of single repeats, below their estimate, as a share of the room of a condition."""
+_LOG_ROOM: Final = 1.25
+"""Factor beyond the smallest and the largest value of a logarithmic axis."""
+_LABELS: Final = {
+    "share": "share",
+    "s": "time",
+    "bit/s": "rate",
+    "dBm": "signal",
+    "m": "length",
+    "m/s": "speed",
+    "count": "count",
+}
+_HOW: Final = (
+    "Each quantity with its 95 % interval: losses as shares of all that was sent, times and rates as medians over "
+    "repeats; below it, faint, each repeat. Properties that are true or false are shares of the valid repeats."
+)
+
+
+@dataclass(frozen=True)
+class _Lane:
+    """One quantity in one panel.
+
+    Attributes:
+        label: Its name, and the size of a ping's requests.
+        quantity: Which.
+        cells: The conditions that have it.
+        around: These, and those that lack it.
+    """
+
+    label: str
+    quantity: Quantity
+    cells: Sequence[Cell]
+    around: Sequence[Cell]
+
+
+def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Chart]:
+    """Yield the dot plot of all quantities that no curve shows; none if there are none."""
+    ranking = Ranking(evidence)
+    quantities = measured(cells)
+    first = ranking.first(quantities)
+    ordered = [*first, *(quantity for quantity in quantities if quantity not in first)]
+    groups: dict[tuple[str, str, str], list[_Lane]] = {}
+    for quantity in ordered:
+        for size, same in distance.by_size(cells, quantity, evidence).items():
+            around = distance.around(cells, quantity, same)
+            if distance.is_curve(around, quantity, evidence):
+                continue
+            for title, group in panels(same).items():
+                label = ", ".join(filter(None, (quantity.label, size)))
+                beside = distance.around(cells, quantity, group)
+                place = wording.distance(group[0])
+                groups.setdefault((title, place, quantity.unit), []).append(_Lane(label, quantity, group, beside))
+    if groups:
+        drawing = _DotDrawing(identities, evidence, ranking)
+        units = list(dict.fromkeys(unit for *_, unit in groups))
+        places = list(dict.fromkeys(place for _, place, _ in groups))
+        ranked = sorted(groups.items(), key=lambda item: (units.index(item[0][2]), *item[0][:2]))
+        drawn = [
+            drawing.panel(title if len(places) == 1 else f"{title}, {place}", unit, lanes)
+            for (title, place, unit), lanes in ranked
+        ]
+        yield Chart("quantities", f"All quantities at {wording.listed(places)}", _caption(drawn), drawn)
+
+
+@dataclass(frozen=True)
+class _DotDrawing:
+    """Draws the panels of one report."""
+
+    identities: Identities
+    evidence: Evidence
+    ranking: Ranking
+
+    def panel(self, title: str, unit: str, lanes: Sequence[_Lane]) -> Panel:
+        """Return the panel of the quantities of one unit."""
+        values = [cell.estimates[lane.quantity.name].value for lane in lanes for cell in lane.cells]
+        scale = scale_of(lanes[0].quantity, values)
+        conditions = list({id(cell): cell for lane in lanes for cell in lane.around}.values())
+        conditions.sort(key=lambda cell: self.identities.of(cell).rank)
+        step = _DODGE / len(conditions)
+        offsets = {id(cell): _DODGE / 2 - (index + 0.5) * step for index, cell in enumerate(conditions)}
+        placed: dict[str, tuple[Identity, list[tuple[float, Point]]]] = {}
+        edges: list[EdgeMark] = []
+        for height, lane in enumerate(reversed(lanes)):
+            for cell in lane.cells:
+                identity = self.identities.of(cell)
+                found = point(cell, lane.quantity, scale.factor, self.evidence)
+                placed.setdefault(identity.label, (identity, []))[1].append((height + offsets[id(cell)], found))
+            is_high = self.ranking.more_is_worse(lane.quantity) is not False
+            edges += [
+                EdgeMark(
+                    height + offsets[id(lack.cell)], lack.text, self.identities.of(lack.cell).style.colour, is_high
+                )
+                for lack in absences(lane.around, lane.quantity, self.evidence)
+                if lack.is_total
+            ]
+        points = [found for _, mine in placed.values() for _, found in mine]
+        ranked = sorted(placed.values(), key=lambda pair: pair[0].rank)
+        return _limited(
+            Panel(
+                title=title,
+                x_label=_axis(unit, scale, lanes),
+                y_label="",
+                series=[_series(identity, mine, _ASIDE * step) for identity, mine in ranked],
+                words=_words(title, lanes, scale),
+                lanes=[lane.label for lane in reversed(lanes)],
+                edges=edges,
+            ),
+            points,
+            scale.unit,
+        )
+
+
+def _axis(unit: str, scale: Scale, lanes: Sequence[_Lane]) -> str:
+    if all(lane.quantity.kind is Kind.FLAG for lane in lanes):
+        return "share of repeats [%]"
+    label = _LABELS.get(unit, "value")
+    return f"{label} [{scale.unit}]" if scale.unit else label
+
+
+def _limited(panel: Panel, points: Sequence[Point], unit: str) -> Panel:
+    """Return a panel with the ends of its axis of values, which is logarithmic where that is needed."""
+    values = list(chain.from_iterable((each.value, *each.repeats) for each in points))
+    if needs_log(values):
+        return replace(panel, x_log=True, left=min(values) / _LOG_ROOM, right=max(values) * _LOG_ROOM)
+    left, right = ends(points, unit)
+    return replace(panel, left=left, right=right)
+
+
+def _series(identity: Identity, placed: Sequence[tuple[float, Point]], aside: float) -> Series:
+    points = [each for _, each in placed]
+    return Series(
+        label=identity.label,
+        style=replace(identity.style, line="none"),
+        x=[each.value for each in points],
+        y=[height for height, _ in placed],
+        low=[each.low for each in points],
+        high=[each.high for each in points],
+        join="none",
+        behind=[(value, height - aside) for height, each in placed for value in each.singles(False)],
+        behind_bounds=[(value, height - aside) for height, each in placed for value in each.singles(True)],
+        bounds=[each.is_bound for each in points],
+        notes=[each.note for each in points] if any(each.note for each in points) else (),
+    )
+
+
+def _caption(drawn: Sequence[Panel]) -> str:
+    parts = [
+        _HOW,
+        "The axis is logarithmic where values differ more than 30 times." if any(one.x_log for one in drawn) else "",
+        "Hollow, with an arrow: a lower bound, because something had not ended."
+        if any(series.behind_bounds for one in drawn for series in one.series)
+        else "",
+        "A cross marks a condition without a value." if any(one.edges for one in drawn) else "",
+    ]
+    return " ".join(filter(None, parts))
+
+
+def _words(title: str, lanes: Sequence[_Lane], scale: Scale) -> str:
+    said = [
+        f"{lane.label}: {', '.join(scale.amount(cell.estimates[lane.quantity.name].value) for cell in lane.cells)}"
+        for lane in lanes
+    ]
+    return f"{title}. {'; '.join(said)}."

@@ -1,0 +1,124 @@
+"""Estimates as points of a figure: value, interval, single repeats, and the axis on which they are drawn."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.quantities import Quantity
+from fieldkit.analysis.wording import incomplete
+from fieldkit.core.columns import Kind
+from fieldkit.report import wording
+from fieldkit.report.evidence import Evidence
+
+MOST_BEHIND: Final = 100
+"""Single repeats behind one estimate; of more, every k-th is drawn."""
+_LEAST_TOP_PERCENT: Final = 1.0
+_MOST_ROOM: Final = 2.0
+"""End of the axis as a multiple of the largest value: wider intervals are cut there."""
+_ROOM_AROUND: Final = 0.25
+"""Above and below the values of an axis that does not begin at 0, as a share of their range."""
+_LOG_FROM_DECADES: Final = 1.5
+_MOST_VAGUE: Final = 0.5
+"""Share of the axis from which on an interval says too little about the course of a curve."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One estimate in the unit of the axis.
+
+    Attributes:
+        cell: The condition.
+        value: The figure.
+        low: Lower end of its 95 % interval, None without one.
+        high: Upper end, likewise.
+        repeats: Values of single repeats, some of them if there are many.
+        bounds: Of those, which are only lower bounds.
+        is_bound: Whether the figure is only a lower bound because of them.
+        note: How many of the valid repeats have a value, if not all: `2 of 3`.
+    """
+
+    cell: Cell
+    value: float
+    low: float | None
+    high: float | None
+    repeats: tuple[float, ...]
+    bounds: tuple[bool, ...] = ()
+    is_bound: bool = False
+    note: str = ""
+
+    @property
+    def protocol(self) -> str:
+        """The protocol of the condition."""
+        return wording.text(self.cell, "protocol")
+
+    @property
+    def metres(self) -> float:
+        """The distance of the condition."""
+        return wording.metres(self.cell)
+
+    @property
+    def top(self) -> float:
+        """The largest of value, interval and repeats."""
+        return max(self.value, *self.repeats, *([] if self.high is None else [self.high]))
+
+    @property
+    def bottom(self) -> float:
+        """The smallest of them."""
+        return min(self.value, *self.repeats, *([] if self.low is None else [self.low]))
+
+    def singles(self, are_bounds: bool) -> list[float]:
+        """Return the values of single repeats that are only lower bounds, or those that are not."""
+        return [value for value, is_bound in zip(self.repeats, self.bounds, strict=True) if is_bound is are_bounds]
+
+    def is_vague(self, ends: tuple[float, float]) -> bool:
+        """Return whether it has no interval, an open one, or one that is as wide as half of the axis."""
+        if self.low is None or self.high is None or self.is_bound:
+            return True
+        return self.high - self.low > _MOST_VAGUE * (ends[1] - ends[0])
+
+
+def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> Point:
+    """Return the estimate of a quantity under one condition, its values times `factor`.
+
+    A flag has no single repeats: each is all or nothing.
+    """
+    estimate = cell.estimates[quantity.name]
+    low, high = (None if end is None else factor * end for end in (estimate.low, estimate.high))
+    values, is_bound = evidence.observed(cell, quantity)
+    some = slice(None, None, max(-(-len(values) // MOST_BEHIND), 1))
+    if quantity.kind is Kind.FLAG:
+        values = values[:0]
+    return Point(
+        cell,
+        factor * estimate.value,
+        low,
+        high,
+        repeats=tuple((factor * values[some]).tolist()),
+        bounds=tuple(is_bound[some].tolist())[: len(values)],
+        is_bound=estimate.is_lower_bound,
+        note=incomplete(estimate),
+    )
+
+
+def ends(points: Sequence[Point], unit: str) -> tuple[float, float]:
+    """Return the ends of an axis for these points: from 0, unless a value is negative, as in dBm."""
+    if min(each.bottom for each in points) < 0:
+        values = [value for each in points for value in (each.value, *each.repeats)]
+        low, high = min(values), max(values)
+        room = _ROOM_AROUND * (high - low) or 1.0
+        return low - room, high + room
+    largest, highest = max(each.value for each in points), max(each.top for each in points)
+    top = min(highest, _MOST_ROOM * largest) if largest > 0 else highest
+    return 0.0, max(1.08 * top, _LEAST_TOP_PERCENT if unit == "%" else 0.0) or 1.0
+
+
+def needs_log(values: Iterable[float]) -> bool:
+    """Return whether values need a logarithmic axis: all above 0, over more than 1.5 decades."""
+    known = np.fromiter(values, np.float64)
+    known = known[np.isfinite(known)]
+    if not len(known) or known.min() <= 0:
+        return False
+    return bool(np.log10(known.max() / known.min()) > _LOG_FROM_DECADES)

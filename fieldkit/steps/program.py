@@ -1,0 +1,121 @@
+"""A step that runs one program on one robot and reads what it prints: the shortest way to a new kind of step."""
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from typing import ClassVar
+
+from typing_extensions import override
+
+from fieldkit.backends.protocols import Testbed
+from fieldkit.core.columns import Measured, Value
+from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.evidence import host, printed
+from fieldkit.remote import jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.steps.base import Step
+from fieldkit.steps.scene import Announce, Planned, Scene
+from fieldkit.steps.view import View
+
+
+class ProgramStep(Step):
+    """A step that runs one program on one robot and reads what it prints.
+
+    A kind needs the fields that are its YAML keys, `columns`, and two methods: `argv` and `parse`. Its output is kept
+    in a file, at most `printed.MOST_BYTES` bytes of it.
+
+    Attributes:
+        exit_codes: Exit codes of a program that succeeded; another one makes the repeat void.
+        limit_s: Seconds after which the program is ended, which makes the repeat void.
+        robot: The role of the robot that runs the program.
+    """
+
+    exit_codes: ClassVar[frozenset[int]] = frozenset({0})
+    limit_s: ClassVar[float] = 60.0
+
+    robot: Role
+
+    @abstractmethod
+    def argv(self, scene: Scene) -> Sequence[str]:
+        """Return the command as words; no shell reads them.
+
+        The address of the robot in another role is `scene.robot(role).address`.
+        """
+
+    @abstractmethod
+    def parse(self, output: str) -> Mapping[str, Value]:
+        """Return the values of columns by name, read from what the program printed.
+
+        A column that is left out has no value, which makes the repeat void.
+
+        Raises:
+            ValueError: The output is not as expected. So do LookupError and ArithmeticError; each makes the repeat
+                void.
+        """
+
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
+        argv = tuple(self.argv(scene))
+        job = Job(
+            folder=scene.folder,
+            name=self.own_name(self.kind_name()),
+            argv=argv,
+            limit_s=self.limit_s,
+            log=self._log,
+            stdout=self._output,
+            output_limit_bytes=printed.MOST_BYTES,
+        )
+        yield Planned(self.robot, job, program=argv[0], remedy=f"install {argv[0]}")
+
+    @override
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        (planned,) = self.jobs(scene)
+        announce(planned.program, self.expected_s(scene.protocol))
+        shell = testbed.shells[self.robot]
+        with shell.silence(planned.job.limit_s):
+            code = jobs.run(shell, planned.job)
+        if code not in self.exit_codes:
+            raise RobotError(
+                f"{planned.program} ended with exit code {code}",
+                where=scene.robot(self.robot).name,
+                remedy=f"see {self._log} and {self._output} of this repeat",
+            )
+
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
+        return 1.0
+
+    @override
+    def files(self) -> tuple[str, ...]:
+        return (self._output, self._log)
+
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """Yield why the program failed, or why its output has no value of a column."""
+        after = view.evidence.read_or_none(host.state, host.after(self.robot))
+        ending = (after.endings or {}).get(self.own_name(self.kind_name())) if after else None
+        if ending is not None and ending.code is not None and ending.code not in self.exit_codes:
+            yield f"{view.scene.robot(self.robot).name}: {self.kind_name()} ended with exit code {ending.code}"
+        for name, reason in self.measure(view).missing.items():
+            yield f"{self._output}: no {name}: {reason}"
+
+    @override
+    def measure(self, view: View) -> Measured:
+        declared = self.output_columns()
+        try:
+            values = self.parse(view.evidence.read(printed.text, self._output))
+        except EvidenceError as error:
+            return Measured.nothing(declared, error.what)
+        except (ValueError, LookupError, ArithmeticError) as error:
+            return Measured.nothing(declared, f"the output is not as expected: {type(error).__name__}: {error}")
+        return Measured.of(
+            {column.name: values.get(column.name) for column in declared}, "the program did not print it"
+        )
+
+    @property
+    def _output(self) -> str:
+        return self.own_name(f"{self.kind_name()}.txt")
+
+    @property
+    def _log(self) -> str:
+        return self.own_name(f"{self.robot}-{self.kind_name()}.log")

@@ -1,0 +1,82 @@
+"""The table of quantities and their sources: those of every attempt, and those that kinds of step declare."""
+
+from collections.abc import Iterator
+from fnmatch import fnmatchcase
+from typing import Final
+
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
+from fieldkit.steps import base
+
+OF_EVERY_ATTEMPT: Final = (
+    CrossCheck(
+        "that a robot was not restarted",
+        (),
+        "`ROLE-after.txt`: boot",
+        ("`ROLE-before.txt`: boot",),
+        "a robot that a step restarts",
+    ),
+    CrossCheck(
+        "that a clock was not set",
+        (),
+        "`ROLE-after.txt`: clock beside seconds since boot",
+        ("`ROLE-before.txt`: the same",),
+        "the error of the readings, 10 ms",
+    ),
+    CrossCheck(
+        "that jobs ended as they should",
+        (),
+        "`ROLE-after.txt`: jobs",
+        ("the procedure", "logs and outputs of jobs: each job with one has an end"),
+        "jobs of steps inside a fault",
+    ),
+    CrossCheck(
+        "that a robot's notes are whole",
+        (),
+        "sections of `ROLE-after.txt`",
+        ("sections of `ROLE-before.txt`",),
+        "a section that a robot cannot provide is missing in both; trials before boots were noted have no jobs",
+    ),
+    CrossCheck(
+        "who wrote a file",
+        (),
+        "name of each file in a robot's archive",
+        ("names that only the laptop writes", "jobs of the other robots"),
+        "none: the evidence is refused",
+    ),
+    CrossCheck(
+        "lateness of the emulator, its radio links",
+        ("emulator_*", "sender_*", "receiver_*"),
+        "`lateness.txt`, `link.csv`; a robot's own `ROLE-link.txt`",
+        (),
+        "the testbed, or the radio's driver, alone knows them",
+        CheckOutcome.UNCHECKED,
+    ),
+)
+
+
+def rows() -> Iterator[tuple[str, CrossCheck]]:
+    """Yield every check with the kind of step that it is of; the kind is empty for those of every attempt."""
+    yield from (("", check) for check in OF_EVERY_ATTEMPT)
+    for kind, step in base.step_types().items():
+        yield from ((kind, check) for check in step.cross_checks)
+
+
+def covers(kind: str, column: str) -> bool:
+    """Return whether a row of a kind of step names a column."""
+    own = (check for name, check in rows() if name == kind)
+    return any(fnmatchcase(column, pattern) for check in own for pattern in check.columns)
+
+
+def markdown() -> str:
+    """Return the table as `docs/evidence.md` has it."""
+    lines = [
+        "| step | quantity | source | compared with | may differ by | else |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for kind, check in rows():
+        against = "; ".join(check.against) or "nothing"
+        step = f"`{kind}`" if kind else "every attempt"
+        lines.append(
+            f"| {step} | {check.quantity} | {check.source} | {against} | {check.tolerance} | {check.outcome} |"
+        )
+    return "\n".join(lines) + "\n"

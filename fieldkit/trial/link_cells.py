@@ -1,0 +1,163 @@
+"""What a middleware must keep on a link, and the repeats that show it, for one size of samples at one place."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.analysis.cells import Cell, Estimate, aggregate
+from fieldkit.analysis.expectations import Expectation, Scope
+from fieldkit.analysis.quantities import Quantity
+from fieldkit.analysis.repeats import SOURCE, Repeats
+from fieldkit.core.columns import Kind, prefixed
+
+LEAST_REPEATS: Final = 5
+"""Losses over TCP may be bimodal (docs/studies/middleware-link.md); fewer repeats may all be of one kind."""
+_DECIMALS: Final = 12
+"""The bound is rounded to these, so that 29 of 1,000 are at a bound of 2.9 %, which is less in binary."""
+_WANTED: Final = "topic_wanted"
+_CELL: Final = "cell"
+_LOSS: Final = Quantity(
+    "loss", "loss, samples never sent included", Kind.COUNTED, "share", "topic_received", _WANTED, (0.0, 1.0)
+)
+_DELAY: Final = Quantity(
+    "topic_delay_p95_s", "delay, 95 %", Kind.MEDIAN, "s", possible=(0.0, math.inf), of_sent="topic_delay_p95_sent_s"
+)
+
+
+@dataclass(frozen=True)
+class LinkCriterion:
+    """What a middleware must keep on the link, in each repeat by itself.
+
+    Attributes:
+        max_loss: Share of the samples that may be lost, 0 to 1; those that were never sent count as lost.
+        max_delay_s: Delay of 95 % of all samples sent; None without a limit.
+        size_bytes: Only samples of this size; None for all that were measured.
+        repeats: Valid repeats that a cell needs.
+        share: Share of all repeats that must be shown to keep it, with 95 % confidence; None if each measured repeat
+            must keep it.
+    """
+
+    max_loss: float
+    max_delay_s: float | None = None
+    size_bytes: float | None = None
+    repeats: int = LEAST_REPEATS
+    share: float | None = None
+
+    def __str__(self) -> str:
+        delay = "" if self.max_delay_s is None else f", 95 % of those sent within {self.max_delay_s:g} s"
+        scope = (
+            "each repeat" if self.share is None else f"{100 * self.share:g} % of all repeats, with 95 % confidence"
+        )
+        return f"loss at most {100 * self.max_loss:g} %{delay}, in {scope}"
+
+    @property
+    def expectations(self) -> tuple[Expectation, ...]:
+        """The criterion as `fieldkit.analysis` judges it."""
+        bounds = [
+            (_LOSS, round(self.max_loss, _DECIMALS)),
+            *([] if self.max_delay_s is None else [(_DELAY, self.max_delay_s)]),
+        ]
+        return tuple(
+            Expectation(
+                f"{quantity.name} <= {bound:g}",
+                quantity.name,
+                is_below=True,
+                bound=bound,
+                is_inclusive=True,
+                scope=Scope.EVERY if self.share is None else Scope.SHARE,
+                share=self.share,
+            )
+            for quantity, bound in bounds
+        )
+
+
+@dataclass(frozen=True)
+class LinkCell:
+    """What was measured of a candidate with one size of samples at one place.
+
+    Attributes:
+        place: Where, in words.
+        size_bytes: Data of a sample.
+        sources: Folders of trials.
+        cell: Its repeats, with the estimates of loss and delay that they have.
+    """
+
+    place: str
+    size_bytes: float
+    sources: tuple[str, ...]
+    cell: Cell
+
+    @property
+    def loss(self) -> Estimate | None:
+        """The loss; None if no valid repeat has one."""
+        return self.cell.estimates.get(_LOSS.name)
+
+    @property
+    def delay(self) -> Estimate | None:
+        """The delay of 95 % of the samples, likewise."""
+        return self.cell.estimates.get(_DELAY.name)
+
+    @property
+    def attempts(self) -> int:
+        """Repeats, valid or not."""
+        return self.cell.n_valid + self.cell.n_void + self.cell.n_failed
+
+    @property
+    def largest_delay_s(self) -> float:
+        """The largest delay of 95 % of the samples sent of any repeat; infinity if a repeat has none."""
+        if self.delay is None or self.delay.sample is None or self.delay.missing:
+            return math.inf
+        return float(self.delay.sample.high.max())
+
+    def __str__(self) -> str:
+        return f"{self.place}, {self.size_bytes:g} B"
+
+
+def topic_columns(rows: Repeats, prefix: str) -> Repeats:
+    """Return the columns that `link_cell` needs of one topic, without the name of its step; NaN where one is missing.
+
+    Args:
+        rows: Attempts of a trial.
+        prefix: What the names of the step's columns begin with.
+    """
+    nothing = np.full(len(rows), np.nan)
+
+    def own(name: str) -> NDArray[np.float64]:
+        return np.asarray(rows.numbers.get(prefixed(prefix, name), nothing), dtype=np.float64)
+
+    names = ("topic_sent", "topic_refused", "topic_skipped", "topic_received", _DELAY.name, _DELAY.of_sent or "")
+    texts = {"status": rows.texts["status"], SOURCE: rows.texts[SOURCE]}
+    return Repeats({name: own(name) for name in names}, texts, ())
+
+
+def link_cell(place: str, size_bytes: float, tables: Sequence[Repeats]) -> LinkCell:
+    """Return the estimates of one candidate, size and place.
+
+    Args:
+        place: Where, in words.
+        size_bytes: Data of a sample.
+        tables: Attempts, as `topic_columns` returns them.
+    """
+    numbers = {name: np.concatenate([table.numbers[name] for table in tables]) for name in tables[0].numbers}
+    texts = {name: np.concatenate([table.texts[name] for table in tables]) for name in tables[0].texts}
+    wanted = numbers["topic_sent"] + numbers["topic_refused"] + numbers["topic_skipped"]
+    # A repeat in which nothing was to be sent is no evidence of a low loss: it has no value.
+    numbers[_WANTED] = np.where(wanted > 0, wanted, np.nan)
+    numbers[_LOSS.name] = (numbers[_WANTED] - numbers["topic_received"]) / numbers[_WANTED]
+    texts[_CELL] = np.full(len(wanted), place, dtype=np.object_)
+    (cell,) = aggregate(Repeats(numbers, texts, ()), (_CELL,), quantities=(_LOSS, _DELAY), words=())
+    return LinkCell(place, size_bytes, tuple(dict.fromkeys(map(str, texts[SOURCE]))), cell)
+
+
+def figure(estimate: Estimate | None, factor: float) -> str:
+    """Return a figure with its 95 % interval and the value of every repeat, in a unit that is `factor` smaller."""
+    if estimate is None or estimate.sample is None:
+        return "unknown"
+    low, high = (f"{factor * end:.2f}" if end is not None else "unknown" for end in (estimate.low, estimate.high))
+    repeats = ", ".join(f"{factor * value:.1f}" for value in estimate.sample.low.tolist())
+    missing = f", unknown in {estimate.missing}" if estimate.missing else ""
+    return f"{factor * estimate.value:.2f} [{low}, {high}], by repeat {repeats}{missing}"

@@ -1,0 +1,126 @@
+"""What a person must confirm before robots move: their places, and that they may move again after a fault."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+from fieldkit.backends.protocols import Attended, Backend, Testbed, Transient
+from fieldkit.core.errors import ConfigurationError, MotionHeldError
+from fieldkit.core.events import Note, Sink
+from fieldkit.core.model import Role
+from fieldkit.core.prompts import Nobody, Operator, Question
+from fieldkit.steps.origins import MemoryOrigins, Origins
+from fieldkit.trial import motion
+from fieldkit.trial.motion import KeptOrigins, MotionJournal
+from fieldkit.trial.plan import Plan
+
+CONFIRM: Final = "confirm"
+_STOP: Final = "stop"
+
+
+def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
+    """Return if robots that move by themselves stay at one place in all trials, or a person puts them there.
+
+    Raises:
+        ConfigurationError: A robot has to be at another place in a later trial, and `--yes` answers for the operator.
+    """
+    if not backend.by_hand or not isinstance(operator, Nobody):
+        return
+    for earlier, later in pairwise(plans):
+        for role in _self_moving(later):
+            if motion.place_of(role, earlier.placement) != motion.place_of(role, later.placement):
+                raise ConfigurationError(
+                    f"{later.cast[role].name} moves by itself and must be at another place for {later.distance}, and "
+                    "with --yes no person puts it there",
+                    remedy="without --yes; or one distance per command",
+                )
+
+
+def _self_moving(plan: Plan) -> tuple[Role, ...]:
+    moved = plan.procedure.moved()
+    return tuple(role for role, robot in plan.cast.items() if role in moved and (robot.drives or robot.flies))
+
+
+class MotionLeave:
+    """Lets the robots of a trial move, or ends the trial.
+
+    Args:
+        plan: The trial.
+        testbed: Its robots. Those of a testbed that ends with this run are at their places again after each motion.
+        folder: Its folder.
+
+    Attributes:
+        origins: Origins of its robots, for its steps.
+
+    Raises:
+        EvidenceError: The journal of motions is damaged.
+    """
+
+    def __init__(self, plan: Plan, testbed: Testbed, folder: Path) -> None:
+        self.origins: Origins
+        self._moving = {role: plan.cast[role].name for role in _self_moving(plan)}
+        self._testbed = testbed
+        self._kept: KeptOrigins | None = None
+        if isinstance(testbed, Transient):
+            self.origins = MemoryOrigins()
+            return
+        self._journal = MotionJournal(motion.journal_of(folder))
+        allowed = isinstance(testbed, Attended) and testbed.allow_motion_after_fault
+        robots = {role: robot.name for role, robot in plan.cast.items()}
+        self.origins = self._kept = KeptOrigins(self._journal, folder, robots, plan.placement, may_return=allowed)
+
+    def demand(self) -> None:
+        """Return if robots may move in the next attempt. After a fault a person is asked, and must type `confirm`.
+
+        Raises:
+            ConfigurationError: As `Operator.enter`.
+            MotionHeldError: No person has confirmed.
+            OSError: The disk is full or gone.
+        """
+        if self._kept is None or not self._moving:
+            return
+        self._demand_placed(self._kept)
+        if self._journal.holds:
+            self._demand_confirmed(self._kept)
+
+    @contextmanager
+    def noting(self, sink: Sink) -> Iterator[None]:
+        """Run the body; if the operator stops it, note each robot that may not move again without a confirmation."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            for hold in self._journal.holds if self._kept is not None else ():
+                place = f"before {hold.robot} moves again, a person has to put it at its place and type {CONFIRM}"
+                sink(Note(f"{hold.reason}: {place}"))
+            raise
+
+    def _demand_placed(self, kept: KeptOrigins) -> None:
+        """With `--yes` no person puts a robot at a new place, so its origin there would be wherever it is."""
+        testbed = self._testbed
+        if isinstance(testbed, Attended) and not isinstance(testbed.operator, Nobody):
+            return  # a person was asked to put it there
+        for role, name in self._moving.items():
+            if kept.is_new_place(role):
+                raise MotionHeldError(
+                    f"{name} must be at another place than before, and --yes does not confirm that it is there",
+                    remedy="put it at its place for this trial, its way free, then the same command without --yes",
+                )
+
+    def _demand_confirmed(self, kept: KeptOrigins) -> None:
+        testbed = self._testbed
+        if isinstance(testbed, Attended):
+            if testbed.allow_motion_after_fault:
+                self._journal.confirm("--allow-motion-after-fault", at_place=False)
+                return
+            stopped = "; ".join(f"{hold.robot}: {hold.reason}" for hold in self._journal.holds)
+            names = " and ".join(hold.robot for hold in self._journal.holds)
+            text = (
+                f"a fault stopped a robot ({stopped}); put {names} at its place, facing as in the beginning, its way "
+                f"free; type {CONFIRM} to let robots move again"
+            )
+            if testbed.operator.enter(Question(text, choices=(CONFIRM, _STOP), usual=_STOP)) == CONFIRM:
+                self._journal.confirm("a person confirmed", at_place=True)
+                return
+        kept.demand()

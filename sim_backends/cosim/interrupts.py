@@ -1,0 +1,37 @@
+"""SIGINT during a run: it ends the run between two windows, never while one is being recorded."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from sim_backends.cosim.coordinator import Coordinator
+
+
+@contextmanager
+def between_windows(coordinator: Coordinator) -> Iterator[None]:
+    """Let SIGINT raise `KeyboardInterrupt` as soon as no window is being hashed and recorded.
+
+    Nothing changes outside the main thread, or where SIGINT is handled otherwise.
+
+    Args:
+        coordinator: Of the run.
+    """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if coordinator.commits:
+            coordinator.is_interrupted = True
+        else:
+            signal.default_int_handler(number, frame)
+
+    coordinator.commits = coordinator.is_interrupted = False
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,0 +1,274 @@
+"""Fail-safes of the emulated autopilots: battery and ground station; what they make the vehicle do.
+
+ArduCopter: https://ardupilot.org/copter/docs/failsafe-battery.html, https://ardupilot.org/copter/docs/gcs-failsafe.html.
+PX4: https://docs.px4.io/main/en/config/safety.html.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from sim_backends.emulated.autopilot.battery import Battery
+from sim_backends.emulated.autopilot.mavlink import dialect
+from sim_backends.emulated.autopilot.modes import LANDING, RETURNING, Mode
+from sim_backends.emulated.autopilot.parameters import Parameters
+
+_WARNING: Final = dialect.MAV_SEVERITY_WARNING
+_CRITICAL: Final = dialect.MAV_SEVERITY_CRITICAL
+_INFO: Final = dialect.MAV_SEVERITY_INFO
+
+
+@dataclass(frozen=True)
+class VehicleState:
+    """State of the vehicle that fail-safes depend on.
+
+    Attributes:
+        now_ns: Time.
+        armed: Whether it is armed.
+        landed: Whether it is on the ground.
+        mode: Its mode.
+        battery: Its battery.
+    """
+
+    now_ns: int
+    armed: bool
+    landed: bool
+    mode: Mode
+    battery: Battery
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """Reaction of a fail-safe.
+
+    Attributes:
+        text: Text for people, empty for none.
+        severity: MAV_SEVERITY of the text.
+        mode: Mode to change to; None for none.
+        disarm: Whether to stop the motors.
+    """
+
+    text: str = ""
+    severity: int = _WARNING
+    mode: Mode | None = None
+    disarm: bool = False
+
+
+class Failsafes(Protocol):
+    """The fail-safes of a vehicle.
+
+    Attributes:
+        active: Whether one is triggered: HEARTBEAT is MAV_STATE_CRITICAL then.
+        unfit: Reasons for which they do not let it be armed.
+    """
+
+    @property
+    def active(self) -> bool:
+        """See the class."""
+
+    @property
+    def unfit(self) -> list[str]:
+        """See the class."""
+
+    def heartbeat(self, system: int, kind: int, now_ns: int) -> None:
+        """Take a heartbeat: system id and MAV_TYPE of its sender."""
+
+    def mode_changed(self, now_ns: int) -> None:
+        """Take note that a client changed the mode, or that the vehicle was disarmed."""
+
+    def set_points_lost(self) -> None:
+        """Take note that the vehicle changed its mode because set-points are missing; only PX4 does."""
+
+    def advance(self, now: VehicleState) -> Iterator[Reaction]:
+        """Yield the reactions that are due; to be called again and again."""
+
+
+class ArduCopterFailsafes:
+    """Battery and ground-station fail-safes of ArduCopter.
+
+    A triggered battery fail-safe lasts until the next boot; that of the ground station until it is heard again.
+
+    Args:
+        parameters: BATT_*, FS_GCS_*, SYSID_MYGCS.
+    """
+
+    _STAGES: Final = (("LOW", "is low"), ("CRT", "is critical"))
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._stage = 0
+        self._below_ns: dict[str, int] = {}
+        self._gcs_heard_ns: int | None = None
+        self._gcs_lost = False
+
+    @property
+    def active(self) -> bool:
+        """See `Failsafes`."""
+        return self._stage > 0 or self._gcs_lost
+
+    @property
+    def unfit(self) -> list[str]:
+        """See `Failsafes`."""
+        return ["Battery failsafe"] * (self._stage > 0) + ["GCS failsafe on"] * self._gcs_lost
+
+    def heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any type counts)
+        """See `Failsafes.heartbeat`."""
+        if system == self._parameters["SYSID_MYGCS"]:
+            self._gcs_heard_ns = now_ns
+
+    def mode_changed(self, now_ns: int) -> None:
+        """See `Failsafes.mode_changed`: nothing depends on it."""
+
+    def set_points_lost(self) -> None:
+        """See `Failsafes.set_points_lost`."""
+
+    def advance(self, now: VehicleState) -> Iterator[Reaction]:
+        """See `Failsafes.advance`."""
+        yield from self._battery(now)
+        yield from self._gcs(now)
+
+    def _battery(self, now: VehicleState) -> Iterator[Reaction]:
+        get = self._parameters
+        for stage, (name, words) in enumerate(self._STAGES, 1):
+            volt, charge_mah = get[f"BATT_{name}_VOLT"], get[f"BATT_{name}_MAH"]
+            left_mah = get["BATT_CAPACITY"] - now.battery.used_mah
+            low = charge_mah > 0 and left_mah < charge_mah
+            if volt > 0 and now.battery.voltage_v < volt:
+                since_ns = self._below_ns.setdefault(name, now.now_ns)
+                low = low or now.now_ns - since_ns > get["BATT_LOW_TIMER"] * 1e9
+            else:
+                self._below_ns.pop(name, None)
+            if not low or stage <= self._stage:
+                continue
+            self._stage = stage
+            battery = now.battery
+            yield Reaction(f"Battery 1 {words} {battery.voltage_v:.2f}V used {battery.used_mah:.0f} mAh")
+            yield from self._act(int(get[f"BATT_FS_{name}_ACT"]), _BATTERY_ACTIONS, "Battery Failsafe", now)
+
+    def _gcs(self, now: VehicleState) -> Iterator[Reaction]:
+        get = self._parameters
+        if not get["FS_GCS_ENABLE"] or self._gcs_heard_ns is None:
+            if self._gcs_lost:
+                self._gcs_lost = False
+                yield Reaction("GCS Failsafe Cleared")
+            return
+        lost = now.now_ns - self._gcs_heard_ns > get["FS_GCS_TIMEOUT"] * 1e9
+        if lost and not self._gcs_lost:
+            self._gcs_lost = True
+            yield from self._act(int(get["FS_GCS_ENABLE"]), _GCS_ACTIONS, "GCS Failsafe", now)
+        elif self._gcs_lost and not lost:
+            self._gcs_lost = False
+            yield Reaction("GCS Failsafe Cleared")
+
+    def _act(self, action: int, modes: dict[int, Mode], text: str, now: VehicleState) -> Iterator[Reaction]:
+        mode = modes.get(action)
+        if not now.armed or mode is None:
+            yield Reaction(text)
+        elif now.landed:
+            yield Reaction(text, disarm=True)
+        elif now.mode in LANDING:
+            yield Reaction(f"{text} - Continuing Landing")
+        else:
+            yield Reaction(text, mode=mode)
+
+
+_BATTERY_ACTIONS: Final = {1: Mode.LAND, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 6: Mode.RTL, 7: Mode.LAND}
+"""BATT_FS_LOW_ACT, BATT_FS_CRT_ACT; SmartRTL is RTL here, and 5 (terminate) is not emulated."""
+_GCS_ACTIONS: Final = {1: Mode.RTL, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 5: Mode.LAND, 6: Mode.RTL, 7: Mode.LAND}
+"""FS_GCS_ENABLE."""
+
+
+class Px4Failsafes:
+    """Ground-station (data-link) and battery fail-safes of PX4.
+
+    The vehicle first holds for COM_FAIL_ACT_T, so that a pilot can take over. A change of the mode ends a fail-safe.
+
+    Args:
+        parameters: NAV_DLL_ACT, COM_DL_LOSS_T, COM_LOW_BAT_ACT, BAT_*_THR, COM_FAIL_ACT_T.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._gcs_heard_ns: int | None = None
+        self._gcs_lost = False
+        self._warning = 0
+        self._active = False
+        self._next: tuple[int, Mode] | None = None
+
+    @property
+    def active(self) -> bool:
+        """See `Failsafes`."""
+        return self._active
+
+    @property
+    def unfit(self) -> list[str]:
+        """See `Failsafes`."""
+        gone = self._parameters["NAV_DLL_ACT"] > 0 and (self._gcs_lost or self._gcs_heard_ns is None)
+        return ["No connection to the ground control station"] * gone
+
+    def heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any system counts)
+        """See `Failsafes.heartbeat`."""
+        if kind == dialect.MAV_TYPE_GCS:
+            self._gcs_heard_ns = now_ns
+
+    def mode_changed(self, now_ns: int) -> None:  # noqa: ARG002
+        """See `Failsafes.mode_changed`: the fail-safe ends."""
+        self._active, self._next = False, None
+
+    def set_points_lost(self) -> None:
+        """See `Failsafes.set_points_lost`: it lasts until a client changes the mode."""
+        self._active = True
+
+    def advance(self, now: VehicleState) -> Iterator[Reaction]:
+        """See `Failsafes.advance`."""
+        yield from self._data_link(now)
+        yield from self._battery(now)
+        if self._next is not None and now.now_ns >= self._next[0]:
+            mode, self._next = self._next[1], None
+            yield Reaction("Failsafe activated", _CRITICAL, mode)
+
+    def _data_link(self, now: VehicleState) -> Iterator[Reaction]:
+        if self._gcs_heard_ns is None:
+            return
+        lost = now.now_ns - self._gcs_heard_ns > self._parameters["COM_DL_LOSS_T"] * 1e9
+        if lost and not self._gcs_lost:
+            self._gcs_lost = True
+            yield Reaction("Connection to ground station lost", _INFO)
+            yield from self._trigger(_DATA_LINK_ACTIONS.get(int(self._parameters["NAV_DLL_ACT"])), now)
+        elif self._gcs_lost and not lost:
+            self._gcs_lost = False
+            yield Reaction("Connection to ground station regained", _INFO)
+
+    def _battery(self, now: VehicleState) -> Iterator[Reaction]:
+        get, left = self._parameters, now.battery.left
+        warning = sum(left < get[name] for name in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR"))
+        if warning <= self._warning:
+            return
+        self._warning = warning
+        text = ("Low battery", "Critical battery", "Emergency battery level")[warning - 1]
+        yield Reaction(text, _WARNING if warning == 1 else _CRITICAL)
+        yield from self._trigger(_BATTERY_LEVELS.get((int(get["COM_LOW_BAT_ACT"]), warning)), now)
+
+    def _trigger(self, mode: Mode | None, now: VehicleState) -> Iterator[Reaction]:
+        if mode is None or not now.armed or now.landed or now.mode in (LANDING if mode is Mode.LAND else RETURNING):
+            return
+        self._active = True
+        hold_s = self._parameters["COM_FAIL_ACT_T"]
+        if mode is Mode.LOITER or hold_s < 1:
+            yield Reaction("Failsafe activated", _CRITICAL, mode)
+            return
+        self._next = now.now_ns + round(hold_s * 1e9), mode
+        yield Reaction(f"Failsafe activated: entering Hold for {hold_s:.0f} seconds", _CRITICAL, Mode.LOITER)
+
+
+_DATA_LINK_ACTIONS: Final = {1: Mode.LOITER, 2: Mode.RTL, 3: Mode.LAND}
+"""NAV_DLL_ACT; 5 and 6 (terminate, lockdown) are not emulated."""
+_BATTERY_LEVELS: Final = {
+    (1, 2): Mode.RTL,
+    (1, 3): Mode.RTL,
+    (2, 2): Mode.LAND,
+    (2, 3): Mode.LAND,
+    (3, 2): Mode.RTL,
+    (3, 3): Mode.LAND,
+}
+"""By COM_LOW_BAT_ACT and the warning: 2 is critical, 3 emergency."""

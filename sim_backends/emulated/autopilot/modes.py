@@ -1,0 +1,30 @@
+"""Flight modes of the emulated autopilots."""
+
+from enum import Enum, auto
+from typing import Final
+
+
+class Mode(Enum):
+    """A flight mode; each family has its own names: OFFBOARD is PX4's, which ArduCopter calls GUIDED.
+
+    The last four are a pilot's modes. There are no sticks: the drone stays at its place in the air as with centred
+    sticks, and on the ground as with the throttle closed.
+    """
+
+    TAKEOFF = auto()
+    LOITER = auto()
+    MISSION = auto()
+    RTL = auto()
+    HOMECOMING = auto()
+    """Last phase of RTL: descent at home."""
+    LAND = auto()
+    OFFBOARD = auto()
+    STABILIZE = auto()
+    ALT_HOLD = auto()
+    POSHOLD = auto()
+    BRAKE = auto()
+
+
+LANDING: Final = frozenset({Mode.LAND, Mode.HOMECOMING})
+RETURNING: Final = LANDING | {Mode.RTL}
+PILOTED: Final = frozenset({Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.BRAKE})

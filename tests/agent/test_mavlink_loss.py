@@ -1,0 +1,46 @@
+"""The loss of MAVLink behind a router against the counters of the kernel that dropped the messages."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fieldkit.measure.motion import tlog
+from tests.helpers import drones
+from tests.helpers.paths import ROOT
+
+pytestmark = pytest.mark.emulated
+
+LASTS_S = 8
+EDGE = 2
+"""Messages that may differ: one of each stream is on its way when the counters begin."""
+SHARE = 0.12
+"""And this share of the sent ones: the drone sends at multiples of 20 ms, and a late message at the time of a missing
+number looks lost."""
+
+
+@pytest.mark.quiet
+@pytest.mark.parametrize("percent", [0, 20])
+def test_the_loss_behind_a_router_is_what_the_kernel_dropped(percent: int, tmp_path: Path) -> None:
+    log = tmp_path / "mavlink.tlog"
+    words = ("unshare", "--net", "--", sys.executable, "-m", "tests.helpers.mavlink_loss")
+    done = subprocess.run(
+        (*words, str(log), str(LASTS_S), str(percent)),
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    counted = json.loads(done.stdout)
+    assert counted["periodic"] > 200
+    assert counted["withheld"] > 10, "numbers have gaps that are no loss"
+    values = tlog.measure(tlog.read(log, drones.SYSTEM, counted["ended_us"]), 0.0).values
+    came, sent = int(values["mavlink_periodic"]), int(values["mavlink_periodic_sent"])
+    assert abs(sent - came - counted["dropped"]) <= EDGE + SHARE * sent
+    assert came >= counted["periodic"] - counted["dropped"]
+    assert float(values["mavlink_loss"]) == pytest.approx(1 - came / sent)
+    assert float(values["mavlink_loss_most"]) > float(values["mavlink_loss"])

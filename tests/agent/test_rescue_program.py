@@ -1,0 +1,151 @@
+"""The rescue program: it ends the pilot and the guard, and lands a drone that their flight still leads."""
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from fieldkit.agent import flight, landing
+from fieldkit.agent.flight_plan import FlightPlan
+from fieldkit.agent.flying import liveness, rescue
+from fieldkit.core.deadline import Deadline
+from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
+from sim_backends.emulated.autopilot.autopilot import Autopilot
+from sim_backends.emulated.autopilot.firmware import Firmware
+from sim_backends.emulated.autopilot.guidance import SetPoint
+from sim_backends.emulated.autopilot.modes import Mode
+from sim_backends.emulated.autopilot.px4 import PX4
+from tests.helpers import drones
+from tests.helpers.sshd import wait_until
+
+HEIGHT_M = 1.0
+BEATS = """\
+import sys, time
+from fieldkit.agent.flying.liveness import FLYING, IDLE, LivenessFile
+file = LivenessFile(sys.argv[1], int(sys.argv[2]))
+while True:
+    file.beat(IDLE if int(sys.argv[2]) else FLYING)
+    time.sleep(0.02)
+"""
+
+
+def plan(folder: Path, port: int) -> FlightPlan:
+    where = f"udpout:127.0.0.1:{port}"
+    return FlightPlan(where, "", "land", 0.0, rescues=True, liveness=str(folder / "liveness"))
+
+
+@contextmanager
+def programs(folder: Path) -> Iterator[list["subprocess.Popen[bytes]"]]:
+    """Run a pilot and a guard that are suspended after a while."""
+    path = folder / "liveness"
+    with ExitStack() as stack:
+        pair = [
+            subprocess.Popen((sys.executable, "-c", BEATS, str(path), str(own)))
+            for own in (liveness.PILOT, liveness.GUARD)
+        ]
+        for process in pair:
+            stack.callback(process.wait, 60)
+            stack.callback(process.kill)
+        wait_until(lambda: have_begun(path), Deadline.after(60))
+        for process in pair:
+            process.send_signal(signal.SIGSTOP)
+        yield pair
+
+
+def have_begun(path: Path) -> bool:
+    """Return whether both programs are in the file."""
+    found = entries(path) if path.exists() else ()
+    return bool(found) and all(entry.turns for entry in found)
+
+
+def entries(path: Path) -> tuple[liveness.LifeEntry, ...]:
+    content = path.read_bytes()
+    return liveness.entries(content) if len(content) == liveness.SIZE else ()
+
+
+def fly_up(autopilot: Autopilot, firmware: Firmware) -> None:
+    """Let it hover in the guided mode; a PX4 follows one set-point and then misses the next."""
+    vehicle = autopilot.vehicle
+    wait_until(lambda: not vehicle.unfit, Deadline.after(60))
+    if firmware is PX4:
+        vehicle.lead(SetPoint((0.0, 0.0, HEIGHT_M), is_place=True))
+    vehicle.change_mode(Mode.OFFBOARD)
+    vehicle.arm()
+    if firmware is PX4:
+        wait_until(lambda: lead(autopilot) > 0.8 * HEIGHT_M, Deadline.after(60))
+    else:
+        vehicle.take_off(HEIGHT_M)
+        wait_until(lambda: vehicle.mode is Mode.OFFBOARD and up_m(autopilot) > 0.8 * HEIGHT_M, Deadline.after(60))
+
+
+def lead(autopilot: Autopilot) -> float:
+    autopilot.vehicle.lead(SetPoint((0.0, 0.0, HEIGHT_M), is_place=True))
+    return up_m(autopilot)
+
+
+def up_m(autopilot: Autopilot) -> float:
+    return autopilot.vehicle.body.position_m[2]
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
+def test_both_are_ended_before_the_drone_lands(tmp_path: Path, firmware: Firmware) -> None:
+    with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot), programs(tmp_path) as pair:
+        fly_up(autopilot, firmware)
+        if firmware is PX4:
+            wait_until(lambda: autopilot.vehicle.mode is Mode.LOITER, Deadline.after(60))
+        assert flight.fly(plan(tmp_path, port), threading.Event()) == 0
+        assert [process.wait(60) for process in pair] == [-signal.SIGKILL] * 2
+        assert not autopilot.vehicle.armed
+        assert autopilot.vehicle.body.on_ground
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
+def test_a_drone_that_a_person_has_taken_over_is_left_alone(
+    tmp_path: Path, firmware: Firmware, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot), programs(tmp_path):
+        fly_up(autopilot, firmware)
+        if firmware is PX4:
+            wait_until(lambda: autopilot.vehicle.mode is Mode.LOITER, Deadline.after(60))
+        autopilot.vehicle.change_mode(Mode.LOITER if firmware is PX4 else Mode.POSHOLD)
+        assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.TAKEN
+        assert autopilot.vehicle.armed
+        assert up_m(autopilot) > 0.5 * HEIGHT_M
+    assert "nothing more is sent" in capfd.readouterr().err
+
+
+def test_an_order_to_end_does_not_stop_the_rescue(tmp_path: Path) -> None:
+    over = threading.Event()
+    over.set()
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), programs(tmp_path):
+        fly_up(autopilot, ARDUCOPTER)
+        assert flight.fly(plan(tmp_path, port), over) == 0
+        assert autopilot.vehicle.body.on_ground
+
+
+def test_an_autopilot_that_is_not_heard_ends_it_with_an_alarm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(rescue, "UNHEARD_S", 1.0)
+    (tmp_path / "liveness").touch()
+    with drones.autopilot_at_udp(damage=lambda _: []) as (port, _):
+        assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.REFUSED
+    said = capfd.readouterr().err
+    assert "ALARM: THE DRONE MAY STILL BE IN THE AIR" in said
+    assert landing.MANUAL_ACTION in said
+    assert "no heartbeat of the autopilot" in said
+
+
+def test_a_connection_that_cannot_be_opened_ends_it_with_an_alarm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(rescue, "UNHEARD_S", 1.0)
+    (tmp_path / "liveness").touch()
+    closed = FlightPlan("tcp:127.0.0.1:9", "", "land", 0.0, rescues=True, liveness=str(tmp_path / "liveness"))
+    assert flight.fly(closed, threading.Event()) == landing.REFUSED
+    assert landing.MANUAL_ACTION in capfd.readouterr().err

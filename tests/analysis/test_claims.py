@@ -1,0 +1,85 @@
+"""What expectations need before a trial runs, against trials in which everything goes as well as it can."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.analysis import claims, expectations, judgements
+from fieldkit.analysis.judgements import Ruling
+from fieldkit.analysis.quantities import Quantity
+from fieldkit.core.columns import Kind
+from tests.analysis.test_expectations import PACKETS, losses
+
+GAP = Quantity("rtt_gap_s", "longest gap", Kind.MEDIAN, "s")
+BACK = Quantity("link_down_recovered", "back after link-down", Kind.FLAG, "share")
+RATE = Quantity("goodput_bit_s", "goodput", Kind.MEDIAN, "bit/s")
+RETRIES = Quantity("retries", "retries", Kind.MEAN, "count")
+KNOWN = (PACKETS, GAP, BACK, RATE, RETRIES)
+
+
+def said(text: str, repeats: int) -> str:
+    return " ".join(claims.shortfalls([expectations.parse(text, KNOWN)], KNOWN, repeats))
+
+
+@pytest.mark.parametrize(
+    ("text", "repeats", "shown"),
+    [
+        (
+            "90 % of rtt_gap_s < 300 ms",
+            20,
+            "needs at least 29 repeats for 95 % confidence, if all meet it; this trial has 20",
+        ),
+        ("90 % of rtt_gap_s < 300 ms", 29, ""),
+        (
+            "max rtt_gap_s < 300 ms",
+            20,
+            (
+                "is about the repeats of this trial; over 90 % of all repeats it needs at least 29 for 95 % "
+                "confidence, and 20 show it for 86 %"
+            ),
+        ),
+        ("max rtt_gap_s < 300 ms", 29, ""),
+        (
+            "ip_loss < 2 %",
+            20,
+            (
+                "needs at least 189 repeats for 95 % confidence, even if nothing is lost; this trial has 20; for "
+                "these packets alone: ip_loss < 2 % of all packets"
+            ),
+        ),
+        (
+            "ip_loss < 2 % of all packets",
+            20,
+            "needs at least 1498 packets per condition for 95 % confidence, if none is lost",
+        ),
+        (
+            "link_down_recovered > 90 %",
+            20,
+            "needs at least 35 repeats for 95 % confidence, if it is so in all of them; this trial has 20",
+        ),
+        ("rtt_gap_s < 300 ms", 6, ""),
+        (
+            "rtt_gap_s < 300 ms",
+            5,
+            (
+                "needs at least 6 repeats for 95 % confidence whatever the distribution of the repeats is; this "
+                "trial has 5"
+            ),
+        ),
+        (
+            "goodput_bit_s > 1 Mbit/s",
+            1,
+            "needs at least 2 repeats for 95 % confidence, which give an interval; this trial has 1",
+        ),
+        ("retries < 3", 2, ""),
+    ],
+)  # fmt: skip
+def test_what_a_claim_needs_is_said_before_a_run(text: str, repeats: int, shown: str) -> None:
+    assert said(text, repeats) == (shown and f"expected {text}: {shown}")
+
+
+@given(st.integers(1, 60), st.integers(1, 60))
+def test_without_a_warning_a_perfect_trial_holds_and_with_one_it_does_not(percent: int, repeats: int) -> None:
+    for text in (f"ip_loss < {percent} %", f"{percent} % of ip_loss < 1 %"):
+        (found,) = judgements.judge([expectations.parse(text, KNOWN)], [losses(*[0] * repeats)])
+        assert (found.ruling is Ruling.HOLDS) is (said(text, repeats) == "")

@@ -1,0 +1,123 @@
+"""Lines of tables: what an operator sees, of which pings a round-trip time is, and how many repeats have a figure."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from fieldkit.analysis import lines, repeats, tables
+from fieldkit.analysis.cells import Cell, aggregate
+from fieldkit.analysis.quantities import DEFAULT_BY, quantities
+from fieldkit.cli import main
+from fieldkit.core.columns import Column, Figure, Kind
+from fieldkit.trial import rows
+from fieldkit.trial.columns import trial_columns
+from tests.helpers.tables import ROW, RepeatRow, replace, write
+
+PINGED = replace(ROW, rtt_sent=10, rtt_received=9, rtt_loss=0.1, rtt_payload_bytes=8192, jitter_s=0.001)
+TCP = replace(
+    PINGED,
+    protocol="tcp",
+    rtt_payload_bytes=502,
+    ip_loss=None,
+    ip_packets_sent=None,
+    ip_packets_received=None,
+    tcp_byte_loss=0.01,
+    paper_packets=40,
+    paper_received=40,
+    paper_loss=0.0,
+)
+
+
+def cells_of(table: Sequence[RepeatRow]) -> tuple[Cell, ...]:
+    return aggregate(repeats.parse(rows.to_csv(table, trial_columns()).encode(), trial_columns()))
+
+
+def shown(cells: Sequence[Cell], chosen: Sequence[lines.TableLine]) -> dict[str, list[str]]:
+    return {line.label: [line.amount(cell, line.scale(cells)) for cell in cells] for line in chosen}
+
+
+def test_a_round_trip_time_says_of_which_pings_it_is() -> None:
+    said = shown(cells := cells_of([TCP, PINGED]), lines.lines(cells))
+    assert said["RTT, 502-byte ping, median"] == ["10.00 ms", ""]
+    assert said["RTT, 8192-byte ping, median"] == ["", "10.00 ms"]
+
+
+def test_pings_of_several_sizes_under_one_condition_are_named_so() -> None:
+    said = shown(cells := cells_of([PINGED, replace(PINGED, repeat=2, rtt_payload_bytes=56)]), lines.lines(cells))
+    assert [label for label in said if "RTT" in label] == ["RTT, 56- to 8192-byte ping, median"]
+
+
+@pytest.mark.parametrize("form", ["markdown", "latex"])
+def test_tables_for_papers_name_the_payload_and_how_many_repeats_have_a_figure(form: str) -> None:
+    made = {"markdown": tables.to_markdown, "latex": tables.to_latex}[form]
+    table = [
+        PINGED,
+        *(replace(PINGED, repeat=2 + n, rtt_loss=1.0, rtt_received=0, rtt_median_s=None) for n in (0, 1)),
+    ]
+    text = made(DEFAULT_BY, cells_of(table), quantities(trial_columns()))
+    assert "RTT, 8192-byte ping, median (ms)" in text
+    assert "10.00 (1 of 3)" in text
+    text = made(DEFAULT_BY, cells_of(table[1:]), quantities(trial_columns()))
+    assert "none, 0 of 2" in text
+
+
+def test_a_condition_without_any_reply_is_there_and_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    far = replace(
+        PINGED, trial="far", distance="60ft", distance_m=18.288, rtt_loss=1.0, rtt_received=0, rtt_median_s=None
+    )
+    assert main(["aggregate", str(write(tmp_path, [PINGED, far])), "--quantity", "rtt_median_s"]) == 0
+    said = capsys.readouterr().out
+    assert "RTT, 8192-byte ping (ms)" in said
+    assert [line.split() for line in said.splitlines() if line.startswith(" 60ft")][-1] == ["60ft", "0", "of", "1"]
+
+
+def test_what_the_radio_lost_of_tcp_and_of_udp_is_one_line_unless_a_condition_has_both() -> None:
+    cells = cells_of([TCP, PINGED])
+    said = shown(cells, lines.with_radio_loss(lines.of_operator(cells), cells))
+    assert said["radio loss"] == ["1.00 %", "4.63 %"]
+    together = cells_of([replace(PINGED, tcp_byte_loss=0.01)])
+    labels = shown(together, lines.with_radio_loss(lines.of_operator(together), together))
+    assert {"IP packet loss", "TCP byte loss before retransmission"} <= labels.keys()
+    assert "radio loss" not in labels
+
+
+def test_an_operator_sees_what_is_expected_and_what_a_lab_measures_but_not_all() -> None:
+    own = Column("probe.level", "dBm", "Level.", figure=Figure("probe: level", Kind.MEDIAN))
+    columns = (*trial_columns(), own)
+    row = replace(PINGED, transfer_stall_s=0.4, transfer_stalls=1)
+    row["probe.level"] = -60.0
+    content = rows.to_csv([row], columns).encode()
+    cells = aggregate(repeats.parse(content, columns))
+    labels = [line.label for line in lines.of_operator(cells)]
+    assert "probe: level, median" in labels
+    others = {
+        "jitter_s": "last jitter value (RFC 3550), median",
+        "transfer_stall_s": "longest stall of the transfer, median",
+        "transfer_stalls": "stalls of the transfer",
+    }
+    for name, label in others.items():
+        assert label not in labels
+        assert label in [line.label for line in lines.of_operator(cells, {name})]
+    assert labels.index("file loss") < labels.index("ping loss") < labels.index("RTT, 8192-byte ping, median")
+
+
+def test_figures_of_equal_rank_are_in_the_order_of_columns() -> None:
+    own = [Column(f"m{n}", "V", "Voltage.", figure=Figure(f"m{n}", Kind.MEDIAN)) for n in range(12)]
+    columns = (*trial_columns(), *own)
+    row = replace(PINGED) | {column.name: 7.4 for column in own}
+    cells = aggregate(repeats.parse(rows.to_csv([row], columns).encode(), columns))
+    labels = [line.label for line in lines.of_operator(cells)]
+    assert [label for label in labels if label.startswith("m")] == [f"m{n}, median" for n in range(12)]
+
+
+def test_a_table_of_nothing_for_an_operator_shows_everything() -> None:
+    bare = replace(ROW, file_loss=None, ip_loss=None, rtt_median_s=None, ip_packets_sent=None)
+    assert [line.label for line in lines.of_operator(cells_of([bare]))] == ["transfer time, median"]
+
+
+def test_packets_that_were_sent_are_counted_over_all_valid_repeats() -> None:
+    cells = cells_of([TCP, PINGED, replace(PINGED, repeat=2), replace(PINGED, repeat=3, status="void")])
+    assert lines.sent(cells) == {"packets sent": ["40", "432"]}

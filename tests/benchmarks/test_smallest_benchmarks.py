@@ -1,0 +1,46 @@
+"""Benchmarks do not rot: each runs at its smallest size, see `tests/helpers/smallest.py`."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.paths import ROOT
+from tests.helpers.smallest import CASES, run_module, run_smallest
+
+NOT_RUN = {
+    "firmware_flights": "flies a simulated firmware, which CI lacks; test_firmware_flights.py runs its rows",
+    "gallery": "draws the pictures of a page; tests/e2e/test_gallery.py runs it",
+    "wifi_vm": "makes a virtual machine of Debian packages, and boots it for 8 minutes or more",
+}
+"""Benchmarks that need more than CI has, and what else is tested of them; their help is printed all the same."""
+
+PARTS = {"bash_peer", "footprint", "lifetimes", "middleware_cells", "middleware_page", "namespaces", "own_time"} | {
+    "pandas_peer",
+    "slow_links",
+    "zenoh_plain",
+}
+"""Modules that others import or start."""
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if not case.emulated])
+def test_a_benchmark_runs_at_its_smallest_size(name: str, tmp_path: Path) -> None:
+    run_smallest(name, tmp_path)
+
+
+@pytest.mark.parametrize("name", NOT_RUN)
+def test_a_benchmark_that_does_not_run_here_prints_its_help(name: str) -> None:
+    done = run_module(f"benchmarks.{name}", "--help")
+    assert done.returncode == 0, done.stderr
+    assert "usage:" in done.stdout
+
+
+def test_every_module_runs_or_is_a_part_of_others() -> None:
+    modules = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
+    assert set(CASES) | set(NOT_RUN) | PARTS == modules
+    texts = [
+        path.read_text(encoding="utf-8")
+        for folder in ("benchmarks", "tests")
+        for path in (ROOT / folder).rglob("*.py")
+    ]
+    for name in PARTS:
+        assert sum(name in text for text in texts) > 1, f"nothing uses benchmarks/{name}.py"

@@ -1,0 +1,30 @@
+"""Benchmarks on namespaces and emulated robots do not rot: each runs at its smallest size."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.smallest import CASES, run_smallest
+
+pytestmark = pytest.mark.emulated
+
+ON_NAMESPACES = ("layers", "medium", "moves", "swarm", "tcp_vs_kernel")
+ON_ROBOTS = ("emane", "field_shape", "mesh", "mesh_losses", "middleware", "stop", "trial_overhead", "zenoh_images")
+ON_LOOPBACK = ("bridge",)
+
+
+# Tests of a class run one after the other in one process: there are two, to share the work.
+class TestOnNamespaces:
+    @pytest.mark.parametrize("name", ON_NAMESPACES + ON_LOOPBACK)
+    def test_a_benchmark_runs_at_its_smallest_size(self, name: str, tmp_path: Path) -> None:
+        run_smallest(name, tmp_path)
+
+
+class TestOnRobots:
+    @pytest.mark.parametrize("name", ON_ROBOTS)
+    def test_a_benchmark_runs_at_its_smallest_size(self, name: str, tmp_path: Path) -> None:
+        run_smallest(name, tmp_path)
+
+
+def test_every_emulated_benchmark_runs() -> None:
+    assert {name for name, case in CASES.items() if case.emulated} == {*ON_NAMESPACES, *ON_LOOPBACK, *ON_ROBOTS}

@@ -1,0 +1,52 @@
+"""`fieldkit docs`: open a page, print its path, list all."""
+
+import webbrowser
+
+import pytest
+
+from fieldkit.cli import main
+from tests.helpers.paths import ROOT
+
+FIELD = ROOT / "docs" / "field.md"
+
+
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The addresses that a browser was asked to open."""
+    addresses: list[str] = []
+
+    def open_address(address: str) -> bool:
+        addresses.append(address)
+        return True
+
+    monkeypatch.setattr(webbrowser, "open", open_address)
+    return addresses
+
+
+def test_a_topic_is_opened_in_the_browser(opened: list[str]) -> None:
+    assert main(["docs", "field"]) == 0
+    assert opened == [FIELD.as_uri()]
+
+
+def test_without_a_topic_the_overview_is_opened(opened: list[str]) -> None:
+    assert main(["docs"]) == 0
+    assert opened == [(ROOT / "docs" / "index.md").as_uri()]
+
+
+def test_the_path_is_printed_and_no_browser_opened(opened: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["docs", "field", "--path"]) == 0
+    assert (capsys.readouterr().out, opened) == (f"{FIELD}\n", [])
+
+
+def test_topics_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["docs", "--list"]) == 0
+    listed = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line.split()}
+    assert {"field", "errors", "reference", "steps"} <= listed
+
+
+def test_a_machine_without_a_browser_gets_the_path(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(webbrowser, "open", lambda address: False)
+    assert main(["docs", "field"]) == 2
+    assert str(FIELD) in capsys.readouterr().err.replace("\n", "")

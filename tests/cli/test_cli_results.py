@@ -1,0 +1,53 @@
+"""What the results of a trial end with: the commands that a person types next."""
+
+import argparse
+import shlex
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main, results
+from fieldkit.trial.running.runner import Outcome
+from tests.analysis.test_lines import PINGED, cells_of
+from tests.helpers.tables import RepeatRow, replace
+
+
+def commands(capsys: pytest.CaptureFixture[str], *rows: RepeatRow, every: bool = False) -> list[str]:
+    """Return the commands that are named as the next ones after trials of one row each."""
+    outcomes = [Outcome(Path(f"trials/{number}"), cells_of([row]), 1, 0) for number, row in enumerate(rows)]
+    assert results.report(outcomes, argparse.Namespace(json=False, all=every, junit=None)) == 0
+    text = capsys.readouterr().out
+    return [line.strip() for line in text[text.index("next: ") :].removeprefix("next: ").splitlines()]
+
+
+def test_the_next_commands_can_be_typed_as_they_are(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    report, every, farther = commands(capsys, PINGED)
+    assert (report, every) == ("fieldkit report trials/0", "fieldkit aggregate trials/0 --all  # 2 more quantities")
+    assert farther == "fieldkit trial los 60ft  # another distance"
+    _, *words = shlex.split(farther, comments=True)
+    assert main([*words, "--dry-run"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("distances", "farther"),
+    [
+        (["10m", "15m"], "20m"),
+        (["2.5m"], "5m"),
+        (["10m", "30ft"], "60ft"),
+        (["porch"], None),
+        (["30ft", "30ft"], None),
+    ],
+)
+def test_another_distance_goes_on_as_those_before(
+    capsys: pytest.CaptureFixture[str], distances: list[str], farther: str | None
+) -> None:
+    said = commands(capsys, *(replace(PINGED, distance=distance) for distance in distances), every=True)
+    assert said[1:] == ([f"fieldkit trial los {farther}  # another distance"] if farther else [])
+
+
+def test_nobody_is_sent_farther_away_where_no_ping_was_answered(capsys: pytest.CaptureFixture[str]) -> None:
+    dead = replace(PINGED, rtt_received=0, rtt_loss=1.0, rtt_median_s=None)
+    assert commands(capsys, dead, every=True) == ["fieldkit report trials/0"]

@@ -1,0 +1,77 @@
+"""What is printed into terminals of any width: nothing is cut off without a mark, no word is broken."""
+
+import io
+import re
+import sys
+from contextlib import redirect_stdout
+from unittest.mock import patch
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.cells import cell_len
+
+from fieldkit.cli.display import table, words_of
+from fieldkit.cli.progress import ProgressBar
+from fieldkit.core.events import NOTHING_ARRIVED, CampaignTrial, PhaseStarted, RepeatEnded, TrialStarted
+from fieldkit.core.model import ENDED, Status
+
+WORD = st.text(st.sampled_from("abcXYZ019-_/.%[]漢é"), min_size=1, max_size=40)
+CELL = st.lists(WORD, max_size=6).map(" ".join)
+WIDTHS = st.integers(20, 220)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def printed(width: int, head: list[str], rows: list[tuple[str, ...]], right: list[int]) -> str:
+    out = Terminal()
+    with redirect_stdout(out), patch.dict("os.environ", COLUMNS=str(width), TERM="xterm"):
+        assert sys.stdout.isatty()
+        table(head, rows, right=right)
+    return re.sub("\x1b[^m]*m", "", out.getvalue())
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data(), WIDTHS)
+def test_a_table_keeps_every_word_and_is_no_wider_than_the_terminal(data: st.DataObject, width: int) -> None:
+    size = data.draw(st.integers(1, 6))
+    head = data.draw(st.lists(st.from_regex(r"[a-z]{1,12}", fullmatch=True), min_size=size, max_size=size))
+    rows = data.draw(st.lists(st.tuples(*[CELL] * size), min_size=1, max_size=4))
+    right = data.draw(st.lists(st.integers(0, size - 1), max_size=2))
+    text = printed(width, head, rows, right)
+    words = [word for row in rows for cell in row for word in cell.split()]
+    shown = text.split()
+    assert all(shown.count(word) >= words.count(word) for word in words)
+    longest = max([cell_len(word) for word in words], default=0) + max(map(len, head)) + 4
+    assert all(cell_len(line) <= max(width, longest) for line in text.splitlines())
+
+
+PARTS = st.lists(st.from_regex(r"[a-zA-Z]{1,15} (loss|RTT) [0-9]{1,4}\.[0-9] (%|ms)", fullmatch=True), min_size=1)
+
+
+@given(PARTS, st.integers(40, 200), st.sampled_from(ENDED), st.text("ab ", max_size=60))
+def test_the_line_of_a_repeat_is_whole_at_any_width(
+    parts: list[str], width: int, status: Status, reason: str
+) -> None:
+    ended = RepeatEnded("udp-07", 1, status, reason.strip(), ", ".join(parts), 7, 40, 0.0)
+    text = "".join(part for part, _ in words_of(ended, width))
+    assert all(len(line) <= width for line in text.splitlines())
+    wide = "".join(part for part, _ in words_of(ended))
+    assert text.split() == wide.split()
+
+
+def test_a_repeat_in_which_nothing_arrived_is_red() -> None:
+    ended = RepeatEnded("udp-07", 1, Status.VALID, "", f"{NOTHING_ARRIVED}, ping loss 100.0 %", 7, 40, 0.0)
+    assert [style for text, style in words_of(ended, 80) if NOTHING_ARRIVED in text] == ["red"]
+
+
+@given(WORD, WORD, st.integers(4, 120))
+def test_the_live_line_marks_what_it_cuts(trial: str, phase: str, width: int) -> None:
+    progress = ProgressBar()
+    for event in (CampaignTrial(trial, 1, 2), TrialStarted("a", 0, 40), PhaseStarted(phase, repeat="udp-07")):
+        progress.take(event)
+    text = "".join(part for part, _ in progress.words(width))
+    assert len(text) <= width
+    assert f"udp-07 {phase}" in text or text.endswith("...") or "..." in text

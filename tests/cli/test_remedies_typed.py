@@ -1,0 +1,108 @@
+"""Remedies are typed as they are shown: their commands and options parse, and what they name is there."""
+
+import ast
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fieldkit import cli
+from fieldkit.cli import main
+from fieldkit.cli.parser import Parser
+from fieldkit.pytest.options import as_pytest_option
+from tests.helpers.paths import ROOT
+
+# As in `cli.hints`: words in small letters are commands; what follows are their arguments.
+COMMAND = re.compile(r"\bfieldkit((?: [a-z][a-z-]*)+)([^;,\n`()]*)")
+OPTION = re.compile(r"--[a-z][a-z-]+")
+
+
+def remedies() -> list[tuple[str, str]]:
+    """Return each remedy in the source with its place; what is filled in when it is shown stands as `X`."""
+    found = []
+    for path in sorted([*(ROOT / "fieldkit").rglob("*.py"), *(ROOT / "sim_backends").rglob("*.py")]):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.keyword) and node.arg == "remedy":
+                found += [(f"{path.relative_to(ROOT)}:{node.value.lineno}", text) for text in texts(node.value)]
+    return found
+
+
+def texts(node: ast.expr) -> list[str]:
+    match node:
+        case ast.Constant(str() as text):
+            return [text]
+        case ast.JoinedStr(parts):
+            return ["".join(part.value if isinstance(part, ast.Constant) else "X" for part in parts)]  # type: ignore[misc]
+        case ast.Call(func=ast.Name("typed"), args=words):
+            return [" ".join(word.value if isinstance(word, ast.Constant) else "X" for word in words)]  # type: ignore[misc]
+        case ast.IfExp(body=first, orelse=second) | ast.BinOp(left=first, right=second):
+            return [*texts(first), *texts(second)]
+    return []
+
+
+REMEDIES = remedies()
+
+
+def test_remedies_are_found() -> None:
+    assert len(REMEDIES) > 200
+    assert sum("fieldkit " in text for _, text in REMEDIES) > 30
+
+
+def parser_of(words: str, parsed: Parser) -> tuple[Parser, list[str]]:
+    parser, rest = parsed, words.split()
+    while rest and (inner := parser.command(rest[0])):
+        parser, rest = inner, rest[1:]
+    return parser, rest
+
+
+def test_commands_in_remedies_are_there_and_take_their_options() -> None:
+    parser = cli.parser()
+    wrong = []
+    for place, text in REMEDIES:
+        for match in COMMAND.finditer(text):
+            known, _ = parser_of(match[1], parser)
+            if known is parser and match[1].split()[0] not in {"is", "runs", "itself", "reads"}:
+                wrong.append((place, match[0], "no such command"))
+            taken = set(re.findall(r"--[a-z][a-z-]+", known.format_help()))
+            wrong += [(place, match[0], option) for option in OPTION.findall(match[2]) if option not in taken]
+    assert wrong == []
+
+
+@pytest.mark.parametrize(
+    ("shown", "typed"),
+    [
+        ("add roles.master, or use --topology master", "add roles.master, or use --fieldkit-topology master"),
+        ("fieldkit init, then fill it in; or by --site", "fieldkit init, then fill it in; or by --fieldkit-site"),
+        ("fieldkit resume trials/a --backend field", "fieldkit resume trials/a --backend field"),
+        ("--storage in record", "--storage in record"),
+        ("--fieldkit-yes", "--fieldkit-yes"),
+    ],
+)
+def test_options_in_messages_of_pytest_are_pytest_s(shown: str, typed: str) -> None:
+    assert as_pytest_option(shown) == typed
+
+
+@pytest.mark.parametrize("words", ["trial los -5m", "trial los 5m -3ft", "check --record -2s"])
+def test_a_negative_length_is_told_as_what_it_is(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words.split()) == 2
+    assert "is below zero\n  remedy: write for example" in capsys.readouterr().err
+
+
+def test_a_copy_of_a_shipped_profile_is_made_as_it_is_documented(tmp_path: Path) -> None:
+    """The shell makes the empty file before fieldkit looks for the profile."""
+    command = f"mkdir -p robots; {shlex.quote(sys.executable)} -m fieldkit robots show husky > robots/husky.yaml"
+    subprocess.run(command, shell=True, cwd=tmp_path, check=True)
+    made = (tmp_path / "robots" / "husky.yaml").read_text(encoding="utf-8")
+    assert made == (ROOT / "robots" / "husky.yaml").read_text(encoding="utf-8")
+
+
+def test_a_line_that_is_indented_otherwise_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    site = tmp_path / "lab.yaml"
+    site.write_text("robots:\n  a: {profile: husky}\n   b: {profile: husky}\n", encoding="utf-8")
+    assert main(["check", "--site", str(site)]) == 2
+    told = capsys.readouterr().err
+    assert "lab.yaml:3" in told
+    assert "indent this line" in told

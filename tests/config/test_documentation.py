@@ -1,0 +1,54 @@
+"""The pages of the documentation by topic, in a wheel and in a checkout."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit.config import documentation
+from fieldkit.core.errors import ConfigurationError
+from tests.helpers.paths import ROOT
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the pages in a package as a wheel installs it."""
+    docs = tmp_path / "fieldkit" / "data" / "docs"
+    for name in ("index", "404", "field", "reference/index", "reference/commands", "studies/mesh"):
+        page = docs / f"{name}.html"
+        page.parent.mkdir(parents=True, exist_ok=True)
+        page.write_text('<a href="#fieldkit-trial">trial</a>', encoding="utf-8")
+    monkeypatch.setattr(documentation, "_PACKAGE", tmp_path / "fieldkit")
+    return docs
+
+
+def test_topics_are_the_pages_of_all_folders(installed: Path) -> None:
+    assert documentation.topics() == {
+        "commands": installed / "reference" / "commands.html",
+        "field": installed / "field.html",
+        "index": installed / "index.html",
+        "mesh": installed / "studies" / "mesh.html",
+        "reference": installed / "reference" / "index.html",
+    }
+
+
+def test_a_checkout_has_its_markdown_pages() -> None:
+    assert documentation.find("field").path == ROOT / "docs" / "field.md"
+    assert documentation.find("steps").path == ROOT / "docs" / "reference" / "steps.md"
+
+
+def test_a_command_is_a_section_of_the_page_of_commands(installed: Path) -> None:
+    page = documentation.find("trial")
+    assert page.uri == (installed / "reference" / "commands.html").as_uri() + "#fieldkit-trial"
+
+
+@pytest.mark.usefixtures("installed")
+def test_an_unknown_topic_gives_the_nearest() -> None:
+    with pytest.raises(ConfigurationError, match="no topic 'fields'") as caught:
+        documentation.find("fields")
+    assert caught.value.remedy == "did you mean 'field'?"
+
+
+def test_a_package_without_pages_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(documentation, "_PACKAGE", tmp_path / "fieldkit")
+    with pytest.raises(ConfigurationError, match="has no documentation"):
+        documentation.topics()

@@ -1,0 +1,137 @@
+"""A key that is known at another level is reported as a line that is indented wrongly, not as a typing error."""
+
+import copy
+import re
+from pathlib import Path
+
+import pytest
+
+from fieldkit.config import documents, schema
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.config.site import Site
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.trial.procedure import Procedure
+from tests.helpers.paths import ROOT
+
+SITE = """\
+robots:
+  a:
+    profile: x
+  b: {profile: x}
+roles:
+  master: {sender: a, receiver: b}
+emulated:
+  ros: builtin
+"""
+STEPS = """\
+name: p
+summary: x
+scenario: los
+topology: master
+protocols: [udp]
+repeats: 1
+steps:
+  - capture:
+      during:
+        - ping:
+            from: sender
+            to: receiver
+  - run:
+      robot: sender
+      command: a
+"""
+
+
+def refused(text: str, model: type[schema.Strict]) -> ConfigurationError:
+    with pytest.raises(ConfigurationError) as caught:
+        schema.validate(schema.parse(text, source="f.yaml"), model)
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("model", "old", "new", "line", "said"),
+    [
+        (
+            Site,
+            "  ros:",
+            "ros:",
+            8,
+            "unknown key ros; valid keys: .*; if it is a key of emulated, indent it below emulated:",
+        ),
+        (Site, "  ros: builtin", "backnd: x", 8, "did you mean 'backend'. if it is a key of emulated"),
+        (
+            Site,
+            "    profile: x",
+            "    profile: x\n    patience: 3s",
+            4,
+            "patience here; it is a key of the whole file: indent it as robots: is",
+        ),
+        (Site, "    profile: x", "  profile: x", 2, "keys that belong to this line are indented more than it is"),
+        (
+            Procedure,
+            "to: receiver",
+            "to: receiver\n            attempts: 3",
+            13,
+            "of the whole file: indent it as steps: is",
+        ),
+        (
+            Procedure,
+            "to: receiver",
+            "to: receiver\n            robots: []",
+            13,
+            "of capture: indent it as during: is",
+        ),
+        (Procedure, "            to:", "          to:", 12, "unknown key to; it is a key of ping: write it inside"),
+        (Procedure, "            to: receiver", "          robots: []", 12, "of capture: indent it as during: is"),
+        (
+            Procedure,
+            "command: a",
+            "command: a\n      code: [1]",
+            16,
+            "it is a key of expect: indent it below expect:",
+        ),
+        (
+            Procedure,
+            "command: a",
+            "command: a\n      expect:\n        limit: 3s",
+            17,
+            "of run: indent it as expect: is",
+        ),
+        (Procedure, "command: a", "comand: a", 15, "did you mean 'command'"),
+    ],
+)
+def test_the_message_says_where_the_line_belongs(
+    model: type[schema.Strict], old: str, new: str, line: int, said: str
+) -> None:
+    text = SITE if model is Site else STEPS
+    assert text.count(old) == 1
+    error = refused(text.replace(old, new), model)
+    assert error.where == f"f.yaml:{line}"
+    assert re.search(said, error.what), error.what
+
+
+PROFILES = sorted((ROOT / "robots").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
+def test_every_key_of_a_section_that_slips_out_of_it_is_sent_back(path: Path) -> None:
+    whole = documents.read(path).data
+    known = {field.alias or name for name, field in RobotProfile.model_fields.items()}
+    moved = [
+        (section, key)
+        for section, value in whole.items()
+        if isinstance(value, dict) and hasattr(RobotProfile.model_fields[section].annotation, "model_fields")
+        for key in value
+        if key not in known
+    ]
+    assert moved
+    for section, key in moved:
+        data = copy.deepcopy(whole)
+        slipped = data[section].pop(key)
+        at = list(data).index(section) + 1
+        items = list(data.items())
+        text = documents.to_text(dict([*items[:at], (key, slipped), *items[at:]]))
+        assert (
+            f"unknown key {key}; it is a key of {section}: indent it below {section}:"
+            in refused(text, RobotProfile).what
+        )

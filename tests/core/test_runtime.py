@@ -1,0 +1,176 @@
+"""Names that one process holds: whatever another user, a crash or a crowd does, one holds it and nothing is left."""
+
+import os
+import signal
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core import runtime
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.runtime import NameHeldError
+from tests.helpers.paths import ROOT
+from tests.helpers.sshd import wait_until
+
+NAME = "trial-0123abcd"
+
+
+@pytest.fixture(autouse=True)
+def base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A base folder of this test's own; its path is short, as `base_folder` wants it."""
+    with tempfile.TemporaryDirectory(dir="/tmp", prefix="rt") as folder:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
+        yield Path(folder)
+
+
+def private(base: Path) -> Path:
+    return base / f"fieldkit-{os.geteuid()}"
+
+
+def test_a_name_is_held_once_and_nothing_is_left(base: Path) -> None:
+    with runtime.held(NAME):
+        assert private(base).stat().st_mode & 0o777 == 0o700
+        with runtime.held("another"):
+            assert len(list(private(base).iterdir())) == 2
+        with pytest.raises(NameHeldError), runtime.held(NAME):
+            raise AssertionError("held twice")
+    assert list(base.iterdir()) == []
+    with runtime.held(NAME):
+        pass
+
+
+def test_what_kill_9_leaves_holds_nothing_and_is_removed(base: Path) -> None:
+    reader, writer = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        with runtime.held(NAME), runtime.held("another"):
+            os.write(writer, b"+")
+            signal.pause()
+    os.read(reader, 1)
+    with pytest.raises(NameHeldError), runtime.held(NAME):
+        raise AssertionError("the other process holds it")
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    os.close(reader)
+    os.close(writer)
+    assert len(list(private(base).iterdir())) == 2, "this is what a kill leaves"
+    with runtime.held(NAME):
+        assert [path.name for path in private(base).iterdir()] == [f"{NAME}.lock"]
+    assert list(base.iterdir()) == []
+
+
+def test_of_many_processes_one_holds_the_name(base: Path) -> None:
+    go, stay = os.pipe(), os.pipe()
+    children = []
+    for _ in range(12):
+        pid = os.fork()
+        if pid == 0:
+            code = 2
+            try:
+                os.close(go[1])
+                os.close(stay[1])
+                os.read(go[0], 1)  # until the pipe is closed
+                with runtime.held(NAME):
+                    os.read(stay[0], 1)
+                code = 0
+            except NameHeldError:
+                code = 1
+            finally:
+                os._exit(code)
+        children.append(pid)
+    os.close(go[1])
+    codes: dict[int, int] = {}
+
+    def are_all_but_one_refused() -> bool:
+        for pid in set(children) - codes.keys():
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            codes.update({pid: os.waitstatus_to_exitcode(status)} if ended else {})
+        return len(codes) >= len(children) - 1
+
+    wait_until(are_all_but_one_refused, Deadline.after(60))
+    assert list(codes.values()) == [1] * 11
+    os.close(stay[1])
+    (holder,) = set(children) - codes.keys()
+    assert os.waitstatus_to_exitcode(os.waitpid(holder, 0)[1]) == 0
+    os.close(go[0])
+    os.close(stay[0])
+    assert list(base.iterdir()) == []
+
+
+def test_names_come_and_go_while_others_remove_what_is_stale(base: Path) -> None:
+    children = []
+    for number in range(4):
+        pid = os.fork()
+        if pid == 0:
+            code = 1
+            try:
+                for _ in range(100):
+                    with runtime.held(f"own-{number}"):
+                        pass
+                code = 0
+            finally:
+                os._exit(code)
+        children.append(pid)
+    assert [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in children] == [0] * 4
+    assert list(base.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["open to others", "of another user", "link", "file", "link to nothing"])
+def test_what_another_user_laid_there_is_refused_and_left_alone(base: Path, tmp_path: Path, kind: str) -> None:
+    path, victim = private(base), tmp_path / "victim"
+    victim.mkdir(mode=0o700)
+    match kind:
+        case "open to others":
+            path.mkdir()
+            path.chmod(0o777)
+        case "of another user":
+            path.mkdir(mode=0o700)
+            try:
+                os.chown(path, 54321, 54321)
+            except PermissionError:
+                pytest.skip("only root gives a folder away")
+        case "link":
+            path.symlink_to(victim)
+        case "file":
+            path.touch(mode=0o600)
+        case _:
+            path.symlink_to(tmp_path / "nothing")
+    with pytest.raises(ConfigurationError) as caught, runtime.held(NAME):
+        raise AssertionError("held where others can write")
+    assert not isinstance(caught.value, NameHeldError)
+    assert "XDG_RUNTIME_DIR" in caught.value.remedy
+    assert list(victim.iterdir()) == []
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_a_link_in_place_of_the_lock_file_is_not_followed(base: Path, tmp_path: Path) -> None:
+    private(base).mkdir(mode=0o700)
+    (private(base) / f"{NAME}.lock").symlink_to(tmp_path / "made")
+    with pytest.raises(ConfigurationError), runtime.held(NAME):
+        raise AssertionError("held by a link")
+    assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.parametrize("spoil", ["is not there", "others write there", "is relative", "is too long"])
+def test_a_runtime_folder_that_is_not_private_is_not_used(
+    base: Path, monkeypatch: pytest.MonkeyPatch, spoil: str
+) -> None:
+    assert runtime.base_folder() == base
+    named = {"is not there": base / "none", "is relative": Path(), "is too long": base / ("x" * 60)}.get(spoil, base)
+    if spoil == "is too long":
+        named.mkdir(mode=0o700)
+    if spoil == "others write there":
+        base.chmod(0o777)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(named))
+    assert runtime.base_folder() != named
+
+
+def test_no_name_of_the_product_can_be_occupied_by_another_user() -> None:
+    """An abstract socket belongs to whoever binds it first (unix(7))."""
+    sources = [path for package in ("fieldkit", "sim_backends") for path in (ROOT / package).rglob("*.py")]
+    assert len(sources) > 300
+    assert [path for path in sources if 'bind(f"\\0' in path.read_text(encoding="utf-8")] == []
+    assert [path for path in sources if '"\\0fieldkit' in path.read_text(encoding="utf-8")] == []

@@ -1,0 +1,156 @@
+"""The fault matrix of moving robots: part of `make soak`; tests/e2e/test_motion_faults.py runs a few of its cells.
+
+`python -m tests.e2e.motion_faults --runs 10 --cells 'rover/*' --jobs 2` prints an outcome per line, then the tables
+of `docs/stopping.md`; `--write docs/stopping.md` puts them there. With `--results FILE` outcomes are added to a
+file, trials that it has are not repeated, and the tables are of all that it has.
+"""
+
+import argparse
+import multiprocessing
+import os
+import random
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime
+from multiprocessing.queues import Queue
+from pathlib import Path
+from typing import Final
+
+from tests.helpers import motion_table
+from tests.helpers.motion_cells import CELLS, MotionCell, chosen
+from tests.helpers.motion_lab import motion_lab
+from tests.helpers.motion_outcomes import MotionOutcome
+from tests.helpers.motion_trials import MotionTrial
+
+_RENEWED_AFTER: Final = 50
+"""Trials after which a lab is set up anew."""
+
+_Task = tuple[str, int]
+"""Name of a cell, and seed."""
+
+
+def observe(cells: Iterable[tuple[MotionCell, int]]) -> Iterator[MotionOutcome]:
+    """Yield the outcome of one trial after the other, each of a cell with its seed, in one lab."""
+    with tempfile.TemporaryDirectory(prefix="fieldkit-motion-") as folder, motion_lab(Path(folder)) as lab:
+        for number, (cell, seed) in enumerate(cells):
+            own = Path(folder, f"trial-{number}")
+            own.mkdir()
+            yield MotionTrial(lab, cell, own, seed).run()
+
+
+def _work(tasks: "Queue[_Task | None]", outcomes: "Queue[str | None]") -> None:
+    """Run trials until there are none left; the end is None."""
+    by_name = {cell.name: cell for cell in CELLS}
+
+    def some() -> Iterator[tuple[MotionCell, int]]:
+        for _ in range(_RENEWED_AFTER):
+            task = tasks.get()
+            if task is None:
+                tasks.put(None)  # for the others, and for the next lab
+                return
+            yield by_name[task[0]], task[1]
+
+    ended = False
+    try:
+        while not ended:
+            count = 0
+            for outcome in observe(some()):
+                count += 1
+                outcomes.put(outcome.line())
+            ended = count < _RENEWED_AFTER
+    finally:
+        outcomes.put(None)
+
+
+def all_outcomes(tasks: Sequence[_Task], jobs: int) -> Iterator[MotionOutcome]:
+    """Yield the outcomes of trials, as they end, `jobs` at the same time, each in a lab of its own process."""
+    context = multiprocessing.get_context("spawn")
+    waiting: Queue[_Task | None] = context.Queue()
+    ended: Queue[str | None] = context.Queue()
+    for task in (*tasks, None):
+        waiting.put(task)
+    workers = [context.Process(target=_work, args=(waiting, ended)) for _ in range(jobs)]
+    for worker in workers:
+        worker.start()
+    left = jobs
+    try:
+        while left:
+            line = ended.get()
+            if line is None:
+                left -= 1
+            else:
+                yield MotionOutcome.of(line)
+    finally:
+        for worker in workers:
+            worker.join()
+
+
+def main() -> int:
+    """Run trials; print the outcomes and the tables."""
+    parser = argparse.ArgumentParser(description="fault matrix of moving robots")
+    parser.add_argument(
+        "--cells", default="*", help="patterns of robot/parties/fault/phase, with commas between them"
+    )
+    parser.add_argument("--runs", type=int, default=1, help="of each cell")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2, help="labs at the same time")
+    parser.add_argument("--sample", type=int, default=0, help="only so many trials of these, at random")
+    parser.add_argument("--results", type=Path, help="file of outcomes, to which new ones are added")
+    parser.add_argument("--write", type=Path, help="page that gets the tables")
+    parser.add_argument("--list", action="store_true", help="list the cells, and run nothing")
+    arguments = parser.parse_args()
+    cells = chosen(arguments.cells)
+    if arguments.list:
+        print("\n".join(cell.name for cell in cells))
+        return 0
+    known = _read(arguments.results)
+    done = {(outcome.cell, outcome.seed) for outcome in known}
+    tasks = [
+        (cell.name, seed)
+        for seed in range(arguments.seed, arguments.seed + arguments.runs)
+        for cell in cells
+        if (cell.name, seed) not in done
+    ]
+    random.Random(arguments.seed).shuffle(tasks)
+    tasks = tasks[: arguments.sample] if arguments.sample else tasks
+    outcomes, began_s = list(known), time.monotonic()
+    for outcome in all_outcomes(tasks, arguments.jobs) if tasks else ():
+        outcomes.append(outcome)
+        if arguments.results:
+            with arguments.results.open("a", encoding="utf-8") as file:
+                file.write(outcome.line() + "\n")
+        times = ", ".join(
+            f"{name} {value:.2f} s"
+            for name, value in (
+                ("first", outcome.begins_s),
+                ("ground", outcome.ends_s),
+                ("alarm", outcome.alarm_s),
+                ("programs ended", outcome.programs_s),
+            )
+            if value is not None
+        )
+        print(f"{outcome.cell}: {times or 'went on'} {'; '.join(outcome.problems) and 'BEYOND: '}", end="")
+        print("; ".join(outcome.problems), flush=True)
+    load = max((outcome.load for outcome in outcomes), default=0.0)
+    made = f"{datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} cores, load up to {load:.1f}, {arguments.jobs} at a time"
+    text = motion_table.tables(outcomes, made)
+    print(text)
+    if arguments.write:
+        motion_table.write(arguments.write, text)
+    beyond = sum(bool(outcome.problems) for outcome in outcomes)
+    if missing := len(known) + len(tasks) - len(outcomes):
+        sys.exit(f"{missing} trials did not end: see the errors above")
+    print(f"trials: {len(outcomes)}, beyond their bounds: {beyond}; {time.monotonic() - began_s:.0f} s")
+    return int(beyond > 0)
+
+
+def _read(path: Path | None) -> list[MotionOutcome]:
+    if path is None or not path.exists():
+        return []
+    return [MotionOutcome.of(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

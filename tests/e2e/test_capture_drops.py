@@ -1,0 +1,91 @@
+"""Packets that tcpdump lost: a topic withholds what depends on its captures, and a transfer is void."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.columns import Measured
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.trial import gates, journal, store
+from fieldkit.trial.plan import Plan
+from tests.helpers.runs import fieldkit, only_trial
+
+pytestmark = pytest.mark.emulated
+
+STREAM = """\
+name: stream
+summary: "A topic with a ping in one capture, a transfer in another"
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+attempts: 1
+steps:
+  - capture:
+      name: topic
+      during:
+        - together:
+            during:
+              - topics: {from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 2s}
+              - ping: {from: sender, to: receiver, count: 10, interval: 200ms, payload_bytes: 56}
+  - record: {robot: sender, topics: [/scan], duration: 1s, name: scan}
+  - capture:
+      name: transfer
+      during:
+        - transfer: {from: sender, to: receiver, into: recv.bag, port: 1234}
+"""
+NEEDS_NO_CAPTURE = {"topic_sent", "topic_received", "topic_loss", "topic_jitter_s", "topic_delay_variation_p95_s"}
+NEEDS_CAPTURES = {"topic_delay_median_s", "topic_delay_error_s", "topic_age_mean_s", "topic_packet_loss"}
+
+
+@pytest.fixture(scope="module")
+def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journal.Attempt]:
+    home = tmp_path_factory.mktemp("drops")
+    (home / "procedures").mkdir()
+    (home / "procedures" / "stream.yaml").write_text(STREAM, encoding="utf-8")
+    run = fieldkit(home, "trial", "stream", "5m", "--yes")
+    assert run.code == 0, run.out + run.err
+    trial = only_trial(home)
+    plan = store.read_plan(trial)
+    (ended,) = journal.ended(journal.history(trial, plan))
+    return plan, store.attempt_folder(trial, ended.folder), ended
+
+
+def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tuple[tuple[str, ...], Measured]:
+    """Return the problems and the columns of an attempt whose tcpdump reports that the kernel dropped 12 packets."""
+    plan, folder, ended = attempt
+    log = folder / f"{capture}-capture.log"
+    whole = log.read_text(encoding="utf-8")
+    log.write_text(
+        re.sub(r"(?m)^0 packets dropped by kernel", "12 packets dropped by kernel", whole), encoding="utf-8"
+    )
+    try:
+        judged = gates.judge(plan, ended.repeat, AttemptEvidence(folder))
+    finally:
+        log.write_text(whole, encoding="utf-8")
+    return judged.problems, judged.measured
+
+
+@pytest.mark.parametrize("role", ["sender", "receiver"])
+def test_a_topic_keeps_what_its_logs_say(attempt: tuple[Plan, Path, journal.Attempt], role: str) -> None:
+    problems, measured = with_drops(attempt, f"topic.{role}")
+    assert problems == ()
+    assert measured.values.keys() >= NEEDS_NO_CAPTURE
+    reason = f"the capture of {role} lacks 12 packets that its kernel dropped"
+    assert {measured.missing[name] for name in NEEDS_CAPTURES} == {reason}
+    assert measured.values["topic_capture_withheld"] == reason
+    assert measured.values[f"topic.{role}_capture_dropped"] == 12
+
+
+def test_without_drops_nothing_is_withheld(attempt: tuple[Plan, Path, journal.Attempt]) -> None:
+    plan, folder, ended = attempt
+    judged = gates.judge(plan, ended.repeat, AttemptEvidence(folder))
+    assert judged.problems == ()
+    assert "topic_packet_loss" in judged.measured.values
+    assert "topic_capture_withheld" not in judged.measured.values
+
+
+def test_a_transfer_needs_its_whole_capture(attempt: tuple[Plan, Path, journal.Attempt]) -> None:
+    problems, _ = with_drops(attempt, "transfer.sender")
+    assert problems == ("transfer: sender capture: dropped 12 packets, its interface 0",)

@@ -1,0 +1,66 @@
+"""A topic between emulated robots: its repeat is valid, and not when its subscriber's log is changed afterwards."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+
+from fieldkit.agent import records
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.trial import gates, journal, store
+from tests.helpers.runs import fieldkit, only_trial
+
+pytestmark = pytest.mark.emulated
+
+STREAM = """\
+name: stream
+summary: "A topic over DDS and one over Zenoh, side by side"
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+attempts: 1
+steps:
+  - capture:
+      during:
+        - together:
+            during:
+              - topics: {name: dds, from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 3s}
+              - topics: {name: zenoh, from: sender, to: receiver, over: zenoh, rate: 20Hz, bytes: 500B, duration: 3s}
+"""
+
+
+def shifted(content: bytes, by_ns: int) -> bytes:
+    """Return a log whose samples came later by so much, with the checksum of its new content."""
+    head, size = len(records.MAGIC), records.RECORD.size
+    rows = [list(records.RECORD.unpack_from(content, at)) for at in range(head, len(content), size)]
+    for row in rows:
+        row[5] += by_ns if row[0] == records.SAMPLE else 0
+    rows[-1][2] = 0
+    rows[-1][2] = zlib.crc32(records.MAGIC + b"".join(records.RECORD.pack(*row) for row in rows))
+    return records.MAGIC + b"".join(records.RECORD.pack(*row) for row in rows)
+
+
+def test_a_changed_log_of_a_real_stream_is_noticed(tmp_path: Path) -> None:
+    (tmp_path / "procedures").mkdir()
+    (tmp_path / "procedures" / "stream.yaml").write_text(STREAM, encoding="utf-8")
+    run = fieldkit(tmp_path, "trial", "stream", "5m", "--yes")
+    assert run.code == 0, run.out + run.err
+    trial = only_trial(tmp_path)
+    plan = store.read_plan(trial)
+    (attempt,) = journal.ended(journal.history(trial, plan))
+    folder = store.attempt_folder(trial, attempt.folder)
+    for name in ("dds", "zenoh"):
+        log = folder / f"{name}.receiver-topic.bin"
+        whole = log.read_bytes()
+        for changed, why in (
+            (shifted(whole, 50_000_000), "later than its capture for every sample"),
+            (shifted(whole, -5_000_000), "before their packets in its capture"),
+            (whole[:-40] + struct.pack("<d", 1.5) + whole[-32:], "its checksum is wrong"),
+        ):
+            log.write_bytes(changed)
+            problems = gates.judge(plan, attempt.repeat, AttemptEvidence(folder)).problems
+            assert any(why in problem for problem in problems), problems
+        log.write_bytes(whole)
+    assert gates.judge(plan, attempt.repeat, AttemptEvidence(folder)).problems == ()

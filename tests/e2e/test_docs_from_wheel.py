@@ -1,0 +1,60 @@
+"""The documentation as a wheel installs it: `fieldkit docs` finds its pages, and it needs no network."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Request, sync_playwright
+
+from tests.helpers import site_links, wheels
+
+pytestmark = pytest.mark.emulated
+
+
+@pytest.fixture(scope="module")
+def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return wheels.installed(tmp_path_factory.mktemp("wheel"))
+
+
+def page(python: Path, topic: str) -> Path:
+    """Return what `fieldkit docs TOPIC --path` prints."""
+    command = (python.with_name("fieldkit"), "docs", topic, "--path")
+    done = subprocess.run(command, cwd=python.parent, capture_output=True, text=True, check=True)
+    return Path(done.stdout.strip())
+
+
+@pytest.mark.parametrize(
+    ("topic", "text"),
+    [
+        ("field", "Real robots"),
+        ("steps", "Sends a file with netcat"),
+        ("trial", "fieldkit trial"),
+        ("errors", "remedy"),
+    ],
+)
+def test_a_topic_is_an_installed_page_about_it(python: Path, topic: str, text: str) -> None:
+    path = page(python, topic)
+    assert path.is_relative_to(python.parents[1])
+    assert text in path.read_text(encoding="utf-8")
+
+
+def test_every_link_leads_to_an_installed_page(python: Path) -> None:
+    assert site_links.broken(page(python, "index").parent) == []
+
+
+def test_search_works_from_files(python: Path) -> None:
+    requested: list[str] = []
+
+    def note(request: Request) -> None:
+        requested.append(request.url)
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
+        tab = browser.new_context(offline=True, viewport={"width": 1300, "height": 900}).new_page()
+        tab.on("request", note)
+        tab.goto(page(python, "index").as_uri())
+        tab.click(".md-search__input")
+        tab.keyboard.type("netcat")
+        tab.wait_for_selector(".md-search-result__item")
+        browser.close()
+    assert not [url for url in requested if not url.startswith(("file:", "data:", "about:", "blob:"))]

@@ -1,0 +1,175 @@
+"""A robot that drives by itself: held after a fault, with one fence for all trials of a campaign; and stopped."""
+
+import json
+import math
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.model import Role
+from tests.helpers.host import wait_for_end
+from tests.helpers.rovers import RECEIVER_SITE, RoverLab, rover_lab
+from tests.helpers.runs import Run, fieldkit, finish, rows, start
+
+pytestmark = pytest.mark.emulated
+
+FENCE_M = 2.5
+WAY_M = 1.0
+BEYOND_M = 0.3
+"""Braking from 0.6 m/s at 2 m/s² takes 0.09 m, two turns of the loop 0.06 m; the rest is for a busy machine."""
+LEASE_S = 30.0
+"""Longer than a test: no robot of these tests is stopped by its lease."""
+CAMPAIGN = """\
+name: lawn
+procedures: [drive]
+distances: [5m, 10m]
+topologies: [masterless]
+protocols: [udp]
+repeats: 1
+seed: 1
+"""
+MOTION = ("--allow-motion",)
+UNASKED = (*MOTION, "--yes")
+OPTION = "--allow-motion-after-fault"
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RoverLab]:
+    with rover_lab(tmp_path_factory.mktemp("lawn"), fence_m=FENCE_M, lease_s=LEASE_S) as made:
+        (made.folder / "lawn.yaml").write_text(CAMPAIGN, encoding="utf-8")
+        yield made
+
+
+def campaign(lab: RoverLab, out: str, *words: str) -> Run:
+    return fieldkit(lab.folder, "campaign", "lawn.yaml", "--out", out, *words)
+
+
+def motions(lab: RoverLab, out: str) -> list[str]:
+    path = lab.folder / out / "campaign_lawn" / "motion.jsonl"
+    return [json.loads(line)["event"] for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def trials(lab: RoverLab, out: str) -> list[Path]:
+    return sorted(path for path in (lab.folder / out / "campaign_lawn").iterdir() if path.is_dir())
+
+
+def answers(lab: RoverLab, *lines: str) -> tuple[str, str]:
+    (lab.folder / "answers").write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    return "--answers", str(lab.folder / "answers")
+
+
+def assert_unmoved(lab: RoverLab, run: Run, reason: str, since_ns: int) -> None:
+    """Assert that a run ended for a reason that needs a person, and that the rover stayed where it was."""
+    assert run.code == 5, run.err
+    assert reason in run.err
+    track = lab.track_m(since_ns)
+    assert all(math.dist(place_m, lab.place_m) < 0.01 for place_m in track)
+
+
+def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_holds_over_all_trials(lab: RoverLab) -> None:
+    out, site = "held", ("--site", RECEIVER_SITE)
+    lab.write_procedure(Role.RECEIVER, WAY_M)
+    lab.put("5m")
+    home_m, begun_ns = lab.place_m, time.time_ns()
+    process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *UNASKED)
+    try:
+        lab.wait_until_it_drives()
+        process.send_signal(signal.SIGINT)
+        stopped = finish(process)
+    finally:
+        process.kill()
+        wait_for_end({process.pid}, within_s=60.0)
+    assert stopped.code == 130, stopped.err
+    assert "before rover-1 moves again, a person has to put it at its place and type confirm" in stopped.out
+    assert motions(lab, out) == ["origin", "begun", "held"]
+
+    since_ns = time.time_ns()
+    assert_unmoved(lab, campaign(lab, out, *site, *UNASKED), "rover-1: stopped by the operator", since_ns)
+    assert len(trials(lab, out)) == 1, "no other trial began"
+
+    # The option: back along its path first, then out again from its origin, and the next trial from there, too.
+    option = campaign(lab, out, *site, *UNASKED, OPTION)
+    assert option.code == 0, option.err
+    assert motions(lab, out) == ["origin", "begun", "held", "allowed", *("begun", "ended") * 2], "one origin"
+    assert [row["status"] for trial in trials(lab, out) for row in rows(trial)] == ["void", "valid", "valid"]
+    farthest_m = max(math.dist(place_m, home_m) for place_m in lab.track_m(begun_ns))
+    assert farthest_m == pytest.approx(WAY_M, abs=BEYOND_M), "not as far again from where it was stopped"
+    assert lab.place_m == pytest.approx(home_m, abs=0.1)
+
+
+def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaign(lab: RoverLab) -> None:
+    out, site = "outside", ("--site", RECEIVER_SITE)
+    lab.write_procedure(Role.RECEIVER, 0.4)
+    lab.put("5m")
+    home_m = lab.place_m
+    process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *UNASKED)
+    try:
+        lab.wait_until_it_drives()
+        process.send_signal(signal.SIGINT)
+        assert finish(process).code == 130
+    finally:
+        process.kill()
+        wait_for_end({process.pid}, within_s=60.0)
+    lab.push(FENCE_M)
+    since_ns = time.time_ns()
+    refused = campaign(lab, out, *site, *UNASKED, OPTION)
+    assert_unmoved(lab, refused, f"outside its fence of {FENCE_M:g} m", since_ns)
+
+    # A person puts it back and confirms it: a new origin, which holds for both trials.
+    lab.put("5m")
+    run = campaign(lab, out, *site, *MOTION, *answers(lab, "", "confirm", ""))
+    assert run.code == 0, run.err
+    assert motions(lab, out)[-6:] == ["confirmed", "origin", "begun", "ended", "begun", "ended"]
+    assert lab.place_m == pytest.approx(home_m, abs=0.1)
+
+
+def test_with_yes_a_robot_does_not_start_at_a_place_where_no_person_put_it(lab: RoverLab) -> None:
+    out = "places"
+    lab.write_procedure(Role.SENDER, 0.4)
+    lab.put("5m")
+    since_ns = time.time_ns()
+    several = fieldkit(lab.folder, "trial", "drive", "5m", "10m", "--out", out, *UNASKED)
+    assert several.code == 2, several.err
+    assert "rover-1 moves by itself and must be at another place for 10m" in several.err
+    assert set(lab.track_m(since_ns)) <= {lab.place_m}
+
+    first = campaign(lab, out, *UNASKED)
+    assert first.code == 5, first.err
+    assert "rover-1 must be at another place than before, and --yes does not confirm that it is there" in first.err
+    assert motions(lab, out) == ["origin", "begun", "ended"]
+    assert [[row["status"] for row in rows(trial)] for trial in trials(lab, out)] == [["valid"], []]
+
+    # A person who answers that it is there: its origin, and with it its fence, is the new place.
+    (distance,) = (name for name in ("5m", "10m") if name in trials(lab, out)[1].name)
+    lab.put(distance)
+    home_m, begun_ns = lab.place_m, time.time_ns()
+    second = campaign(lab, out, *MOTION, *answers(lab, ""))
+    assert second.code == 0, second.err
+    assert motions(lab, out) == ["origin", "begun", "ended"] * 2
+    farthest_m = max(math.dist(place_m, home_m) for place_m in lab.track_m(begun_ns))
+    assert farthest_m == pytest.approx(0.4, abs=BEYOND_M)
+
+
+def test_stop_stops_a_robot_whose_fieldkit_was_killed(lab: RoverLab) -> None:
+    lab.write_procedure(Role.SENDER, FENCE_M - BEYOND_M)
+    lab.put("5m")
+    process = start(lab.folder, "trial", "drive", "5m", "--out", "killed", *UNASKED)
+    try:
+        lab.wait_until_it_drives()
+    finally:
+        process.kill()
+        process.communicate()
+    # An error of the site file that does not concern the robots is no reason not to stop them.
+    (lab.folder / "broken.yaml").write_text(
+        (lab.folder / "fieldkit.yaml").read_text(encoding="utf-8") + "no such key: 1\n", encoding="utf-8"
+    )
+    stopped = fieldkit(lab.folder, "stop", "--all", "--site", "broken.yaml")
+    assert stopped.code == 0, stopped.out + stopped.err
+    assert sorted(stopped.out.splitlines()) == [
+        "box-1: nothing of fieldkit moves it; nothing was sent to it",
+        "rover-1: stopped (standing)",
+    ]
+    assert lab.stationary

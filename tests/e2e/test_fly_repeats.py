@@ -1,0 +1,102 @@
+"""Ten repeats of a flight in a row fly the same way: an emulated ArduCopter in the field backend, by the lab's truth.
+
+The field backend leaves the drone where and as it landed: an ArduCopter has turned its nose along its way back.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.model import Role, Vector
+from tests.helpers.outside import robots_outside
+from tests.helpers.paths import ROOT
+from tests.helpers.runs import fieldkit, only_trial, rows
+
+pytestmark = pytest.mark.emulated
+
+REPEATS = 10
+WAY_M = 1.0
+HEIGHT_M = 0.4
+AIRBORNE_M = 0.1
+LAB = """\
+backend: emulated
+robots:
+  turtlebot-1: {profile: turtlebot3_burger}
+  copter-1: {profile: copter}
+roles:
+  masterless: {sender: turtlebot-1, receiver: copter-1}
+emulated:
+  ros: builtin
+"""
+PROCEDURE = f"""\
+name: again
+summary: an ArduCopter flies away and returns, again and again
+scenario: los
+topology: masterless
+protocols: [tcp]
+repeats: {REPEATS}
+attempts: 3
+steps:
+  - fly:
+      robot: receiver
+      height: {HEIGHT_M:g}m
+      path: [{{away: {WAY_M:g}m}}]
+      speed: 3m/s
+      climb: 2m/s
+      then: return
+      lease: 60s
+      during: [{{wait: {{duration: 3s}}}}]
+"""
+
+
+def flights(places_m: Sequence[Vector]) -> Iterator[list[Vector]]:
+    """Yield the places of each flight, from the last one on the ground to the first one there."""
+    ground_m, flight = places_m[0][2], [places_m[0]]
+    for place_m in places_m:
+        if place_m[2] > ground_m + AIRBORNE_M:
+            flight.append(place_m)
+        elif len(flight) > 1:
+            yield [*flight, place_m]
+            flight = [place_m]
+        else:
+            flight = [place_m]
+
+
+def farthest_m(flight: Sequence[Vector], start_m: Vector) -> tuple[float, float]:
+    """Return the farthest place of a flight relative to a start, east and north."""
+    east_m, north_m, _ = max(flight, key=lambda place_m: math.dist(place_m[:2], start_m[:2]))
+    return east_m - start_m[0], north_m - start_m[1]
+
+
+def test_ten_repeats_in_a_row_fly_the_same_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "procedures").mkdir()
+    profile = (ROOT / "robots/duckiedrone.yaml").read_text(encoding="utf-8")
+    profile = profile.replace("name: duckiedrone", "name: copter")
+    profile = profile.replace("port: 14550", "port: 14550\n  autopilot: ardupilot\n  boot_s: 0")
+    (tmp_path / "robots/copter.yaml").write_text(profile, encoding="utf-8")
+    (tmp_path / "procedures/again.yaml").write_text(PROCEDURE, encoding="utf-8")
+    (tmp_path / "lab.yaml").write_text(LAB, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    with robots_outside(tmp_path, site=tmp_path / "lab.yaml") as outside:
+        run = fieldkit(tmp_path, "trial", "again", "5m", "--yes", "--allow-motion", "--allow-motion-after-fault")
+        assert run.code == 0, run.err
+        track = [place for place in outside.testbed.oracle.track(0) if place.role is Role.RECEIVER]
+    places_m = [place.position_m for place in track if place.position_m is not None]
+    flown = list(flights(places_m))
+    home_m = places_m[0]
+    for flight in flown:
+        away_m, aside_m = farthest_m(flight, home_m)
+        assert 0.4 * WAY_M < away_m < 1.3 * WAY_M, "it is called back on its way where the machine is busy"
+        assert abs(aside_m) < 0.3
+    results = rows(only_trial(tmp_path))
+    assert [row["status"] for row in results] == ["valid"] * REPEATS
+    attempts = sum(int(row["attempt"]) for row in results)
+    assert len(flown) <= attempts
+    if attempts == REPEATS:  # a busy machine suspends the pilot, which lands the drone then
+        assert len(flown) == REPEATS
+        for row, flight in zip(results, flown, strict=True):
+            assert math.dist(flight[-1][:2], home_m[:2]) < 0.5, "it came back"
+            assert float(row["fly_farthest_m"]) == pytest.approx(farthest_m(flight, home_m)[0], abs=0.3)

@@ -1,0 +1,76 @@
+"""The figures of docs/studies/middleware.md say what its tables say, with the number of samples and intervals."""
+
+import re
+
+import pytest
+from scipy import stats
+
+from benchmarks import middleware, middleware_page
+from benchmarks.middleware_cells import MiddlewareFindings
+from tests.helpers.paths import ROOT
+
+PAGE = ROOT / "docs" / "studies" / "middleware.md"
+
+
+def test_every_point_of_the_loss_figure_has_its_interval_and_its_number_of_samples() -> None:
+    cells = middleware_page.cells(PAGE)
+    chart = middleware.by_distance(MiddlewareFindings(cells, "", 0.0, 0.0), "middleware-loss", middleware.LOST)
+    points = [
+        point
+        for panel in chart.panels
+        for series in panel.series
+        for point in zip(series.y, series.low, series.high, strict=True)
+    ]
+    assert len(points) == len([cell for cell in cells if cell.robots == 2]) >= 4 * 70
+    for value, low, high in points:
+        assert low is not None
+        assert high is not None
+        assert 0 <= low <= value <= high <= 100
+    assert {re.sub(r".*, (n = .*)", r"\1", panel.title) for panel in chart.panels} == {
+        "n = 80 (2 repeats)",
+        "n = 20 (2 repeats)",
+    }
+    assert {series.join for panel in chart.panels for series in panel.series} == {"none"}
+
+
+def test_a_bimodal_loss_is_marked_wherever_it_is_in_the_tables() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    marked = [line for line in page.splitlines() if line.startswith("|") and "*" in line]
+    assert [line.split("|")[1:4] for line in marked] == [[" 1 MB ", " reliable ", " Zenoh "]]
+    assert marked[0].count(" * |") == 4
+    # The same tables are written again: with the marks, and the note that explains them.
+    written = list(middleware.tables(MiddlewareFindings(middleware_page.cells(PAGE), "", 0.0, 0.0), ""))
+    assert marked[0] in written
+    assert middleware.BIMODAL_NOTE in written
+    assert middleware.BIMODAL_NOTE in page
+
+
+@pytest.mark.parametrize(("size_bytes", "samples", "lost"), [(1_000, 80, 0), (1_000, 80, 20), (1_000_000, 20, 15)])
+def test_the_interval_counts_samples_within_half_a_second_as_one(size_bytes: int, samples: int, lost: int) -> None:
+    trials = samples / (5 if size_bytes < 1_000_000 else 1)
+    low, high = middleware_page.interval(lost / samples, size_bytes, samples)
+    z = stats.norm.ppf(0.975)
+    p = lost / samples
+    centre = (p + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * (p * (1 - p) / trials + z**2 / (4 * trials**2)) ** 0.5
+    assert (low, high) == pytest.approx((max(centre - half, 0.0), min(centre + half, 1.0)), abs=1e-9)
+
+
+def test_the_intervals_that_the_page_quotes_are_those_of_its_table() -> None:
+    by_cell = {
+        (cell.who, cell.kind, cell.size_bytes, cell.robots, cell.distance_m): cell
+        for cell in middleware_page.cells(PAGE)
+    }
+    text = PAGE.read_text(encoding="utf-8")
+    for key, quoted in (
+        (("Fast DDS", "reliable", 1_000_000, 2, 20.0), "75 % [53, 89]"),
+        (("Fast DDS, tuned", "reliable", 1_000_000, 2, 20.0), "5 % [1, 24]"),
+        (("Fast DDS", "reliable", 10_000, 5, 60.0), "30 % [20, 42]"),
+    ):
+        cell = by_cell[key]
+        assert cell.loss is not None
+        assert cell.loss_low is not None
+        assert cell.loss_high is not None
+        assert f"{100 * cell.loss:.0f} % [{100 * cell.loss_low:.0f}, {100 * cell.loss_high:.0f}]" == quoted
+        assert quoted in text
+    assert "95 % [76, 99]" not in text  # of Zenoh's images, of which two repeats give no rate

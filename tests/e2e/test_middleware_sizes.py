@@ -1,0 +1,100 @@
+"""A sample of the shipped campaign of message sizes on a link of known loss, and what is recommended by it."""
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from fieldkit.ros import tuning
+from tests.helpers.paths import ROOT
+from tests.helpers.runs import fieldkit, only_trial
+
+pytestmark = pytest.mark.emulated
+
+EXAMPLE = ROOT / "docs" / "examples" / "middleware"
+REPEATS = 2
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with trials of the shipped procedure, of its smallest samples, tuned, and what blocks alone."""
+    home = tmp_path_factory.mktemp("sizes")
+    text = (ROOT / "procedures" / "middleware_sizes.yaml").read_text(encoding="utf-8")
+    text = text.replace("name: middleware_sizes", "name: sizes_sample", 1).replace("[last, all]", "[all]")
+    text = text.replace("[default, tuned]", "[tuned]")
+    head, smallest, *_ = text.split("        - for:\n            each: {bytes: ")
+    assert smallest.startswith("[1000, 10000, 100000]")
+    smallest = smallest.replace("[1000, 10000, 100000]", "[1000]").replace("duration: 4s", "duration: 1s")
+    text = f"{head}        - for:\n            each: {{bytes: {smallest.replace('count: 20', 'count: 5')}"
+    (home / "procedures").mkdir()
+    (home / "procedures" / "sizes_sample.yaml").write_text(text, encoding="utf-8")
+    (home / "fieldkit.yaml").write_text((EXAMPLE / "loss-2.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    run = fieldkit(home, "trial", "sizes_sample", "5m", "--repeats", str(REPEATS), "--yes")
+    assert run.code == 0, run.out + run.err
+    return home
+
+
+def test_what_passed_is_written_with_its_evidence(measured: Path) -> None:
+    out = measured / "passed"
+    words = ("middleware", "recommend", "trials", "-o", str(out), "--repeats", str(REPEATS), "--max-loss", "20%")
+    run = fieldkit(measured, *words)
+    assert run.code == 0, run.out + run.err
+    assert sorted(path.name for path in out.iterdir()) == ["cyclonedds.xml", "zenoh.json5"]
+    assert len(re.findall(r"(?m)^passed: (dds|zenoh)", run.out)) == 2, run.out
+    for path in out.iterdir():
+        text = path.read_text(encoding="utf-8")
+        assert f"{REPEATS} of {REPEATS} repeats count" in text
+        assert only_trial(measured).name in text
+        assert "loss at most 20 %, in each repeat" in text
+    domain = ET.parse(out / "cyclonedds.xml").getroot().find("Domain")
+    assert domain is not None
+    values = {f"{outer.tag}/{inner.tag}": inner.text for outer in domain for inner in outer}
+    assert values == dict(tuning.tuned("dds", "tcp"))
+
+
+@pytest.mark.parametrize(
+    ("criterion", "why"),
+    [
+        (("--repeats", "9"), "undecided"),
+        (("--repeats", str(REPEATS), "--max-loss", "20%", "--max-delay", "1us"), "failed|undecided"),
+        (("--size", "10kB"), "no trial there has"),
+        (("--repeats", str(REPEATS), "--max-loss", "20%", "--share", "90%"), "undecided.*\n.*29 repeats are needed"),
+    ],
+)
+def test_without_evidence_nothing_is_written(measured: Path, criterion: tuple[str, ...], why: str) -> None:
+    out = measured / "nothing"
+    run = fieldkit(measured, "middleware", "recommend", "trials", "-o", str(out), *criterion)
+    assert run.code == 1, run.out + run.err
+    assert re.search(why, run.out), run.out
+    assert "passed:" not in run.out
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("loss", [0, 2, 10])
+def test_the_shipped_campaigns_can_run(tmp_path: Path, loss: int) -> None:
+    for name in (f"sizes-{loss}.yaml", f"loss-{loss}.yaml"):
+        (tmp_path / name).write_text((EXAMPLE / name).read_text(encoding="utf-8"), encoding="utf-8")
+    run = fieldkit(tmp_path, "campaign", f"sizes-{loss}.yaml", "--site", f"loss-{loss}.yaml", "--dry-run")
+    assert run.code == 0, run.err
+    assert "0 of 1 trials are done" in run.out
+
+
+def test_the_shipped_collapse_is_a_procedure_that_can_run(tmp_path: Path) -> None:
+    (tmp_path / "procedures").mkdir()
+    text = (EXAMPLE / "procedures" / "collapse.yaml").read_text(encoding="utf-8")
+    (tmp_path / "procedures" / "collapse.yaml").write_text(text, encoding="utf-8")
+    run = fieldkit(tmp_path, "trial", "collapse", "20m", "--dry-run")
+    assert run.code == 0, run.err
+    assert "-B 32768" in run.out
+    assert "-s 256" in run.out
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--max-loss", "101%"), ("--share", "100%"), ("--share", "0%"), ("--repeats", "1")]
+)
+def test_what_no_repeat_can_show_is_refused(tmp_path: Path, option: str, value: str) -> None:
+    run = fieldkit(tmp_path, "middleware", "recommend", ".", "-o", "config", option, value)
+    assert run.code == 2, run.out
+    assert option in run.err
+    assert not (tmp_path / "config").exists()

@@ -1,0 +1,93 @@
+"""Cells of the fault matrix of moving robots: each party and each fault once, within bounds (docs/stopping.md)."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.motion_cells import CELLS, Blow, chosen
+from tests.helpers.motion_outcomes import MotionOutcome
+from tests.helpers.motion_parties import Party
+from tests.helpers.paths import ROOT
+
+SAMPLE = (
+    "rover/agent/pause/out",
+    "rover/link/slow/out",
+    "rover/fieldkit+operator/stop/out",
+    "px4/guard/suspend/climbing",
+    "px4/server/kill/there",
+    "px4/laptop/suspend/flying",
+    "copter/pilot/kill/flying",
+    "copter/router/pause/flying",
+    "copter/pilot+guard/suspend/there",
+    "px4/pilot+guard+server/kill/flying",
+    "copter/router+operator/abort/there",
+    "copter/operator/ctrl-c/back",
+)
+IN_CI = (
+    "rover/agent/pause/out",
+    "rover/fieldkit+operator/stop/out",
+    "px4/guard/suspend/climbing",
+    "px4/laptop/suspend/flying",
+    "copter/pilot/kill/flying",
+    "copter/pilot+guard/suspend/there",
+    "copter/operator/ctrl-c/back",
+)
+"""Cells of the sample that CI runs; the others are left to `make nightly`."""
+AT_NIGHT = tuple(name for name in SAMPLE if name not in IN_CI)
+JOBS = 3
+LIMIT_S = 600
+
+
+def outcomes_of(names: Sequence[str], folder: Path) -> dict[str, MotionOutcome]:
+    """Run the command once for several cells, which mostly wait."""
+    results = folder / "results.jsonl"
+    words = ("--cells", ",".join(names), "--jobs", str(JOBS), "--results", str(results))
+    done = subprocess.run(
+        (sys.executable, "-m", "tests.e2e.motion_faults", *words),
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        check=False,
+    )
+    assert done.returncode in {0, 1}, done.stdout + done.stderr
+    lines = Path(results).read_text(encoding="utf-8").splitlines()
+    return {outcome.cell: outcome for outcome in map(MotionOutcome.of, lines)}
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, MotionOutcome]:
+    return outcomes_of(IN_CI, tmp_path_factory.mktemp("matrix"))
+
+
+@pytest.fixture(scope="module")
+def outcomes_at_night(tmp_path_factory: pytest.TempPathFactory) -> dict[str, MotionOutcome]:
+    return outcomes_of(AT_NIGHT, tmp_path_factory.mktemp("matrix"))
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize("name", IN_CI)
+def test_a_robot_stops_within_the_bounds_and_does_not_move_again(
+    name: str, outcomes: dict[str, MotionOutcome]
+) -> None:
+    assert outcomes[name].problems == (), outcomes[name]
+
+
+@pytest.mark.emulated
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", AT_NIGHT)
+def test_so_does_a_robot_of_the_rest_of_the_sample(name: str, outcomes_at_night: dict[str, MotionOutcome]) -> None:
+    assert outcomes_at_night[name].problems == (), outcomes_at_night[name]
+
+
+def test_the_sample_has_each_party_and_each_fault() -> None:
+    assert set(IN_CI) <= set(SAMPLE)
+    cells = chosen(",".join(SAMPLE))
+    assert {party for cell in cells for party in cell.parties} == set(Party)
+    assert {cell.blow for cell in cells} == set(Blow)
+    assert {cell.craft for cell in cells} == {cell.craft for cell in CELLS}

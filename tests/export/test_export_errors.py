@@ -1,0 +1,71 @@
+"""Every form of export with everything that can be wrong with a trial: an error with a remedy, or a whole file."""
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.trial import store
+from fieldkit.trial.journal import JOURNAL_FILE
+from fieldkit.trial.plan import PLAN_FILE
+from tests.helpers.stored_trials import TRIALS
+
+LOSSY = next(TRIALS.glob("20261122T013134*"))
+FORMATS = ("csv", "parquet", "mcap", "junit")
+
+
+def _pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def _folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "gone": lambda path: path.unlink(),
+    "empty": lambda path: path.write_bytes(b""),
+    "text": lambda path: path.write_bytes(b"a: [1, {"),
+    "binary": lambda path: path.write_bytes(bytes(range(256))),
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-200]),
+    "pipe": _pipe,
+    "folder": _folder,
+}
+
+
+def exported(path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> int:
+    out = path.parent / f"out.{form}"
+    code = main(["export", str(path), "--format", form, "-o", str(out)])
+    said = capsys.readouterr().err
+    assert code in {0, 2, 4}
+    assert out.exists() is (code == 0), "a file that is not whole is not left behind"
+    assert code == 0 or ("error: " in said and "remedy: " in said)
+    return code
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("name", [PLAN_FILE, JOURNAL_FILE, store.TRIAL_CSV])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_trial_is_an_error_with_a_remedy_or_a_whole_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, name: str, damage: str
+) -> None:
+    trial = tmp_path / LOSSY.name
+    trial.mkdir()
+    for kept in (PLAN_FILE, JOURNAL_FILE, store.TRIAL_CSV, store.MANIFEST_FILE):
+        shutil.copy(LOSSY / kept, trial)
+    DAMAGES[damage](trial / name)
+    exported(trial, form, capsys)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("missing", ["none", "folder"])
+def test_what_is_no_trial_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, missing: str
+) -> None:
+    (tmp_path / "folder").mkdir()
+    assert exported(tmp_path / missing, form, capsys) == 2

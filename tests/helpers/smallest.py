@@ -1,0 +1,318 @@
+"""The smallest run of each benchmark: `python -m tests.helpers.smallest NAME FOLDER` runs one in an empty folder.
+
+It shows that a benchmark still works; its figures mean nothing. To replace a constant that is not there is an error.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Final
+
+from benchmarks.radio_vs_ns3 import Ns3
+from tests.helpers.labs import changed
+from tests.helpers.paths import ROOT
+
+Shrink = Callable[[ModuleType, Path], None]
+
+
+@dataclass(frozen=True)
+class Smallest:
+    """How a benchmark runs at its smallest size.
+
+    Attributes:
+        arguments: Of the command line; `FOLDER` is replaced by the folder.
+        constants: Constants of the module, and smaller values.
+        shrink: Makes smaller what is not a constant.
+        emulated: It needs namespaces or programs of robots.
+    """
+
+    arguments: str = ""
+    constants: Mapping[str, object] = field(default_factory=dict)
+    shrink: Shrink = lambda module, folder: None
+    emulated: bool = False
+
+
+LONGEST_S: Final = 600.0
+
+
+def run_module(*words: str) -> "subprocess.CompletedProcess[str]":
+    """Run a module of the clone as a program."""
+    return subprocess.run(
+        (sys.executable, "-m", *words),
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_S,
+        check=False,
+    )
+
+
+def run_smallest(name: str, folder: Path) -> None:
+    """Run a benchmark at its smallest size in an empty folder.
+
+    Raises:
+        AssertionError: It failed, or it printed no figures.
+    """
+    done = run_module("tests.helpers.smallest", name, str(folder))
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert any(character.isdigit() for character in done.stdout), "a benchmark prints figures"
+
+
+def replace(module: ModuleType, name: str, value: object) -> None:
+    """Replace a constant of a module.
+
+    Raises:
+        AttributeError: It has no such constant.
+    """
+    getattr(module, name)
+    setattr(module, name, value)
+
+
+class StandInNs3(Ns3):
+    """Prints what ns-3 could print: CI has no ns-3."""
+
+    def __call__(self, **options: object) -> str:
+        """Return a plausible output of `ns3_link.cc`."""
+        what = options.get("what")
+        if what == "errors":
+            return "\n".join(f"{ratio_db} {1.0 if ratio_db < 15 else 0.0}" for ratio_db in range(0, 40, 5))
+        if what == "udp":
+            return "2.0 0.0\n"
+        if what == "tcp":
+            return "1000000 window 14480\n2000000 sent 0\n20.0 0\n"
+        return "20.0\n"
+
+
+def _without_ns3(module: ModuleType, folder: Path) -> None:
+    replace(module, "build", lambda _: StandInNs3(folder))
+
+
+def _one_link(module: ModuleType, folder: Path) -> None:
+    """Let `cosim_vs_ns3` measure a single link, twice."""
+    _without_ns3(module, folder)
+    replace(module, "DISTANCES_M", {("g54", False): (10,)})
+    replace(module, "SECONDS", 0.2)
+    replace(module, "BATCH", 2)
+    replace(module, "MOST_RUNS", 2)
+
+
+def _few_losses(module: ModuleType, folder: Path) -> None:
+    """Let `tcp_vs_ns3` look at one pattern and one chance."""
+    _without_ns3(module, folder)
+    replace(module, "PATTERNS", {"1 packet": module.PATTERNS["1 packet"]})
+    replace(module, "CHANCES", {"2 % of data": (0.02, 0.0, 1.0)})
+
+
+def _stand_in_iw(module: ModuleType, folder: Path) -> None:
+    """Let `telemetry` find a program `iw` that does nothing, where there is none."""
+    del module
+    program = folder / "iw"
+    program.write_text("#!/bin/sh\nexit 1\n", encoding="ascii")
+    program.chmod(0o755)
+    os.environ["PATH"] += f":{folder}"
+
+
+def _two_commands(module: ModuleType, folder: Path) -> None:
+    del folder
+    replace(module, "COMMANDS", {name: module.COMMANDS[name] for name in ("--version", "columns")})
+
+
+def _two_ways(module: ModuleType, folder: Path) -> None:
+    del folder
+    replace(module, "WAYS", tuple(way for way in module.WAYS if way.name in {"ros1 plain", "ros1 bridged to dds"}))
+
+
+def _slow_iperf(module: ModuleType, folder: Path) -> None:
+    """Let iperf3 send slowly: at full rate it keeps both cores busy."""
+    del folder
+    at_full_rate = module.iperf
+    replace(module, "iperf", lambda near, seconds, *options: at_full_rate(near, seconds, *options, "-b", "5M"))
+
+
+def _small_swarm(module: ModuleType, folder: Path) -> None:
+    _slow_iperf(module, folder)
+    _one_radio(module, folder)
+    replace(module, "ALL_TALK", dict.fromkeys(module.ALL_TALK, 500))
+    replace(module, "ONE_TALKS", 500)
+
+
+def _one_radio(module: ModuleType, folder: Path) -> None:
+    del folder
+    replace(module, "RADIOS", dict(list(module.RADIOS.items())[:1]))
+
+
+def _one_layer(module: ModuleType, folder: Path) -> None:
+    del folder
+    replace(module, "LAYERS", module.LAYERS[-1:])
+
+
+def _one_setting(module: ModuleType, folder: Path) -> None:
+    """Let `zenoh_images` measure one pair of each kind in a lab of two robots."""
+    lab = folder / "small-lab"
+    lab.mkdir()
+    text = (module.LAB / "fieldkit.yaml").read_text(encoding="utf-8")
+    kept = [line for line in text.splitlines() if not line.lstrip().startswith(("rover-2", "rover-3", "rover-4"))]
+    small = changed("\n".join(kept) + "\n", ", rover2: rover-2, rover3: rover-3, rover4: rover-4", "")
+    (lab / "fieldkit.yaml").write_text(small, encoding="utf-8")
+    replace(module, "LAB", lab)
+    replace(module, "SUBSCRIBER", ("base", "10.42.0.2"))
+    replace(module, "SETTINGS", module.SETTINGS[:2])
+
+
+def _one_trial(module: ModuleType, folder: Path) -> None:
+    """Let `field_shape` run one trial of a repeat for each protocol."""
+    lab = folder / "lawn"
+    shutil.copytree(module.LAB, lab)
+    path = lab / "masterless-los.yaml"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(changed(text, "[10ft, 20ft, 30ft, 55ft]", "[10ft]", "record: 2s", "record: 1s"), encoding="utf-8")
+    replace(module, "CAMPAIGNS", ("masterless-los",))
+    replace(module, "LAB", lab)
+
+
+_STREAM: Final = """\
+name: middleware_dds
+summary: One short stream
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+steps:
+  - capture:
+      name: default_tuned_100
+      during:
+        - together:
+            during:
+              - topics:
+                  name: default_tuned_100
+                  from: sender
+                  to: receiver
+                  over: dds
+                  rate: 10Hz
+                  bytes: 100B
+                  duration: 1s
+                  qos: {profile: default}
+                  settings: tuned
+              - ping: {name: default_tuned_100, from: sender, to: receiver, count: 10, interval: 100ms}
+"""
+
+
+def _one_stream(module: ModuleType, folder: Path) -> None:
+    """Let `middleware` run one short stream between two robots."""
+    lab = folder / "small-lab"
+    (lab / "procedures").mkdir(parents=True)
+    text = (module.LAB / "fieldkit.yaml").read_text(encoding="utf-8")
+    kept = [line for line in text.splitlines() if not line.lstrip().startswith(("rover-2", "rover-3", "rover-4"))]
+    small = changed(
+        "\n".join(kept) + "\n",
+        ", rover2: rover-2, rover3: rover-3, rover4: rover-4",
+        "",
+        "ros: debian",
+        "ros: builtin",
+    )
+    (lab / "fieldkit.yaml").write_text(small, encoding="utf-8")
+    campaign = (module.LAB / "dds.yaml").read_text(encoding="utf-8")
+    (lab / "dds.yaml").write_text(changed(campaign, "[20m, 40m, 60m, 80m]", "[20m]"), encoding="utf-8")
+    (folder / "lab" / "procedures").mkdir(parents=True)
+    (folder / "lab" / "procedures" / "middleware_dds.yaml").write_text(_STREAM, encoding="utf-8")
+    replace(module, "LAB", lab)
+    replace(module, "CAMPAIGNS", ("dds",))
+
+
+_ROW: Final = """\
+name: mesh_small
+summary: Three in a row, one of which is away for a second
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+places:
+  first: {near: sender, towards: 60m}
+steps:
+  - wait: {duration: 10s}
+  - fault:
+      name: lost
+      robot: first
+      kind: link-down
+      for: 1s
+      after: 1s
+      during:
+        - ping: {from: sender, to: receiver, count: 100, interval: 100ms, payload_bytes: 56, gap: true}
+"""
+
+
+def _short_row(module: ModuleType, folder: Path) -> None:
+    """Let `mesh` lose one robot of three for a second."""
+    source = folder / "mesh"
+    source.mkdir()
+    shutil.copy(ROOT / "benchmarks" / "mesh" / "box.yaml", source)
+    (source / "mesh_small.yaml").write_text(_ROW, encoding="utf-8")
+    replace(module, "HERE", folder)
+    replace(module, "HELLOS_S", (1,))
+    replace(module, "LAYOUTS", {"row": module.Layout("row of three", "mesh_small", "120m", ("first",))})
+    kept = [line for line in module.SITE.splitlines() if not line.strip().startswith(("r4", "r5", "r6", "r7"))]
+    replace(module, "SITE", "\n".join(kept) + "\n")
+
+
+def _short_detour(module: ModuleType, folder: Path) -> None:
+    """Let `mesh_losses` lose one robot of four."""
+    del folder
+    places = {"sender": (0, 0), "first": (60, -35), "left": (60, 35), "receiver": (120, 0)}
+    detour = module.Detour("two hops beside two", places, ("first", "left"), fading=False)
+    replace(module, "DETOURS", (detour,))
+    replace(module, "SETTLE_S", 2.0)
+
+
+CASES: Final[Mapping[str, Smallest]] = {
+    "aggregate": Smallest("--rounds 1 --tables 1 --rows 80"),
+    "bridge": Smallest(
+        "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLES_S": 0.5}, shrink=_two_ways, emulated=True
+    ),
+    "cosim_discovery": Smallest("", {"COUNT": 3, "SEEDS": (1,), "ROWS": ((0.0, None), (0.1, "g6"))}),
+    "cosim_speed": Smallest("--rounds 1 --seconds 0.2 --robots 2 --scenarios convoy"),
+    "cosim_vs_ns3": Smallest("", shrink=_one_link),
+    "emane": Smallest("--rounds 1", {"ROBOTS": 2, "PINGS": 3}, shrink=_one_radio, emulated=True),
+    "field_shape": Smallest("--out FOLDER/lab --repeats 1", shrink=_one_trial, emulated=True),
+    "layers": Smallest("--rounds 1 --packets 20", {"PINGS": 5, "STATIONS": (2,)}, shrink=_one_layer, emulated=True),
+    "ledger": Smallest("--repeats 3"),
+    "medium": Smallest("--rounds 1 --seconds 1 --probes 20", shrink=_slow_iperf, emulated=True),
+    "mesh": Smallest("--out FOLDER/lab --repeats 1", shrink=_short_row, emulated=True),
+    "mesh_losses": Smallest("--losses 1", shrink=_short_detour, emulated=True),
+    "middleware": Smallest("--out FOLDER/lab --only dds --repeats 1", shrink=_one_stream, emulated=True),
+    "moves": Smallest("--sizes 2", {"STEPS": 10, "WORLDS": ("lawn",)}, emulated=True),
+    "pcap": Smallest("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 400}),
+    "radio_vs_ns3": Smallest("", {"DISTANCES_M": (5,), "STATIONS": (1,), "SECONDS": 0.1}, shrink=_without_ns3),
+    "startup": Smallest("--rounds 1", shrink=_two_commands),
+    "stop": Smallest("--rounds 1", emulated=True),
+    "swarm": Smallest("--sizes 2 --seconds 1", {"PINGS": 5}, shrink=_small_swarm, emulated=True),
+    "tcp_vs_kernel": Smallest("--runs 2 --seconds 1 --together 1 --loss 1% --delay 5ms", emulated=True),
+    "tcp_vs_ns3": Smallest("", {"SECONDS": 1.0, "SEEDS": 2}, shrink=_few_losses),
+    "telemetry": Smallest("--seconds 0.5", {"SLOWER": (1,)}, shrink=_stand_in_iw),
+    "topics": Smallest("--rounds 1", {"PLAIN": {"zenoh": ("plain", "attached")}, "LASTS_S": 1.0, "BURST_S": 0.1}),
+    "trial_overhead": Smallest("--rounds 1 --record 1s --round-trips 0s", emulated=True),
+    "zenoh_images": Smallest("--rounds 1", {"SAMPLES": 2, "BYTES": 10_000}, shrink=_one_setting, emulated=True),
+}
+"""Each benchmark that runs here."""
+
+
+def main() -> int:
+    """Run a benchmark at its smallest size; return its exit code."""
+    name, folder = sys.argv[1], Path(sys.argv[2]).resolve()
+    case = CASES[name]
+    module = import_module(f"benchmarks.{name}")
+    for constant, value in case.constants.items():
+        replace(module, constant, value)
+    case.shrink(module, folder)
+    sys.argv = [f"benchmarks.{name}", *case.arguments.replace("FOLDER", str(folder)).split()]
+    return module.main() or 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

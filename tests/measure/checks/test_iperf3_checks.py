@@ -1,0 +1,116 @@
+"""JSON of both ends of real tests contradicts nothing in any version; one number changed contradicts another."""
+
+import copy
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.checks import iperf3_checks
+from fieldkit.measure.checks.iperf3_checks import IperfOrder
+from fieldkit.measure.evidence import iperf3
+from tests.helpers.paths import DATA
+
+VERSIONS = ("3.1.3", "3.7", "3.12", "3.17.1")
+TESTS = ("tcp", "udp", "udp-reverse")
+NUMBERS = ("bytes", "seconds", "packets", "lost_packets", "retransmits")
+
+
+def document(version: str, test: str, end: str) -> Any:  # noqa: ANN401 (of JSON)
+    return json.loads((DATA / "iperf3" / version / f"{test}-{end}.json").read_text(encoding="utf-8"))
+
+
+def order(test: str) -> IperfOrder:
+    tcp = test == "tcp"
+    protocol = Protocol.TCP if tcp else Protocol.UDP
+    return IperfOrder(protocol, streams=1 + tcp, payload_bytes=1400, reverse=test.endswith("reverse"), lasts_s=3.0)
+
+
+def contradictions(client: Any, server: Any, test: str) -> list[str]:  # noqa: ANN401 (of JSON)
+    ends = [iperf3.parse(json.dumps(end)) for end in (client, server)]
+    reverse = test.endswith("reverse")
+    own = (iperf3_checks.within(end, sends=sends) for end, sends in zip(ends, (not reverse, reverse), strict=True))
+    return [*chain(*own), *iperf3_checks.between(ends[0], ends[1], order(test))]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("test", TESTS)
+def test_both_ends_of_a_real_test_contradict_nothing(version: str, test: str) -> None:
+    assert contradictions(document(version, test, "client"), document(version, test, "server"), test) == []
+
+
+@given(
+    version=st.sampled_from(VERSIONS),
+    test=st.sampled_from(TESTS),
+    end=st.sampled_from(["client", "server"]),
+    change=st.tuples(st.integers(0, 10), st.sampled_from(NUMBERS), st.sampled_from([0, 0.5, 1.1, 2, 10])),
+)
+def test_one_number_of_an_interval_that_is_changed_contradicts_another(
+    version: str, test: str, end: str, change: tuple[int, str, float]
+) -> None:
+    """A number that columns are computed from: the sender's bytes and retransmissions, all of the receiver's."""
+    number, key, factor = change
+    ends = {name: document(version, test, name) for name in ("client", "server")}
+    intervals = ends[end]["intervals"]
+    total = intervals[number % len(intervals)]["sum"]
+    sends = (end == "client") != test.endswith("reverse")
+    if key not in total or (sends and key in {"packets", "lost_packets"}):
+        return
+    old = total[key]
+    total[key] = type(old)(old * factor)
+    if abs(total[key] - old) > (0.002 if key == "seconds" else 0):
+        assert (
+            contradictions(ends["client"], ends["server"], test) or total[key] == 0 == intervals[-1]["sum"]["bytes"]
+        )
+
+
+@given(version=st.sampled_from(VERSIONS), test=st.sampled_from(TESTS), number=st.integers(0, 10))
+def test_an_interval_that_is_missing(version: str, test: str, number: int) -> None:
+    ends = {name: document(version, test, name) for name in ("client", "server")}
+    receiver = ends["client" if test.endswith("reverse") else "server"]
+    removed = receiver["intervals"].pop(number % len(receiver["intervals"]))
+    found = contradictions(ends["client"], ends["server"], test)
+    assert found or removed["sum"]["bytes"] == 0, "an interval in which nothing came changes no column"
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("test", TESTS)
+@pytest.mark.parametrize("end", ["client", "server"])
+def test_the_json_of_another_test(version: str, test: str, end: str) -> None:
+    ends = {name: document(version, test, name) for name in ("client", "server")}
+    ends[end] = document(version, next(one for one in TESTS if one != test), end)
+    assert "they are two tests" in " ".join(contradictions(ends["client"], ends["server"], test))
+
+
+def changes_of_start() -> Iterator[tuple[str, Any, str]]:
+    yield "protocol", "SCTP", "another protocol"
+    yield "num_streams", 7, "another streams"
+    yield "reverse", 2, "another direction"
+    yield "blksize", 64, "another datagram size"
+
+
+@pytest.mark.parametrize(("key", "value", "reason"), changes_of_start())
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_test_that_nobody_asked_for(version: str, key: str, value: object, reason: str) -> None:
+    ends = {name: document(version, "udp", name) for name in ("client", "server")}
+    ends["server"] = copy.deepcopy(ends["server"])
+    ends["server"]["start"]["test_start"][key] = value
+    assert reason in " ".join(contradictions(ends["client"], ends["server"], "udp"))
+
+
+def test_a_test_that_ended_too_soon_or_is_of_another_time() -> None:
+    client, server = (iperf3.parse(json.dumps(document("3.12", "tcp", end))) for end in ("client", "server"))
+    (reason,) = iperf3_checks.between(client, server, replace(order("tcp"), lasts_s=10.0))
+    assert reason == "the client has intervals of 3.0 s in all, of 10 s"
+    began_ns = 10**9 * (client.start.began_utc_s or 0)
+    assert iperf3_checks.misdated(client, (began_ns - 10**9, began_ns + 5 * 10**9)) is None
+    assert iperf3_checks.misdated(client, None) is None
+    hour_ns = 3600 * 10**9
+    late = iperf3_checks.misdated(client, (began_ns - hour_ns, began_ns - hour_ns + 10**10))
+    assert late == "it began 3590 s after the attempt"

@@ -1,0 +1,213 @@
+"""What no link can do to a transfer: losses, copies, reordering and clocks contradict nothing."""
+
+import random
+import struct
+import tempfile
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.checks import contradictions
+from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, file_bytes, ipv4, segment, transfer
+
+SYN, FIN, ACK = 0x02, 0x01, 0x10
+SPORT = 40_000
+
+SEEDS = st.integers(0, 2**32)
+SHARES = st.sampled_from((0.0, 0.05, 0.3, 0.9))
+"""Of packets that are lost, copied, or late."""
+
+
+class Link:
+    """A link that loses, copies and delays, and what is captured at both of its ends."""
+
+    def __init__(self, seed: int, lost: float, copied: float, late: float) -> None:
+        self.chance = random.Random(seed)
+        self.shares = lost, copied, late
+        self.ahead_ns = self.chance.randrange(-(10**15), 10**15)
+        self.now_ns = 1_700_000_000_000_000_000
+        self.sent: list[Frame] = []
+        self.received: list[Frame] = []
+
+    def carry(self, data: bytes, *, back: bool = False) -> int:
+        """Send a packet; return how many copies of it arrive."""
+        near, far = (self.received, self.sent) if back else (self.sent, self.received)
+        ahead_ns = (self.ahead_ns, 0) if back else (0, self.ahead_ns)
+        self.now_ns += 1_000_000
+        near.append(Frame(self.now_ns + ahead_ns[0], data))
+        lost, copied, late = (self.chance.random() < share for share in self.shares)
+        copies = 0 if lost else 2 if copied else 1
+        for _ in range(copies):
+            delay_ns = self.chance.randrange(50_000_000 if late else 1_000_000)
+            far.append(Frame(self.now_ns + delay_ns + ahead_ns[1], data))
+        return copies
+
+    def contradictions(
+        self, protocol: Protocol, sent: bytes, received: bytes, *, finished: bool, captured: bool = True
+    ) -> list[str]:
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place)
+            for name, content in (
+                ("scan.bag", sent),
+                ("recv.bag", received),
+                ("sender.pcap", file_of(self.sent)),
+                ("receiver.pcap", file_of(self.received)),
+            ):
+                (folder / name).write_bytes(content)
+            evidence = AttemptEvidence(folder)
+            told = transfer(protocol) if captured else replace(transfer(protocol), captures=(None, None))
+            return list(contradictions.find(evidence, told, finished=finished))
+
+
+def file_of(frames: Iterable[Frame]) -> bytes:
+    return file_bytes(sorted(frames, key=lambda frame: frame.time_ns))
+
+
+def frame(seq: int, ack: int, flags: int, payload_bytes: int = 0, *, back: bool = False) -> bytes:
+    ports = (PORT, SPORT) if back else (SPORT, PORT)
+    head = struct.pack(">HHIIBBHHH", *ports, seq % 2**32, ack % 2**32, 5 << 4, flags, 502, 0, 0)
+    src, dst = (RECEIVER, SENDER) if back else (SENDER, RECEIVER)
+    return ipv4(head, protocol=6, size=20 + payload_bytes, src=src, dst=dst)
+
+
+@given(SEEDS, SHARES, SHARES, SHARES, st.integers(1, 30))
+def test_no_udp_transfer_contradicts_itself(
+    seed: int, lost: float, copied: float, late: float, datagrams: int
+) -> None:
+    link = Link(seed, lost, copied, late)
+    chance = random.Random(seed)
+    parts = [chance.randbytes(chance.randrange(1, 9_000)) for _ in range(datagrams)]
+    received: list[bytes] = []
+    for number, part in enumerate(parts):
+        whole = min([link.carry(one) for one in datagram(number, len(part))])
+        # The socket may have no room for it.
+        received += [part] * chance.randrange(whole + 1)
+    chance.shuffle(received)
+    assert link.contradictions(Protocol.UDP, b"".join(parts), b"".join(received), finished=True) == []
+
+
+@given(SEEDS, SHARES, SHARES, SHARES, st.integers(0, 40))
+def test_no_tcp_transfer_contradicts_itself(
+    seed: int, lost: float, copied: float, late: float, segments: int
+) -> None:
+    link = Link(seed, lost, copied, late)
+    chance = random.Random(seed)
+    isn = chance.choice((0, 2**32 - 5_000, chance.randrange(2**32)))
+    sizes = [chance.randrange(1, 3_000) for _ in range(segments)]
+    data = chance.randbytes(sum(sizes))
+    starts = [sum(sizes[:index]) for index in range(segments)]
+    # A sender gives up at some time; then the transfer broke off.
+    tries = chance.randrange(1, 500)
+    came, done = set[int](), False
+
+    def send(at: int, flags: int, size: int = 0) -> bool:
+        nonlocal tries
+        while tries > 0:
+            tries -= 1
+            if link.carry(frame(isn + at, 0, flags, size)):
+                return True
+        return False
+
+    def acknowledge(ack: int, flags: int = ACK) -> None:
+        link.carry(frame(77, isn + ack, flags, back=True), back=True)
+
+    if send(0, SYN):
+        acknowledge(1, SYN | ACK)
+        order = sorted(range(segments), key=lambda index: index + chance.random() * 3)
+        for index in (*order, *chance.choices(order, k=3)) if order else ():
+            if not send(1 + starts[index], ACK, sizes[index]):
+                break
+            came.add(index)
+            reached = next((one for one in range(segments) if one not in came), segments)
+            acknowledge(1 + sum(sizes[:reached]))
+        if len(came) == segments and send(1 + len(data), FIN | ACK):
+            done = True
+            acknowledge(2 + len(data))
+    reached = next((one for one in range(segments) if one not in came), segments)
+    received = data[: sum(sizes[:reached])]
+    if not done:  # ended at its limit, it may not have read all
+        received = received[: chance.randrange(len(received) + 1)]
+    assert link.contradictions(Protocol.TCP, data, received, finished=done) == []
+
+
+def test_a_datagram_that_nobody_saw_leave() -> None:
+    """Where others did, one is no router: it may be of something earlier."""
+    link = Link(0, 0.0, 0.0, 0.0)
+    for number in range(3):
+        link.carry(datagram(number, 1000)[0])
+    del link.sent[1]
+    found = link.contradictions(Protocol.UDP, bytes(3000), bytes(3000), finished=True)
+    assert found == ["1 datagram arrived that the sender's capture did not see leave"]
+
+
+def three_segments() -> Link:
+    link = Link(0, 0.0, 0.0, 0.0)
+    link.carry(frame(0, 0, SYN))
+    for number in range(3):
+        link.carry(frame(1 + 100 * number, 0, ACK, 100))
+    return link
+
+
+def test_bytes_that_nobody_saw_leave(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = three_segments()
+    del link.sent[2]
+    found = link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True)
+    assert found == ["100 bytes arrived that the sender's capture did not see leave"]
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True, captured=False) == []
+    monkeypatch.setattr(contradictions, "LONGEST_BYTES", 300)
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True) == [], "numbers went round"
+
+
+def test_what_is_repeated_of_an_earlier_connection_contradicts_nothing() -> None:
+    link = three_segments()
+    link.carry(segment(7_000, 100, sport=SPORT - 1))
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True) == []
+
+
+def test_bytes_that_were_acknowledged_and_came_by_neither_capture() -> None:
+    link = three_segments()
+    link.carry(frame(77, 301, ACK, back=True), back=True)
+    del link.sent[2], link.received[2]
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(200), finished=False) == [
+        f"100 bytes were acknowledged that are not in the {role}'s capture" for role in ("sender", "receiver")
+    ]
+
+
+def test_bytes_behind_a_hole_are_not_missed_by_the_file() -> None:
+    """The listener left, and the sender never said that it was done: nobody had all."""
+    link = Link(0, 0.0, 0.0, 0.0)
+    link.carry(frame(0, 0, SYN))
+    link.carry(frame(0, 1, SYN | ACK, back=True), back=True)
+    for number in (0, 2):
+        link.carry(frame(1 + 100 * number, 0, ACK, 100))
+    link.carry(segment(9, 0, flags=0x04, port=11_311, back=True), back=True)  # ROS refuses somebody
+    assert link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True) == []
+    link.carry(segment(9, 0, flags=0x04, back=True), back=True)
+    (found,) = link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True)
+    assert found.endswith("though its listener ended as if it had them all"), "it stopped reading"
+
+
+def test_a_fragment_of_another_program_is_none_of_the_file() -> None:
+    """A capture has every later fragment between the two ends, as those of ROS 2, and the radio may lose them."""
+    link = Link(0, 0.0, 0.0, 0.0)
+    for number, port in ((0, PORT), (1, 7400), (2, PORT)):
+        for one in datagram(number, 3000, port=port):
+            link.carry(one)
+    lost = next(at for at, one in enumerate(link.received) if one.data in datagram(1, 3000, port=7400)[1:])
+    del link.received[lost]
+    assert link.contradictions(Protocol.UDP, bytes(6000), bytes(6000), finished=True) == []
+
+
+def test_what_a_capture_lacks_of_a_whole_file_is_told_once() -> None:
+    link = Link(0, 0.0, 0.0, 0.0)
+    for number in range(3):
+        link.carry(datagram(number, 1000)[0])
+    del link.received[1]
+    found = link.contradictions(Protocol.UDP, bytes(3000), bytes(3000), finished=True)
+    assert found == ["the receiver's capture holds 2000 bytes of the transfer, and recv.bag has 3000"]

@@ -1,0 +1,148 @@
+"""What was written down of a flight: its columns on a way that is known, and lines that no flight writes."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as d
+
+from fieldkit.agent.autopilot import AutopilotState
+from fieldkit.agent.flight_log import FlightLog
+from fieldkit.agent.flying.origin import FlightOrigin
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.motion import fly_log
+from fieldkit.measure.motion.fly_log import FlightMoment
+from tests.agent.test_agent_flight import talk
+
+NAMES = {column.name for column in fly_log.COLUMNS}
+BEGIN_M = (10.0, -4.0, -1.5)
+LINE = {
+    "utc_ns": 1,
+    "at_s": 0.0,
+    "phase": "flying",
+    "ahead_m": 0.0,
+    "left_m": 0.0,
+    "up_m": 0.0,
+    "speed_m_s": 0.0,
+}
+
+
+def written(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
+    path = folder / fly_log.FILE
+    path.write_text("".join(f"{json.dumps(line)}\n" for line in lines) + end, encoding="ascii")
+    return path
+
+
+def at(place_m: tuple[float, float, float] | None, speed_m_s: float) -> AutopilotState:
+    """Return the state of an autopilot that has reported this."""
+    if place_m is None:
+        return talk()[0]
+    return talk(d.MAVLink_local_position_ned_message(1, *place_m, speed_m_s, 0.0, 0.0))[0]
+
+
+def flown(path: Path, yaw_rad: float) -> None:
+    """Rise 3 m, fly 4 m ahead and 3 m to the left at 2 m/s, wait there, and land 0.5 m short of where it rose."""
+    log = FlightLog(str(path))
+    drone = at(BEGIN_M, 0.0)
+    log.note(drone)
+    log.begin(FlightOrigin("local", "", *BEGIN_M[:2], yaw_rad), BEGIN_M[2])
+    way = [("standing", 0.0, 0.0, 0.0, 0.0), ("climbing", 0.0, 0.0, 1.0, 1.0), ("up", 0.0, 0.0, 3.1, 0.1)]
+    way += [("flying", 4 * tenth / 10, 3 * tenth / 10, 3.0, 2.0) for tenth in range(11)]
+    way += [("there", 4, 3, 3.0, 0.0)] * 5 + [("coming back", 2, 1, 3.0, 2.5), ("coming down", 0.3, 0.4, -0.1, 0.2)]
+    for phase, ahead_m, left_m, up_m, speed_m_s in way:
+        log.phase = phase
+        north_m = ahead_m * math.cos(yaw_rad) + left_m * math.sin(yaw_rad)
+        east_m = ahead_m * math.sin(yaw_rad) - left_m * math.cos(yaw_rad)
+        log.note(at((BEGIN_M[0] + north_m, BEGIN_M[1] + east_m, BEGIN_M[2] - up_m), speed_m_s))
+        log.note(at(None, 0.0))
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 2.0, -3.0])
+def test_the_columns_of_a_flight_that_is_known(tmp_path: Path, yaw_rad: float) -> None:
+    flown(tmp_path / fly_log.FILE, yaw_rad)
+    log = fly_log.read(tmp_path / fly_log.FILE)
+    assert len(log) == 21, "before it stood, and where it does not say where it is, nothing is written"
+    assert (log[13].ahead_m, log[13].left_m) == pytest.approx((4.0, 3.0), abs=1e-3)
+    found = fly_log.measure(log)
+    assert not found.missing
+    assert found.values == pytest.approx(
+        {
+            "fly_height_median_m": 3.0,
+            "fly_height_max_m": 3.1,
+            "fly_farthest_m": 5.0,
+            "fly_speed_median_m_s": 2.0,
+            "fly_speed_max_m_s": 2.5,
+            "fly_back_off_m": 0.5,
+        },
+        abs=1e-3,
+    )
+
+
+def test_what_is_not_known_is_missing_and_says_why(tmp_path: Path) -> None:
+    assert fly_log.measure(None).missing.keys() == NAMES
+    torn = written(tmp_path, [{**LINE, "phase": "up"}], end='{"utc_ns": 1')
+    found = fly_log.measure(fly_log.read(torn))
+    assert found.missing.keys() == {"fly_height_median_m", "fly_speed_median_m_s", "fly_back_off_m"}
+
+
+@pytest.mark.parametrize("place", ["/dev/full", "/nowhere/fly.jsonl", ""])
+def test_no_flight_ends_because_it_cannot_be_written_down(place: str) -> None:
+    log = FlightLog(place)
+    log.begin(FlightOrigin("local", "", *BEGIN_M[:2], 0.0), BEGIN_M[2])
+    log.phase = "flying"
+    for _ in range(3):
+        log.note(at(BEGIN_M, 1.0))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"ahead_m": None},
+        {"ahead_m": math.nan},
+        {"left_m": math.inf},
+        {"up_m": 10**400},
+        {"up_m": -1e7},
+        {"at_s": -1.0},
+        {"speed_m_s": -0.1},
+        {"speed_m_s": math.nan},
+        {"phase": "lost"},
+        {"phase": ["flying"]},
+    ],
+)
+def test_a_line_that_no_flight_writes_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    with pytest.raises(EvidenceError, match="line 2 does not say where the drone flew"):
+        fly_log.read(written(tmp_path, [LINE, {**LINE, **wrong}]))
+
+
+def test_a_log_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match="says nothing of where"):
+        fly_log.read(written(tmp_path, []))
+    with pytest.raises(EvidenceError, match="not in the order of time"):
+        fly_log.read(written(tmp_path, [{**LINE, "at_s": 1.0}, LINE]))
+    with pytest.raises(EvidenceError, match="cannot be read"):
+        fly_log.read(tmp_path / "none")
+
+
+numbers = st.floats(-1e6, 1e6)
+moments = st.builds(
+    FlightMoment,
+    at_s=st.just(0.0),
+    phase=st.sampled_from(["standing", "flying", "there", "coming down"]),
+    ahead_m=numbers,
+    left_m=numbers,
+    up_m=numbers,
+    speed_m_s=st.floats(0, 1e4),
+)
+
+
+@given(st.lists(moments, max_size=6))
+def test_the_columns_of_any_log_are_possible(log: list[FlightMoment]) -> None:
+    found = fly_log.measure(log)
+    assert found.values.keys() | found.missing.keys() == NAMES
+    for column in fly_log.COLUMNS:
+        if column.name in found.values:
+            assert column.problem(str(found.values[column.name])) is None

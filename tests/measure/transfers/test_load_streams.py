@@ -1,0 +1,180 @@
+"""Stalls and jitter of iperf3's streams, by captures whose gaps and delays are known."""
+
+import random
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.transfers import delay, load_streams, stalls
+from fieldkit.measure.transfers.deliveries import FlowSchedule
+from fieldkit.measure.transfers.load_streams import COOKIE_BYTES, LoadStreams
+from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame
+from tests.helpers.streams import ISN, MS, SECOND, START, Stream, captured
+
+EVERY = FlowSchedule(interval_s=0.01)
+UDP = LoadStreams(Protocol.UDP, SENDER, RECEIVER, PORT, False, 1, 1000, (), EVERY)
+TCP = replace(UDP, protocol=Protocol.TCP, expected=FlowSchedule(head_bytes=COOKIE_BYTES))
+GAP = (100, 150)
+
+
+def measured(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
+    found = load_streams.measure("iperf3", load, *captured(streams))
+    assert found.values.keys() | found.missing.keys() == {
+        column.name for column in stalls.declared("iperf3", "iperf3", 0)
+    }
+    return {name.removeprefix("iperf3_"): value for name, value in found.values.items()}
+
+
+def control(**ends: Any) -> Stream:  # noqa: ANN401 (fields of Stream)
+    """The connection by which both ends agree, opened first and idle meanwhile."""
+    stream = Stream(**{"sport": 39000, **ends})
+    stream.opens(0)
+    for number, at_ns in enumerate((10 * MS, 9 * SECOND)):
+        stream.segment(number, at_ns)
+        stream.answer(number + 1, at_ns + 5 * MS)
+    return stream
+
+
+def data(sport: int = 40000, lost: range = range(*GAP)) -> Stream:
+    stream = Stream(sport=sport)
+    for number in range(400):
+        stream.datagram(number, SECOND + number * 10 * MS, arrives=number not in lost)
+    return stream
+
+
+def test_datagrams_that_the_radio_lost_in_a_row_are_a_stall() -> None:
+    found = measured(UDP, [control(), data()])
+    assert found == {"stall_s": pytest.approx(0.5), "stalls": 1}
+
+
+def test_parallel_streams_stall_each_by_itself() -> None:
+    both = [control(), data(), data(40001, range(200, 300))]
+    two = replace(UDP, count=2)
+    assert measured(two, both) == {"stall_s": pytest.approx(1.0), "stalls": 2}
+    named = replace(UDP, ports=((40000, PORT),))
+    assert measured(named, both) == {"stall_s": pytest.approx(0.5), "stalls": 1}
+
+
+def test_streams_that_cannot_be_told_from_others_have_no_stall() -> None:
+    assert not measured(UDP, [control(), data(), data(40001)])
+
+
+def test_a_test_that_lasted_longer_than_anything_arrived_has_a_lower_bound() -> None:
+    lasts = replace(UDP, expected=replace(EVERY, lasts_s=10.0))
+    assert measured(lasts, [control(), data()]) == {"stall_at_least_s": pytest.approx(6.0), "stalls": 2}
+
+
+def tcp_data(gap_ns: int) -> Stream:
+    """A data connection: the cookie of a client, segments, and a gap in which one is sent again in vain."""
+    stream = Stream()
+    stream.opens(100 * MS)
+    stream.forward(105 * MS, ISN + 1, "PA", b"c" * COOKIE_BYTES)
+    shift = COOKIE_BYTES
+    at_ns = SECOND
+    for number in range(100):
+        if number == 50:
+            for again_ns in range(200 * MS, gap_ns, 400 * MS):
+                stream.forward(at_ns + again_ns, ISN + 1 + shift + number * 1000, "A", b"x" * 1000, arrives=False)
+            at_ns += gap_ns
+        stream.forward(at_ns, ISN + 1 + shift + number * 1000, "A", b"x" * 1000)
+        at_ns += 10 * MS
+    return stream
+
+
+@given(st.integers(300, 4000))
+@settings(max_examples=15, deadline=None)
+def test_segments_sent_again_in_vain_end_no_stall(gap_ms: int) -> None:
+    found = measured(TCP, [control(), tcp_data(gap_ms * MS)])
+    # The setup counts, too: from SYN to the first data 0.9 s.
+    assert found["stall_s"] == pytest.approx(max(gap_ms / 1e3 + 0.01, 0.9), abs=1e-3)
+    assert found["stalls"] == 2
+
+
+def test_a_test_in_reverse_sends_from_the_servers_port() -> None:
+    rebuilt = Stream(sport=PORT, port=40000)
+    rebuilt.opens(100 * MS)
+    for number in range(100):
+        rebuilt.forward(
+            SECOND + number * 10 * MS + 2 * SECOND * (number >= 50), ISN + 1 + number * 1000, "A", b"x" * 1000
+        )
+    first = Stream(sport=PORT, port=39000)
+    first.opens(0)
+    load = replace(TCP, source_listens=True, expected=FlowSchedule())
+    assert measured(load, [first, rebuilt])["stall_s"] == pytest.approx(2.01, abs=1e-3)
+
+
+@pytest.mark.parametrize("end", ["sender", "receiver"])
+def test_a_clock_that_is_set_forward_is_no_stall(end: str) -> None:
+    streams = [control(), data()]
+    for stream in streams:
+        frames = getattr(stream, end)
+        frames[:] = [
+            Frame(frame.time_ns + 3600 * SECOND * (frame.time_ns > START + 3 * SECOND), frame.data)
+            for frame in frames
+        ]
+    assert not measured(UDP, streams)
+
+
+def test_without_captures_or_packets_nothing_is_told() -> None:
+    assert not load_streams.measure("iperf3", UDP, None, captured([data()])[1]).values
+    assert not measured(UDP, [])
+    assert not measured(TCP, [control()])
+
+
+def rfc_3550(transit_s: Sequence[float]) -> float:
+    """The mean of the estimator, as the RFC writes it down."""
+    jitter_s, all_of_them = 0.0, []
+    for before_s, after_s in pairwise(transit_s):
+        jitter_s += (abs(after_s - before_s) - jitter_s) / 16
+        all_of_them.append(jitter_s)
+    return float(np.mean(all_of_them))
+
+
+@given(st.lists(st.integers(0, 50_000_000), min_size=2, max_size=400))
+def test_the_mean_of_the_estimator_is_that_of_its_definition(transit_ns: list[int]) -> None:
+    found = delay.mean_jitter_s(np.array(transit_ns))
+    assert found == pytest.approx(rfc_3550([one / 1e9 for one in transit_ns]), abs=1e-12)
+
+
+def jittered(delays_ms: Sequence[float], sport: int = 40000) -> Stream:
+    stream = Stream(sport=sport)
+    for number, delay_ms in enumerate(delays_ms):
+        stream.delay_ns = round(delay_ms * MS)
+        stream.datagram(number, SECOND + number * 100 * MS)
+    return stream
+
+
+def jitter(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
+    found = load_streams.measure_jitter(load, *captured(streams))
+    assert found.values.keys() | found.missing.keys() == {column.name for column in load_streams.JITTER}
+    return {name.removeprefix("iperf3_captured_"): value for name, value in found.values.items()}
+
+
+def test_jitter_is_that_of_the_whole_test_and_not_of_its_end() -> None:
+    noisy = [random.Random(number).uniform(2.0, 20.0) for number in range(60)]
+    quiet = [5.0] * 20
+    delays_ms = [*noisy, *quiet]
+    found = jitter(UDP, [control(), jittered(delays_ms)])
+    assert found["jitter_mean_s"] == pytest.approx(rfc_3550([one / 1e3 for one in delays_ms]), rel=1e-3)
+    assert found["variation_p95_s"] == pytest.approx((np.percentile(delays_ms, 95) - min(delays_ms)) / 1e3, rel=1e-3)
+    last_s = delay.jitter_s(np.array([round(one * MS) for one in delays_ms]))
+    assert last_s is not None
+    assert last_s < 0.5 * found["jitter_mean_s"], "the last value tells of the quiet end alone"
+
+
+def test_jitter_of_streams_is_that_of_all_their_datagrams() -> None:
+    steady, noisy = [5.0] * 30, [5.0, 15.0] * 15
+    found = jitter(replace(UDP, count=2), [control(), jittered(steady), jittered(noisy, 40001)])
+    assert found["jitter_mean_s"] == pytest.approx(rfc_3550([one / 1e3 for one in noisy]) / 2, rel=1e-3)
+
+
+def test_of_tcp_there_is_no_jitter_and_of_one_way_traffic_neither() -> None:
+    assert not jitter(TCP, [control(), tcp_data(SECOND)])
+    assert not jitter(UDP, [data()])

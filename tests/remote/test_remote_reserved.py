@@ -1,0 +1,90 @@
+"""Files that a robot may not provide: those that only the laptop, its testbed or another robot writes."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core import laptop_files
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Protocol, RepeatId, Role
+from fieldkit.remote import fetching
+from fieldkit.trial.owners import FileOwners
+from tests.helpers.casts import los_plan
+from tests.remote.test_remote_fuzz import Sender, entry
+
+PLAN = los_plan()
+OWNERS = FileOwners.of(PLAN.procedure, PLAN.scene(RepeatId(Protocol.UDP, 1), ""))
+OF_THE_LAPTOP = (
+    *("medium.txt", "track.csv", "link.csv", "lateness.txt", "MANIFEST.sha256", "air.pcap", "air.csv"),
+    *("answer-grass.txt", "receiver-unfetched.txt", "positions.json", "trial.yaml", "trial.csv", "journal.jsonl"),
+)
+
+
+def archive(*names: str, large: str = "") -> bytes:
+    content = b"1 2 3\n"
+    sums = "".join(f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name in names)
+    files = {".sums-1": sums.encode(), ".large-1": large.encode(), **dict.fromkeys(names, content)}
+    return b"".join(entry(name.encode(), data) for name, data in files.items()) + bytes(1024)
+
+
+def fetch(data: bytes, into: Path, role: Role = Role.SENDER) -> None:
+    shell = Sender(into, data)
+    fetching.fetch(shell, "x", role, "lo", into, foreign=lambda name: OWNERS.refusal(role, name))
+
+
+def test_a_robots_own_files_are_taken(tmp_path: Path) -> None:
+    fetch(archive("sender.pcap", "sender-after.txt", "ping.txt", "notes.txt", "scan.bag"), tmp_path)
+    assert (tmp_path / "ping.txt").exists()
+
+
+@pytest.mark.parametrize("name", OF_THE_LAPTOP)
+@pytest.mark.parametrize("form", ["{}", "up.{}", "scan/{}", "scan/up.{}"])
+@pytest.mark.parametrize("case", [str, str.upper, str.title])
+def test_what_only_the_laptop_writes_is_refused(name: str, form: str, case: type, tmp_path: Path) -> None:
+    wrong = form.format(case(name))
+    with pytest.raises(EvidenceError, match="only the laptop writes a file of this name"):
+        fetch(archive("ping.txt", wrong), tmp_path)
+    assert not (tmp_path / wrong).exists()
+
+
+def test_a_large_file_is_refused_by_its_name_too(tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match="only the laptop writes"):
+        fetch(archive("ping.txt", large="99999999 track.csv\n"), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["./medium.txt", "../track.csv", "/track.csv", "a//track.csv", ".track.csv"])
+def test_other_ways_to_write_a_name_are_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError):
+        fetch(archive("ping.txt", name), tmp_path)
+    assert not list(tmp_path.rglob("*track.csv")) + list(tmp_path.rglob("*medium.txt"))
+
+
+@pytest.mark.parametrize(
+    ("role", "name"),
+    [
+        (Role.RECEIVER, "ping.txt"),
+        (Role.RECEIVER, "PING.txt"),
+        (Role.RECEIVER, "scan.bag"),
+        (Role.SENDER, "recv.bag"),
+        (Role.SENDER, "receiver.pcap"),
+        (Role.SENDER, "Receiver-After.txt"),
+        (Role.SENDER, "up.receiver-iperf3.json"),
+    ],
+)
+def test_what_another_robot_writes_is_refused(role: Role, name: str, tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match="only the robot in role"):
+        fetch(archive(name), tmp_path, role)
+
+
+@given(st.sampled_from(OF_THE_LAPTOP), st.lists(st.booleans(), min_size=30, max_size=30))
+def test_a_name_is_reserved_in_any_case(name: str, upper: list[bool]) -> None:
+    mixed = "".join(letter.upper() if up else letter for letter, up in zip(name, upper, strict=False))
+    assert laptop_files.reserved(mixed)
+
+
+@pytest.mark.parametrize("name", ["sender-link.txt", "ping.txt", "my-track.csv.gz", "answers.txt", "x.trial.csv.bak"])
+def test_other_names_are_not_reserved(name: str) -> None:
+    assert not laptop_files.reserved(name)

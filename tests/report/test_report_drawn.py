@@ -1,0 +1,224 @@
+"""What figures are given to draw: crosses where nothing arrived, dots of one distance, logarithmic axes, captions."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.analysis.cells import aggregate
+from fieldkit.analysis.repeats import Repeats, read
+from fieldkit.core.columns import of_fault
+from fieldkit.core.model import FaultKind
+from fieldkit.measure.evidence import ping, recovery
+from fieldkit.report import distance, distribution, dots, figures
+from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
+from fieldkit.report.conditions import Identities
+from fieldkit.report.contents import put_together
+from fieldkit.report.evidence import at_hand
+from fieldkit.report.points import needs_log
+from fieldkit.report.theme import Style
+from fieldkit.trial.columns import trial_columns
+from fieldkit.trial.rows import to_csv
+from tests.helpers import lawns
+from tests.helpers.tables import RepeatRow, parsed, replace
+
+LOST = {"datagrams_received": 0, "datagram_loss": 1.0, "rtt_loss": 1.0, "rtt_median_s": None, "transfer_s": None}
+
+
+def at(metres: float, repeats: int = 8, **changes: object) -> list[RepeatRow]:
+    """Return repeats at one distance whose round-trip times differ by a hundredth."""
+    rows = [lawns.row(n, distance=f"{metres:g}m", distance_m=metres) for n in range(1, repeats + 1)]
+    return [replace(row, **({"rtt_median_s": 0.010 + 1e-4 * n} | changes)) for n, row in enumerate(rows)]
+
+
+def curves(repeats: Repeats, *names: str) -> list[Chart]:
+    found = at_hand(repeats)
+    cells = aggregate(repeats)
+    return list(distance.charts(cells, Identities(cells), found, names))
+
+
+def of_dots(repeats: Repeats) -> list[Chart]:
+    found = at_hand(repeats)
+    cells = aggregate(repeats)
+    return list(dots.charts(cells, Identities(cells), found))
+
+
+def panel_of(charts: Sequence[Chart]) -> Panel:
+    ((panel,),) = (chart.panels for chart in charts)
+    return panel
+
+
+def test_a_curve_does_not_end_where_nothing_arrived() -> None:
+    (chart,) = curves(parsed([*at(10), *at(20), *at(60, 3, **LOST)]), "rtt_median_s")
+    (panel,) = chart.panels
+    (cross,) = panel.edges
+    assert (cross.at, cross.text, cross.is_high) == (60.0, "nothing arrived: 3 of 3", True)
+    assert [label for _, label in panel.x_ticks] == ["10m", "20m", "60m"]
+    assert panel.right is not None
+    assert panel.right > 60
+    assert "nothing arrived: 3 of 3 at 60m" in panel.words
+    assert "a cross at the edge where a condition has no value" in chart.caption
+
+
+def test_a_rate_that_is_missing_has_its_cross_at_the_bottom() -> None:
+    rows = [*at(10, goodput_bit_s=1e6), *at(20, goodput_bit_s=1e6), *at(60, 3, **LOST)]
+    assert [edge.is_high for edge in panel_of(curves(parsed(rows), "goodput_bit_s")).edges] == [False]
+
+
+def test_a_condition_with_no_valid_repeat_has_a_cross_with_how_its_attempts_ended() -> None:
+    rows = [*at(10), *at(20), *at(60, 2, status="failed", reason="no answer")]
+    assert [edge.text for edge in panel_of(curves(parsed(rows), "rtt_median_s")).edges] == [
+        "no valid repeat: 2 failed"
+    ]
+
+
+def test_a_point_says_how_many_repeats_have_a_value() -> None:
+    some = [*at(20, 2), lawns.row(3, distance="20m", distance_m=20.0, **LOST)]
+    (chart,) = curves(parsed([*at(10), *some]), "rtt_median_s")
+    assert list(chart.panels[0].series[0].notes) == ["", "2 of 3"]
+    assert "how many of the valid repeats have a value" in chart.caption
+
+
+def test_no_line_goes_over_a_dead_place_or_through_an_interval_that_says_nothing() -> None:
+    near = [row for metres in (10, 20, 30, 40) for row in at(metres)]
+    (series,) = panel_of(curves(parsed(near), "rtt_median_s")).series
+    assert (series.join, set(series.breaks)) == ("line", set())
+    dead = [*near, *at(25, 2, **LOST)]
+    (series,) = panel_of(curves(parsed(dead), "rtt_median_s")).series
+    assert set(series.breaks) == {1}
+    # Two repeats that differ much have an interval over the whole axis.
+    vague = [*near, *(replace(row, rtt_median_s=0.001 + 0.03 * n) for n, row in enumerate(at(25, 2)))]
+    (series,) = panel_of(curves(parsed(vague), "rtt_median_s")).series
+    assert set(series.breaks) == {1, 2}
+
+
+def test_a_broken_line_is_drawn_in_its_stretches() -> None:
+    def lines(breaks: set[int]) -> int:
+        series = Series("", Style("blue", "o"), [1.0, 2.0, 3.0, 4.0], [1.0, 2.0, 3.0, 4.0], breaks=breaks)
+        return figures.panel_svg(Panel("", "", "", [series], "", top=4.0)).count("stroke-width: 1.4")
+
+    assert lines({1}) == lines(set()) + 1
+    assert lines({0, 1, 2}) == 0
+
+
+def test_quantities_of_one_distance_are_dots_and_no_curve() -> None:
+    repeats = parsed(at(10, 3, goodput_bit_s=2e6))
+    made = put_together(repeats, title="", repeat="", command=["fieldkit"])
+    assert made.against_distance == []
+    (chart,) = of_dots(repeats)
+    assert chart.title == "All quantities at 10m"
+    lanes = {panel.x_label: list(panel.lanes) for panel in chart.panels}
+    assert lanes == {
+        "share [%]": ["UDP datagram loss"],
+        "time [ms]": ["transfer time", "RTT"],
+        "rate [Mbit/s]": ["goodput"],
+    }
+    (_, times, _) = chart.panels
+    (series,) = times.series
+    assert sorted(series.x) == pytest.approx([10.1, 500.0])
+    assert len(series.behind) == 6
+    assert times.x_log
+    assert "quantities" in [section.name for section in made.sections]
+
+
+def test_a_distance_for_each_topology_is_no_curve_either() -> None:
+    repeats = parsed([*at(10, 3), *at(20, 3, topology="masterless")])
+    assert curves(repeats, "rtt_median_s") == []
+    (chart,) = of_dots(repeats)
+    assert {panel.title for panel in chart.panels} == {"UDP, master, 10m", "UDP, masterless, 20m"}
+
+
+def test_several_distances_are_curves_and_no_dots() -> None:
+    assert of_dots(parsed([*at(10), *at(20)])) == []
+
+
+def test_a_condition_of_one_distance_in_which_nothing_arrived_has_a_cross_in_its_lane() -> None:
+    dead = at(10, 2, scenario="nlos", procedure="nlos", **LOST)
+    times = next(panel for panel in of_dots(parsed([*at(10), *dead]))[0].panels if "time" in panel.x_label)
+    assert [edge.text for edge in times.edges] == ["nothing arrived: 2 of 2"] * 2
+    assert [round(edge.at) for edge in times.edges] == [1, 0] or [round(edge.at) for edge in times.edges] == [0, 1]
+
+
+@given(st.lists(st.floats(1e-6, 1e6), min_size=1))
+def test_an_axis_is_logarithmic_over_more_than_one_and_a_half_decades(values: list[float]) -> None:
+    decades = math.log10(max(values)) - math.log10(min(values))
+    if abs(decades - 1.5) > 1e-9:
+        assert needs_log(values) is (decades > 1.5)
+    assert not needs_log([0.0, *values])
+    assert not needs_log([-1.0, *values])
+
+
+@pytest.mark.parametrize(("longest_s", "is_log"), [(0.02, False), (2.0, True)])
+def test_the_axis_of_a_distribution_is_logarithmic_where_that_is_needed(longest_s: float, is_log: bool) -> None:
+    rows = at(10, 4)
+    rows[-1] = replace(rows[-1], rtt_median_s=longest_s)
+    repeats = parsed(rows)
+    cells = aggregate(repeats)
+    chart = next(iter(distribution.charts(cells, Identities(cells), at_hand(repeats))))
+    assert chart.panels[0].x_log is is_log
+    assert ("logarithmic" in chart.caption) is is_log
+    assert chart.panels[0].left == (pytest.approx(10 / 1.1) if is_log else 0)
+
+
+def test_a_flag_is_a_share_of_repeats(tmp_path: Path) -> None:
+    columns = trial_columns(recovery.declared(FaultKind.REBOOT))
+    name = of_fault(FaultKind.REBOOT, "recovered")
+    rows = [{**row, name: n > 1} for metres in (10, 20) for n, row in enumerate(at(metres, 4))]
+    path = tmp_path / "trial.csv"
+    path.write_text(to_csv(rows, columns), encoding="utf-8")
+    (chart,) = curves(read([path], columns), name)
+    assert chart.caption == "Share of the valid repeats in which it is true, with its 95 % interval."
+    assert chart.panels[0].y_label == "Ping back after reboot [% of repeats]"
+    assert chart.panels[0].series[0].behind == []
+
+
+def test_distances_are_called_as_the_operator_typed_them() -> None:
+    rows = [*at(10), *(replace(row, distance="60ft") for row in at(18.288))]
+    panel = panel_of(curves(parsed(rows), "rtt_median_s"))
+    assert [label for _, label in panel.x_ticks] == ["10m", "60ft"]
+    assert "at 60ft" in panel.words
+
+
+@pytest.mark.parametrize("lanes", [(), ("RTT",)])
+@pytest.mark.parametrize("is_high", [True, False])
+def test_a_cross_is_drawn_with_its_text(lanes: tuple[str, ...], is_high: bool) -> None:
+    edge = EdgeMark(0.0, "nothing arrived: 3 of 3", "blue", is_high)
+    series = Series("", Style("blue", "o", "none"), [1.0], [0.0], [0.5], [2.0], join="none")
+    drawn = figures.panel_svg(Panel("", "", "", [series], "", top=3.0, right=3.0, lanes=lanes, edges=[edge]))
+    assert "nothing arrived: 3 of 3" in drawn
+
+
+def test_a_value_that_is_only_a_lower_bound_is_drawn_open_and_its_line_ends_there(tmp_path: Path) -> None:
+    columns = trial_columns((*ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS))
+    rows = [
+        {
+            **row,
+            "rtt_gap_s": None if metres == 40 and n else 0.1,
+            "rtt_gap_at_least_s": 2.0 if metres == 40 and n else None,
+        }
+        for metres in (10, 20, 30, 40, 50)
+        for n, row in enumerate(at(metres, 6))
+    ]
+    path = tmp_path / "trial.csv"
+    path.write_text(to_csv(rows, columns), encoding="utf-8")
+    (chart,) = curves(read([path], columns), "rtt_gap_s")
+    (series,) = chart.panels[0].series
+    assert list(series.bounds) == [False, False, False, True, False]
+    assert [y for _, y in series.behind_bounds] == [2000.0] * 5
+    assert series.high[3] is None
+    assert series.notes[3] == "5 of 6 not ended"
+    assert {2, 3} <= set(series.breaks)
+    assert "a lower bound" in chart.caption
+    drawn = figures.panel_svg(chart.panels[0])
+    closed = replace_bounds(chart.panels[0])
+    assert drawn.count("<path") > figures.panel_svg(closed).count("<path")
+
+
+def replace_bounds(panel: Panel) -> Panel:
+    """Return the panel with every value taken as measured."""
+    series = [dataclasses.replace(one, bounds=()) for one in panel.series]
+    return dataclasses.replace(panel, series=series)

@@ -1,0 +1,163 @@
+"""The time line of one repeat: bars of steps, faults and moves, and flows, all on one axis of time."""
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fieldkit.analysis.cells import aggregate
+from fieldkit.config import schema
+from fieldkit.core.model import Role, Whereabouts
+from fieldkit.measure.evidence import host, track
+from fieldkit.measure.transfers import topic_log
+from fieldkit.report import timeline
+from fieldkit.report.charts import Panel
+from fieldkit.report.contents import repeat_to_draw
+from fieldkit.report.evidence import at_hand
+from fieldkit.trial import procedure, sources, store
+from fieldkit.trial.plan import PLAN_FILE
+from tests.helpers import recorded
+
+BEGAN_NS = recorded.START_NS + 10 * recorded.SECOND_NS
+"""The recording begins then; the transfer 2 s later, the ping 3 s later."""
+BOOT_S = 100
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Path:
+    (tmp_path / "trials").mkdir()
+    return recorded.make(tmp_path / "trials")
+
+
+def jobs(trial: Path, **spans: tuple[float, float]) -> Path:
+    """Write when jobs ran on the sender, in seconds since the attempt began; return the attempt's folder."""
+    folder = trial / "repeats" / "udp-01"
+    lines = [
+        f"{name.replace('__', '.').replace('_', '-')} itself 0 {round(100 * (BOOT_S + start))} {BOOT_S + stop:.2f}"
+        for name, (start, stop) in spans.items()
+    ]
+    clock = f"{BOOT_S}.00 {BEGAN_NS // recorded.SECOND_NS}.000000000 {BOOT_S}.00"
+    text = "\n".join(["==> jobs <==", *lines, "==> clock <==", clock, "==> end <==", ""])
+    (folder / host.after(Role.SENDER)).write_text(text, encoding="utf-8")
+    return folder
+
+
+def panels(trial: Path) -> list[Panel]:
+    found = at_hand(sources.find([trial], print).read())
+    row = repeat_to_draw(aggregate(found.repeats), found, "")
+    assert row is not None
+    chart, *_ = timeline.charts(row, found)
+    assert chart.is_stacked
+    return list(chart.panels)
+
+
+def bars(panel: Panel) -> dict[str, tuple[float, float]]:
+    """Return from when until when each lane has a bar, to 10 ms."""
+    return {panel.lanes[span.lane]: (round(span.start, 2), round(span.stop, 2)) for span in panel.spans}
+
+
+def test_jobs_have_bars_and_all_panels_one_axis(trial: Path) -> None:
+    jobs(trial, capture=(1.0, 6.0), ping=(2.9, 5.0))
+    found = panels(trial)
+    shown = bars(found[0])
+    assert shown["capture"][1] - shown["capture"][0] == pytest.approx(5.0, abs=0.02)
+    assert shown["ping"][1] - shown["ping"][0] == pytest.approx(2.1, abs=0.02)
+    assert shown["send"][0] - shown["capture"][0] == pytest.approx(1.0, abs=0.02)
+    assert len({(panel.left, panel.right) for panel in found}) == 1
+    assert [panel.x_label for panel in found] == [""] * (len(found) - 1) + ["time [s]"]
+    assert found[0].left == 0
+
+
+def test_a_fault_has_a_bar_for_its_cause_and_one_for_the_time_without_an_answer(trial: Path) -> None:
+    folder = jobs(trial, fault_link_down=(1.0, 9.0), fault_link_down_heals=(5.0, 8.0))
+    (folder / "fault-link-down.txt").write_text("lasted_s 2.000\ninterval_s 0.1\n", encoding="ascii")
+    replies = [
+        f"[{BEGAN_NS // recorded.SECOND_NS + at_s}.000000] 64 bytes from 10.0.0.2: icmp_seq={at_s} ttl=64 time=1 ms"
+        for at_s in (1, 2, 6, 7, 8)
+    ]
+    (folder / "fault-link-down-ping.txt").write_text(
+        "\n".join(["PING 10.0.0.2 (10.0.0.2) 56(84) bytes of data.", *replies]), encoding="utf-8"
+    )
+    shown = bars(panels(trial)[0])
+    cause, silence = shown["fault link-down"], shown["no answer link-down"]
+    assert cause[1] - cause[0] == pytest.approx(2.0, abs=0.02)
+    assert silence[1] - silence[0] == pytest.approx(4.0, abs=0.02)
+    assert cause[0] - silence[0] == pytest.approx(1.0, abs=0.02)
+    assert "fault-link-down" not in shown
+
+
+def test_a_move_has_a_bar_from_its_first_step_to_its_last(trial: Path) -> None:
+    folder = jobs(trial, capture=(1.0, 9.0))
+    went = [
+        Whereabouts(BEGAN_NS + 2 * 10**9 + round(n * 1e8), Role.RECEIVER, (10.0 + n / 10, 0.0, 0.2))
+        for n in range(21)
+    ]
+    stood = [Whereabouts(1, Role.RECEIVER, (10.0, 0.0, 0.2)), Whereabouts(1, Role.SENDER, (0.0, 0.0, 0.2))]
+    (folder / track.FILE).write_text(track.text([*stood, *went]), encoding="ascii")
+    start, stop = bars(panels(trial)[0])["move receiver"]
+    assert stop - start == pytest.approx(2.0, abs=0.02)
+
+
+def test_a_ping_without_any_reply_shows_all_its_losses(trial: Path) -> None:
+    folder = jobs(trial, ping=(3.0, 5.0))
+    summary = "10 packets transmitted, 0 received, 100% packet loss, time 1800ms"
+    (folder / "ping.txt").write_text(f"{recorded.PING_HEAD}\n{summary}\n", encoding="utf-8")
+    trips = next(panel for panel in panels(trial) if panel.title == "round trips")
+    lost = next(series for series in trips.series if series.label == "no reply")
+    assert len(lost.x) == 10
+    assert trips.words == "0 round trips; 10 without a reply"
+
+
+def with_step(trial: Path, text: str) -> None:
+    """Let the trial's procedure have one more step."""
+    plan = store.read_plan(trial)
+    extra = procedure.Procedure.model_validate(
+        {"name": "los", "summary": "s", "scenario": "los", "topology": "master", "protocols": ["udp"], "repeats": 1}
+        | {"steps": [json.loads(text)]}
+    )
+    steps = (*plan.procedure.steps, *extra.steps)
+    changed = plan.model_copy(update={"procedure": plan.procedure.model_copy(update={"steps": steps})})
+    (trial / PLAN_FILE).write_text(schema.dump(changed), encoding="utf-8")
+
+
+def test_iperf3_has_a_panel_of_its_rate_second_by_second(trial: Path) -> None:
+    with_step(trial, '{"iperf3": {"from": "sender", "to": "receiver", "duration": "3s"}}')
+    folder = jobs(trial, iperf3_client=(4.0, 7.0))
+    intervals = [{"sum": {"seconds": 1.0, "bytes": size}} for size in (125_000, 250_000, 0)]
+    test = {"start": {}, "intervals": intervals, "end": {}}
+    (folder / "receiver-iperf3.json").write_text(json.dumps(test), encoding="utf-8")
+    rates = next(panel for panel in panels(trial) if panel.title == "payload of iperf3")
+    (series,) = rates.series
+    assert list(series.y) == [1.0, 2.0, 0.0, 0.0]
+    assert np.diff(series.x) == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_a_topic_has_a_panel_of_its_delays_and_losses(trial: Path) -> None:
+    with_step(
+        trial, '{"topics": {"from": "sender", "to": "receiver", "over": "dds", "rate": "10Hz", "bytes": "100B"}}'
+    )
+    folder = jobs(trial, publish=(4.0, 7.0))
+    after = folder / host.after(Role.SENDER)
+    text = after.read_text(encoding="utf-8").replace("publish", "subscribe")
+    (folder / host.after(Role.RECEIVER)).write_text(text, encoding="utf-8")
+    begin_ns = BEGAN_NS + 4 * 10**9
+
+    def record(kind: int, sequence: int, sent_ns: int, at_ns: int) -> bytes:
+        return struct.pack("<HHIqqq", kind, 0, 100, sequence, sent_ns, at_ns)
+
+    def log(name: str, numbers: tuple[int, ...], late_ns: int) -> None:
+        samples = [
+            record(1, n, begin_ns + n * 10**8, begin_ns + n * 10**8 + late_ns + (n == 3) * 5 * 10**6) for n in numbers
+        ]
+        content = topic_log.MAGIC + b"".join(samples) + record(7, len(numbers), 0, begin_ns + 10**9)
+        (folder / name).write_bytes(content)
+
+    log("sender-topic.bin", (0, 1, 2, 3, 4), 0)
+    log("receiver-topic.bin", (0, 2, 3), 10**6)
+    delays = next(panel for panel in panels(trial) if "beyond its fastest sample" in panel.title)
+    came, lost = delays.series
+    assert list(came.y) == pytest.approx([0.0, 0.0, 5.0])
+    assert np.diff(lost.x) == pytest.approx([0.3])
+    assert delays.words == "5 samples sent, 2 lost, 3 received"

@@ -1,0 +1,73 @@
+"""Periods that share a beat with windows, against the phases that packets meet when they are counted."""
+
+from fractions import Fraction
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim_backends.cosim import build, load_scenario
+from sim_backends.cosim.scenario.phases import MOST_PHASES, other_window_s, shared_beats
+from sim_backends.cosim.scenario.schema import CosimScenario
+
+AGENTS = {
+    "ann": {"robot": "husky", "at_m": [20, 12], "radio": {}},
+    "bob": {"robot": "husky", "at_m": [24, 12], "radio": {}},
+}
+
+
+def pair(rate: str = "50Hz") -> CosimScenario:
+    traffic = [{"kind": "stream", "from": "ann", "to": "bob", "rate": rate}]
+    return load_scenario("convoy", {"agents": AGENTS, "traffic": traffic, "duration": "10s"})
+
+
+@settings(max_examples=25)
+@given(period_ms=st.integers(5, 200), window_ms=st.integers(1, 100))
+def test_a_shared_beat_is_found_where_few_phases_are_counted(period_ms: int, window_ms: int) -> None:
+    """Of whole milliseconds the phases repeat after the window's share of the period in lowest terms."""
+    phases = Fraction(period_ms, window_ms).denominator
+    beats = shared_beats(pair(rate=f"{1000 / period_ms:.20f}Hz"), [window_ms / 1000])
+    events = 10_000 // period_ms
+    counted = len({number * period_ms % window_ms for number in range(events)})
+    assert counted == min(phases, events)
+    if phases <= MOST_PHASES:
+        assert [beat.phases for beat in beats] == [phases]
+    for beat in beats:
+        # Of more phases those that stay near as few others: an event that far on is at nearly the same phase.
+        moved_ms = [number * period_ms % window_ms for number in range(0, events, beat.phases)]
+        assert all(min(ms, window_ms - ms) < window_ms / beat.phases for ms in moved_ms)
+
+
+@pytest.mark.parametrize(
+    ("rate", "window_s", "phases"),
+    [("50Hz", 0.01, [1]), ("50Hz", 0.04, [2]), ("47Hz", 0.01, []), ("50Hz", 0.011, []), ("50.001Hz", 0.01, [1])],
+)
+def test_near_enough_is_shared_and_a_drift_over_all_phases_is_not(
+    rate: str, window_s: float, phases: list[int]
+) -> None:
+    assert [one.phases for one in shared_beats(pair(rate=rate), [window_s])] == phases
+
+
+def test_the_window_that_is_proposed_shares_no_beat() -> None:
+    scenario = pair()
+    proposed_s = other_window_s(scenario, 0.01)
+    assert proposed_s == pytest.approx(0.011)
+    assert not shared_beats(scenario, [proposed_s or 0.0])
+    assert other_window_s(scenario, 0.001) is None, "whole steps of 1 ms share a beat with 20 ms"
+
+
+@pytest.mark.parametrize("kind", [{"kind": "file", "size_bytes": 100}, {}, {"kind": "ping"}, {"kind": "bag"}])
+def test_every_flow_begins_at_a_phase_that_its_seed_draws(kind: dict[str, object]) -> None:
+    keys = {"kind": "stream", "rate": "2Hz"} | kind
+    if kind:
+        del keys["rate"]
+    traffic = [{"from": "ann", "to": "bob", "start": "100ms", **keys}]
+    scenario = load_scenario("convoy", {"agents": AGENTS, "traffic": traffic, "duration": "2s"})
+    firsts_ns = set()
+    for seed in range(8):
+        wakes_ns = build(scenario, seed=seed).agents.programs["ann"].next_wake_ns()
+        assert wakes_ns is not None
+        firsts_ns.add(wakes_ns)
+    assert len(firsts_ns) == 8
+    assert min(firsts_ns) >= 100_000_000
+    assert len({at_ns % 10_000_000 // 1_000_000 for at_ns in firsts_ns}) > 3, "of a window of 10 ms"

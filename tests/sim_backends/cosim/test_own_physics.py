@@ -1,0 +1,89 @@
+"""A physics class as docs/cosim-api.md shows it, by the page's own code; and errors of one that lacks something."""
+
+import math
+import re
+from typing import Any
+
+import pytest
+
+from fieldkit.core.errors import FieldkitError
+from sim_backends.cosim import build, load_scenario
+from sim_backends.cosim.comparison import errors
+from sim_backends.cosim.policies.scheduled import Scheduled
+from sim_backends.cosim.scenario.policies import POLICIES
+from sim_backends.cosim.studies.local_errors import local_errors
+from sim_backends.world.motion import State
+from tests.helpers.paths import ROOT
+
+MS = 1_000_000
+SCENARIO = load_scenario("convoy", {"duration": "1s"})
+
+
+@pytest.fixture(scope="module")
+def carts() -> Any:  # noqa: ANN401 (a class of the page)
+    page = (ROOT / "docs" / "cosim-api.md").read_text(encoding="utf-8")
+    (source,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Carts" in block)
+    names: dict[str, Any] = {"__name__": "example"}
+    exec(compile(source, "cosim-api.md", "exec"), names)
+    return names["Carts"]
+
+
+def physics(carts: Any) -> Any:  # noqa: ANN401 (as above)
+    return carts(build(SCENARIO).agents.states(0))
+
+
+# The rule as printed stops where a subscriber is faster, which the drone is at once.
+@pytest.mark.parametrize("policy", sorted({*POLICIES} - {"velocity_aware_raw"}))
+def test_the_class_of_the_page_runs_with_every_policy(policy: str, carts: Any) -> None:  # noqa: ANN401 (as above)
+    simulation = build(SCENARIO, policy=policy, physics=physics(carts))
+    run = simulation.run(400 * MS)
+    assert run.fates
+    exact = build(SCENARIO, physics=physics(carts)).run(400 * MS)
+    if policy in {"event_driven", "variable_stepped"}:
+        assert errors(exact, run).delivery_error_s.largest == 0
+
+
+def test_its_commands_reach_it_and_forks_leave_it_alone(carts: Any) -> None:  # noqa: ANN401 (as above)
+    simulation = build(SCENARIO, physics=physics(carts))
+    simulation.run(1000 * MS)
+    # The leader is told 0.4 m/s, which it does at once.
+    assert simulation.agents.states(1000 * MS)["leader"].position_m[0] == pytest.approx(20.4, abs=0.001)
+    measured = local_errors(
+        lambda policy: build(SCENARIO, policy=policy, physics=physics(carts)).coordinator,
+        {"scheduled": Scheduled},
+        (0.01, 0.02),
+        [100 * MS, 203 * MS],
+    )
+    assert measured["scheduled"].mean("delivery_s").shape == (2,)
+
+
+LACKING = [
+    ({"step_ns": None}, r"the physics \w+ has no step_ns, an integer above 0 \(it is None\)"),
+    ({"step_ns": 1e6}, r"no step_ns, an integer above 0 \(it is 1000000.0\)"),
+    ({"step_ns": 0}, "no step_ns, an integer above 0"),
+    ({"limits_m_s2": None}, "no limits_m_s2, a mapping from each agent to a number"),
+    ({"advance": None}, r"no method advance\(to_ns, commands\)"),
+    ({"advance": lambda to_ns, commands: {}}, "has no state of drone, follower, leader"),
+    ({"advance": lambda to_ns, commands: dict.fromkeys(SCENARIO.agents, (0, 0, 0))}, "which is no State"),
+    ({"advance": lambda to_ns, commands: None}, "which is no mapping of states"),
+    ({"advance": lambda to_ns: {}}, "physics failed when it was asked to advance"),
+]
+
+
+@pytest.mark.parametrize(("changes", "said"), LACKING)
+def test_what_a_physics_lacks_is_named_before_the_run(changes: dict[str, Any], said: str, carts: Any) -> None:  # noqa: ANN401
+    lacking = physics(carts)
+    vars(lacking).update(changes)
+    with pytest.raises(FieldkitError, match=said):
+        build(SCENARIO, physics=lacking)
+
+
+def test_states_without_a_heading_are_named_where_a_program_has_to_drive(carts: Any) -> None:  # noqa: ANN401 (as above)
+    lacking = physics(carts)
+    advance = lacking.advance
+    lacking.advance = lambda to_ns, commands: {
+        name: State(state.position_m) for name, state in advance(to_ns, commands).items()
+    }
+    with pytest.raises(FieldkitError, match="where its robot heads"):
+        build(SCENARIO, physics=lacking).run()
+    assert math.isfinite(lacking.step_ns)

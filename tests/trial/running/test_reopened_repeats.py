@@ -1,0 +1,131 @@
+"""`resume --failed`: failed repeats are run once more, what they left is kept, and the tables always agree."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.events import Event, Note
+from fieldkit.core.model import Protocol, RepeatId, Status
+from fieldkit.trial import journal, store
+from fieldkit.trial.journal import JournalEntry
+from fieldkit.trial.running.robots import Robots
+from fieldkit.trial.running.runner import Outcome, resume_trial, run_trial
+from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.plans import write_states
+from tests.helpers.runs import rows
+from tests.trial.test_trial_crash import KILLED, PING, at_write, demand_agreement, die, plan, robots_with_evidence
+
+TWO = plan().model_copy(update={"repeats": 2})
+FIRST = RepeatId(Protocol.TCP, 1)
+
+
+@pytest.fixture
+def broken(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Repeats whose evidence is not whole."""
+    robots_with_evidence(monkeypatch)
+    names: set[str] = set()
+
+    def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+        text = "" if remote.rpartition("/")[2].rpartition("-")[0] in names else PING
+        (into / "ping.txt").write_text(text, encoding="utf-8")
+        write_states(into)
+        return []
+
+    monkeypatch.setattr(Robots, "fetch", fetch)
+    return names
+
+
+def with_a_failed_repeat(out: Path, broken: set[str]) -> Path:
+    broken.add(str(FIRST))
+    outcome = run_trial(TWO, IdleTestbed(), out, lambda _: None)
+    assert outcome is not None
+    assert (outcome.valid, outcome.failed) == (1, 1)
+    return outcome.folder
+
+
+def redo(folder: Path, told: list[Event] | None = None) -> Outcome:
+    events: list[Event] = [] if told is None else told
+    outcome = resume_trial(folder, IdleTestbed(), events.append, failed=True)
+    assert outcome is not None
+    return outcome
+
+
+def test_a_failed_repeat_is_redone_and_what_failed_is_kept_as_void(tmp_path: Path, broken: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, broken)
+    broken.clear()
+    unasked = resume_trial(folder, IdleTestbed(), lambda _: None)
+    assert unasked is not None
+    assert unasked.failed == 1, "nobody asked for it"
+    outcome = redo(folder)
+    assert (outcome.valid, outcome.failed) == (2, 0)
+    table = rows(folder)
+    assert [row["status"] for row in table if row["repeat"] == "1"] == ["void", "void", "void", "valid"]
+    assert [row["attempt"] for row in table if row["repeat"] == "1"] == ["1", "2", "3", "4"]
+    assert all(row["reason"] for row in table if row["status"] == "void")
+    names = {path.name for path in (folder / store.REPEATS).iterdir()}
+    assert names == {"tcp-01", "tcp-01.void1", "tcp-01.void2", "tcp-01.void3", "tcp-02"}
+    demand_agreement(folder)
+
+
+def test_it_has_all_attempts_again_and_may_fail_again(tmp_path: Path, broken: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, broken)
+    assert redo(folder).failed == 1
+    assert [row["status"] for row in rows(folder) if row["repeat"] == "1"] == ["void"] * 5 + ["failed"]
+    demand_agreement(folder)
+    broken.clear()
+    assert redo(folder).failed == 0
+    demand_agreement(folder)
+    told: list[Event] = []
+    assert redo(folder, told).valid == 2
+    assert Note("no repeat of this trial failed") in told
+
+
+def moments(folder: Path) -> Iterator[Path]:
+    """Yield the trial's folder as a process left it that died at each of its writes while it redid a repeat."""
+    moment, kept = 0, folder.with_name("kept")
+    shutil.copytree(folder, kept)
+    while True:
+        moment += 1
+        pid = os.fork()
+        if pid == 0:
+            at_write(moment, die)
+            redo(folder)
+            os._exit(0)
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        yield folder
+        shutil.rmtree(folder)
+        shutil.copytree(kept, folder)
+        if code == 0:
+            return
+        assert code == KILLED
+
+
+def test_it_may_die_at_any_write(tmp_path: Path, broken: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, broken)
+    broken.clear()
+    count = 0
+    for died in moments(folder):
+        count += 1
+        redo(died)
+        assert Status.FAILED not in {attempt.status for attempt in journal.ended(journal.read(died))}
+        assert [row["repeat"] for row in rows(died) if row["status"] == "valid"].count("1") == 1
+        demand_agreement(died)
+    assert count > 10, "hardly a write was met"
+
+
+def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, broken: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, broken)
+    journal.append(folder, JournalEntry(1, Protocol.TCP, 2, 0, Status.PLANNED))
+    with pytest.raises(EvidenceError, match="tcp-02 is planned again, though it was valid"):
+        redo(folder)
+
+
+def test_altered_evidence_of_a_failed_attempt_is_not_measured_again(tmp_path: Path, broken: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, broken)
+    (folder / store.REPEATS / "tcp-01.failed3" / "ping.txt").write_text(PING, encoding="utf-8")
+    with pytest.raises(EvidenceError, match="evidence is not what was measured"):
+        redo(folder)

@@ -1,0 +1,229 @@
+"""One source of a stored attempt changed: the repeat is void, or no column that depends on it moves.
+
+The attempts are valid ones of a transfer, pings and iperf3 in both directions, with and without captures, recorded on
+emulated robots with 5 % loss (`tests/data/README.md`).
+"""
+
+import json
+import random
+import re
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.trial import gates
+from tests.helpers.changed_evidence import ATTEMPTS, Stored, changes, stored
+
+Change = Callable[[bytes], bytes]
+TRIAL = ATTEMPTS[0][0]
+
+
+@cache
+def attempt(protocol: Protocol) -> Stored:
+    return stored(TRIAL, protocol)
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+def test_the_stored_attempts_are_valid(protocol: Protocol) -> None:
+    assert attempt(protocol).judged.problems == ()
+    assert attempt(protocol).judged.measured.values["rtt_received"] in range(10, 20), "of 20, some lost"
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(protocol=st.sampled_from(Protocol), seed=st.integers(0, 2**32))
+def test_a_source_changed_at_random_never_moves_a_column_of_a_valid_repeat(
+    tmp_path_factory: pytest.TempPathFactory, protocol: Protocol, seed: int
+) -> None:
+    other = attempt(next(one for one in Protocol if one is not protocol))
+    kind, name, content = next(changes(attempt(protocol), other, random.Random(seed)))
+    judged = attempt(protocol).changed(name, content, tmp_path_factory.mktemp("changed"))
+    assert attempt(protocol).wrong(judged) == {}, (kind, name)
+
+
+def demand(protocol: Protocol, name: str, change: Change | None, place: Path, reason: str) -> None:
+    old = (attempt(protocol).folder / name).read_bytes()
+    new = None if change is None else change(old)
+    assert new != old
+    found = attempt(protocol).changed(name, new, place).problems
+    assert any(reason in one for one in found), found
+
+
+def of_json(edit: Callable[[Any], object]) -> Change:
+    def change(content: bytes) -> bytes:
+        document = json.loads(content)
+        edit(document)
+        return json.dumps(document).encode()
+
+    return change
+
+
+def everywhere(key: str, factor: float) -> Change:
+    """Multiply every number of a key, in intervals, streams and totals alike."""
+
+    def multiply(value: Any) -> None:  # noqa: ANN401 (of JSON)
+        for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+            multiply(inner)
+        if isinstance(value, dict) and isinstance(value.get(key), int | float):
+            value[key] = type(value[key])(value[key] * factor)
+
+    return of_json(multiply)
+
+
+def other_test(name: str) -> Change:
+    return lambda _: (attempt(Protocol.UDP).folder / name).read_bytes()
+
+
+JSON = "receiver-iperf3.json"
+SENT = "sender-iperf3.json"
+
+
+@pytest.mark.parametrize(
+    ("protocol", "name", "change", "reason"),
+    [
+        (Protocol.TCP, JSON, everywhere("bytes", 10), "bit/s by its bytes"),
+        (Protocol.UDP, JSON, everywhere("bytes", 10), "bit/s by its bytes"),
+        (Protocol.UDP, JSON, everywhere("lost_packets", 10), "and counts"),
+        (Protocol.UDP, JSON, everywhere("packets", 2), "datagrams"),
+        (Protocol.UDP, SENT, everywhere("packets", 0.5), "datagrams"),
+        (Protocol.UDP, JSON, everywhere("jitter_ms", 3), "different jitters"),
+        (Protocol.TCP, SENT, everywhere("retransmits", 100), "segments sent again"),
+        (Protocol.TCP, JSON, of_json(lambda test: test["intervals"].pop(1)), "and the one before it ends at"),
+        (Protocol.TCP, JSON, of_json(lambda test: test["intervals"].pop()), "its summary"),
+        (Protocol.TCP, JSON, of_json(lambda test: test["start"].update(cookie="x")), "they are two tests"),
+        (
+            Protocol.TCP,
+            JSON,
+            of_json(lambda test: test["start"]["timestamp"].update(timesecs=1)),
+            "before the attempt",
+        ),
+        (Protocol.TCP, JSON, of_json(lambda test: test["start"]["connected"].pop()), "name different ports"),
+        (Protocol.UDP, JSON, other_test("back.receiver-iperf3.json"), "they are two tests"),
+        (Protocol.UDP, JSON, other_test("bare.receiver-iperf3.json"), "they are two tests"),
+        (Protocol.UDP, "bare.receiver-iperf3.json", everywhere("bytes", 10), "bit/s by its bytes"),
+    ],
+)
+def test_iperf3_results_that_other_evidence_contradicts(
+    protocol: Protocol, name: str, change: Change, reason: str, tmp_path: Path
+) -> None:
+    demand(protocol, name, change, tmp_path, reason)
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+@pytest.mark.parametrize("factor", [0.5, 1.3, 10])
+@pytest.mark.parametrize("test", ["", "back."])
+def test_bytes_that_are_consistent_in_their_file_are_compared_with_captures(
+    protocol: Protocol, factor: float, test: str, tmp_path: Path
+) -> None:
+    """Even if both ends agree: the program itself counted wrongly."""
+    stored_one = attempt(protocol)
+    for path in stored_one.folder.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    for role in ("sender", "receiver"):
+        name = f"{test}{role}-iperf3.json"
+        content = (stored_one.folder / name).read_bytes()
+        for key in ("bytes", "bits_per_second", *(("packets", "lost_packets") if protocol is Protocol.UDP else ())):
+            content = everywhere(key, factor)(content)
+        (tmp_path / name).unlink()
+        (tmp_path / name).write_bytes(content)
+    found = gates.judge(stored_one.plan, stored_one.repeat, AttemptEvidence(tmp_path)).problems
+    assert any("capture" in one for one in found), found
+
+
+def lines(keep: Callable[[str], bool]) -> Change:
+    return lambda content: "".join(line for line in content.decode().splitlines(keepends=True) if keep(line)).encode()
+
+
+def replies(change: Callable[[float], float], pattern: str = r"(time=)([0-9.]+)", form: str = "{:.2f}") -> Change:
+    def changed(content: bytes) -> bytes:
+        return re.sub(
+            pattern, lambda match: match[1] + form.format(change(float(match[2]))), content.decode()
+        ).encode()
+
+    return changed
+
+
+def fewer(content: bytes) -> bytes:
+    """One reply less, and a summary that agrees."""
+    text = content.decode()
+    without = re.sub(r"^\[.*icmp_seq=\d+ .*\n", "", text, count=1, flags=re.MULTILINE)
+    return re.sub(r"(\d+) received", lambda match: f"{int(match[1]) - 1} received", without).encode()
+
+
+STAMP = r"(\[)([0-9.]+)"
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (fewer, "answer that ping did not print"),
+        (lines(lambda line: "icmp_seq" not in line or "seq=3 " in line), "ping counted"),
+        (replies(lambda ms: 10 * ms), "summary"),
+        (replies(lambda ms: ms + 50), "summary"),
+        (replies(lambda ms: 1.5 * ms), "summary"),
+        (replies(lambda s: s + 3600, STAMP, "{:.6f}"), "before or after the attempt"),
+        (replies(lambda s: s + 1.1, STAMP, "{:.6f}"), "after it came"),
+        (replies(lambda s: s - 0.05, STAMP, "{:.6f}"), "after it came"),
+        (lambda text: text.replace(b"20 packets transmitted", b"40 packets transmitted"), "40 requests of 20"),
+    ],
+)
+def test_pings_that_captures_contradict(protocol: Protocol, change: Change, reason: str, tmp_path: Path) -> None:
+    demand(protocol, "ping.txt", change, tmp_path, reason)
+
+
+def test_a_ping_of_other_times_that_its_own_summary_confirms(tmp_path: Path) -> None:
+    """Every time of the file 5 ms longer: only the capture tells."""
+
+    def longer(content: bytes) -> bytes:
+        text = replies(lambda ms: ms + 5, form="{:.3f}")(content).decode()
+        return re.sub(r"= ([0-9./]+) ms", "= " + _summary(text) + " ms", text).encode()
+
+    def _summary(text: str) -> str:
+        times = [float(one) for one in re.findall(r"time=([0-9.]+)", text)]
+        return f"{min(times):.3f}/{sum(times) / len(times):.3f}/{max(times):.3f}/0.1"
+
+    demand(Protocol.TCP, "ping.txt", longer, tmp_path, "ms longer than in the sender's capture, in the median")
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda content: content[: len(content) // 2], "other content than scan.bag from byte"),
+        (lambda content: content[:8192], "the kernel of the receiver refused 0"),
+        (lambda content: content[:100] + bytes([content[100] ^ 1]) + content[101:], "other content than scan.bag"),
+        (lambda _: b"", "the kernel of the receiver refused 0"),
+    ],
+)
+def test_a_udp_file_that_is_not_what_arrived(change: Change, reason: str, tmp_path: Path) -> None:
+    assert len((attempt(Protocol.UDP).folder / "recv.bag").read_bytes()) > 8192
+    demand(Protocol.UDP, "recv.bag", change, tmp_path, reason)
+
+
+def test_datagrams_that_the_kernel_refused_are_a_loss_of_the_receiver(tmp_path: Path) -> None:
+    """A socket buffer overflow is legitimate: the kernel counts it (RcvbufErrors)."""
+    stored_one = attempt(Protocol.UDP)
+    for path in stored_one.folder.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    for name, content in (
+        ("recv.bag", (stored_one.folder / "recv.bag").read_bytes()[:8192]),
+        ("receiver-after.txt", _refusing(stored_one.folder / "receiver-after.txt", 9)),
+    ):
+        (tmp_path / name).unlink()
+        (tmp_path / name).write_bytes(content)
+    assert gates.judge(stored_one.plan, stored_one.repeat, AttemptEvidence(tmp_path)).problems == ()
+
+
+def _refusing(path: Path, count: int) -> bytes:
+    """The state of a host whose kernel refused so many datagrams more."""
+    text = path.read_text(encoding="utf-8")
+    names, values = re.findall(r"^Udp: (.*)$", text, re.MULTILINE)
+    table = dict(zip(names.split(), map(int, values.split()), strict=True))
+    table["RcvbufErrors"] += count
+    return text.replace(f"Udp: {values}", "Udp: " + " ".join(map(str, table.values()))).encode()

@@ -1,0 +1,104 @@
+"""Recorded positions against the placement that was planned: what an operator's tape allows, and what it does not."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.positions import accounts
+from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions.samples import LOCAL, WGS84
+from fieldkit.steps.kinds import follow
+from fieldkit.steps.view import View
+from fieldkit.trial import placements
+from tests.helpers.casts import los_plan
+
+DEGREE_M = 110_574.28
+"""A degree north, on the equator."""
+
+
+def stood(folder: Path, receiver: Account, sender: Account) -> AttemptEvidence:
+    told = Accounts({Role.SENDER: sender, Role.RECEIVER: receiver})
+    (folder / accounts.FILE).write_text(accounts.text(told), encoding="utf-8")
+    return AttemptEvidence(folder)
+
+
+def in_metres(folder: Path, apart_m: float) -> AttemptEvidence:
+    sender, receiver = (Account(place=(at_m, 0.0, 0.0), frame=LOCAL) for at_m in (5.0, 5.0 + apart_m))
+    return stood(folder, receiver, sender)
+
+
+def on_earth(folder: Path, apart_m: float) -> AttemptEvidence:
+    sender, receiver = (Account(place=(at_m / DEGREE_M, 0.0, None), frame=WGS84) for at_m in (0.0, apart_m))
+    return stood(folder, receiver, sender)
+
+
+PLAN = los_plan()
+SCENE = PLAN.scene(next(iter(PLAN.order())), "")
+PLANNED_M = math.dist(SCENE.places_m[Role.SENDER], SCENE.places_m[Role.RECEIVER])
+"""30 ft from the relay to each."""
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "agrees"), [(18.288, True), (18.897, True), (17.0, True), (24.0, False), (200.0, False)]
+)
+def test_a_place_in_metres_is_within_two_metres(apart_m: float, agrees: bool, tmp_path: Path) -> None:
+    """31 ft instead of 30 ft are 18.897 m from one to the other."""
+    why = placements.contradiction(SCENE, in_metres(tmp_path, apart_m))
+    assert (why is None) is agrees
+    if why:
+        assert why.startswith("the sender and the receiver were placed 18.3 m apart, and by the record")
+
+
+@given(off_m=st.floats(-18, 300))
+def test_a_place_by_satellites_is_within_their_error(off_m: float, tmp_path_factory: pytest.TempPathFactory) -> None:
+    found = placements.contradiction(SCENE, on_earth(tmp_path_factory.getbasetemp(), PLANNED_M + off_m))
+    least_m = placements.SATELLITE_M + placements.SHARE * PLANNED_M
+    if not math.isclose(abs(off_m), least_m, abs_tol=0.2):
+        assert (found is None) is (abs(off_m) < least_m)
+
+
+def test_nobody_who_tells_of_positions_contradicts_nothing(tmp_path: Path) -> None:
+    assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
+    lone = Accounts({Role.RECEIVER: Account(place=(300.0, 0.0, 0.0), frame=LOCAL)})
+    (tmp_path / accounts.FILE).write_text(accounts.text(lone), encoding="utf-8")
+    assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
+    assert placements.contradiction(replace(SCENE, placement=None), in_metres(tmp_path, 300.0)) is None
+
+
+@pytest.mark.parametrize(
+    ("off_m", "why"), [(0.0, None), (200.0, "has the receiver 200.0 m from where it was placed")]
+)
+def test_a_place_that_the_laptop_wrote_is_the_planned_one(off_m: float, why: str | None, tmp_path: Path) -> None:
+    places_m = SCENE.places_m
+    x, y, z = places_m[Role.RECEIVER]
+    evidence = stood(tmp_path, Account(place=(x + off_m, y, z)), Account(place=places_m[Role.SENDER]))
+    found = list(follow.problems(View(SCENE, evidence), ()))
+    assert (found == []) if why is None else [why in reason for reason in found] == [True]
+
+
+@pytest.mark.parametrize(
+    ("column", "dependent"),
+    [
+        ("transfer_distance_start_m", True),
+        ("up.rtt_distance_max_m", True),
+        ("rtt_relative_speed_m_s", True),
+        ("transfer_sender_speed_m_s", True),
+        ("distance_m", False),
+        ("drive_farthest_m", False),
+        ("rtt_median_s", False),
+    ],
+)
+def test_columns_that_depend_on_positions(column: str, dependent: bool) -> None:
+    assert placements.is_dependent(column) is dependent
+
+
+def test_every_column_of_positions_depends_on_them() -> None:
+    from fieldkit.measure.evidence.track import Apart  # noqa: PLC0415
+
+    assert all(placements.is_dependent(f"rtt_{name}") for name in Apart.__dataclass_fields__)

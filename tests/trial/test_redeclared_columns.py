@@ -1,0 +1,106 @@
+"""A trial whose own columns are declared as what their values are not: errors with a remedy, no traceback."""
+
+import re
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from fieldkit.config.schema import parse, validate
+from fieldkit.core.units import parse_distance
+from fieldkit.trial import store
+from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.request import TrialRequest, make_plan
+from fieldkit.trial.running.robots import Robots
+from fieldkit.trial.running.runner import run_trial
+from tests.helpers.casts import CAST
+from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.plans import write_states
+from tests.trial.test_trial_crash import robots_with_evidence
+
+PROCEDURE = """\
+name: small
+summary: x
+scenario: los
+topology: master
+protocols: [tcp]
+repeats: 3
+steps:
+  - run:
+      robot: sender
+      command: show
+      columns: [{name: own, unit: %s, json: own}]
+"""
+NOW = datetime(2026, 11, 20, 12, 0, tzinfo=UTC)
+VALUES = {"V": "-3.25", "text": '"full"', "bool": "true", "count": "7", "ns": "1795000000000000000"}
+UNITS = (*VALUES, "share")
+
+
+def fetching(text: str) -> Callable[..., list[str]]:
+    def fetch(_self: Robots, _remote: str, into: Path, *, clean: bool) -> list[str]:
+        (into / "run.txt").write_text(text, encoding="utf-8")
+        write_states(into)
+        return []
+
+    return fetch
+
+
+@pytest.fixture(scope="module")
+def trials(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A trial for each unit, with a value of it."""
+    made = {}
+    with pytest.MonkeyPatch.context() as patch:
+        robots_with_evidence(patch)
+        for unit, value in VALUES.items():
+            text = f'{{"own": {value}}}'
+            patch.setattr(Robots, "fetch", fetching(text))
+            request = TrialRequest(validate(parse(PROCEDURE % unit, source="x"), Procedure), parse_distance("30ft"))
+            planned = make_plan(request, backend="field", cast=CAST, now=NOW)
+            outcome = run_trial(planned, IdleTestbed(), tmp_path_factory.mktemp(unit), lambda _: None)
+            assert outcome is not None
+            assert outcome.valid == 3
+            made[unit] = outcome.folder
+    return made
+
+
+@pytest.mark.parametrize("now", UNITS)
+@pytest.mark.parametrize("was", VALUES)
+def test_every_command_ends_with_a_table_or_an_error(
+    trials: dict[str, Path],
+    tmp_path: Path,
+    was: str,
+    now: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "trial"
+    shutil.copytree(trials[was], folder)
+    plan = folder / PLAN_FILE
+    written = plan.read_text(encoding="utf-8")
+    head, table, columns = written.partition("\ncolumns:\n")  # what the procedure says is as it was
+    changed, count = re.subn(rf"(name: own\n\s*unit: ){was}\b", rf"\g<1>{now}", columns)
+    assert count == 1, written
+    plan.write_text(head + table + changed, encoding="utf-8")
+    (folder / store.MANIFEST_FILE).unlink()
+    before = (folder / store.TRIAL_CSV).read_bytes()
+    out = str(tmp_path / "out")
+    for words in (
+        ("rebuild", str(folder)),
+        ("aggregate", str(folder), "--rebuild"),
+        ("aggregate", str(folder)),
+        ("aggregate", str(folder), str(trials[was])),
+        ("export", str(folder), "--format", "csv", "-o", f"{out}.csv"),
+        ("export", str(folder), "--format", "parquet", "-o", f"{out}.parquet"),
+    ):
+        code = main([*words])
+        said = capsys.readouterr().err
+        assert code in {0, 2, 4}, words
+        assert "Traceback" not in said
+        if code:
+            assert "remedy:" in said, (words, said)
+            assert "own" in said or "trial.yaml" in said, (words, said)
+        if words[0] == "rebuild" and code:
+            assert (folder / store.TRIAL_CSV).read_bytes() == before, "nothing is written"
