@@ -1,27 +1,52 @@
-"""Lost messages of streams that an autopilot sends at a fixed period, which are addressed to every station."""
+"""Loss of messages that an autopilot sends to every station at a fixed period.
+
+Sequence numbers alone overestimate this loss: a router withholds messages that are addressed to other stations, and
+their numbers are missing too. So a message counts as lost only if the autopilot's time (`time_boot_ms`) shows that
+one was due, and a number is missing there.
+
+An autopilot sends late when it is busy, and catches up. The received messages of a stream are therefore assigned to
+its periods together, by the least sum of squared deviations from the schedule (a beam search over the number of lost
+messages), and not one gap at a time.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import mean
-from typing import Final
+from typing import Final, NamedTuple
 
 from fieldkit.measure.evidence.sequence import NUMBERS, SILENCE_US
 
 LEAST: Final = 10
-"""With fewer messages of a stream its period is not known."""
-_FOLLOWS: Final = 0.1
-"""Share of a message's deviation from its expected time that the next one follows: the period is an estimate."""
+"""A stream with fewer messages is not counted."""
+_COMPLETE: Final = 3
+"""With fewer intervals in which no number is missing, they do not show a period."""
+_REQUEST_TOLERANCE: Final = 0.25
+"""Relative difference of the observed period up to which a request was met. A station that changes the rate changes
+it by more. The observed mean is too short, because long intervals more often contain a missing number, and are left
+out."""
+_RATE_TOLERANCE: Final = 0.08
+"""Relative difference up to which a whole rate explains an observed one that was not requested."""
+_HIGHEST_HZ: Final = 10
+"""Whole rates above it are too close to be distinguished."""
+_PHASE_GAIN: Final = 0.03
+"""Share of a deviation by which the schedule is corrected. A larger gain follows late messages; a smaller one does
+not follow the drift of a period that is known to 0.1 %."""
+_SKIP_COST: Final = 1.0
+"""Cost of a period that the autopilot skipped, in squared periods: more than the deviation of a late message,
+less than two of them."""
+_HYPOTHESES: Final = 4
+"""Hypotheses that are kept; late messages leave two or three undecided."""
 
 
 @dataclass(frozen=True)
 class StreamMessage:
-    """A message with the time of the autopilot in it.
+    """A received message with the time of the autopilot in it.
 
     Attributes:
-        at_us: When it came, microseconds.
-        boot_ms: The autopilot's own time (`time_boot_ms`), milliseconds.
-        position: Index among all messages of the autopilot that came.
+        at_us: Time of arrival, microseconds.
+        boot_ms: The autopilot's time (`time_boot_ms`), milliseconds.
+        position: Index among all received messages of the autopilot.
     """
 
     at_us: int
@@ -29,74 +54,118 @@ class StreamMessage:
     position: int
 
 
-def lost(
-    numbers: Sequence[tuple[int, int]], streams: Mapping[str, Sequence[StreamMessage]], ended_us: int
-) -> tuple[int, int]:
-    """Return how many messages of periodic streams came, and how many of them were lost.
+class _Hypothesis(NamedTuple):
+    """An assignment of the messages so far to periods; the cheapest compares as least.
 
-    A message of a stream is counted as lost where the autopilot's own times have a gap of at least 1.5 periods, and
-    only as many as numbers of messages are missing in that gap. So neither a number that a router withheld (of an
-    answer to another station) nor a period that the autopilot skipped is a loss. A message that the autopilot only
-    sent late, at the time of such an answer, is followed by one that comes early, which takes the loss back. In a
-    silence of more than 1 s, and between the last message and the end, numbers are ambiguous, and the period counts
-    alone.
+    Attributes:
+        cost: Sum of squared deviations and of costs of skipped periods, in periods.
+        phase_ms: Scheduled time of the last message, milliseconds.
+        lost: Number of lost messages.
+    """
+
+    cost: float
+    phase_ms: float
+    lost: int
+
+
+def lost(
+    numbers: Sequence[tuple[int, int]],
+    streams: Mapping[str, Sequence[StreamMessage]],
+    ended_us: int,
+    intervals_us: Mapping[str, int] | None = None,
+) -> tuple[int, int]:
+    """Return the number of received and of lost messages of all periodic streams.
+
+    In a silence of more than 1 s, and between the last message and the end, sequence numbers are ambiguous (they
+    repeat after 256 messages), and the period counts alone. A period that an overloaded autopilot skips counts as a
+    loss if a number is missing at that time.
 
     Args:
-        numbers: Of each message of the autopilot when it came, in us, and its number, in order of arrival.
-        streams: Messages with a time, by their names, in order of arrival.
-        ended_us: End of the recording; 0 where it is not known.
+        numbers: Time of arrival (microseconds) and sequence number of each message of the autopilot, in this order.
+        streams: Messages with a time by message name, in order of arrival.
+        ended_us: End of the recording; 0 if unknown.
+        intervals_us: Requested intervals by message name. Other messages are counted if their rate is a whole number
+        of
+            hertz up to 10.
     """
     indices = _unwrapped([number for _, number in numbers])
-    came = lacking = 0
-    tail_ms = max(ended_us - numbers[-1][0], 0) / 1e3 if numbers else 0.0
-    for messages in streams.values():
-        if len(messages) < LEAST or (period_ms := _period_ms(messages, indices)) <= 0:
+    received = missing = 0
+    tail_us = max(ended_us - numbers[-1][0], 0) if numbers else 0
+    for name, messages in streams.items():
+        if len(messages) < LEAST:
             continue
-        came += len(messages)
-        lacking += _lacking(messages, indices, period_ms)
-        if tail_ms * 1e3 > SILENCE_US:
-            lacking += max(round(tail_ms / period_ms) - 1, 0)
-    return came, lacking
+        if (period_ms := _period_ms(messages, indices, (intervals_us or {}).get(name))) is None:
+            continue
+        received += len(messages)
+        missing += _assigned(messages, indices, period_ms).lost
+        if tail_us > SILENCE_US:
+            missing += max(round(tail_us / 1e3 / period_ms) - 1, 0)
+    return received, missing
 
 
-def _lacking(messages: Sequence[StreamMessage], indices: Sequence[int], period_ms: float) -> int:
-    """Return how many messages of a stream are missing between its first and its last one."""
-    lacking, expected_ms = 0, float(messages[0].boot_ms)
+def _assigned(messages: Sequence[StreamMessage], indices: Sequence[int], period_ms: float) -> _Hypothesis:
+    """Return the best hypothesis about the messages of a stream that were lost between its first and its last one."""
+    hypotheses = [_Hypothesis(0.0, float(messages[0].boot_ms), 0)]
     for before, after in pairwise(messages):
         if after.at_us - before.at_us > SILENCE_US:
-            lacking += max(round((after.boot_ms - before.boot_ms) / period_ms) - 1, 0)
-            expected_ms = after.boot_ms
+            silent = max(round((after.boot_ms - before.boot_ms) / period_ms) - 1, 0)
+            best = hypotheses[0]
+            hypotheses = [_Hypothesis(best.cost, float(after.boot_ms), best.lost + silent)]
             continue
-        periods = round((after.boot_ms - expected_ms) / period_ms) - 1
-        missing = indices[after.position] - indices[before.position] - (after.position - before.position)
-        if periods > missing:  # the autopilot has skipped a period, or sends late from now on
-            lacking += missing
-            expected_ms = after.boot_ms
+        missing = max(indices[after.position] - indices[before.position] - (after.position - before.position), 0)
+        cheapest = dict[int, _Hypothesis]()
+        for hypothesis in hypotheses:
+            for following in _following(hypothesis, after.boot_ms, missing, period_ms):
+                cheapest[following.lost] = min(cheapest.get(following.lost, following), following)
+        hypotheses = sorted(cheapest.values())[:_HYPOTHESES]
+    return hypotheses[0]
+
+
+def _following(before: _Hypothesis, boot_ms: int, missing: int, period_ms: float) -> list[_Hypothesis]:
+    """Return the hypotheses about the next message, of which at most `missing` predecessors were lost."""
+    elapsed = (boot_ms - before.phase_ms) / period_ms
+    nearest = max(round(elapsed), 1)
+    hypotheses = list[_Hypothesis]()
+    for periods in range(max(nearest - 1, 1), nearest + 2):
+        lost_here = min(periods - 1, missing)
+        if skipped := periods - 1 - lost_here:  # the schedule begins again at this message
+            cost, phase_ms = before.cost + _SKIP_COST * skipped, float(boot_ms)
         else:
-            lacking += periods
-            expected_ms += (periods + 1) * period_ms
-            expected_ms += _FOLLOWS * (after.boot_ms - expected_ms)
-    return max(lacking, 0)
+            deviation = elapsed - periods
+            cost = before.cost + deviation**2
+            phase_ms = before.phase_ms + (periods + _PHASE_GAIN * deviation) * period_ms
+        hypotheses.append(_Hypothesis(cost, phase_ms, before.lost + lost_here))
+    return hypotheses
 
 
-def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int]) -> float:
-    """Return the period of a stream: the mean of the middle half of its steps in which no number is missing.
+def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int], interval_us: int | None) -> float | None:
+    """Return the period of a stream in milliseconds, or None if it is unknown.
 
-    A median of all steps is too large where messages are lost and the autopilot sends at multiples of its own period.
+    That is the requested interval if the stream has about this period. Otherwise it is the period of the nearest
+    whole rate up to 10 Hz, as autopilots are configured in hertz.
     """
-    pairs = list(pairwise(messages))
-    whole = [
+    intervals_ms = sorted(
         after.boot_ms - before.boot_ms
-        for before, after in pairs
+        for before, after in pairwise(messages)
         if indices[after.position] - indices[before.position] == after.position - before.position
-    ]
-    steps_ms = sorted(whole if len(whole) >= LEAST else [after.boot_ms - before.boot_ms for before, after in pairs])
-    edge = len(steps_ms) // 4
-    return mean(steps_ms[edge : len(steps_ms) - edge])
+    )
+    if len(intervals_ms) < _COMPLETE:
+        if interval_us:
+            return interval_us / 1e3
+        intervals_ms = sorted(after.boot_ms - before.boot_ms for before, after in pairwise(messages))
+    edge = len(intervals_ms) // 4
+    observed_ms = mean(intervals_ms[edge : len(intervals_ms) - edge])
+    if observed_ms <= 0:
+        return None
+    if interval_us and abs(observed_ms * 1e3 / interval_us - 1) <= _REQUEST_TOLERANCE:
+        return interval_us / 1e3
+    rate_hz = max(round(1e3 / observed_ms), 1)
+    is_near = rate_hz <= _HIGHEST_HZ and abs(rate_hz * observed_ms / 1e3 - 1) <= _RATE_TOLERANCE
+    return 1e3 / rate_hz if is_near else None
 
 
 def _unwrapped(numbers: Sequence[int]) -> list[int]:
-    """Return numbers that do not begin again after 255; one that is late stays before the newest."""
+    """Return sequence numbers that continue after 255; a late one stays before the newest."""
     indices, newest = list[int](), 0
     for number in numbers:
         if not indices:

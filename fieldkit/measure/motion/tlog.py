@@ -34,7 +34,11 @@ COLUMNS: Final = columns(
         "share",
         "1 - mavlink_messages/mavlink_sent: a bound, as a router withholds messages to other stations.",
     ),
-    ("mavlink_periodic", "count", "Messages of periodic streams with time_boot_ms, of at least 10 messages each."),
+    (
+        "mavlink_periodic",
+        "count",
+        "Messages with time_boot_ms of streams whose period is known: requested, or a whole rate of up to 10 Hz.",
+    ),
     ("mavlink_periodic_sent", "count", "These, and those that lack in both the periods and the numbers."),
     (
         "mavlink_loss",
@@ -170,18 +174,19 @@ class Tlog:
     back_us: int
 
 
-def read(path: Path, system: int, ended_us: int) -> Tlog:
+def read(path: Path, system: int, ended_us: int, intervals_us: tuple[tuple[str, int], ...] = ()) -> Tlog:
     """Return what a log says of an autopilot.
 
     Args:
         path: The log.
         system: Id of its system; 0 for the only one.
-        ended_us: When it ended; 0 where nobody knows.
+        ended_us: When it ended; 0 if that is unknown.
+        intervals_us: Names of messages with their requested intervals.
 
     Raises:
         EvidenceError: It is missing, cut off, damaged, or of no autopilot.
     """
-    found = _asked(path, system, ended_us=ended_us)
+    found = _asked(path, system, ended_us=ended_us, intervals_us=dict(intervals_us))
     counts = found["numbers"]
     sent = counts["messages"] + counts["lost"]
     periodic, lacking = found["periodic"]

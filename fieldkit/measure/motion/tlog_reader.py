@@ -7,7 +7,7 @@ QGroundControl write it. Messages and fields are named as in https://mavlink.io/
 import math
 import struct
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -124,7 +124,7 @@ def answer(question: Json) -> Json:
     autopilot = _autopilot(data, question["system"])
     if "positions" in question:
         return {"rows": list(_positions(data, autopilot, question["positions"]))}
-    return _summary(data, autopilot, question["ended_us"])
+    return _summary(data, autopilot, question["ended_us"], question["intervals_us"])
 
 
 def _autopilot(data: bytes, wanted: int) -> Source:
@@ -146,7 +146,7 @@ def _autopilot(data: bytes, wanted: int) -> Source:
     return next(iter(found))
 
 
-def _summary(data: bytes, autopilot: Source, ended_us: int) -> Json:
+def _summary(data: bytes, autopilot: Source, ended_us: int, intervals_us: Mapping[str, int]) -> Json:
     decoder, series = TlogDecoder(), defaultdict[str, list[float]](list)
     kinds, numbers, count, back_us = Counter[str](), list[tuple[int, int]](), 0, 0
     first_us, last_us, before_us = _MOST_US, 0, 0
@@ -174,7 +174,7 @@ def _summary(data: bytes, autopilot: Source, ended_us: int) -> Json:
         "system": autopilot[0],
         "kinds": dict(kinds),
         "numbers": vars(sequence.counted(numbers, ended_us)),
-        "periodic": periodic.lost(numbers, streams, ended_us),
+        "periodic": periodic.lost(numbers, streams, ended_us, intervals_us),
         "values": dict(_reduced(series)),
     }
 

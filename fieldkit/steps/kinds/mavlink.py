@@ -278,7 +278,8 @@ class MavlinkStep(Nest):
             EvidenceError: It, or what its recorder says of it, cannot be read.
         """
         told = view.evidence.read(tlog.told, self._told)
-        return view.evidence.read(tlog.read, self._file, self.system, told.ended_us)
+        intervals_us = tuple((name, round(1e6 / rate)) for name, rate in self.rates.items())
+        return view.evidence.read(tlog.read, self._file, self.system, told.ended_us, intervals_us)
 
     @override
     def output_columns(self) -> tuple[Column, ...]:

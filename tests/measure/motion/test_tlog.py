@@ -174,7 +174,7 @@ def test_cut_anywhere_it_is_whole_frames_or_refused(end: int) -> None:
 @given(st.binary(max_size=300), st.integers(0, 2**40))
 def test_bytes_of_any_kind_are_refused_or_read(noise: bytes, at_us: int) -> None:
     for data in (noise, stamped([(at_us, Sender().frame(beat()))]) + noise):
-        for question in ({"ended_us": 0}, {"positions": tlog.LOCAL}, {"positions": tlog.GLOBAL}):
+        for question in ({"ended_us": 0, "intervals_us": {}}, {"positions": tlog.LOCAL}, {"positions": tlog.GLOBAL}):
             with suppress(ValueError):  # and nothing else
                 _answered(data, question)
 
