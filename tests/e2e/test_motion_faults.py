@@ -71,6 +71,7 @@ def outcomes_at_night(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Mot
 
 
 @pytest.mark.emulated
+@pytest.mark.quiet  # the bounds hold on a machine that is not overloaded
 @pytest.mark.parametrize("name", IN_CI)
 def test_a_robot_stops_within_the_bounds_and_does_not_move_again(
     name: str, outcomes: dict[str, MotionOutcome]
