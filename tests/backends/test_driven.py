@@ -48,7 +48,7 @@ def test_robots_of_one_master_hear_each_other(other: Robot, why: str | None) -> 
 def test_robots_of_one_domain_hear_each_other(domain: str, alone: bool) -> None:
     found = disturbed(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
     assert (found is None) is alone
-    assert alone or found == "other listens to /cmd_vel of ROS domain 0 too, and would drive as well"
+    assert alone or found == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"
 
 
 def test_robots_with_masters_of_their_own_hear_nobody_else() -> None:

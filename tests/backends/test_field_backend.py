@@ -123,7 +123,7 @@ def test_robots_drive_by_themselves_where_that_is_allowed_alone(tmp_path: Path, 
     assert operator.asked == [
         (
             "move turtlebot-1 to 5 m from duckiedrone-1, nothing between them; let turtlebot-1 face away from "
-            "duckiedrone-1, its way free: it drives by itself"
+            "duckiedrone-1 with a clear path: it drives automatically"
         ),
         "bring turtlebot-1 back to its place",
     ]

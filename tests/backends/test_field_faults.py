@@ -32,7 +32,7 @@ class Person:
         (Fault(FaultKind.KILL, Role.SENDER, process="nc"), ["kill nc on turtlebot-1"], 0.0),
         (
             Fault(FaultKind.OUT_OF_RANGE, Role.SENDER, 10.0),
-            ["carry turtlebot-1 out of range, wait 10 s, and back"],
+            ["carry turtlebot-1 out of range, wait 10 s, and carry it back"],
             None,
         ),
     ],
@@ -69,7 +69,7 @@ def test_a_link_is_off_between_the_answers_to_two_requests(monkeypatch: pytest.M
 
 
 AWAY = Move(Role.SENDER, (Leg(away_m=10.0), Leg(left_m=2.0)), 0.2)
-SET_OFF = "move turtlebot-1, as seen from {}: 10 m away, then 2 m left, at 0.2 m/s; answer as it sets off"
+SET_OFF = "move turtlebot-1, as seen from {}: 10 m away, then 2 m left, at 0.2 m/s; answer when it starts to move"
 
 
 def test_a_robot_is_driven_and_brought_back() -> None:

@@ -98,7 +98,7 @@ def test_two_robots_that_hear_one_topic_are_not_driven() -> None:
     shared = {role: robot.model_copy(update={"ros_master": "10.42.0.3"}) for role, robot in DRIVES.items()}
     (refusal,) = STEP.refusals(replace(SCENE, cast=shared))
     assert refusal.what == (
-        "turtlebot-1 listens to /cmd_vel of the ROS master at 10.42.0.3 too, and would drive as well"
+        "turtlebot-1 also subscribes to /cmd_vel of the ROS master at 10.42.0.3 and would drive, too"
     )
 
 
