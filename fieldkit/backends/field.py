@@ -44,7 +44,7 @@ class FieldBackend:
         if site is None or document is None:
             raise ConfigurationError(
                 "the field backend needs a site file",
-                remedy="run fieldkit init and fill it in, or name a site file with --site",
+                remedy="fieldkit init, then fill it in; or name a site file with --site",
             )
         for name, robot in site.robots.items():
             for key in ("host", "user", "host_key"):

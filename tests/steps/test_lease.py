@@ -10,7 +10,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, LockLostError, RobotError
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed, Shell
-from fieldkit.steps.lease import HeldLease, orders_file
+from fieldkit.steps.lease import LeaseKeeper, orders_file
 
 JOB = Job(folder="f", name="up.fly", argv=(), limit_s=1.0, log="up.fly.log")
 SOON_S = 0.05
@@ -40,9 +40,9 @@ class Link:
         return [words[-2] for words in self.words]
 
 
-def held(link: Link, unheard_s: float | None = None) -> HeldLease:
+def held(link: Link, unheard_s: float | None = None) -> LeaseKeeper:
     shell = cast("Shell", link)
-    return HeldLease(shell, JOB, says="log", order="stay", lease_s=SOON_S, renewals=2, unheard_s=unheard_s)
+    return LeaseKeeper(shell, JOB, says="log", order="stay", lease_s=SOON_S, renewals=2, unheard_s=unheard_s)
 
 
 def test_an_order_is_renewed_over_a_link_that_breaks_until_the_context_is_left() -> None:
@@ -70,7 +70,7 @@ def test_where_nothing_may_be_sent_an_order_holds_longer_and_is_not_renewed() ->
     assert link.lines == ["1 stay 90", "2 go 90"]
 
 
-def thread_renews(lease: HeldLease) -> list[bool]:
+def thread_renews(lease: LeaseKeeper) -> list[bool]:
     lease._thread.join(60)
     return [lease._thread.is_alive()]
 
