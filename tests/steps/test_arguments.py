@@ -83,5 +83,5 @@ def test_what_is_almost_a_variable_is_refused_with_the_nearest_name(word: str, m
 
 
 def test_the_path_of_a_program_that_is_not_copied_is_refused() -> None:
-    assert "there is no put:" in (arguments.problem("{put}", has_program=False) or "")
+    assert "the step has no put:" in (arguments.problem("{put}", has_program=False) or "")
     assert arguments.problem("{{put}}", has_program=False) is None

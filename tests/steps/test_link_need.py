@@ -37,7 +37,7 @@ def test_it_names_the_connection_and_its_programs(connection: str, kind: str) ->
     ("text", "detail", "remedy"),
     [
         (CLOSED, "cannot be opened: Connection refused", "this computer has TCP port 5760, /dev/ttyACM0; write"),
-        (SILENT, "no heartbeat of an autopilot", "no other one that is usual"),
+        (SILENT, "no heartbeat of an autopilot", "no other common connection"),
         ("error: MAVLink by usb: is not a connection", "is not a connection", "mavlink.connection"),
         ("", "no answer", "mavlink.connection"),
         ("[]", "[]", "mavlink.connection"),

@@ -30,7 +30,7 @@ class ToldShell:
 
 
 def mover(shell: ToldShell, name: str = "rover") -> Mover:
-    return Mover(name, cast("Shell", shell), ".fieldkit/t/a", "it stops by itself within 2 s")
+    return Mover(name, cast("Shell", shell), ".fieldkit/t/a", "it stops automatically within 2 s")
 
 
 def test_without_motion_nothing_is_ordered() -> None:
@@ -69,14 +69,14 @@ def test_after_the_order_no_robot_begins_to_move() -> None:
         pytest.fail("it moves")
     assert not shell.asked
     wait_until(lambda: bool(told), Deadline.after(60))
-    assert told == ["stopping: no robot begins to move; ending what runs on the robots"]
+    assert told == ["stopping: no robot moves; stopping the programs on the robots"]
 
 
 def test_a_robot_out_of_reach_is_reported_with_what_it_does_by_itself() -> None:
     motions, told = Motions(), list[str]()
     with motions.moving(mover(ToldShell(LinkError("the connection broke", where="rover", remedy="")))):
         motions.order(told.append)
-    assert told == ["no answer from rover: it stops by itself within 2 s (the connection broke)"]
+    assert told == ["no answer from rover: it stops automatically within 2 s (the connection broke)"]
 
 
 def test_who_abandons_the_wait_does_not_wait_for_a_landing() -> None:

@@ -89,7 +89,7 @@ def test_a_master_on_a_robot_without_ros_1_is_refused(tmp_path: Path, monkeypatc
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
-        ConfigurationError, match="duckiedrone-1 plays relay, and its profile box has no ROS 1"
+        ConfigurationError, match="duckiedrone-1 plays relay, but its profile box has no ROS 1"
     ) as caught:
         registry.cast_of(*site(SITE.replace("profile: duckiedrone}", "profile: box}")), Topology.MASTER, ADDRESSES)
     assert caught.value.where == "fieldkit.yaml:9"
@@ -121,7 +121,7 @@ def test_preflight_asks_the_master_only_where_robots_share_one() -> None:
 def test_a_master_that_does_not_answer_as_one_fails_with_what_starts_it(said: Said, detail: str) -> None:
     verdict, told, remedy = ros_master.judged(SHARED[Role.RELAY], said)
     assert verdict is Verdict.FAIL
-    assert told.startswith("none answers at duckiedrone-1, 10.42.0.3:11311: ")
+    assert told.startswith("no master answers at duckiedrone-1, 10.42.0.3:11311: ")
     assert detail in told
     assert remedy.startswith("on duckiedrone-1: ROS_HOSTNAME=10.42.0.3 roscore ")
 

@@ -47,8 +47,8 @@ def test_a_daemon_is_found_by_its_whole_name_in_any_shell(tmp_path: Path, shell:
     [
         (Said("babeld\n", 0), Verdict.OK, "babeld"),
         (Said("babeld\nbabeld\nbatman-adv\n", 0), Verdict.OK, "babeld, batman-adv"),
-        (Said("", 0), Verdict.FAIL, "nothing on it finds ways over others"),
-        (Said("sh: not found", 127), Verdict.FAIL, "nothing on it finds ways over others"),
+        (Said("", 0), Verdict.FAIL, "no routing protocol runs on it"),
+        (Said("sh: not found", 127), Verdict.FAIL, "no routing protocol runs on it"),
     ],
 )
 def test_what_was_found_is_told(said: Said, verdict: Verdict, told: str) -> None:

@@ -80,10 +80,10 @@ def test_what_is_fitted_reads_back() -> None:
 @pytest.mark.parametrize(
     ("kind", "words", "complaint"),
     [
-        ("ping", f"{ENDS}, along: true, count: 3", "as count says; leave one out"),
-        ("topics", f"{ENDS}, along: true, duration: 3s", "as duration says; leave one out"),
-        ("iperf3", f"{ENDS}, along: true, duration: 3s", "as duration says; leave one out"),
-        ("iperf3", f"{ENDS}, along: true, size: 3MB", "until its size is sent; leave one out"),
+        ("ping", f"{ENDS}, along: true, count: 3", "along and count exclude each other"),
+        ("topics", f"{ENDS}, along: true, duration: 3s", "along and duration exclude each other"),
+        ("iperf3", f"{ENDS}, along: true, duration: 3s", "along and duration exclude each other"),
+        ("iperf3", f"{ENDS}, along: true, size: 3MB", "a test has along: true or a size, not both"),
         ("wait", "along: true, until: open the door", "or along: true"),
         ("wait", "along: true, duration: 3s", "leave one out"),
     ],

@@ -81,14 +81,14 @@ def test_without_leave_there_is_no_job() -> None:
     (line, *_) = STEP.dry_run_notes(scene)
     assert "by itself" not in line
     (line, *_) = STEP.dry_run_notes(SCENE)
-    assert "it stops where the laptop is silent for 2 s, and 30 m from its place" in line
+    assert "it stops if the laptop is silent for 2 s, and 30 m from its place" in line
 
 
 def test_beyond_the_fence_or_its_speed_nothing_starts() -> None:
     far = move("robot: receiver, path: [{away: 25m}, {left: 20m}], speed: 0.3m/s")
     speed, fence = far.refusals(SCENE)
-    assert speed.what == "its top speed is 0.22 m/s, and it is to move at 0.3 m/s"
-    assert fence.what == "its fence is 30 m from its place, and it is to drive 32.0156 m away"
+    assert speed.what == "its top speed is 0.22 m/s, but the move needs 0.3 m/s"
+    assert fence.what == "its fence is 30 m from its place, but its path leads 32.0156 m away"
     assert [one.what for one in far.refusals(replace(SCENE, cast=CAST))] == [speed.what], "a person has eyes"
     round_trip = move("robot: receiver, path: [{away: 25m}, {towards: 25m}, {away: 25m}], speed: 0.2m/s")
     assert not list(round_trip.refusals(SCENE)), "how far, not how long"
@@ -209,7 +209,7 @@ def test_what_a_driver_says_that_is_no_status_is_none(said: str, monkeypatch: py
     with held(Link(status=[said])) as lease:
         assert lease.why == ""
         monkeypatch.setattr(DriveLease, "unchanged_s", 41.0)
-        assert lease.why == "nothing was heard of its driver for 41 s"
+        assert lease.why == "its driver sent no status for 41 s"
 
 
 def test_why_a_driver_stopped_is_a_line_that_fits_into_a_table() -> None:
@@ -280,7 +280,7 @@ def test_one_that_comes_home_is_not_brought(stopped: list[str]) -> None:
 
 def test_one_that_stopped_is_brought_and_the_attempt_fails(stopped: list[str]) -> None:
     field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "odometry was silent for 0.5 s"}']))
-    with pytest.raises(RobotError, match="it stopped on its way: odometry was silent"):
+    with pytest.raises(RobotError, match="it stopped on its path: odometry was silent"):
         driven(field, lambda: None)
     assert field.brought == [False]
     assert stopped == ["out.drive"]
@@ -290,9 +290,9 @@ def test_one_that_stops_early_ends_the_steps_inside(stopped: list[str]) -> None:
     waits = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
     step = schema.validate(schema.parse(json.dumps(waits), source="x.yaml"), MoveStep)
     field = Field(Link(status=['{"ended": "", "ready": true}'] * 4 + ['{"ended": "beyond the fence"}']))
-    with pytest.raises(RobotError, match="it stopped on its way: beyond the fence") as caught:
+    with pytest.raises(RobotError, match="it stopped on its path: beyond the fence") as caught:
         step.run(quick(), field, lambda *_: None)
-    assert "the wait was cut short" in str(caught.value.__cause__)
+    assert "the wait was interrupted" in str(caught.value.__cause__)
     assert field.brought == [False]
     assert stopped == ["out.drive"]
 

@@ -76,14 +76,14 @@ def test_what_cannot_be_loaded_names_its_entry_point(
 @pytest.mark.parametrize("target", ["os.path:join", "fieldkit.steps.base:View", "fieldkit.steps.kinds.ping"])
 def test_what_is_no_step_is_refused(install: Install, target: str) -> None:
     install(load=target)
-    with pytest.raises(ConfigurationError, match="a kind of step is a subclass of Step") as caught:
+    with pytest.raises(ConfigurationError, match="a kind of step must be a subclass of Step") as caught:
         step_types()
     assert caught.value.where == f"entry point load = {target}"
 
 
 def test_a_kind_of_fieldkits_own_is_not_replaced(install: Install) -> None:
     install(ping="no_such_package.steps:Ping")
-    with pytest.raises(ConfigurationError, match="there is a kind of step 'ping' already") as caught:
+    with pytest.raises(ConfigurationError, match="there is already a kind of step 'ping'") as caught:
         step_types()
     assert caught.value.where == "entry point ping = no_such_package.steps:Ping"
 

@@ -82,7 +82,7 @@ def test_a_soak_surrounds_the_steps_inside() -> None:
         ("iperf3: {from: sender, to: receiver, size: 0MB}", "greater than 0"),
         ("iperf3: {from: sender, to: receiver, size: 10}", "write for example 10B"),
         ("iperf3: {from: sender, to: receiver, duration: 1500ms}", "whole seconds, not 1.5 s"),
-        ("iperf3: {from: sender, to: receiver, duration: 130s}", "would be ended before"),
+        ("iperf3: {from: sender, to: receiver, duration: 130s}", "so its limit must be longer"),
         ("iperf3: {from: sender, to: receiver, rate: 5}", "write for example 5bit/s"),
         ("iperf3: {from: sender, to: receiver, protocol: sctp}", "tcp"),
         (
@@ -151,7 +151,7 @@ def test_figures_are_those_of_the_end_that_sends_and_the_one_that_receives(tmp_p
         ),
         (
             lambda path: shutil.copy(DATA / "iperf3" / "3.7" / "refused-client.json", path),
-            "receiver-iperf3.json: iperf3 says: error - unable to connect to server: Connection refused",
+            "receiver-iperf3.json: iperf3 reports: error - unable to connect to server: Connection refused",
         ),
         (
             lambda path: path.write_text('{"start": {}, "intervals": []}'),
@@ -215,7 +215,7 @@ def test_a_server_that_is_not_told_of_the_end_is_ended(played: Played, tmp_path:
     assert done == told
     done.clear()
     codes["wait iperf3-server"] = jobs.STILL_RUNNING
-    with pytest.raises(RobotError, match="turtlebot-2: iperf3-server was not told of its end"):
+    with pytest.raises(RobotError, match="turtlebot-2: iperf3-server did not exit"):
         play(step, tmp_path)
     assert done == [*told, "stop iperf3-server receiver"]
 

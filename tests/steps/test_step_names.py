@@ -159,8 +159,8 @@ def test_gates_put_names_before_columns_and_reasons_and_rows_before_words(tmp_pa
         ("ping: {name: up, ", "ping: {", "a ping comes twice; tell them apart by name:"),
         ("transfer: {name: bare", "transfer: {name: up", "a transfer named up comes twice; give one another name"),
         ("name: imu}", "name: scan}", "a recording on sender comes twice; tell them apart by name:"),
-        ("file: imu", "file: odom", "sends odom, and nothing of that name is recorded on sender before it"),
-        (", file: imu", "", "names no file, and 2 are recorded there before it: write file:"),
+        ("file: imu", "file: odom", "sends odom, but no recording of that name is made on sender before it"),
+        (", file: imu", "", "names no file, but 2 files are recorded there before it: write file:"),
         ("            name: inner\n", "", "a capture on sender comes twice; tell them apart by name:"),
         ("robots: [sender]", "robots: [sender, sender]", "a robot is named twice"),
     ],
@@ -181,7 +181,7 @@ def test_a_transfer_names_its_bag_or_its_file(file: str) -> None:
 
 def test_a_file_that_no_recorder_writes_so_is_refused_with_those_that_there_are() -> None:
     (refusal,) = plan_of(STEPS.replace("file: imu", "file: imu/imu_0.db3")).refusals({})
-    assert refusal.what == "it is to send imu/imu_0.db3, and its recorder writes scan.bag, imu.bag"
+    assert refusal.what == "it cannot send imu/imu_0.db3: its recorder writes scan.bag, imu.bag"
     assert refusal.remedy == "write file: scan.bag"
 
 

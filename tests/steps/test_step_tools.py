@@ -164,7 +164,7 @@ def test_an_ncat_that_reads_half_of_the_datagrams_of_openbsd_is_refused(version:
     found = {Role.SENDER: replace(USUAL, netcat=Netcat.OPENBSD), Role.RECEIVER: receiver}
     refusals = list(los_plan().refusals(found))
     assert bool(refusals) == is_refused
-    assert all("cuts off the datagrams of 16384 bytes" in refusal.what for refusal in refusals)
+    assert all("truncates the datagrams of 16384 bytes" in refusal.what for refusal in refusals)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ MCAP = "--storage mcap > {name}/{name}_0.mcap"
     [
         (MCAP, Recorder.MCAP, None),
         (MCAP, Recorder.NONE, "its record command cannot write ros2-mcap"),
-        (MCAP, Recorder.SQLITE3, "its record command writes ros2-sqlite3, its profile says {name}/{name}_0.mcap"),
+        (MCAP, Recorder.SQLITE3, "its record command writes ros2-sqlite3, but its profile has {name}/{name}_0.mcap"),
     ],
 )
 def test_a_recorder_that_writes_no_bag_or_another_is_refused(text: str, found: Recorder, what: str | None) -> None:

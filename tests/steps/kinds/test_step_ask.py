@@ -64,13 +64,13 @@ def answered(step: AskStep, here: Path, operator: Talkative | None = None) -> Vi
     [
         (f"{GRASS}, unit: m", "they take no unit"),
         (f"{WIND}, choices: [a, b]", "they take no unit"),
-        ("column: a, question: b, least: 2, most: 1", "least is above most"),
-        (f"{WIND}, usual: strong", "usual is 'strong', and what can be answered is a number in m/s from 0 to 40"),
-        (f"{GRASS}, usual: high", "usual is 'high', and what can be answered is 1 dry, 2 wet; - if nobody knows\n"),
+        ("column: a, question: b, least: 2, most: 1", "least is greater than most"),
+        (f"{WIND}, usual: strong", "usual is 'strong'; permitted answers: a number in m/s from 0 to 40"),
+        (f"{GRASS}, usual: high", "usual is 'high'; permitted answers: 1 dry, 2 wet; - if nobody knows\n"),
         ("column: a, question: b, choices: [a]", "at least 2 items"),
         ("column: A, question: b", "'A' is not a name: small letters"),
         ("column: a, question: b, unit: 2m", "'2m' is not a unit"),
-        ("column: a, question: b, choices: [a, b, a]", "a choice comes twice"),
+        ("column: a, question: b, choices: [a, b, a]", "a choice is listed twice"),
         ("column: a, question: b, choices: [a, '2']", "choices.1: '2' cannot be a choice: write words"),
         ("column: a, question: b, choices: [a, ' b']", "cannot be a choice"),
         ("column: a, question: b, choices: [a, '-']", "cannot be a choice"),
@@ -157,7 +157,7 @@ def test_a_question_is_asked_once_per_trial_or_in_each_repeat(tmp_path: Path, ea
 def test_a_file_that_answers_nothing_voids_the_repeat(tmp_path: Path, text: str) -> None:
     (tmp_path / "answer-wind.txt").write_text(text, encoding="utf-8")
     step, view = ask(WIND), View(SCENE, AttemptEvidence(tmp_path))
-    assert list(step.check(view)) == ["answer-wind.txt does not say what the operator answered"]
+    assert list(step.check(view)) == ["answer-wind.txt has no valid answer of the operator"]
     assert step.measure(view).missing
 
 

@@ -41,7 +41,7 @@ def refused(text: str) -> list[str]:
         ("robot: receiver", "'height' is missing"),
         ("robot: receiver, height: 0m", "greater than 0"),
         ("robot: receiver, height: 2", "has no unit"),
-        ("robot: receiver, height: 2m, path: [{up: 1m, down: 1m}]", "up or down; make two pieces"),
+        ("robot: receiver, height: 2m, path: [{up: 1m, down: 1m}]", "up or down, not both; make two segments"),
         ("robot: receiver, height: 2m, path: [{}]", "towards, left, right, up or down"),
         ("robot: receiver, height: 2m, path: [{down: 2m}]", "leads to the ground"),
         ("robot: receiver, height: 2m, then: hover", "land.*return"),
@@ -76,8 +76,8 @@ def test_a_way_is_refused_exactly_where_it_leaves_the_limits(
 def test_who_cannot_fly_is_refused() -> None:
     ground = next(role for role, robot in CAST.items() if robot.profile.mavlink is None)
     said = refused(f"robot: {ground}, height: 1m")
-    assert said[0] == "its profile has no mavlink: nothing flies it"
-    assert "its profile does not say how high it may fly" in said
+    assert said[0] == "it cannot fly: its profile has no mavlink"
+    assert "its profile has no limit for the height" in said
 
 
 def test_the_log_of_a_longer_flight_is_larger_and_is_on_the_drone_alone() -> None:
@@ -90,7 +90,7 @@ def test_the_log_of_a_longer_flight_is_larger_and_is_on_the_drone_alone() -> Non
 
 def test_a_real_one_needs_leave() -> None:
     (refusal,) = step(f"robot: {DRONE}, height: 1m").refusals(Scene(Protocol.TCP, CAST, "f"))
-    assert refusal.what == "it is real, and fieldkit is to fly it"
+    assert refusal.what == "it is a real drone, and flights are not allowed"
     assert "--allow-motion" in refusal.remedy
 
 
@@ -171,8 +171,8 @@ steps: [{ping: {from: sender, to: receiver}}]
 def test_what_becomes_of_it_where_it_is_stopped_at_once_is_told() -> None:
     flight = step(f"robot: {DRONE}, height: 2m")
     assert list(flight.abort_notes(SCENE)) == [
-        f"{CAST[DRONE].name} lands, if it is in the air: for up to about 37 s, also when fieldkit has ended"
+        f"{CAST[DRONE].name} lands, if it is in the air: this takes up to about 37 s, also after fieldkit has exited"
     ]
     returns = Scene(Protocol.TCP, FREE, "f", on_abort={DRONE: OnAbort.RETURN})
     (said,) = flight.abort_notes(returns)
-    assert "returns by itself" in said
+    assert "returns automatically" in said

@@ -97,7 +97,7 @@ def test_who_takes_a_drone_over_ends_the_steps_inside(shell: Shell) -> None:
     with drones.autopilot_at_udp() as (port, autopilot):
         with pytest.raises(RobotError, match="here: its flight ended early: another party flies it") as caught:
             fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LAND))
-        assert "the wait was cut short" in str(caught.value.__cause__)
+        assert "the wait was interrupted" in str(caught.value.__cause__)
         assert "landed" not in log(shell), "it let go of it"
 
 

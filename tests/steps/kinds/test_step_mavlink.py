@@ -48,11 +48,11 @@ def mavlink(more: str = "", during: str = PING) -> MavlinkStep:
 @pytest.mark.parametrize(
     ("more", "complaint"),
     [
-        ("rates: {ATITUDE: 5Hz}", "no rate can be asked for 'ATITUDE'; there are SYS_STATUS"),
+        ("rates: {ATITUDE: 5Hz}", "no rate can be requested for 'ATITUDE'; possible: SYS_STATUS"),
         ("rates: {ATTITUDE: 5}", "has no unit"),
         ("rates: {ATTITUDE: 0Hz}", "greater than 0"),
-        ("positions: local", "say where it faces"),
-        ("positions: global, facing: away", "say where it faces"),
+        ("positions: local", "facing is required with positions: local"),
+        ("positions: global, facing: away", "facing is required with positions: local"),
         ("system: 256", "less than or equal to 255"),
     ],
 )
@@ -180,8 +180,8 @@ def test_degrees_stand_beside_a_place_on_the_earth(tmp_path: Path) -> None:
         (flight(10)[:-3], {}, "is cut off"),
         (flight(10), {"frames": 9}, "mavlink.tlog has 203 frames, its recorder wrote 9"),
         (flight(10), {"left_out": 4}, "4 frames more came"),
-        (flight(10), {"refused": {"1": 2}}, "does not send SYS_STATUS as asked"),
-        (flight(10), {}, "no SYS_STATUS, which was asked for"),
+        (flight(10), {"refused": {"1": 2}}, "refused the request for SYS_STATUS"),
+        (flight(10), {}, "no SYS_STATUS, which was requested"),
         (b"", {"frames": 0}, "no heartbeat of an autopilot"),
     ],
 )

@@ -104,7 +104,7 @@ def test_ways_lead_from_the_place_of_each_role() -> None:
 def test_a_robot_is_not_asked_for_more_than_its_top_speed() -> None:
     (refusal,) = move(f"robot: sender, path: [{{away: 1m}}], speed: 0.3m/s, {PING}").refusals(SCENE)
     assert refusal.role is Role.SENDER
-    assert refusal.what == "its top speed is 0.22 m/s, and it is to move at 0.3 m/s"
+    assert refusal.what == "its top speed is 0.22 m/s, but the move needs 0.3 m/s"
     assert not list(move(f"robot: relay, path: [{{away: 1m}}], speed: 3m/s, {PING}").refusals(SCENE))
 
 
@@ -151,14 +151,14 @@ def test_a_robot_within_its_limits_goes_as_fast_and_as_far_as_it_may() -> None:
     path = "path: [{away: 60m}], speed: 2m/s"
     slow = fitted(f"robot: receiver, {path}, within_limits: true, {PING}")
     assert slow.motion == model.Move(Role.RECEIVER, (Leg(29.5),), 0.22)
-    assert slow.lasts_s == pytest.approx(29.5 / 0.22, abs=1e-3)
+    assert slow.straight_s == pytest.approx(29.5 / 0.22, abs=1e-3)
     assert not list(slow.refusals(SCENE))
     drone = fitted(f"robot: relay, {path}, within_limits: true, {PING}")
     assert drone.motion == model.Move(Role.RELAY, (Leg(60.0),), 2.0), "it may"
     assert not slow.within_limits, "what is planned says what is driven"
     refused = fitted(f"robot: receiver, {path}, {PING}")
     assert refused.motion.speed_m_s == 2.0
-    assert [one.what for one in refused.refusals(SCENE)] == ["its top speed is 0.22 m/s, and it is to move at 2 m/s"]
+    assert [one.what for one in refused.refusals(SCENE)] == ["its top speed is 0.22 m/s, but the move needs 2 m/s"]
 
 
 @pytest.mark.parametrize(

@@ -89,8 +89,8 @@ def test_a_file_is_copied_from_where_it_lies(tmp_path: Path, file: str, copied: 
     [
         (Said("1900", 0), Verdict.OK, "1.9 kB"),
         (Said("501", 0), Verdict.OK, "0.5 kB"),
-        (Said("499", 0), Verdict.WARN, "and the procedure says 1.0 kB"),
-        (Said("2001", 0), Verdict.WARN, "and the procedure says 1.0 kB"),
+        (Said("499", 0), Verdict.WARN, "but the procedure has 1.0 kB"),
+        (Said("2001", 0), Verdict.WARN, "but the procedure has 1.0 kB"),
         (Said("0", 0), Verdict.FAIL, "it is empty"),
         (Said("sh: 1: cannot open maps/lab.pgm: No such file", 2), Verdict.FAIL, "cannot open"),
         (Said("", 0), Verdict.FAIL, ""),
@@ -148,6 +148,6 @@ def test_what_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(jobs, "run", lambda shell, job: 1)
     testbed = IdleTestbed({role: LocalShell(tmp_path) for role in FIXED_ROLES})
     with pytest.raises(
-        RobotError, match="turtlebot-1: what is to be sent could not be made: cp ended with exit code 1"
+        RobotError, match="turtlebot-1: the file to send could not be created: cp ended with exit code 1"
     ):
         send("size: 1kB, file: gone").run(SCENE, testbed, lambda name, expected_s: None)

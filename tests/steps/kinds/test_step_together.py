@@ -342,7 +342,7 @@ def load(steps: str) -> Procedure:
         (FROM_TWO, "port 5201 comes twice at the same time", 4),
         (SAME_WAY, "port 5201 comes twice in one capture, from sender to receiver", 4),
         (BESIDE_A_TRANSFER, "port 5201 comes twice in one capture", 4),
-        (ASKED, "fault may ask the operator: no other step runs beside it", 4),
+        (ASKED, "fault may prompt the operator, so no step may run at the same time", 4),
         (
             ASKED.replace("fault: {robot: sender, kind: reboot}", "wait: {until: say so}"),
             "wait may ask the operator",
@@ -353,8 +353,8 @@ def load(steps: str) -> Procedure:
             "ask may ask the operator",
             4,
         ),
-        (MOVE_INSIDE, "move may ask the operator: no other step runs beside it", 6),
-        (RECORDED_BESIDE, "sends a, and nothing of that name is recorded on sender before it", 4),
+        (MOVE_INSIDE, "move may prompt the operator, so no step may run at the same time", 6),
+        (RECORDED_BESIDE, "sends a, but no recording of that name is made on sender before it", 4),
         (SWEEP.replace("VALUES", "[1, 2, 3, 4, 5, 6, 7, 8, 9]"), f"9 steps at the same time are more than {MOST}", 4),
     ],
 )

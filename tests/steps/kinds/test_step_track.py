@@ -32,17 +32,17 @@ def track(robots: str, during: str = PING) -> TrackStep:
     ("robots", "complaint"),
     [
         ("{}", "at least 1 item"),
-        ("{sender: {}}", "which topic tells it, or at which place"),
-        ("{sender: {topic: /odom, at: {lat: 1, lon: 2}}}", "which topic tells it, or at which place"),
+        ("{sender: {}}", "a robot needs either topic or at"),
+        ("{sender: {topic: /odom, at: {lat: 1, lon: 2}}}", "a robot needs either topic or at"),
         ("{sender: {topic: odom}}", "'odom' is not the name of a topic"),
         ("{sender: {topic: /odom, facing: north}}", "away.*towards"),
         ("{sender: {topic: /odom, gap: 3}}", "has no unit"),
         ("{sender: {topic: /odom, gap: 0s}}", "greater than 0"),
-        ("{sender: {at: {}}}", "a place has lat and lon, or frame, x and y"),
-        ("{sender: {at: {lat: 1}}}", "a place has lat and lon, or frame, x and y"),
+        ("{sender: {at: {}}}", "a position needs lat and lon, or frame, x and y"),
+        ("{sender: {at: {lat: 1}}}", "a position needs lat and lon, or frame, x and y"),
         ("{sender: {at: {lat: 91, lon: 0}}}", "less than or equal to 90"),
-        ("{sender: {at: {x: 1, y: 2}}}", "a place has lat and lon, or frame, x and y"),
-        ("{sender: {at: {frame: map, x: 1}}}", "a place has lat and lon, or frame, x and y"),
+        ("{sender: {at: {x: 1, y: 2}}}", "a position needs lat and lon, or frame, x and y"),
+        ("{sender: {at: {frame: map, x: 1}}}", "a position needs lat and lon, or frame, x and y"),
         ("{sender: {at: {frame: map, x: 1, y: 2, lat: 1, lon: 2}}}", "not both"),
     ],
 )
@@ -54,7 +54,7 @@ def test_what_does_not_fit_is_refused_with_a_sentence(robots: str, complaint: st
 @pytest.mark.parametrize(
     ("steps", "complaint"),
     [
-        ("[{TRACK}, {TRACK}]", "one track records a repeat"),
+        ("[{TRACK}, {TRACK}]", "a repeat can have only one track"),
         ("[{{move: {{robot: sender, path: [away: 1m], speed: 1m/s, during: [{TRACK}]}}}}]", "put the move into"),
         ("[{{fault: {{robot: sender, kind: reboot, during: [{TRACK}]}}}}]", "put them into the track"),
         ("[{{together: {{during: [{TRACK}, {WAIT}]}}}}]", "put them into the track"),

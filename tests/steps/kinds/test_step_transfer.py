@@ -116,7 +116,7 @@ def test_what_the_lab_knows_of_the_delays_meanwhile_is_kept(tmp_path: Path, pack
 
 @pytest.mark.parametrize(
     ("protocol", "words"),
-    [(Protocol.UDP, "ends after 1 s of silence"), (Protocol.TCP, "was ended 2 s after it began")],
+    [(Protocol.UDP, "the listener exits after 1 s of silence"), (Protocol.TCP, "the listener was stopped after 2 s")],
 )
 def test_a_sender_that_begins_after_the_listener_is_gone_is_no_measurement(
     tmp_path: Path, protocol: Protocol, words: str
