@@ -85,7 +85,11 @@ def test_distance_repeat_and_the_copied_program_are_filled_in(
         ("robot: sender\nargv:\n- a\n- '{repeats}'", 4, "no variable {repeats}; did you mean '{repeat}'"),
         ("robot: sender\ncommand: 'a-{repeat} b'", 2, "the name of the program must not depend on a variable"),
         ("robot: sender\ncommand: 'sh {put}'", 2, "the step has no put:"),
-        ("robot: sender\ncommand: sh\nput: LICENSE", 3, "the command does not run LICENSE: write {put} in the command"),
+        (
+            "robot: sender\ncommand: sh\nput: LICENSE",
+            3,
+            "the command does not run LICENSE: write {put} in the command",
+        ),
         ("robot: sender\ncommand: '{put}'\nput: LICENSE", 3, "LICENSE is not executable: chmod"),
         ("robot: sender\ncommand: '{put}'\nput: no-such", 3, "there is no file 'no-such'"),
         ("robot: sender", 1, "one of them"),
