@@ -25,7 +25,7 @@ _BRACES: Final = re.compile(
 
 
 def fill_in(word: str, values: Mapping[str, str], address: Callable[[str], str]) -> str:
-    """Return an argument with the values of its variables.
+    """Return an argument in which the variables are replaced by their values.
 
     The result is one argument, also if a value contains blanks.
 

@@ -51,7 +51,7 @@ class Step(Strict, ABC):
         columns: Columns that steps of its kind measure.
         cross_checks: Sources of these columns, and the checks between them.
         kept_bytes: Bytes of each frame that a capture must keep for the step; 0 if headers are enough.
-        capture_buffer_kib: Kernel buffer that a capture needs for the step's packets; 0 if the usual one is enough.
+        capture_buffer_kib: Kernel buffer that a capture needs for the step's packets; 0 if the default is enough.
         needs_complete_capture: Whether packets that a capture dropped make the step's figures wrong. If not, the step
             withholds the columns that depend on captures.
         name: Letters, digits and `_`, a lower-case letter first; distinguishes the step from others of its kind.

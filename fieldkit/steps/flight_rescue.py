@@ -22,7 +22,7 @@ SILENT_S: Final = 0.6
 """Programs whose counters do not change for this time of the robot's clock do not run; they count ten a second."""
 _POLL_S: Final = 0.15
 _MAX_STEP_S: Final = 0.4
-"""Maximum time that counts between two polls, because a robot that was suspended is no robot without programs."""
+"""Maximum time that counts between two polls: after a suspension of the robot its programs still run."""
 
 
 class LifeSigns:

@@ -35,12 +35,12 @@ class Origins(Protocol):
 
     @property
     def kept(self) -> bool:
-        """See the class."""
+        """Whether robots stay where a motion ended."""
         ...
 
     @property
     def may_return(self) -> bool:
-        """See the class."""
+        """Whether a ground robot may drive back to its place."""
         ...
 
     def get(self, role: Role) -> MotionOrigin | None:

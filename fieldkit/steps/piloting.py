@@ -1,7 +1,7 @@
 """Control of drones from the laptop: jobs of the programs on the drone that fly or guard it, and their leases.
 
 The programs are parts of the agent (`fieldkit.agent.flight`, `fieldkit.agent.flying.guard`). If this process is
-killed, or the control link is down for longer than the lease, they land the drone.
+killed, or the control link is down for longer than the lease, they end the flight as `on_abort` says.
 """
 
 import json
@@ -78,7 +78,7 @@ def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: floa
 
 
 def guard(scene: Scene, role: Role, name: str, *, lease_s: float = LEASE_S, has_pilot: bool = False) -> Planned:
-    """Return the job of the program that guards a drone, and lands it if the attempt is aborted.
+    """Return the job of the program that guards a drone, and ends its flight if the attempt is aborted.
 
     Args:
         scene: The attempt.
@@ -99,7 +99,7 @@ def guard(scene: Scene, role: Role, name: str, *, lease_s: float = LEASE_S, has_
 
 
 def rescue(scene: Scene, role: Role, name: str, guard_name: str) -> Job:
-    """Return the job that lands a drone if neither its pilot nor its guard runs.
+    """Return the job that ends the flight of a drone if neither its pilot nor its guard runs.
 
     Args:
         scene: The attempt.

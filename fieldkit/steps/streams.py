@@ -44,7 +44,7 @@ def _is_profile(name: str) -> str:
 
 
 class StreamQos(Strict):
-    """A quality of service: a profile of ROS 2, and what differs from it.
+    """A quality of service: a profile of ROS 2, and values that override it.
 
     Attributes:
         profile: `default`, `sensor_data`, `services_default`, `parameters`, `parameter_events` or `system_default`,

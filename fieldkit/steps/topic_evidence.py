@@ -24,7 +24,7 @@ _CDR_BYTES: Final = 16
 _ROS1_QUEUE: Final = 1000
 """Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.ros1`)."""
 _LATE_S: Final = 0.1
-"""The discovery time is withheld if the first sample follows it later than the publisher's delay by this time."""
+"""Permitted delay of the first sample after discovery and the publisher's wait; else the discovery time is withheld."""
 
 
 def plan(step: StreamOptions) -> TopicPlan:

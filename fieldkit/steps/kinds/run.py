@@ -320,7 +320,7 @@ class RunStep(Step):
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        """Return the columns of the procedure."""
+        """Return the columns that the procedure declares."""
         return tuple(column.column for column in self.figures)
 
     @override
