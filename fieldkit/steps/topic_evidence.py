@@ -24,7 +24,7 @@ _CDR_BYTES: Final = 16
 _ROS1_QUEUE: Final = 1000
 """Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.ros1`)."""
 _LATE_S: Final = 0.1
-"""Permitted delay of the first sample after discovery and the publisher's wait; else the discovery time is withheld."""
+"""Permitted delay of the first sample after discovery and the publisher's wait; else discovery is withheld."""
 
 
 def plan(step: StreamOptions) -> TopicPlan:
