@@ -255,13 +255,13 @@ class Iperf3Step(LoadOptions, AlongStep):
         protocol = self.carried_by(view.scene.protocol)
         sent, received = (self._report(view, role) for role in (self.source, self.destination))
         flow = self._flow(view, sent, received)
-        captures = self._packets(view)
+        packets = self._packets(view)
         data = self._data_streams(view)
         return (
             iperf3.measure(protocol, sent, received)
-            | load.measure(flow, *captures)
-            | load_streams.measure_jitter(data, *captures)
-            | load_streams.measure("iperf3", data, *captures)
+            | load.measure(flow, *packets)
+            | load_streams.measure_jitter(data, *packets)
+            | load_streams.measure("iperf3", data, *packets)
         )
 
     def deliveries(self, view: View) -> Sequence[Delivery]:
