@@ -307,7 +307,7 @@ def test_an_answer_that_took_no_time(udp: Attempt) -> None:
 
 
 @pytest.mark.parametrize(
-    ("shift_s", "reason"), [(-3600, "before the attempt began"), (3600, "after the attempt had")]
+    ("shift_s", "reason"), [(-3600, "before the start of the attempt"), (3600, "after the end of the attempt")]
 )
 def test_a_capture_of_another_time(attempt: Attempt, shift_s: int, reason: str) -> None:
     attempt.capture("receiver", lambda packets: [(at + shift_s * 10**6, rest) for at, rest in packets])

@@ -15,7 +15,7 @@ from tests.helpers.plans import problems
 from tests.helpers.stored_trials import TRIALS
 from tests.trial.test_trial_contradictions import LOSSLESS, Attempt, Packet, of
 
-EARLIER = "packets of an earlier attempt were delayed"
+EARLIER = "packets of an earlier attempt were still on the way"
 HEADS = 8
 """Bytes of a record's lengths, behind which its IP packet begins: the captures are of link type RAW."""
 KEPT = sorted(TRIALS.glob("*/repeats/*-0[0-9]"))
