@@ -1,4 +1,4 @@
-"""Conditions for driving a robot by its topic: nobody else obeys it, and nobody else says where the robot is."""
+"""Conflicts of ROS topics between a robot that drives itself and other robots that hear the same topics."""
 
 from collections.abc import Iterable
 
@@ -6,23 +6,22 @@ from fieldkit.backends.protocols import Robot
 
 
 def disturbed(robot: Robot, others: Iterable[Robot]) -> str | None:
-    """Return why a robot with `drive` in its profile cannot be driven among others; None where it can.
+    """Return why a robot with `drive` in its profile cannot be driven next to other robots; None if it can.
 
-    Robots that share a ROS master, or a domain of ROS 2, hear each other's topics.
+    Robots that share a ROS master or a ROS 2 domain receive each other's topics. No other robot may subscribe to the
+    robot's velocity topic or publish its odometry topic.
 
     Args:
         robot: The robot.
-        others: Robots that take part, which may be it, too.
+        others: The robots that take part; may contain `robot`.
     """
-    own = robot.profile.drive
+    drive = robot.profile.drive
     for other in others:
-        if own is None or other.name == robot.name or not robot.ros_graph or other.ros_graph != robot.ros_graph:
+        if drive is None or other.name == robot.name or not robot.ros_graph or other.ros_graph != robot.ros_graph:
             continue
-        theirs, ros = other.profile.drive, other.profile.ros
-        if theirs is not None and theirs.topic == own.topic:
-            return f"{other.name} listens to {own.topic} of {robot.ros_graph} too, and would drive as well"
-        if ros is not None and own.odometry in {topic.name for topic in ros.topics}:
-            return (
-                f"{other.name} publishes {own.odometry} of {robot.ros_graph} too: whose odometry it is nobody knows"
-            )
+        other_drive, other_ros = other.profile.drive, other.profile.ros
+        if other_drive is not None and other_drive.topic == drive.topic:
+            return f"{other.name} also subscribes to {drive.topic} of {robot.ros_graph} and would drive, too"
+        if other_ros is not None and drive.odometry in {topic.name for topic in other_ros.topics}:
+            return f"{other.name} also publishes {drive.odometry} of {robot.ros_graph}: the odometry is ambiguous"
     return None

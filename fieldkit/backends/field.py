@@ -28,11 +28,11 @@ class FieldBackend:
     Args:
         site: The site file.
         document: Its document, for messages with lines.
-        ask: Asks the person for a password, unseen.
+        ask: Prompts the operator for a password without echo.
 
     Attributes:
-        allow_motion: Whether robots may be driven by fieldkit; otherwise the operator is asked to move them.
-        allow_motion_after_fault: Whether robots may move again after a fault stopped one, without a confirmation.
+        allow_motion: Whether fieldkit may drive robots; otherwise the operator is asked to move them.
+        allow_motion_after_fault: Whether robots may move again without a confirmation after a fault stopped one.
     """
 
     by_hand: Final = True
@@ -44,7 +44,7 @@ class FieldBackend:
         if site is None or document is None:
             raise ConfigurationError(
                 "the field backend needs a site file",
-                remedy="fieldkit init, then fill it in; or name it by --site",
+                remedy="fieldkit init, then fill it in; or name a site file with --site",
             )
         for name, robot in site.robots.items():
             for key in ("host", "user", "host_key"):
@@ -62,7 +62,7 @@ class FieldBackend:
         self._passwords: dict[str, str | None] = {}
 
     def cast(self, topology: Topology) -> Cast:
-        """See `Backend.cast`."""
+        """Return the robot in each role; see `Backend.cast`."""
         addresses = {name: robot.address or robot.host or "" for name, robot in self._site.robots.items()}
         cast = cast_of(self._site, self._document, topology, addresses)
         for robot in cast.values():
@@ -72,16 +72,16 @@ class FieldBackend:
                     where=self._document.where(("robots", robot.name)),
                     remedy="add address: to it",
                 )
-        return {role: robot.model_copy(update=self._allowed(robot.profile)) for role, robot in cast.items()}
+        return {role: robot.model_copy(update=self._permissions(robot.profile)) for role, robot in cast.items()}
 
-    def _allowed(self, profile: RobotProfile) -> dict[str, bool]:
-        """Return what steps may do with a robot: without leave, nothing that moves it."""
-        can = {"drives": profile.drive is not None, "flies": profile.mavlink is not None}
-        return {name: self.allow_motion and one for name, one in can.items()}
+    def _permissions(self, profile: RobotProfile) -> dict[str, bool]:
+        """Return the values of `Robot.drives` and `Robot.flies`, which are false without `allow_motion`."""
+        abilities = {"drives": profile.drive is not None, "flies": profile.mavlink is not None}
+        return {name: self.allow_motion and is_able for name, is_able in abilities.items()}
 
     @contextmanager
     def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (starts nothing)
-        """See `Backend.open`; robots are connected when they are first asked for something."""
+        """Yield the testbed; see `Backend.open`. Each robot is connected at its first command."""
         shells: dict[Role, Shell] = {}
         try:
             for role, robot in cast.items():
@@ -93,8 +93,11 @@ class FieldBackend:
 
     @contextmanager
     def standing(self, *, sink: Sink) -> Iterator[Mapping[str, Shell | FieldkitError]]:
-        """See `Backend.standing`; robots are connected when they are first asked for something."""
-        shells = {name: _tried(partial(self._shell, name, sink)) for name in self._site.robots}
+        """Yield the connection or the error of each robot; see `Backend.standing`.
+
+        Each robot is connected at its first command.
+        """
+        shells = {name: _shell_or_error(partial(self._shell, name, sink)) for name in self._site.robots}
         try:
             yield shells
         finally:
@@ -116,7 +119,7 @@ class FieldBackend:
         )
 
 
-def _tried(make: Callable[[], Shell]) -> Shell | FieldkitError:
+def _shell_or_error(make: Callable[[], Shell]) -> Shell | FieldkitError:
     try:
         return make()
     except FieldkitError as error:
@@ -124,12 +127,12 @@ def _tried(make: Callable[[], Shell]) -> Shell | FieldkitError:
 
 
 class FieldTestbed:
-    """Real robots that a person puts where the trial wants them.
+    """Real robots that the operator places and moves.
 
     Args:
-        cast: Who plays which role.
-        shells: Their control connections.
-        operator: The person.
+        cast: The robot in each role.
+        shells: Control connection of each robot.
+        operator: The operator.
         allow_motion_after_fault: See `Attended`.
     """
 
@@ -150,20 +153,20 @@ class FieldTestbed:
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
-        """See `Testbed.shells`."""
+        """The control connection of each robot of the cast."""
         return self._shells
 
     def place(self, placement: Placement) -> Answer:
-        """See `Testbed.place`."""
+        """Ask the operator to place the robots; see `Testbed.place`."""
         names = {role: robot.name for role, robot in self._cast.items()}
         sender, receiver = names[Role.SENDER], names[Role.RECEIVER]
-        where = format_distance(placement.distance)
+        distance = format_distance(placement.distance)
         behind = placement.scenario is Scenario.NLOS
         if placement.topology is Topology.MASTER:
-            text = f"move {sender} and {receiver} to {where} from {names[Role.RELAY]}, on opposite sides of it"
+            text = f"move {sender} and {receiver} to {distance} from {names[Role.RELAY]}, on opposite sides of it"
             wall = f"{sender} behind the wall"
         else:
-            text = f"move {sender} to {where} from {receiver}"
+            text = f"move {sender} to {distance} from {receiver}"
             wall = "behind the wall"
         posts = "".join(
             f"; put {names[post.role]} {geometry.leg_in_words(post.leg)} of {names[post.near]}, as seen from "
@@ -171,8 +174,8 @@ class FieldTestbed:
             for post in placement.posts
         )
         facing = "".join(
-            f"; let {robot.name} face away from {names[geometry.other_end(role, placement.topology)]}, its way free: "
-            "it drives by itself"
+            f"; let {robot.name} face away from {names[geometry.other_end(role, placement.topology)]} with a clear "
+            "path: it drives automatically"
             for role, robot in self._cast.items()
             if robot.drives
         )
@@ -181,7 +184,10 @@ class FieldTestbed:
         )
 
     def inject(self, fault: Fault) -> float | None:
-        """See `Testbed.inject`; for a link, the time between the operator's two answers."""
+        """Ask the operator to cause a fault; see `Testbed.inject`.
+
+        The duration of `link-down` is the time between the operator's two answers.
+        """
         name = self._cast[fault.role].name
         match fault.kind:
             case FaultKind.LINK_DOWN:
@@ -191,8 +197,8 @@ class FieldTestbed:
                 self.operator.ask(f"switch the Wi-Fi of {name} on again")
                 return time.monotonic() - began_s
             case FaultKind.OUT_OF_RANGE:
-                self.operator.ask(f"carry {name} out of range, wait {fault.duration_s:g} s, and back")
-                return None  # nobody sees where the range ends
+                self.operator.ask(f"carry {name} out of range, wait {fault.duration_s:g} s, and carry it back")
+                return None  # the operator cannot see where the range ends
             case FaultKind.REBOOT:
                 self.operator.ask(f"reboot {name}")
             case FaultKind.KILL:
@@ -201,11 +207,13 @@ class FieldTestbed:
 
     @contextmanager
     def moving(self, move: Move) -> Iterator[None]:
-        """See `Testbed.moving`; the operator drives it, and brings it back unless the trial is interrupted."""
+        """Ask the operator to move a robot, and to bring it back unless the trial is interrupted."""
         name = self._cast[move.role].name
         topology = Topology.MASTER if Role.RELAY in self._cast else Topology.MASTERLESS
         other = self._cast[geometry.other_end(move.role, topology)].name
-        self.operator.ask(f"move {name}, as seen from {other}: {geometry.in_words(move)}; answer as it sets off")
+        self.operator.ask(
+            f"move {name}, as seen from {other}: {geometry.in_words(move)}; answer when it starts to move"
+        )
         try:
             yield
         except Exception:
@@ -214,7 +222,7 @@ class FieldTestbed:
         self._bring_back(name)
 
     def bring_back(self, role: Role, *, by_itself: bool) -> None:
-        """See `Testbed.bring_back`; one that is not back the operator brings."""
+        """Ask the operator to bring back a robot that did not drive back; see `Testbed.bring_back`."""
         if not by_itself:
             self._bring_back(self._cast[role].name)
 

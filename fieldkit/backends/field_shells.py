@@ -1,4 +1,7 @@
-"""SSH connections to the robots of the field; imports neither pydantic nor profiles, for `fieldkit stop`."""
+"""SSH connections to the robots of a site file.
+
+Imports neither pydantic nor profiles, so that `fieldkit stop` starts quickly.
+"""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -10,11 +13,11 @@ from fieldkit.remote.ssh import PATIENCE_S, SshShell
 
 
 class SshAccess(Protocol):
-    """How a robot is reached: a `SiteRobot`, or a `RobotAccess`."""
+    """SSH access data of a robot: a `SiteRobot` or a `RobotAccess`."""
 
     @property
     def host(self) -> str | None:
-        """Name or address."""
+        """Host name or address."""
         ...
 
     @property
@@ -44,12 +47,12 @@ class SshAccess(Protocol):
 
 
 def find_password(name: str, access: SshAccess, ask: passwords.Ask = passwords.at_terminal) -> str | None:
-    """Return the password of a robot from its source; None if it has none. Raises as `passwords`."""
+    """Return the password of a robot from its source; None if it needs no password. Raises as `passwords`."""
     source = access.password
     if source is None:
         return None
-    find = ask if source == "ask" else passwords.in_keyring
-    return find(access.user or "", access.host or "", name)
+    read_password = ask if source == "ask" else passwords.in_keyring
+    return read_password(access.user or "", access.host or "", name)
 
 
 def open_shell(
@@ -61,15 +64,15 @@ def open_shell(
     notice: Callable[[str], None] = lambda _: None,
     on_air: bool = False,
 ) -> SshShell:
-    """Return the connection to a robot, which is made when it is first used.
+    """Return the connection to a robot, which is opened at its first use.
 
     Args:
         name: Name of the robot.
-        access: How it is reached.
-        password: Its password, if it has one.
-        patience_s: See `SshShell`, as for the others.
-        notice: Receives a line when the connection is lost or back.
-        on_air: Whether it crosses the radio under test.
+        access: Its SSH access data.
+        password: Its password; None if it needs no password.
+        patience_s: As for `SshShell`.
+        notice: Called with a line of text when the connection is lost or restored.
+        on_air: Whether the connection crosses the radio under test.
 
     Raises:
         ConfigurationError: The private key cannot be used, or the host key is not valid.

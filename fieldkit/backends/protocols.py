@@ -1,4 +1,4 @@
-"""Protocols of backends: a source of robots, its robots when they are up, and what a carrier of packets knows."""
+"""Protocols of backends: `Backend` provides robots, `Testbed` is the running robots, `Oracle` a modelled radio."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -30,15 +30,15 @@ from fieldkit.remote.shell import Shell
 
 
 class Robot(Strict):
-    """A robot in a role; the plan of a trial holds it as it is.
+    """A robot in a role, as it is written into the plan of a trial.
 
     Attributes:
         name: Its name in the lab, `turtlebot-1`.
         address: Its IPv4 address on the radio under test.
-        profile: What it is.
-        control: Which way SSH takes to it, as the site file says.
-        ros_master: Address on the radio of the robot whose ROS master it uses; empty where its setup files say which.
-        drives: Whether it drives by itself where a step moves it, by the topic of its profile.
+        profile: Its profile.
+        control: The network that SSH uses to reach it, from the site file.
+        ros_master: Address on the radio of the robot that runs its ROS master; empty if its setup files define it.
+        drives: Whether steps that move it drive it by the velocity topic of its profile.
         flies: Whether a step may fly it.
     """
 
@@ -52,7 +52,7 @@ class Robot(Strict):
 
     @property
     def ros_graph(self) -> str:
-        """What robots have in common that hear each other's topics, in words; empty for one whose are its own."""
+        """Text for the ROS domain or master of its topics; empty if it shares topics with no other robot."""
         ros = self.profile.ros
         if ros is not None and ros.variant == "ros2":
             return f"ROS domain {ros.domain}{' over Zenoh' if ros.middleware == 'zenoh' else ''}"
@@ -60,89 +60,90 @@ class Robot(Strict):
 
     @property
     def ros_environment(self) -> dict[str, str]:
-        """The variables that its ROS programs run with, beside those of its setup files.
+        """Environment variables of its ROS programs, in addition to those of its setup files.
 
-        Where robots share a master they find each other by addresses on the radio: ROS_HOSTNAME comes before ROS_IP,
-        whatever a setup file says of either (wiki.ros.org/ROS/EnvironmentVariables).
+        Robots that share a master find each other by their addresses on the radio. ROS_HOSTNAME overrides ROS_IP,
+        which a setup file may set (wiki.ros.org/ROS/EnvironmentVariables).
         """
-        own = dict(self.profile.ros.environment) if self.profile.ros else {}
+        variables = dict(self.profile.ros.environment) if self.profile.ros else {}
         if not self.ros_master:
-            return own
+            return variables
         master = f"http://{self.ros_master}:{ROS_MASTER_PORT}"
-        return own | {"ROS_MASTER_URI": master, "ROS_HOSTNAME": self.address}
+        return variables | {"ROS_MASTER_URI": master, "ROS_HOSTNAME": self.address}
 
 
 Cast = Mapping[Role, Robot]
 
 
 class Oracle(Protocol):
-    """What is known only to who carries the packets: how late they were, what delayed them, where the robots were."""
+    """Data that only a modelled radio has: lateness and delays of packets, and positions of robots."""
 
     def track(self, since_utc_ns: int) -> Sequence[Whereabouts]:
-        """Return where the robots were from a moment of the laptop's clock on, until now.
+        """Return the positions of the robots from a time of the laptop's clock until now.
 
-        Asked with times that never go back: what was before may be forgotten.
+        `since_utc_ns` must not decrease from call to call, because older positions may be deleted.
 
         Returns:
-            In the order of time. Of each robot, first what held at that moment, with the time since when it did.
+            Positions in the order of time. The first one of each robot is valid at `since_utc_ns`; its time is when
+            the robot arrived there.
         """
         ...
 
     def delays(self, source: Role, destination: Role, protocol: model.Protocol, port: int) -> DelayParts:
-        """Return what the packets from one robot to a port of another were delayed by.
+        """Return the parts of the delay of the packets from one robot to a port of another.
 
         Args:
-            source: Who sends.
-            destination: Who receives.
+            source: The sending robot.
+            destination: The receiving robot.
             protocol: Transport protocol.
-            port: Port of `destination` that they go to, by which they are told from those of other flows.
+            port: Destination port, which distinguishes the flow from others.
 
         Returns:
-            Sums over the packets of this flow, fragments too, that `destination` was given since they were asked
-            for first.
+            Sums over the packets and fragments of this flow that were delivered to `destination` since the first call
+            for this flow.
 
         Raises:
-            LinkError: What carries them did not answer.
+            LinkError: The medium did not answer.
         """
         ...
 
     def lateness(self) -> Lateness:
-        """Return how far the modelled radio fell behind its model, over all packets since the testbed came up.
+        """Return by how much packets were later than the model demands, over all packets since the testbed started.
 
         Raises:
-            LinkError: What carries the packets did not answer.
+            LinkError: The medium did not answer.
         """
         ...
 
     def links(self, *, go_on: bool) -> Mapping[Role, Sequence[LinkSample]]:
-        """Return what the robots' radios told of their links five times a second since this was asked last, and now.
+        """Return the samples of the robots' links since the last call, five per second, and one of now.
 
         Args:
-            go_on: Whether they are to be sampled from now on; they are not before anybody asked.
+            go_on: Whether sampling continues after this call; it starts with the first such call.
 
         Returns:
-            By robot, in the order of time; times are those of the laptop's clock, stations the robots' names.
+            Samples by robot in the order of time. Times are of the laptop's clock; stations are names of robots.
 
         Raises:
-            LinkError: What carries the packets did not answer.
+            LinkError: The medium did not answer.
         """
         ...
 
     def record_air(self, folder: Path | None) -> None:
-        """Write every transmission from now on into `folder`, if the site file asks for it.
+        """Record every transmission from now on in `folder`, if the site file enables this.
 
         Args:
-            folder: Where to; None to write no longer.
+            folder: Destination folder; None stops the recording.
 
         Raises:
-            LinkError: What carries the packets did not answer.
-            OSError: The files cannot be made.
+            LinkError: The medium did not answer.
+            OSError: The files cannot be created.
         """
         ...
 
 
 class Testbed(Protocol):
-    """Robots that are up and reachable, and what can be done to them in every lab."""
+    """Running, reachable robots, with the actions that every backend supports."""
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
@@ -151,19 +152,19 @@ class Testbed(Protocol):
 
     @property
     def oracle(self) -> Oracle | None:
-        """What is known of the packets under way; None where the radio is real. It does not change."""
+        """The data of a modelled radio; None if the radio is real. Constant."""
         ...
 
     @property
     def operator(self) -> Operator:
-        """Who does what it cannot do by itself, and is asked what only a person sees."""
+        """The operator, for actions and observations that need a person."""
         ...
 
     def place(self, placement: Placement) -> Answer:
-        """Bring the robots to their places; returns when they stand there.
+        """Bring the robots to their places; return when they are there.
 
         Returns:
-            What the operator said to it: a note, or to leave this placement for later.
+            The operator's answer: a note, or the decision to postpone this placement.
 
         Raises:
             FieldkitError: They could not be placed.
@@ -171,97 +172,97 @@ class Testbed(Protocol):
         ...
 
     def inject(self, fault: Fault) -> float | None:
-        """Do something to a robot on purpose; returns when the cause is over, which is before the robot has healed.
+        """Cause a fault; return when the cause is over, which is before the robot has recovered.
 
-        The link is up again, the robot has power again, the process has been killed.
+        The cause is over when the link is up again, the robot has power again, or the process has been killed.
 
         Returns:
-            How many seconds the cause lasted, 0 for a reboot or a kill; None where nobody can know.
+            Duration of the cause in seconds, 0 for a reboot or a kill; None if unknown.
 
         Raises:
-            RobotError: It could not be done, for example because no such process runs.
-            LinkError: The robot could not be told to.
+            RobotError: The fault could not be caused, for example because no such process runs.
+            LinkError: The robot could not be reached.
         """
         ...
 
     def moving(self, move: Move) -> AbstractContextManager[None]:
-        """Let a robot move from its place, from when the context is entered.
+        """Return a context in which a robot moves along its path from its place.
 
-        At the end of its way the robot stands. Leaving the context brings it back to its place, also after an error,
-        so that each repeat begins alike.
+        At the end of the path the robot waits. Leaving the context brings it back to its place, also after an error,
+        so that all repeats start from the same place.
 
         Raises:
-            FieldkitError: The robot could not be moved, or not brought back.
+            FieldkitError: The robot could not be moved or brought back.
         """
         ...
 
     def bring_back(self, role: Role, *, by_itself: bool) -> None:
-        """See that a robot that drove by itself stands at its place again.
+        """Bring a robot that drove automatically back to its place.
 
         Args:
-            role: Whose robot.
-            by_itself: Whether it says that it is back.
+            role: Role of the robot.
+            by_itself: Whether the robot reports that it has driven back.
 
         Raises:
-            FieldkitError: It could not be brought.
+            FieldkitError: The robot could not be brought back.
         """
         ...
 
 
 @runtime_checkable
 class Transient(Protocol):
-    """An optional part of a `Testbed`: its robots, and all files on them, end with it."""
+    """Optional capability of a `Testbed` whose robots, with all their files, disappear when it is closed."""
 
     def demand_up(self) -> None:
-        """Return if every process that the robots need runs.
+        """Check that every process that the robots need is running.
 
         Raises:
-            TestbedLostError: One of them has ended, or does not answer any more.
+            TestbedLostError: A process has ended or no longer answers.
         """
         ...
 
 
 @runtime_checkable
 class Attended(Protocol):
-    """An optional part of a `Testbed` whose robots are real: who confirms that robots may move again after a fault.
+    """Optional capability of a `Testbed` with real robots: a person can allow motion again after a fault.
 
-    Without it nobody does, and after a fault nothing moves by itself again.
+    Without it no robot moves automatically again after a fault.
     """
 
     @property
     def operator(self) -> Operator:
-        """Who is asked."""
+        """The operator who confirms."""
         ...
 
     @property
     def allow_motion_after_fault(self) -> bool:
-        """Whether robots may move from where a fault stopped them, as `--allow-motion-after-fault` says."""
+        """Whether robots may move from where a fault stopped them (`--allow-motion-after-fault`)."""
         ...
 
 
 class Backend(Protocol):
-    """A source of robots, made from the lab's site file: `Backend(site, document)`.
+    """A source of robots, created from the lab's site file: `Backend(site, document)`.
 
-    Making it checks the site file and touches nothing else; `ConfigurationError` says what the backend misses there.
+    The constructor only checks the site file; it raises `ConfigurationError` if an entry is missing there.
     """
 
     allow_motion: bool
-    """Whether fieldkit may drive real robots, as `--allow-motion` says; a new backend may not."""
+    """Whether fieldkit may drive real robots (`--allow-motion`); false in a new backend."""
 
     @property
     def by_hand(self) -> bool:
-        """Whether people rig the robots and carry them to their places."""
+        """Whether people set up the robots and carry them to their places."""
         ...
 
     @property
     def lab_bytes(self) -> int:
-        """How many bytes an attempt gets from the testbed itself at most, beside what robots leave."""
+        """Maximum number of bytes that the testbed itself writes per attempt, in addition to the robots' files."""
         ...
 
     def cast(self, topology: Topology) -> Cast:
-        """Return who plays which role, without touching any robot (`--dry-run` uses this alone).
+        """Return the robot in each role without contacting any robot (`--dry-run` uses nothing else).
 
-        Robots with `Robot.drives` are driven by the steps that move them; others `Testbed.moving` moves.
+        Steps drive robots with `Robot.drives` themselves; `Testbed.moving` moves the others.
 
         Raises:
             ConfigurationError: The site file gives no roles for this topology.
@@ -269,38 +270,38 @@ class Backend(Protocol):
         ...
 
     def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> AbstractContextManager[Testbed]:
-        """Bring up the lab of a cast from `cast`; leaving the context takes it down without trace.
+        """Start the testbed of a cast; leaving the context removes it completely.
 
-        Whether every robot can be reached is for `fieldkit.trial.running.preflight` to find out.
+        It need not check that every robot can be reached: `fieldkit.trial.running.preflight` does.
 
         Args:
-            cast: What `cast` returned.
-            seed: Seed of everything random in the lab.
-            sink: Told about phases.
-            operator: Does what a backend cannot do by itself.
+            cast: The result of `cast`.
+            seed: Seed of all random numbers of the lab.
+            sink: Receives the names of phases.
+            operator: Performs actions that need a person.
 
         Raises:
-            ConfigurationError: A right or a program is missing on this machine.
+            ConfigurationError: A permission or a program is missing on this machine.
             LinkError: A robot cannot be reached.
         """
         ...
 
     def standing(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:
-        """Give control connections to the robots of the site file that go on without fieldkit, whatever their roles.
+        """Return a context with control connections to the robots that keep running without fieldkit, in any role.
 
         Args:
-            sink: Told about phases.
+            sink: Receives the names of phases.
 
         Returns:
-            A context that gives the connection of each robot by its name, or why there is none; none at all where
-            robots end with their lab.
+            A context that yields the connection, or the error of the attempt to connect, by name of the robot. The
+            mapping is empty if the robots disappear with their lab.
         """
         ...
 
 
 class BackendFactory(Protocol):
-    """What an entry point of the group `fieldkit.backends` names: usually the backend's class."""
+    """The object of an entry point of the group `fieldkit.backends`, usually the backend's class."""
 
     def __call__(self, site: Site | None, document: Document | None) -> Backend:
-        """Return the backend for a site file, or for no site file."""
+        """Return the backend for a site file, or without one."""
         ...

@@ -16,7 +16,7 @@ def load_backend(name: str, site: Site | None, document: Document | None) -> Bac
     """Return the backend `name` for a site file.
 
     Raises:
-        ConfigurationError: No such backend is installed, it cannot be loaded, or the site file does not give what it
+        ConfigurationError: No such backend is installed, it cannot be loaded, or the site file lacks an entry that it
             needs.
     """
     installed = {point.name: point for point in plugins.points(plugins.BACKENDS)}
@@ -40,7 +40,7 @@ def cast_of(site: Site, document: Document | None, topology: Topology, addresses
         ConfigurationError: The site file has no roles for the topology, or names a profile that does not exist.
     """
     if topology not in site.roles:
-        other = "".join(f", or use --topology {one}" for one in list(site.roles)[:1])
+        other = "".join(f", or use --topology {name}" for name in list(site.roles)[:1])
         raise ConfigurationError(
             f"the site file gives no roles for topology {topology}",
             where=document.where(("roles",)) if document else "",
@@ -51,9 +51,9 @@ def cast_of(site: Site, document: Document | None, topology: Topology, addresses
     master = names.get(site.ros_master) if site.ros_master else None
     if master is not None and not _runs_ros1(profiles[master]):
         raise ConfigurationError(
-            f"ros_master: {master} plays {site.ros_master}, and its profile {profiles[master].name} has no ROS 1",
+            f"ros_master: {master} plays {site.ros_master}, but its profile {profiles[master].name} has no ROS 1",
             where=document.where(("ros_master",)) if document else "",
-            remedy="name the role of a robot that can run roscore, or take the line out",
+            remedy="name the role of a robot that can run roscore, or remove the line",
         )
     return {
         role: Robot(
@@ -72,20 +72,20 @@ def _runs_ros1(profile: RobotProfile) -> bool:
 
 
 def profiles_of(site: Site, document: Document | None, robots: Iterable[str]) -> dict[str, RobotProfile]:
-    """Return the profiles of robots by their names in the site file, each file read once.
+    """Return the profile of each robot by the robot's name; each file is read once.
 
     Args:
         site: The site file.
         document: Its document, for messages with lines.
-        robots: Names.
+        robots: Names of robots in the site file.
 
     Raises:
-        ConfigurationError: A profile is wrong, or does not exist, which is told with the line that names it.
+        ConfigurationError: A profile is invalid or does not exist; the message has the line of the site file.
     """
-    files: dict[str, RobotProfile] = {}
-    found = {}
+    loaded: dict[str, RobotProfile] = {}
+    profiles = {}
     for robot in robots:
         name = site.robots[robot].profile
         with document.naming("robots", robot, "profile") if document else nullcontext():
-            found[robot] = files[name] if name in files else files.setdefault(name, load_profile(name))
-    return found
+            profiles[robot] = loaded[name] if name in loaded else loaded.setdefault(name, load_profile(name))
+    return profiles

@@ -19,10 +19,10 @@ class RobotState:
     Attributes:
         name: Its name.
         profile: Name of its profile.
-        roles: What it plays in trials.
+        roles: Its roles in trials.
         address: Its address on the radio.
-        place_m: Where its antenna is, metres east, north, up.
-        programs: What runs on it; nothing when it has ended.
+        place_m: Position of its antenna, metres east, north, up.
+        programs: Names of the programs that run on it; empty if the robot has terminated.
     """
 
     name: str
@@ -38,8 +38,8 @@ class LabState:
     """State of a lab.
 
     Attributes:
-        pid: Its process.
-        up_s: For how long it has been up.
+        pid: Process id.
+        up_s: Time since it has been up.
         robots: Its robots.
     """
 
@@ -73,22 +73,22 @@ def pack_state(state: LabState) -> bytes:
 
 
 def pack_overview(overview: Overview) -> bytes:
-    """Return a lab from above as JSON."""
+    """Return a plan view of a lab as JSON."""
     return json.dumps(_OVERVIEW.dump(overview)).encode()
 
 
 def pack_destination(destination: Destination) -> str:
-    """Return a destination as JSON in one line, for a request."""
+    """Return a destination as one line of JSON, for a request."""
     return json.dumps(_DESTINATION.dump(destination))
 
 
 def pack_place(place_m: Vector) -> bytes:
-    """Return a place as JSON."""
+    """Return a position as JSON."""
     return json.dumps(_PLACE.dump(_Place(place_m))).encode()
 
 
 def pack_error(error: FieldkitError) -> bytes:
-    """Return an error as JSON, for whoever asked to raise."""
+    """Return an error as JSON, which the client raises."""
     family = type(error).__name__ if type(error).__name__ in _FAMILIES else LinkError.__name__
     return json.dumps(_REFUSAL.dump(_Refusal(family, error.what, error.remedy))).encode()
 
@@ -97,19 +97,19 @@ def state(answer: bytes) -> LabState:
     """Return the state in an answer.
 
     Raises:
-        FieldkitError: The error that it has instead.
-        ValueError: It is no such answer.
+        FieldkitError: The answer is an error.
+        ValueError: The answer is invalid.
     """
     return _STATE.parse(_read(answer))
 
 
 def place_m(answer: bytes) -> Vector:
-    """Return the place in an answer; raises as `state`."""
+    """Return the position in an answer; raises as `state`."""
     return _PLACE.parse(_read(answer)).place_m
 
 
 def overview(answer: bytes) -> Overview:
-    """Return the lab from above in an answer; raises as `state`."""
+    """Return the plan view of the lab in an answer; raises as `state`."""
     return _OVERVIEW.parse(_read(answer))
 
 
@@ -117,14 +117,14 @@ def destination(request: str) -> Destination:
     """Return the destination in a request.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The request is invalid.
     """
     return _DESTINATION.parse(json.loads(request))
 
 
 def _read(answer: bytes) -> object:
-    found = json.loads(answer)
-    if isinstance(found, dict) and "error" in found:
-        refusal = _REFUSAL.parse(found)
+    content = json.loads(answer)
+    if isinstance(content, dict) and "error" in content:
+        refusal = _REFUSAL.parse(content)
         raise _FAMILIES.get(refusal.error, LinkError)(refusal.what, remedy=refusal.remedy)
-    return found
+    return content

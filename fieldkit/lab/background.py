@@ -1,4 +1,4 @@
-"""Go on in the background, once everything is up."""
+"""Move a command to the background once its start-up is complete."""
 
 import os
 import signal
@@ -8,38 +8,39 @@ from pathlib import Path
 from typing import Final
 
 Leave = Callable[[Path], None]
-"""To be called when all is up, with a file for what is said from then on."""
+"""Called when start-up is complete, with the log file for all further output."""
 
 _READY: Final = b"+"
 
 
 def detached(work: Callable[[Leave], int]) -> int:
-    """Run `work` in another process, and return when it is up or has ended.
+    """Run `work` in a child process; return when its start-up is complete or it has exited.
 
-    Until it is up it has this terminal: what it says, and Ctrl-C, are as if it ran here.
+    During start-up the child keeps this terminal: its output is shown here, and it receives Ctrl-C.
 
     Args:
-        work: Gets what to call when it is up, with its log; from then on it has no terminal. Returns its exit code.
+        work: Receives a function that it calls with its log file when start-up is complete; after that call it has no
+            terminal. Returns its exit code.
 
     Returns:
-        0 when it is up, its exit code when it ended before.
+        0 if start-up is complete, the exit code of `work` if it exited before.
     """
     reader, writer = os.pipe()
-    sys.stdout.flush()  # or the other one would write it, too
+    sys.stdout.flush()  # otherwise the child would write the buffered text again
     pid = os.fork()
     if pid == 0:
         os.close(reader)
         code = 1
         try:
             code = work(lambda log: _leave(writer, log))
-        except BaseException:  # noqa: BLE001 (told, as the interpreter tells it; the caller's clean-up is not ours to run)
+        except BaseException:  # noqa: BLE001 (reported as by the interpreter; the parent does its own clean-up)
             sys.excepthook(*sys.exc_info())
         sys.stdout.flush()
         os._exit(code)
     os.close(writer)
     try:
-        with os.fdopen(reader, "rb") as up:
-            if up.read() == _READY:
+        with os.fdopen(reader, "rb") as ready:
+            if ready.read() == _READY:
                 return 0
     except BaseException:
         os.kill(pid, signal.SIGTERM)
@@ -49,15 +50,15 @@ def detached(work: Callable[[Leave], int]) -> int:
 
 
 def _leave(writer: int, log: Path) -> None:
-    """Let go of the terminal and of the caller's directory, and say that all is up."""
+    """Detach from the terminal and the current directory, and notify the parent that start-up is complete."""
     sys.stdout.flush()
     os.setsid()
     os.chdir("/")
-    nothing = os.open(os.devnull, os.O_RDONLY)
-    said = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
-    for source, target in ((nothing, 0), (said, 1), (said, 2)):
+    null = os.open(os.devnull, os.O_RDONLY)
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    for source, target in ((null, 0), (output, 1), (output, 2)):
         os.dup2(source, target)
-    os.close(nothing)
-    os.close(said)
+    os.close(null)
+    os.close(output)
     os.write(writer, _READY)
     os.close(writer)

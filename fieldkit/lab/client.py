@@ -1,4 +1,4 @@
-"""Requests of other commands to the lab of a directory, and its end."""
+"""Client of a lab's process: request its state, move its robots, terminate it."""
 
 import os
 import select
@@ -28,38 +28,38 @@ class NoLabError(ConfigurationError):
 
 
 def state(folder: LabFolder) -> LabState:
-    """Return what the lab is doing.
+    """Return the state of the lab.
 
     Raises:
         NoLabError: No lab is up.
         LinkError: It does not answer.
     """
-    return _ask(folder, "state", answers.state)
+    return _request(folder, "state", answers.state)
 
 
 def overview(folder: LabFolder) -> Overview:
-    """Return the lab from above, as it is now. Errors as `state`."""
-    return _ask(folder, "overview", answers.overview)
+    """Return the current plan view of the lab. Errors as `state`."""
+    return _request(folder, "overview", answers.overview)
 
 
 def move(folder: LabFolder, robot: str, to: Destination) -> Vector:
-    """Put a robot elsewhere and return where its antenna is then. Errors as `state`.
+    """Move a robot instantly and return the new position of its antenna in metres. Errors as `state`.
 
     Raises:
-        ConfigurationError: There is no such robot, or no such place.
+        ConfigurationError: There is no such robot, or the destination is not in the world.
     """
-    return _ask(folder, f"move {robot} {answers.pack_destination(to)}", answers.place_m)
+    return _request(folder, f"move {robot} {answers.pack_destination(to)}", answers.place_m)
 
 
 def end(folder: LabFolder) -> None:
-    """End the lab's process and return when it is gone, its robots with it.
+    """Terminate the lab's process with its robots; return when it has exited.
 
     Raises:
         NoLabError: No lab is up.
-        LinkError: It does not end.
+        LinkError: It does not exit.
     """
     with _connected(folder) as lab:
-        # The kernel says who listens, so that no other process is ever ended in its place.
+        # The kernel reports which process listens on the socket, so that no other process is killed.
         credentials = lab.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
         process = os.pidfd_open(struct.unpack("3i", credentials)[0])
     try:
@@ -69,10 +69,10 @@ def end(folder: LabFolder) -> None:
                 return
     finally:
         os.close(process)
-    raise LinkError("the lab does not end, even when it is killed", remedy="look what holds it: ps axf")
+    raise LinkError("the lab does not exit, not even after SIGKILL", remedy="see what blocks it: ps axf")
 
 
-def _ask(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -> Answer:
+def _request(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -> Answer:
     with _connected(folder) as lab:
         try:
             lab.sendall(f"{request}\n".encode())

@@ -1,6 +1,6 @@
-"""ProxyCommand of ssh: get a stream to a robot from the lab's process, and hand it over to ssh.
+"""ProxyCommand of ssh: obtain a socket to a robot from the lab's process and pass it to ssh.
 
-Usage: connect.py SOCKET ROBOT. It imports nothing of fieldkit, so that it starts at once, wherever ssh is typed.
+Usage: connect.py SOCKET ROBOT. The script does not import fieldkit: it starts quickly, and in any directory.
 """
 
 import socket
@@ -10,17 +10,17 @@ TIMEOUT_S = 20.0
 
 
 def main(path: str, robot: str) -> int:
-    """Send the stream over standard output, a socket of ssh's: `ProxyUseFdpass` in ssh_config(5)."""
+    """Pass the robot's socket to ssh over standard output (`ProxyUseFdpass` in ssh_config(5))."""
     try:
         with socket.socket(socket.AF_UNIX) as lab:
             lab.settimeout(TIMEOUT_S)
             lab.connect(path)
             lab.sendall(f"connect {robot}\n".encode())
-            said, descriptors, _, _ = socket.recv_fds(lab, 4096, 1)
+            message, descriptors, _, _ = socket.recv_fds(lab, 4096, 1)
     except OSError as error:
-        said, descriptors = f"the lab does not answer: {error}; fieldkit lab ps".encode(), []
+        message, descriptors = f"the lab does not answer: {error}; fieldkit lab ps".encode(), []
     if not descriptors:
-        sys.stderr.write(f"{said.decode(errors='replace')}\n")
+        sys.stderr.write(f"{message.decode(errors='replace')}\n")
         return 1
     with socket.socket(fileno=sys.stdout.fileno()) as ssh:
         socket.send_fds(ssh, [b"\0"], descriptors)

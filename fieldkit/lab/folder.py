@@ -1,4 +1,4 @@
-"""The folder of a directory's lab, with what others need to find it: in memory, and closed to other users."""
+"""The runtime folder of a directory's lab: socket, key, ssh configuration and log; in memory, for one user only."""
 
 import hashlib
 import os
@@ -11,10 +11,10 @@ from fieldkit.core import runtime
 
 @dataclass(frozen=True)
 class LabFolder:
-    """The folder of one lab; its path is short, as the name of a Unix socket must be.
+    """The folder of one lab; its path is short because the path of a Unix socket is limited to 107 bytes.
 
     Attributes:
-        path: The folder, which is there while the lab is up.
+        path: The folder, which exists while the lab is up.
     """
 
     path: Path
@@ -26,7 +26,7 @@ class LabFolder:
 
     @property
     def key(self) -> Path:
-        """Private key that logs in on every robot."""
+        """Private key for the login on every robot."""
         return self.path / "key"
 
     @property
@@ -36,38 +36,38 @@ class LabFolder:
 
     @property
     def ssh_config(self) -> Path:
-        """What `ssh -F` takes."""
+        """Configuration file for `ssh -F`."""
         return self.path / "ssh_config"
 
     @property
     def log(self) -> Path:
-        """What the lab's process says in the background."""
+        """Output of the lab's process while it runs in the background."""
         return self.path / "log"
 
     @property
     def claim(self) -> str:
-        """Name that only one process can hold, see `runtime.held`."""
+        """Name of the lock that only one process can hold, see `runtime.held`."""
         return f"lab-{self.path.name}"
 
 
 def of_directory(directory: Path) -> LabFolder:
-    """Return the folder of the lab of a directory; nothing is made.
+    """Return the folder of the lab of a directory, without creating it.
 
     Raises:
-        ConfigurationError: Somebody else owns the place.
+        ConfigurationError: Another user owns the path.
     """
     digest = hashlib.sha256(os.fsencode(directory.resolve())).hexdigest()[:16]
     path = runtime.base_folder() / f"fieldkit-{os.geteuid()}-{digest}"
-    if not _is_own(path):
+    if not _is_private_or_absent(path):
         raise runtime.not_private(path)
     return LabFolder(path)
 
 
 def make(folder: LabFolder) -> None:
-    """Make the folder, closed to other users; what a lab that was killed left there is gone.
+    """Create the folder for this user only, and delete files that a killed lab left there.
 
     Raises:
-        ConfigurationError: Somebody else owns the place.
+        ConfigurationError: Another user owns the path.
     """
     remove(folder)
     try:
@@ -77,12 +77,11 @@ def make(folder: LabFolder) -> None:
 
 
 def remove(folder: LabFolder) -> None:
-    """Remove the folder, if there is one."""
+    """Remove the folder if it exists."""
     shutil.rmtree(folder.path, ignore_errors=True)
 
 
-def _is_own(path: Path) -> bool:
-    """Return whether nobody else can change what lies there, if anything does."""
+def _is_private_or_absent(path: Path) -> bool:
     try:
         return runtime.is_private(path.lstat())
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Protocols of a lab: robots that are up outside of any trial, and a backend that brings up all of a site file."""
+"""Protocols of labs: robots that run without a trial, and a backend that starts all robots of a site file."""
 
 import socket
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,9 +22,9 @@ class LabRobot:
 
     Attributes:
         name: Its name.
-        profile: What it is.
+        profile: Its profile.
         address: Its IPv4 address on the radio.
-        roles: What it plays in trials, as people read it: `sender (master)`.
+        roles: Its roles in trials, as text: `sender (master)`.
     """
 
     name: str
@@ -50,14 +50,14 @@ class Login:
 
 @dataclass(frozen=True)
 class Destination:
-    """Destination of a robot, given by the place of its antenna.
+    """Destination of a robot, as a position of its antenna.
 
     Attributes:
-        east_m: Metres east of the world's corner, or of where the robot is.
-        north_m: Metres north of it.
-        up_m: Height of the antenna in the world, or by how much it rises over the ground; None: the robot stands on
-            the ground, or stays as high over it as it is.
-        relative: Whether the first three are from where the robot is.
+        east_m: Metres east of the world's corner, or of the robot if `relative`.
+        north_m: Metres north of the same point.
+        up_m: Height of the antenna in the world, or change of its height above the ground if `relative`. None keeps
+            the height above the ground if `relative`, and puts the robot on the ground otherwise.
+        relative: Whether the other values are relative to the robot's current position.
     """
 
     east_m: float
@@ -68,11 +68,11 @@ class Destination:
 
 @dataclass(frozen=True)
 class Outline:
-    """An obstacle from above.
+    """Outline of an obstacle in the plan view.
 
     Attributes:
-        material: Of what it is.
-        corners: Its outline.
+        material: Its material.
+        corners: Corners of the polygon.
     """
 
     material: str
@@ -84,9 +84,9 @@ class LabLink:
     """Radio link between two robots of a lab.
 
     Attributes:
-        ends: Their names.
-        snr_db: Signal-to-noise ratio, that of the worse direction.
-        linked: Whether frames arrive at all.
+        ends: Names of the two robots.
+        snr_db: Signal-to-noise ratio of the worse direction.
+        linked: Whether any frames arrive.
         through: Names of the obstacles between them.
     """
 
@@ -98,14 +98,14 @@ class LabLink:
 
 @dataclass(frozen=True)
 class Overview:
-    """A lab from above.
+    """Plan view of a lab.
 
     Attributes:
         world: Name of its world.
         area_m: Its extent, metres east and north from the origin.
-        outlines: What stands in it, what covers others last.
-        robots: Where the robots stand.
-        links: Between any two of them; none where the radio does not depend on places.
+        outlines: Obstacles in drawing order: an obstacle that covers others comes after them.
+        robots: Position of each robot.
+        links: Links between each two robots; empty if the radio does not depend on positions.
     """
 
     world: str
@@ -116,7 +116,7 @@ class Overview:
 
 
 class Lab(Protocol):
-    """Robots that are up."""
+    """The running robots of a lab."""
 
     @property
     def members(self) -> Mapping[str, LabRobot]:
@@ -125,75 +125,76 @@ class Lab(Protocol):
 
     @property
     def login(self) -> Login:
-        """Login on all of them."""
+        """Login on the robots."""
         ...
 
     def connect(self, name: str, timeout_s: float) -> socket.socket:
-        """Return a stream to the SSH server of a robot.
+        """Return a connected socket to the SSH server of a robot.
 
         Raises:
-            OSError: There was none in time.
+            OSError: The connection failed or timed out.
         """
         ...
 
     def programs(self, name: str) -> tuple[str, ...]:
-        """Return the names of the programs that run on a robot, none when it has ended."""
+        """Return the names of the programs that run on a robot; empty if the robot has terminated."""
         ...
 
     def place_m(self, name: str) -> Vector:
-        """Return where a robot's antenna is."""
+        """Return the position of a robot's antenna in metres."""
         ...
 
     def move(self, name: str, to: Destination) -> Vector:
-        """Put a robot elsewhere, at once, and return where its antenna is now.
+        """Move a robot instantly and return the new position of its antenna in metres.
 
         Raises:
-            ConfigurationError: That is no place in the world.
+            ConfigurationError: The destination is not in the world.
             LinkError: The radio does not answer.
         """
         ...
 
     def overview(self) -> Overview:
-        """Return the robots from above, where they are now."""
+        """Return the plan view with the current positions of the robots."""
         ...
 
 
 @runtime_checkable
 class LabBackend(Protocol):
-    """A backend that can bring up all robots of its site file at once, with or without roles."""
+    """A backend that can start all robots of its site file together, with or without roles."""
 
     def open_lab(self, *, seed: int, sink: Sink) -> AbstractContextManager[Lab]:
-        """Bring up every robot, each in the range of the others where the world allows it.
+        """Start every robot, in radio range of the others if the world allows it.
 
         Raises:
-            FieldkitError: A right or a program is missing, or a robot did not come up.
+            FieldkitError: A permission or a program is missing, or a robot did not start.
         """
         ...
 
     def overview(self) -> Overview:
-        """Return what `open_lab` would bring up, from above; nothing is brought up.
+        """Return the plan view of the lab that `open_lab` would start, without starting it.
 
         Raises:
-            ConfigurationError: A profile is missing or wrong.
+            ConfigurationError: A profile is missing or invalid.
         """
         ...
 
 
 def unknown_robot(name: str, names: Iterable[str]) -> ConfigurationError:
-    """Return the error for a robot that a lab does not have, with what was perhaps meant."""
+    """Return the error for a robot that is not in the lab, with the nearest name as a hint."""
     return ConfigurationError(
         f"there is no robot {name!r} in this lab", remedy=nearest(name, names, "fieldkit lab ps lists them")
     )
 
 
 def of(name: str, backend: Backend) -> LabBackend:
-    """Return what brings up the robots of a backend.
+    """Return a backend as a `LabBackend`.
 
     Raises:
-        ConfigurationError: It cannot.
+        ConfigurationError: The backend cannot start robots.
     """
     if not isinstance(backend, LabBackend):
         raise ConfigurationError(
-            f"the backend {name} finds robots, it brings up none", remedy="fieldkit lab up --backend emulated"
+            f"the backend {name} connects to existing robots and cannot start any",
+            remedy="fieldkit lab up --backend emulated",
         )
     return backend

@@ -1,4 +1,4 @@
-"""The lab's process: brings the robots up, answers on its Unix socket, and ends them."""
+"""The lab's process: starts the robots, answers requests on a Unix socket, and stops the robots."""
 
 import os
 import signal
@@ -19,25 +19,25 @@ from fieldkit.lab.folder import LabFolder, make, remove
 from fieldkit.lab.protocol import Lab, LabBackend, unknown_robot
 
 REQUEST_S: Final = 5.0
-"""How long a client may take to say what it wants, and a robot to answer."""
+"""Timeout for a client to send its request, and for a robot to accept a connection."""
 
 _REQUEST_BYTES: Final = 4096
 
 
 def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready: Callable[[Lab], None]) -> None:
-    """Keep the robots of a backend up until SIGINT, SIGTERM or SIGHUP; nothing is left then.
+    """Run the robots of a backend until SIGINT, SIGTERM or SIGHUP, then remove them completely.
 
-    Call it in the main thread, which the robots' lives hang on.
+    Call it in the main thread: the robots are terminated when the thread that started them exits.
 
     Args:
-        folder: The lab's.
-        backend: Brings the robots up.
-        seed: Seed of everything random in the lab.
-        sink: Told about phases.
+        folder: The folder of the lab.
+        backend: Starts the robots.
+        seed: Seed of all random numbers of the lab.
+        sink: Receives the names of phases.
         ready: Called when the robots can be reached.
 
     Raises:
-        ConfigurationError: The directory has a lab already.
+        ConfigurationError: A lab of this directory is already up.
         FieldkitError: As `LabBackend.open_lab`.
     """
     with (
@@ -56,7 +56,7 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready:
 
 @contextmanager
 def _claimed(folder: LabFolder) -> Iterator[None]:
-    """Be the only lab of the directory."""
+    """Hold the lock that allows only one lab per directory."""
     with ExitStack() as stack:
         try:
             stack.enter_context(runtime.held(folder.claim))
@@ -80,46 +80,46 @@ def _listening(folder: LabFolder) -> Iterator[socket.socket]:
 
 @contextmanager
 def _until_signal() -> Iterator[None]:
-    """End the body at the first signal that asks for it; what follows, the clean-up, ends by its own deadlines."""
-    asked = False
+    """Leave the body at the first signal. Later signals are ignored, so that the clean-up is not interrupted."""
+    is_stopping = False
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        if not asked:
-            asked = True
+        nonlocal is_stopping
+        if not is_stopping:
+            is_stopping = True
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
     except KeyboardInterrupt:
         return
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
 def _serve(client: socket.socket, robots: Lab, began_s: float) -> None:
-    """Answer one request; a client that goes away has no answer."""
+    """Answer one request; errors of the connection and invalid requests are ignored."""
     with closing(client):
         client.settimeout(REQUEST_S)
         try:
-            word, _, rest = client.recv(_REQUEST_BYTES).decode().strip().partition(" ")
-            match word:
+            command, _, arguments = client.recv(_REQUEST_BYTES).decode().strip().partition(" ")
+            match command:
                 case "connect":
-                    _hand_over(client, robots, rest)
+                    _pass_socket(client, robots, arguments)
                 case "state":
                     client.sendall(answers.pack_state(_state(robots, time.monotonic() - began_s)))
                 case "overview":
                     client.sendall(answers.pack_overview(robots.overview()))
                 case "move":
-                    client.sendall(_moved(robots, *rest.split(" ", 1)))
+                    client.sendall(_move(robots, *arguments.split(" ", 1)))
         except (OSError, TypeError, ValueError):
             return
 
 
-def _hand_over(client: socket.socket, robots: Lab, name: str) -> None:
-    """Give a client its stream, or say why there is none."""
+def _pass_socket(client: socket.socket, robots: Lab, name: str) -> None:
+    """Pass a client the socket to a robot, or send it the error message."""
     try:
         stream = robots.connect(name, REQUEST_S)
     except KeyError:
@@ -132,8 +132,8 @@ def _hand_over(client: socket.socket, robots: Lab, name: str) -> None:
             socket.send_fds(client, [b"+"], [stream.fileno()])
 
 
-def _moved(robots: Lab, name: str, to: str) -> bytes:
-    """Move a robot; return the answer: where it is now, or what is wrong."""
+def _move(robots: Lab, name: str, to: str) -> bytes:
+    """Move a robot; return the answer, which is its new position or an error."""
     try:
         if name not in robots.members:
             raise unknown_robot(name, robots.members)

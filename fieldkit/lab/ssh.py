@@ -1,4 +1,4 @@
-"""Configuration by which plain ssh, scp, sftp, rsync and Ansible reach the robots of a lab."""
+"""OpenSSH configuration with which ssh, scp, sftp, rsync and Ansible reach the robots of a lab."""
 
 import os
 import shlex
@@ -14,7 +14,7 @@ _CONNECT: Final = Path(__file__).with_name("connect.py")
 
 
 def write(folder: LabFolder, login: Login) -> None:
-    """Write key, host keys and configuration into the lab's folder, which is this user's alone."""
+    """Write key, host keys and configuration into the lab's folder, readable for this user only."""
     hosts = "".join(f"{name} {key}\n" for name, key in login.host_keys.items())
     for path, text in (
         (folder.key, login.private_key),
@@ -27,8 +27,8 @@ def write(folder: LabFolder, login: Login) -> None:
 
 
 def config(folder: LabFolder, user: str, robots: Iterable[str]) -> str:
-    """Return a configuration for `ssh -F`: each robot by its name, with its pinned host key, over no network."""
-    # -I: whatever Python finds in the directory or the environment where ssh is typed is none of its business.
+    """Return a configuration for `ssh -F`: robots by name, with pinned host keys, over Unix sockets."""
+    # -I ignores modules in the current directory and Python's environment variables.
     words = (sys.executable, "-I", str(_CONNECT), str(folder.socket))
     command = shlex.join(words).replace("%", "%%")
     return f"""\

@@ -1,1 +1,1 @@
-"""Kinds of step: one module each, which owns its YAML, commands, needs, files, gates and columns."""
+"""Steps of procedures: their contract (`base`), shared parts, and the kinds of step (`kinds`), one module each."""

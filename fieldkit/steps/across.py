@@ -1,4 +1,4 @@
-"""Flows that run across a fault: inside it, or around it. No step runs beside one."""
+"""Recovery of data flows from faults: a flow inside the step of the fault, or a fault inside the step of the flow."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,24 +19,24 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class SendsFlow(Protocol):
-    """A step that sends payload of which the receiver's evidence shows when it arrived.
+    """A step that sends payload, with evidence of when the payload arrived.
 
     Attributes:
-        flow_kind: What its columns begin with.
+        flow_kind: Prefix of its columns.
     """
 
     flow_kind: ClassVar[str]
 
     @property
     def destination(self) -> Role:
-        """Role of the robot that receives."""
+        """Role of the receiving robot."""
         ...
 
     def deliveries(self, view: View) -> "Sequence[Delivery]":
         """Return the deliveries of each of its streams.
 
         Raises:
-            EvidenceError: The evidence does not show them.
+            EvidenceError: The evidence does not contain them.
         """
         ...
 
@@ -51,57 +51,63 @@ class CausesFault(Protocol):
         ...
 
     def times(self, evidence: AttemptEvidence) -> FaultTimes | None:
-        """Return when it was; None if that was not noted."""
+        """Return the times of the fault; None if they were not recorded."""
         ...
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """A fault, a flow that may run across it, and the steps that the flow is inside, from the fault on."""
+    """A fault, and a flow that may run during it.
+
+    Attributes:
+        fault: The step of the fault.
+        flow: The step of the flow.
+        within: The steps around the flow, from the fault inwards; empty if the fault is inside the flow.
+    """
 
     fault: Step
     flow: Step
     within: tuple[Nest, ...]
 
     def prefixes(self, nest: Nest) -> tuple[str, ...]:
-        """Return the names of both steps, the flow's first; that of `nest` its columns get anyway."""
+        """Return the names of flow and fault without that of `nest`, which is added to its columns later."""
         return tuple(step.prefix for step in (self.flow, self.fault) if step is not nest)
 
 
 def declared(nest: Nest) -> tuple[Column, ...]:
-    """Return the columns of the recoveries that a step knows of, without its own name."""
+    """Return the columns of the recoveries of a step, without the prefix of its name."""
     from fieldkit.measure.transfers import recoveries  # noqa: PLC0415 (numpy, which most commands do not need)
 
-    found: list[Column] = []
+    all_columns: list[Column] = []
     for pair in _pairs(nest):
         if isinstance(pair.flow, SendsFlow) and isinstance(pair.fault, CausesFault):
             columns = recoveries.declared(pair.flow.flow_kind, pair.fault.cause.kind)
             for prefix in pair.prefixes(nest):
                 columns = tuple(named(prefix, column) for column in columns)
-            found += columns
-    return tuple(found)
+            all_columns += columns
+    return tuple(all_columns)
 
 
 def measure(nest: Nest, view: View) -> Measured:
-    """Return the values of `declared`."""
+    """Return the values of the columns of `declared`."""
     from fieldkit.measure.transfers import recoveries  # noqa: PLC0415 (as above)
 
-    found = Measured()
+    measured = Measured()
     for pair in _pairs(nest):
         if isinstance(pair.flow, SendsFlow) and isinstance(pair.fault, CausesFault):
             inside = View(view.scene, view.evidence, (*view.within, *pair.within))
             kind, times = pair.fault.cause.kind, pair.fault.times(view.evidence)
             deliveries = partial(pair.flow.deliveries, inside)
-            own = recoveries.measure(pair.flow.flow_kind, kind, deliveries, times, pair.flow.destination)
+            recovery = recoveries.measure(pair.flow.flow_kind, kind, deliveries, times, pair.flow.destination)
             for prefix in pair.prefixes(nest):
-                own = own.named(prefix)
-            found |= own
-    return found
+                recovery = recovery.named(prefix)
+            measured |= recovery
+    return measured
 
 
 def _pairs(nest: Nest) -> Iterator[_Pair]:
-    """Yield the flows that run across this step, which is a fault, and the faults in it, which is a flow."""
-    inside = [found for entry in nest.during for found in _walk(entry.step, (nest,))]
+    """Yield the pairs of a fault and a flow of which one is `nest` and the other is inside it."""
+    inside = [step_within for entry in nest.during for step_within in _walk(entry.step, (nest,))]
     if isinstance(nest, CausesFault):
         yield from (_Pair(nest, step, within) for step, within in inside if isinstance(step, SendsFlow))
     if isinstance(nest, SendsFlow):
@@ -109,7 +115,7 @@ def _pairs(nest: Nest) -> Iterator[_Pair]:
 
 
 def _walk(step: Step, within: tuple[Nest, ...]) -> Iterator[tuple[Step, tuple[Nest, ...]]]:
-    """Yield a step and those inside it, each with what it is inside."""
+    """Yield a step and all steps inside it, each with the steps around it."""
     yield step, within
     if isinstance(step, Nest):
         for entry in step.during:

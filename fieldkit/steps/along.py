@@ -1,4 +1,4 @@
-"""Steps that can last as long as the way along which a robot moves meanwhile."""
+"""Steps that can take their duration from the motion of a `move` around them (`along: true`)."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -14,44 +14,44 @@ from fieldkit.steps.nest import Nest
 
 
 class AlongStep(Step):
-    """A step that can.
+    """A step that can last as long as the motion around it.
 
     Attributes:
-        lasts_by: The key that says otherwise how long it lasts.
+        duration_key: The key that sets its duration without `along`: `duration` or `count`.
         along: Whether the step lasts as long as the motion of the `move` or `fly` around it, in place of its own
             duration or count.
     """
 
-    lasts_by: ClassVar[str] = "duration"
+    duration_key: ClassVar[str] = "duration"
 
     along: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
-    def _lasts_one_time(self) -> Self:
-        if self.along and self.lasts_by in self.model_fields_set:
-            raise schema.complaint(f"it lasts along a way, or as {self.lasts_by} says; leave one out", self.lasts_by)
+    def _has_one_duration(self) -> Self:
+        if self.along and self.duration_key in self.model_fields_set:
+            raise schema.complaint(
+                f"along and {self.duration_key} exclude each other; leave one out", self.duration_key
+            )
         return self
 
     @schema.model_serializer(mode="wrap")
-    def _written(self, written: schema.SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Write what says how long it lasts, and no default beside `along`."""
-        found: dict[str, Any] = written(self)
-        return {key: value for key, value in found.items() if not (self.along and key == self.lasts_by)}
+    def _serialize(self, serialize: schema.SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit the default of `duration_key` if `along` is set."""
+        fields: dict[str, Any] = serialize(self)
+        return {key: value for key, value in fields.items() if not (self.along and key == self.duration_key)}
 
     @abstractmethod
-    def lasting(self, seconds: float) -> Self:
-        """Return this step with its own key saying that it lasts so long."""
+    def with_duration(self, seconds: float) -> Self:
+        """Return this step with the value of `duration_key` that corresponds to this duration."""
 
     @override
-    def resolved(self, cast: Cast, way_s: float | None = None) -> Self:
-        if not self.along or way_s is None:
+    def resolved(self, cast: Cast, path_s: float | None = None) -> Self:
+        if not self.along or path_s is None:
             return self
-        return self.lasting(way_s).model_copy(update={"along": False})
+        return self.with_duration(path_s).model_copy(update={"along": False})
 
     @override
     def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         if self.along and not any(nest.leads for nest in within):
-            return (
-                f"nothing moves around it, so it lasts along no way; say its {self.lasts_by}, or put it into a move"
-            )
+            return f"along: true needs a move around it; put it into a move, or write {self.duration_key}"
         return None

@@ -1,8 +1,8 @@
 """Variables in the arguments of a program: `{address.ROLE}`, `{distance}`, `{repeat}` and `{put}`.
 
-Programs such as awk, jq and Go templates have braces of their own. So only these names are replaced, `{{distance}}`
-stands for the text `{distance}`, and all other braces stay as they are. `${distance}` is of a shell, and stays.
-A name that is almost one of these is refused, because it is most likely a typing error.
+Programs such as awk, jq and Go templates use braces, too. So only these names are replaced. `{{distance}}` is written
+for the text `{distance}`; all other braces stay unchanged, also `${distance}`, a variable of a shell. A name that
+resembles one of these variables is refused, because it is most likely a typing error.
 """
 
 import difflib
@@ -15,8 +15,8 @@ from fieldkit.core.errors import nearest
 PUT: Final = "put"
 _VALUES: Final = ("distance", "repeat")
 _ADDRESS: Final = "address"
-_SHORTEST: Final = 4
-"""Letters of the beginning of a name that is taken for an abbreviation of it."""
+_MIN_ABBREVIATION: Final = 4
+"""Minimum length of a prefix of a name that counts as an abbreviation of it."""
 
 _NAME: Final = r"address\.[^{}]*|\s*[A-Za-z_][A-Za-z0-9_.-]*\s*"
 _BRACES: Final = re.compile(
@@ -24,18 +24,20 @@ _BRACES: Final = re.compile(
 )
 
 
-def filled(word: str, values: Mapping[str, str], address: Callable[[str], str]) -> str:
-    """Return one argument with its variables filled in; it stays one argument, whatever the values are.
+def fill_in(word: str, values: Mapping[str, str], address: Callable[[str], str]) -> str:
+    """Return an argument in which the variables are replaced by their values.
+
+    The result is one argument, also if a value contains blanks.
 
     Args:
         word: The argument.
-        values: Value by name of a variable; a variable without a value stays as it is.
+        values: Value by name of a variable; a variable without a value is not replaced.
         address: Returns the address of the robot in a role.
     """
 
-    def value(match: re.Match[str]) -> str:
+    def replacement(match: re.Match[str]) -> str:
         if (literal := match["literal"]) is not None:
-            return f"{{{literal}}}" if _is_known(literal) or meant(literal) else match[0]
+            return f"{{{literal}}}" if _is_variable(literal) or suggestion(literal) else match[0]
         name = match["name"]
         if name is None:
             return match[0]
@@ -44,60 +46,61 @@ def filled(word: str, values: Mapping[str, str], address: Callable[[str], str]) 
             return address(role)
         return values.get(name, match[0])
 
-    return _BRACES.sub(value, word)
+    return _BRACES.sub(replacement, word)
 
 
 def names(word: str) -> list[str]:
-    """Return what stands in single braces in an argument, in order, where it could be the name of a variable."""
+    """Return the texts in single braces in an argument that have the form of a variable, in order."""
     return [name for match in _BRACES.finditer(word) if (name := match["name"]) is not None]
 
 
 def roles(word: str) -> list[str]:
-    """Return the roles whose addresses an argument has."""
+    """Return the roles of the variables `{address.ROLE}` in an argument."""
     return [name.partition(".")[2] for name in names(word) if name.startswith(f"{_ADDRESS}.")]
 
 
 def problem(word: str, *, has_program: bool) -> str | None:
-    """Return why an argument cannot be filled in, None where it can.
+    """Return why an argument has an invalid variable; None if all are valid.
 
     Args:
         word: The argument.
-        has_program: Whether a program is copied for it, which `{put}` names.
+        has_program: Whether the step copies a program, so that `{put}` has a value.
     """
     for name in names(word):
         if name == PUT and not has_program:
-            return f"{{put}} is the program that put: copies, and there is no put:; {_escape(name)}"
-        if hint := meant(name):
+            return f"{{put}} is the program copied by put:, and the step has no put:; {_escape(name)}"
+        if hint := suggestion(name):
             return f"there is no variable {{{name}}}; {hint} {_escape(name)}"
     return None
 
 
-def varies(word: str) -> bool:
-    """Return whether an argument depends on the distance or the repeat."""
+def depends_on_repeat(word: str) -> bool:
+    """Return True if an argument depends on the distance or the repeat."""
     return any(name in _VALUES for name in names(word))
 
 
-def meant(name: str) -> str:
-    """Return which variable was probably meant by a name that is none; empty where it is one, or another's braces."""
-    if _is_known(name):
+def suggestion(name: str) -> str:
+    """Return a question with the variable that a misspelled name resembles; empty if `name` is valid or unrelated."""
+    if _is_variable(name):
         return ""
     kind, dot, role = name.strip().lower().partition(".")
     if dot:
         near = nearest(kind, (_ADDRESS,), "")
         return f"did you mean '{{address.{role}}}'?" if near else ""
-    for known in (*_VALUES, PUT):
-        if kind == known or (known != PUT and _is_like(kind, known)):
-            return f"did you mean '{{{known}}}'?"
+    for variable in (*_VALUES, PUT):
+        if kind == variable or (variable != PUT and _resembles(kind, variable)):
+            return f"did you mean '{{{variable}}}'?"
     return ""
 
 
-def _is_known(name: str) -> bool:
+def _is_variable(name: str) -> bool:
     return name in (*_VALUES, PUT) or name.startswith(f"{_ADDRESS}.")
 
 
-def _is_like(name: str, known: str) -> bool:
-    abbreviated = len(name) >= _SHORTEST and known.startswith(name)
-    return abbreviated or name.startswith(known) or bool(difflib.get_close_matches(name, (known,), n=1, cutoff=0.8))
+def _resembles(name: str, variable: str) -> bool:
+    if name.startswith(variable) or (len(name) >= _MIN_ABBREVIATION and variable.startswith(name)):
+        return True
+    return bool(difflib.get_close_matches(name, (variable,), n=1, cutoff=0.8))
 
 
 def _escape(name: str) -> str:

@@ -1,4 +1,4 @@
-"""The contract of a step: data from a procedure that owns all that its kind needs, does and leaves."""
+"""The contract of a step: its YAML keys, jobs, requirements, files, checks and columns."""
 
 from abc import ABC
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,10 +29,11 @@ StepName = Annotated[
     str,
     schema.shaped(r"^[a-z][a-z0-9_]{0,30}$", "a name: small letters, digits and _, a small letter first, 31 in all"),
 ]
+"""Name of a step or a bag."""
 FileName = Annotated[
     str, schema.shaped(r"^[a-z][a-z0-9_.-]{0,40}$", "the name of a file: small letters, digits, _ . and -, 41 in all")
 ]
-"""What a step, and a bag, may be called."""
+"""Name of a file in the folder of an attempt."""
 
 
 class Step(Strict, ABC):
@@ -47,10 +48,10 @@ class Step(Strict, ABC):
     `fieldkit.steps`.
 
     Attributes:
-        columns: What steps of its kind measure.
+        columns: Columns that steps of its kind measure.
         cross_checks: Sources of these columns, and the checks between them.
         kept_bytes: Bytes of each frame that a capture must keep for the step; 0 if headers are enough.
-        capture_buffer_kib: Kernel buffer that a capture needs for the step's packets; 0 if the usual one is enough.
+        capture_buffer_kib: Kernel buffer that a capture needs for the step's packets; 0 if the default is enough.
         needs_complete_capture: Whether packets that a capture dropped make the step's figures wrong. If not, the step
             withholds the columns that depend on captures.
         name: Letters, digits and `_`, a lower-case letter first; distinguishes the step from others of its kind.
@@ -67,30 +68,30 @@ class Step(Strict, ABC):
 
     @property
     def prefix(self) -> str:
-        """The name that jobs, files and columns begin with; empty where they stand for themselves."""
+        """Prefix of the names of its jobs, files and columns; empty if they have none."""
         return self.name
 
     def own_name(self, what: str) -> str:
-        """Return what a job or a file of the step is called: `up.recv.bag`; `recv.bag` of a step without a name."""
+        """Return the name of a job or file of the step: `up.recv.bag`, or `recv.bag` for a step without a name."""
         return prefixed(self.prefix, what)
 
     @classmethod
     def kind_name(cls) -> str:
-        """Return the name of the class in lower case, without `Step`: part of the names of jobs and files."""
+        """Return the class name in lower case without `Step`, a part of names of jobs and files."""
         return cls.__name__.removesuffix("Step").lower()
 
-    # What it does.
+    # Execution.
 
     def jobs(self, scene: Scene) -> Iterator[Planned]:  # noqa: ARG002 (some steps need no robot)
         """Yield every job in the order in which it starts."""
         return iter(())
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """Carry the step out. By default each job starts when the one before has ended with exit code 0.
+        """Carry out the step. By default each job starts when the previous one has exited with code 0.
 
         Raises:
             LinkError: A robot did not answer.
-            RobotError: A robot could not do it.
+            RobotError: A job failed.
         """
         for planned in self.jobs(scene):
             announce(planned.job.name, None)
@@ -101,9 +102,9 @@ class Step(Strict, ABC):
                 raise scene.failure(planned, f"{planned.program} ended with exit code {code}")
 
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        """Start what must be ready before the step begins, as a listener, and return the function that runs the step.
+        """Start processes that must be ready first, such as a listener; return the function that runs the step.
 
-        A capture calls it in a thread while tcpdump starts. Errors as `run`, of both.
+        A capture calls it in a thread while tcpdump starts. Both functions raise the errors of `run`.
         """
         return partial(self.run, scene, testbed)
 
@@ -111,12 +112,12 @@ class Step(Strict, ABC):
         """Yield the jobs of the step itself, without those of the steps inside it."""
         return self.jobs(scene)
 
-    def dry_run_notes(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps are nothing but commands)
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps have no such actions)
         """Yield a line for each action that is not a command on a robot; `--dry-run` prints them."""
         return iter(())
 
-    def abort_notes(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most leave robots where they are)
-        """Yield a sentence about each moving robot: what it does if the attempt is stopped immediately."""
+    def abort_notes(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most move no robot)
+        """Yield a sentence for each moving robot on what it does if the attempt is stopped immediately."""
         return iter(())
 
     def roles(self) -> frozenset[Role]:
@@ -124,30 +125,30 @@ class Step(Strict, ABC):
         return frozenset(role for name in type(self).model_fields for role in _roles_in(getattr(self, name)))
 
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
-        """Return about how many seconds the step takes on a good link."""
+        """Return the approximate duration of the step on a good link, in seconds."""
         return 0.0
 
     def with_record(self, duration_s: float) -> Self:  # noqa: ARG002 (most steps record nothing)
         """Return this step with every recording in it `duration_s` long."""
         return self
 
-    def resolved(self, cast: Cast, way_s: float | None = None) -> Self:  # noqa: ARG002 (most ask nothing of robots)
+    def resolved(self, cast: Cast, path_s: float | None = None) -> Self:  # noqa: ARG002 (most have no such setting)
         """Return this step with each setting that depends on the robots filled in. A plan has resolved steps only.
 
         Args:
             cast: The robot in each role.
-            way_s: Duration of the path of the robot that moves meanwhile; None if no robot moves.
+            path_s: Duration of the path of the robot that moves meanwhile, in seconds; None if no robot moves.
         """
         return self
 
-    def adjustments(self, cast: Cast) -> Iterator[str]:  # noqa: ARG002 (most do what they say, or not at all)
+    def adjustments(self, cast: Cast) -> Iterator[str]:  # noqa: ARG002 (most reduce nothing)
         """Yield a sentence for each setting that `resolved` reduces."""
         return iter(())
 
-    # What it needs.
+    # Requirements.
 
     def listens(self) -> tuple[ListeningPort, ...]:
-        """Return the ports on which robots listen for the step. They identify its packets in a capture."""
+        """Return the listening ports of the step, which identify its packets in a capture."""
         return ()
 
     def restarts(self) -> frozenset[Role]:
@@ -159,47 +160,47 @@ class Step(Strict, ABC):
         return frozenset()
 
     def placement_error(self, earlier: Sequence["Step"], within: Sequence["Nest"]) -> str | None:  # noqa: ARG002 (most fit)
-        """Return why a procedure cannot have the step at its position; None if it can.
+        """Return why the step is not allowed at its position in the procedure; None if it is.
 
         Args:
-            earlier: The steps that begin before it.
+            earlier: The steps that start before it.
             within: The steps around it, the outermost first.
         """
         return None
 
     def asks(self) -> bool:
-        """Return whether the step may ask the operator to do something, so that no other step may run beside it."""
+        """Return True if the step may prompt the operator; then no other step may run at the same time."""
         return False
 
-    def refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (most tools can do what they are for)
-        """Yield what cannot work with the tools that the robots have."""
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (most work with every tool)
+        """Yield the reasons why the step cannot work with the tools of the robots."""
         return iter(())
 
-    def needs(self, scene: Scene) -> Iterator[Need]:  # noqa: ARG002 (most need programs alone)
-        """Yield what the step needs of robots beside the programs of its `jobs`."""
+    def needs(self, scene: Scene) -> Iterator[Need]:  # noqa: ARG002 (most need only programs)
+        """Yield the preflight checks of the step, in addition to the search for the programs of its `jobs`."""
         return iter(())
 
-    def live_topics(self, role: Role) -> tuple[str, ...]:  # noqa: ARG002 (most hear none)
-        """Return the ROS topics that must be alive on the robot in `role`."""
+    def live_topics(self, role: Role) -> tuple[str, ...]:  # noqa: ARG002 (most subscribe to no topic)
+        """Return the ROS topics that must be published on the robot in `role`."""
         return ()
 
-    def bytes_left(self, scene: Scene, role: Role) -> float:  # noqa: ARG002 (a few lines of text are counted for all)
-        """Return about how many bytes the step leaves on the robot in `role`, without text files."""
+    def bytes_left(self, scene: Scene, role: Role) -> float:  # noqa: ARG002 (small text files are estimated elsewhere)
+        """Return the approximate size of its files on the robot in `role`, in bytes, without small text files."""
         return 0.0
 
-    def reserve_bytes(self, scene: Scene, role: Role) -> int:  # noqa: ARG002 (most write until the disk is full)
-        """Return the free bytes that its programs demand on the robot in `role`, beside what they write."""
+    def reserve_bytes(self, scene: Scene, role: Role) -> int:  # noqa: ARG002 (most need no reserve)
+        """Return the free disk space that its programs need on the robot beyond their output, in bytes."""
         return 0
 
-    # What it sends and leaves.
+    # Traffic and files.
 
     def exclusive_resources(self) -> tuple[str, ...]:
-        """Return what no other step with the same `name` may use in a repeat, for messages: `a ping`."""
+        """Return the resources that no other step with the same `name` may use in a repeat, as text: `a ping`."""
         kind = self.kind_name()
         return (f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}",)
 
     def files(self) -> tuple[str, ...]:
-        """Return the names of all files that the step leaves in an attempt's folder, logs too.
+        """Return the names of all files that the step writes into an attempt's folder, including logs.
 
         A bag is listed with and without the suffix `.bag`: the robot's profile determines its actual name, which may
         be that of a folder.
@@ -207,11 +208,11 @@ class Step(Strict, ABC):
         return ()
 
     def laptop_files(self) -> tuple[str, ...]:
-        """Return which of `files` the laptop writes; `fieldkit.core.laptop_files` has their names."""
+        """Return those of `files` that the laptop writes; their names are in `fieldkit.core.laptop_files`."""
         return ()
 
-    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:  # noqa: ARG002 (most make none)
-        """Yield the files that the step makes and that other steps may send."""
+    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:  # noqa: ARG002 (most record nothing)
+        """Yield the recordings of the step, which other steps may send."""
         return iter(())
 
     def records_on(self) -> frozenset[Role]:
@@ -219,24 +220,24 @@ class Step(Strict, ABC):
         return frozenset()
 
     def flows(self, scene: Scene) -> Iterator[Flow]:  # noqa: ARG002 (most send nothing over the radio)
-        """Yield what the step sends over the radio."""
+        """Yield the traffic of the step on the radio."""
         return iter(())
 
-    # What its evidence shows.
+    # Checks and measurements.
 
-    def check(self, view: View) -> Iterator[str]:  # noqa: ARG002 (what it declares is asked for anyway)
-        """Yield each reason why the evidence is incomplete or contradictory: a sentence without a full stop."""
+    def check(self, view: View) -> Iterator[str]:  # noqa: ARG002 (missing values of columns are reported by the gates)
+        """Yield each reason why the evidence is incomplete or contradictory, a sentence without a full stop."""
         return iter(())
 
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns that the step measures."""
         return self.columns
 
-    def measure(self, view: View) -> Measured:  # noqa: ARG002 (most of those that measure nothing)
+    def measure(self, view: View) -> Measured:  # noqa: ARG002 (some measure nothing)
         """Return a value for each of `output_columns`, or the reason why it is missing."""
         return Measured()
 
-    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:  # noqa: ARG002 (not all is worth a word)
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:  # noqa: ARG002 (some have no important figures)
         """Yield the most important figures for the line of a repeat: `IP loss 3.2 %`.
 
         Parts with the word `loss` come first in that line.
@@ -244,7 +245,7 @@ class Step(Strict, ABC):
         return iter(())
 
     def transfer(self, scene: Scene, within: Sequence["Nest"]) -> Transfer | None:  # noqa: ARG002 (most send no file)
-        """Return the file transfer of the step and what identifies its packets; None if it sends no file.
+        """Return the packet filter of the file transfer; None if the step sends no file.
 
         Args:
             scene: The attempt.
@@ -253,7 +254,7 @@ class Step(Strict, ABC):
         return None
 
     def pinging(self) -> Pinging | None:
-        """Return the role and file that contain the step's round-trip times; None if it measures none."""
+        """Return the source of the step's round-trip times; None if it measures none."""
         return None
 
 
@@ -272,22 +273,22 @@ def _roles_in(value: object) -> Iterator[Role]:
 
 @cache
 def step_types() -> Mapping[str, type[Step]]:
-    """Return the class of every kind of step by name, fieldkit's own first.
+    """Return the class of every kind of step by name, built-in kinds first.
 
     Raises:
         ConfigurationError: As `kinds.load`, or an entry point names an object that is not a complete subclass of
             `Step`.
     """
-    found: dict[str, type[Step]] = {}
+    types: dict[str, type[Step]] = {}
     for point, loaded in kinds.load():
         where, remedy = plugins.where(point), plugins.REMEDY
         if not (isinstance(loaded, type) and issubclass(loaded, Step)):
-            raise ConfigurationError("a kind of step is a subclass of Step", where=where, remedy=remedy)
+            raise ConfigurationError("a kind of step must be a subclass of Step", where=where, remedy=remedy)
         if isabstract(loaded):
-            lacking = ", ".join(sorted(loaded.__abstractmethods__))
-            raise ConfigurationError(f"the kind of step lacks {lacking}", where=where, remedy=remedy)
-        found[point.name] = loaded
-    return MappingProxyType(found)
+            missing = ", ".join(sorted(loaded.__abstractmethods__))
+            raise ConfigurationError(f"the kind of step lacks {missing}", where=where, remedy=remedy)
+        types[point.name] = loaded
+    return MappingProxyType(types)
 
 
 @dataclass(frozen=True)

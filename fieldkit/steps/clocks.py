@@ -1,4 +1,4 @@
-"""Ask robots for the time, against the laptop's."""
+"""Time exchanges between the laptop and robots, to estimate clock offsets."""
 
 import time
 
@@ -7,24 +7,24 @@ from fieldkit.measure.offsets import Exchange, parse_date
 from fieldkit.remote.shell import Shell
 
 EXCHANGES = 5
-"""Of so many questions the one that was answered soonest is trusted."""
+"""Number of requests; the exchange with the shortest round trip is used."""
 
 
 def exchanges(shell: Shell, within_s: float) -> list[Exchange]:
-    """Return answers of a robot to the question for the time; none where its `date` tells no time.
+    """Query the time of a robot several times; return an empty list if the output of its `date` is invalid.
 
     Args:
-        shell: The robot.
-        within_s: How long it may take to one.
+        shell: Connection to the robot.
+        within_s: Timeout of each query in seconds.
 
     Raises:
         LinkError: It did not answer.
     """
-    found = []
+    results = []
     for _ in range(EXCHANGES):
         asked_ns = time.time_ns()
-        said = shell.run(("date", "-u", "+%s.%N"), deadline=Deadline.after(within_s), check=False).stdout
+        output = shell.run(("date", "-u", "+%s.%N"), deadline=Deadline.after(within_s), check=False).stdout
         answered_ns = time.time_ns()
-        if (read := parse_date(said.decode("ascii", "replace"))) is not None:
-            found.append(Exchange(asked_ns, read[0], answered_ns, resolution_ns=read[1]))
-    return found
+        if (date := parse_date(output.decode("ascii", "replace"))) is not None:
+            results.append(Exchange(asked_ns, date[0], answered_ns, resolution_ns=date[1]))
+    return results

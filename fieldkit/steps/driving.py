@@ -1,4 +1,4 @@
-"""Drive a robot by its own velocity topic while other steps run: its agent steers, this laptop holds the lease."""
+"""Drive a robot by its velocity topic while other steps run: its agent steers, this laptop renews the lease."""
 
 import json
 import math
@@ -25,43 +25,43 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import lease, streams
-from fieldkit.steps.lease import HeldLease, orders_file
+from fieldkit.steps.lease import LeaseKeeper, orders_file
 from fieldkit.steps.middlewares import Over
 from fieldkit.steps.motions import Mover
 from fieldkit.steps.origins import RobotMotion
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
 
 ODOMETRY_S: Final = 0.5
-"""A robot whose odometry is silent for so long stands."""
+"""The robot stops if it receives no odometry for this time."""
 
 _TURN_S: Final = 12.0
-"""What a turn at a corner may take: half a turn at 0.3 rad/s."""
+"""Maximum duration of a turn at a corner: half a turn at 0.3 rad/s."""
 _SLACK_S: Final = 20.0
 _START_S: Final = 40.0
-"""Starting Python, the middleware, and both topics."""
+"""Time for the start of Python, the middleware and both topics."""
 _RENEWALS: Final = 5
-"""So often a lease is renewed in its time."""
+"""Renewals per lease."""
 _GRACE_S: Final = 3.0
 _SILENT_S: Final = 10.0
 
 _ZENOH_PORT: Final = 7447
-"""Zenoh's own, at which rmw_zenoh's router listens."""
+"""Default port of Zenoh, on which the router of rmw_zenoh listens."""
 
-_NAMED: Final = MappingProxyType(
+_TOPIC_KEYS: Final = MappingProxyType(
     {
         Over.ROS1: ("md5", "definition"),
         Over.DDS: ("members", "dds_topic", "dds_types", "user_data"),
         Over.ZENOH: ("key", "tokens"),
     }
 )
-"""What each middleware wants to know of a topic: command lines are for people, too."""
+"""Keys of a topic description that each middleware needs; others are omitted to keep command lines readable."""
 
 _STATUS: Final = "drive.status"
 _TEXT: Final = "drive.log"
 
 
-def over(robot: Robot) -> Over:
-    """Return the middleware that a robot's base listens to."""
+def middleware_of(robot: Robot) -> Over:
+    """Return the middleware through which a robot's base receives velocities."""
     ros = robot.profile.ros
     if ros is None or ros.variant == "ros1":
         return Over.ROS1
@@ -69,12 +69,12 @@ def over(robot: Robot) -> Over:
 
 
 def limit_s(move: Move) -> float:
-    """Return how long one way of a move may take, in seconds, before the robot stops."""
+    """Return the maximum duration of the path of a move in one direction, in seconds; then the robot stops."""
     return 2 * geometry.length_m(move) / move.speed_m_s + _TURN_S * (len(move.legs) + 1) + _SLACK_S
 
 
-def way_s(robot: Robot, move: Move) -> float:
-    """Return how long a robot takes for one way of a move, with its turns, to the millisecond."""
+def path_duration_s(robot: Robot, move: Move) -> float:
+    """Return the duration of the path of a move in one direction with its turns, in seconds, to the millisecond."""
     return round(drive_plan.way_s(DriveTask.from_json(_task(robot, move))), 3)
 
 
@@ -83,16 +83,16 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
 
     Args:
         scene: The attempt.
-        move: Where it drives, and how fast.
-        inside_s: How long the steps inside may take.
-        name: What names of the step's jobs and files begin with, as `Step.own_name` has it: `{}` stands for the rest.
+        move: Path and speed.
+        inside_s: Maximum duration of the steps inside.
+        name: Pattern of the names of the step's jobs and files, from `Step.own_name`; `{}` is replaced.
     """
     robot = scene.robot(move.role)
     argv = (
         robot.profile.tools.python,
         agent.path_from_job(),
         "drive",
-        _told(scene, move, name),
+        _driver_arguments(scene, move, name),
         name.format(drive_log.FILE),
     )
     setup = streams.setup(robot)
@@ -109,31 +109,31 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
 
 
 def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
-    """Yield why a robot may not drive by itself."""
+    """Yield the reasons why a robot must not drive automatically."""
     robot = scene.robot(move.role)
     limits = robot.profile.limits
     farthest_m = geometry.farthest_m(move.legs)
     if limits.fence_m is not None and farthest_m > limits.fence_m:
         yield Refusal(
             move.role,
-            f"its fence is {limits.fence_m:g} m from its place, and it is to drive {farthest_m:g} m away",
-            "a shorter way in the procedure; limits.fence_m in its profile says it, and the lawn must be as wide",
+            f"its fence is {limits.fence_m:g} m from its place, but its path leads {farthest_m:g} m away",
+            "shorten the path in the procedure, or increase limits.fence_m in its profile if the area allows it",
         )
     if why := disturbed(robot, scene.cast.values()):
-        remedy = "give each its own topics, or ROS domain or master; or let somebody move it: without --allow-motion"
+        remedy = "give each robot its own topics, ROS domain or master; or move it by hand: without --allow-motion"
         yield Refusal(move.role, why, remedy)
 
 
 def files(name: str) -> tuple[str, ...]:
-    """Return the files that a drive leaves; see `planned` for the name."""
-    return tuple(name.format(one) for one in (drive_log.FILE, orders_file("drive"), _STATUS, _TEXT))
+    """Return the files that a drive writes; see `planned` for `name`."""
+    return tuple(name.format(file) for file in (drive_log.FILE, orders_file("drive"), _STATUS, _TEXT))
 
 
 def _drive(robot: Robot) -> Drive:
-    """Return how a robot is driven.
+    """Return the section `drive` of a robot's profile.
 
     Raises:
-        RobotError: Its profile does not say.
+        RobotError: The profile has no such section.
     """
     if robot.profile.drive is None:
         raise RobotError(
@@ -143,7 +143,7 @@ def _drive(robot: Robot) -> Drive:
 
 
 def _origin(scene: Scene, move: Move) -> dict[str, Any]:
-    """Return what of a task depends on the place of the robot in this trial."""
+    """Return the keys of a drive task that depend on the origin of the robot in this trial."""
     origin, last = scene.origins.get(move.role), scene.origins.last(move.role)
     if origin is None or not scene.origins.kept:
         return {}
@@ -154,41 +154,47 @@ def _origin(scene: Scene, move: Move) -> dict[str, Any]:
 
 
 def _task(robot: Robot, move: Move) -> dict[str, Any]:
-    """Return what a robot is to drive, as `fieldkit.agent.steering.DriveTask` has it."""
+    """Return the fields of a `fieldkit.agent.drive_plan.DriveTask`."""
     drive = _drive(robot)
     return {
         "legs": [(leg.away_m, leg.left_m) for leg in move.legs],
         "speed_m_s": move.speed_m_s,
         "turn_rad_s": drive.turn_rad_s,
         "acceleration_m_s2": drive.acceleration_m_s2,
-        "fence_m": robot.profile.limits.fence_m,  # of which a profile that drives has one
+        "fence_m": robot.profile.limits.fence_m,  # required in a profile with `drive`
         "lease_s": drive.lease,
         "odometry_s": ODOMETRY_S,
         "limit_s": limit_s(move),
     }
 
 
-def _told(scene: Scene, move: Move, name: str) -> str:
-    """Return the argument of the driver, as JSON."""
-    from fieldkit.ros import topics, types  # noqa: PLC0415 (50 ms, and only a robot that drives needs it)
+def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
+    """Return the argument of the driver program, as JSON."""
+    from fieldkit.ros import topics, types  # noqa: PLC0415 (takes 50 ms and is needed only here)
     from fieldkit.ros.qos import PROFILES  # noqa: PLC0415
 
     robot = scene.robot(move.role)
     drive = _drive(robot)
-    way, ros = over(robot), robot.profile.ros
-    known = types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.shipped()
-    network = _network(robot, way) | {"gid_bytes": known.distribution.gid_bytes}
+    middleware, ros = middleware_of(robot), robot.profile.ros
+    message_types = types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.shipped()
+    network = _network(robot, middleware) | {"gid_bytes": message_types.distribution.gid_bytes}
 
-    def topic(called: str, kind: str, profile: str, number: int) -> dict[str, Any]:
+    def topic(topic_name: str, kind: str, profile: str, number: int) -> dict[str, Any]:
         described = topics.describe(
-            known, called, kind, PROFILES[profile], domain=network["domain"], node=network["node"], number=number
+            message_types,
+            topic_name,
+            kind,
+            PROFILES[profile],
+            domain=network["domain"],
+            node=network["node"],
+            number=number,
         )
-        return {key: described[key] for key in ("name", "type", "quality", *_NAMED[way])}
+        return {key: described[key] for key in ("name", "type", "quality", *_TOPIC_KEYS[middleware])}
 
-    told = {
-        "over": way.value,
+    arguments = {
+        "over": middleware.value,
         "network": network,
-        "cdr": way is not Over.ROS1,
+        "cdr": middleware is not Over.ROS1,
         "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default", 1),
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
         "task": {**_task(robot, move), **_origin(scene, move)},
@@ -196,57 +202,60 @@ def _told(scene: Scene, move: Move, name: str) -> str:
         "status": name.format(_STATUS),
         "stationary": jobs.stationary_file(name.format("drive")),
     }
-    return streams.compact(told)
+    return streams.compact(arguments)
 
 
-def _network(robot: Robot, way: Over) -> dict[str, Any]:
-    """Return how the driver finds the nodes of its own robot, also where nobody hears multicast."""
-    found = {
+def _network(robot: Robot, middleware: Over) -> dict[str, Any]:
+    """Return the settings with which the driver discovers the nodes of its robot without multicast."""
+    network = {
         "address": robot.address,
         "domain": robot.profile.ros.domain if robot.profile.ros else 0,
         "node": f"fieldkit_drive_{robot.name}".replace("-", "_"),
     }
-    if way is not Over.ZENOH:
-        return found | {"peers": [robot.address]}
-    # rmw_zenoh's router on the robot tells it of all sessions there; a session may be where a router would be.
-    near = [f"tcp/{address}:{_ZENOH_PORT}" for address in ("127.0.0.1", robot.address)]
-    own = {"connect/endpoints": streams.compact(near), "listen/endpoints": f'["tcp/{robot.address}:0"]'}
-    return found | {"settings": own}
+    if middleware is not Over.ZENOH:
+        return network | {"peers": [robot.address]}
+    # The router of rmw_zenoh on the robot announces all sessions there. A session without a router may use its port.
+    endpoints = [f"tcp/{address}:{_ZENOH_PORT}" for address in ("127.0.0.1", robot.address)]
+    settings = {"connect/endpoints": streams.compact(endpoints), "listen/endpoints": f'["tcp/{robot.address}:0"]'}
+    return network | {"settings": settings}
 
 
-class DriveLease(HeldLease):
-    """Holds the program that drives a robot, which waits at first.
+class DriveLease(LeaseKeeper):
+    """Keeps the lease of the program that drives a robot. The first order is to wait.
 
     Args:
-        shell: The robot.
-        job: The program, which runs.
+        shell: Connection to the robot.
+        job: The running program.
         name: See `planned`.
-        lease_s: The robot stops where it was not renewed for so long.
+        lease_s: The robot stops if the lease is not renewed for this time.
     """
 
     def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
         super().__init__(
-            shell, job, says=name.format(_STATUS), order=drive_plan.WAIT, lease_s=lease_s, renewals=_RENEWALS
+            shell, job, output_file=name.format(_STATUS), order=drive_plan.WAIT, lease_s=lease_s, renewals=_RENEWALS
         )
 
     def turn_back(self) -> None:
-        """Want the robot at its place again; where it does not hear of it now, it does with a renewal, or stops."""
+        """Order the robot back to its place.
+
+        If the order is lost, the next renewal repeats it; without renewals the robot stops.
+        """
         with suppress(LinkError, RobotError):
-            self.order(drive_plan.BACK)
+            self.give_order(drive_plan.BACK)
 
     @property
     def is_ready(self) -> bool:
-        """Whether the robot is stationary, and where it must be to start."""
+        """Whether the robot is stationary at its start position."""
         return self.status.get("ready") is True
 
     @property
     def is_refused(self) -> bool:
-        """Whether the robot did not start because it is not where it must be."""
+        """Whether the robot refused to start because it is not at its start position."""
         return self.status.get("refused") is True
 
     @property
     def pose(self) -> MotionOrigin | None:
-        """Where the robot was when it reported last, in the frame of its odometry; None if it did not report that."""
+        """The last reported pose of the robot in the frame of its odometry; None if there is no valid report."""
         status = self.status
         try:
             x_m, y_m, yaw_rad = map(float, status["pose"])
@@ -259,130 +268,133 @@ class DriveLease(HeldLease):
 
     @property
     def status(self) -> dict[str, Any]:
-        """What the program said last of how far the robot is; empty before that."""
-        return _read(self.said)
+        """The last status of the program; empty before the first one."""
+        return _parse_status(self.said)
 
     @property
     def why(self) -> str:
-        """Why the robot is at its end, `home` where it is back; empty while it is not.
+        """Why the drive has ended, `home` if the robot is back at its place; empty while it drives.
 
-        A driver writes its status ten times a second: one that does not has ended, or is out of reach.
+        The driver writes its status ten times a second. A driver without a new status has exited or is out of reach.
         """
         status, silent_s = self.status, self.unchanged_s
         if isinstance(ended := status.get("ended"), str) and ended:
             return brief(ended)
         if silent_s > (_SILENT_S if status else _START_S):
-            return f"nothing was heard of its driver for {silent_s:.0f} s"
-        return super().over
+            return f"its driver sent no status for {silent_s:.0f} s"
+        return super().end_reason
 
     @property
     @override
-    def over(self) -> str:
-        return "" if self.why in {"", drive_log.HOME} else f"it stopped on its way: {self.why}"
+    def end_reason(self) -> str:
+        return "" if self.why in {"", drive_log.HOME} else f"it stopped on its path: {self.why}"
 
     def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
-        """Wait until something holds, or the deadline has passed."""
+        """Wait until a condition holds or the deadline has passed."""
         while not condition() and not deadline.expired:
             self.pause()
-            # Where the link is gone the robot stops by itself, and its driver says why; the link may come back.
+            # Without the link the robot stops automatically and its driver reports why; the link may be restored.
             with suppress(LinkError, RobotError):
-                self.look()
+                self.renew()
 
 
-def _read(said: bytes) -> dict[str, Any]:
-    """Return what a driver wrote of itself; nothing where it is not whole."""
+def _parse_status(text: bytes) -> dict[str, Any]:
+    """Return the status that a driver wrote; empty if it is incomplete."""
     try:
-        found = json.loads(said)
+        status = json.loads(text)
     except JSON_ERRORS:
         return {}
-    return found if isinstance(found, dict) else {}
+    return status if isinstance(status, dict) else {}
 
 
 @contextmanager
 def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str) -> Iterator[DriveLease]:
-    """Let a robot drive while the body runs, which is given its lease, and come back to its place afterwards.
+    """Drive a robot along its path while the body runs, and back to its place afterwards; yield its lease.
 
-    Whatever ends the body but an interruption, the robot drives back; one that cannot is brought by the operator.
-    One that is interrupted stands where it is.
+    After an error in the body the robot drives back, too; if it cannot, the operator brings it back. After an
+    interruption (Ctrl-C) the robot stops where it is.
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: It could not be driven, or stopped by itself before the body had ended.
-        MotionHeldError: It is not where it must be to start, or robots may not move before a person confirms it.
+        RobotError: It could not be driven, or stopped before the body had ended.
+        MotionHeldError: It is not at its start position, or a person must confirm before robots may move again.
         OSError: The journal of motions cannot be written; the robot does not start.
     """
     shell, robot = testbed.shells[move.role], scene.robot(move.role)
     lease_s = robot.profile.drive.lease if robot.profile.drive else 0.0
-    mover = Mover(robot.name, shell, scene.folder, f"it stops by itself within {lease_s:g} s")
-    held = DriveLease(shell, plan.job, name, lease_s)
-    with scene.motions.moving(mover), lease.started(shell, plan.job), held, ExitStack() as stack:
+    mover = Mover(robot.name, shell, scene.folder, f"it stops automatically within {lease_s:g} s")
+    drive_lease = DriveLease(shell, plan.job, name, lease_s)
+    with scene.motions.moving(mover), lease.start_program(shell, plan.job), drive_lease, ExitStack() as stack:
         try:
-            _commit(scene, held, move)
+            _commit(scene, drive_lease, move)
             motion = stack.enter_context(scene.origins.moving(move.role))
         except BaseException:
             _end(shell, plan.job)
             raise
-        yield from _moving(scene, testbed, shell, plan.job, held, move, motion)
+        yield from _out_and_back(scene, testbed, shell, plan.job, drive_lease, move, motion)
 
 
-def _commit(scene: Scene, held: DriveLease, move: Move) -> None:
+def _commit(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
     """Wait until a robot is stationary at its place, and record its origin before its first start there."""
-    held.wait(lambda: held.is_ready or held.why, Deadline.after(_START_S))
-    if held.is_refused:
-        scene.origins.refuse(move.role, held.why)
+    drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.why, Deadline.after(_START_S))
+    if drive_lease.is_refused:
+        scene.origins.refuse(move.role, drive_lease.why)
         raise MotionHeldError(
-            f"it does not start: {held.why}",
+            f"it does not start: {drive_lease.why}",
             where=scene.robot(move.role).name,
-            remedy="put it at its place, facing as in the beginning, then resume without --yes and confirm it",
+            remedy="put it at its place with its initial direction, then resume without --yes and confirm it",
         )
-    held.demand()
-    if not held.is_ready:
-        raise held.failure(f"it was not stationary for {_START_S:g} s")
+    drive_lease.check_running()
+    if not drive_lease.is_ready:
+        raise drive_lease.failure(f"it was not stationary for {_START_S:g} s")
     if scene.origins.kept and scene.origins.get(move.role) is None:
-        pose = held.pose
+        pose = drive_lease.pose
         if pose is None:
-            raise held.failure("its driver does not report where it is")
+            raise drive_lease.failure("its driver does not report its position")
         scene.origins.record(move.role, pose)
 
 
-def _moving(  # noqa: PLR0917 (the parts of one motion)
-    scene: Scene, testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move: Move, motion: RobotMotion
+def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
+    scene: Scene, testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, motion: RobotMotion
 ) -> Iterator[DriveLease]:
-    """Let a robot drive while the body runs, and back; see `driven`."""
+    """Drive a robot out while the body runs, and back; see `driven`."""
 
     def bring_back() -> str:
-        came = _bring_back(testbed, shell, job, held, move, by_hand=not scene.origins.kept)
-        if came == drive_log.HOME:
-            motion.ended(held.pose)
-        elif held.status.get("ended"):
-            motion.at = held.pose
-        return came
+        why_ended = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not scene.origins.kept)
+        if why_ended == drive_log.HOME:
+            motion.ended(drive_lease.pose)
+        elif drive_lease.status.get("ended"):
+            motion.at = drive_lease.pose
+        return why_ended
 
     try:
-        with suppress(LinkError, RobotError):  # it is given again with each renewal
-            held.order(drive_plan.OUT)
-        yield held
+        with suppress(LinkError, RobotError):  # each renewal repeats the order
+            drive_lease.give_order(drive_plan.OUT)
+        yield drive_lease
     except Exception:
         bring_back()
         raise
     except BaseException:
         _end(shell, job)
         raise
-    early = held.over
-    came = bring_back()
-    if early or came != drive_log.HOME:
-        raise held.failure(early or held.over or "it stopped on its way: it is not back in time")
+    early_end = drive_lease.end_reason
+    why_ended = bring_back()
+    if early_end or why_ended != drive_log.HOME:
+        reason = early_end or drive_lease.end_reason or "it stopped on its path: it was not back in time"
+        raise drive_lease.failure(reason)
 
 
-def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move: Move, *, by_hand: bool) -> str:
-    """Let a robot drive back, or be brought; return `DriveLease.why`.
+def _bring_back(
+    testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, by_hand: bool
+) -> str:
+    """Let a robot drive back; if it fails and `by_hand` is set, let the operator bring it. Return `DriveLease.why`.
 
-    With `by_hand` false a robot that did not come back stays where it is: before robots move again a person is asked
-    to put it at its place (`fieldkit.trial.running.motion_leave`).
+    Without `by_hand` a robot that did not come back stays where it is: before robots move again, a person is asked to
+    put it at its place (`fieldkit.trial.running.motion_leave`).
     """
-    held.turn_back()
-    held.wait(lambda: held.why, Deadline.after(_START_S + limit_s(move)))
-    why = held.why
+    drive_lease.turn_back()
+    drive_lease.wait(lambda: drive_lease.why, Deadline.after(_START_S + limit_s(move)))
+    why = drive_lease.why
     _end(shell, job)
     if by_hand or why == drive_log.HOME:
         testbed.bring_back(move.role, by_itself=why == drive_log.HOME)
@@ -390,6 +402,6 @@ def _bring_back(testbed: Testbed, shell: Shell, job: Job, held: DriveLease, move
 
 
 def _end(shell: Shell, job: Job) -> None:
-    """End the driver, which lets the robot stand; where the link is gone it does that by itself."""
+    """Stop the driver, which stops the robot; without the link, the robot stops when its lease expires."""
     with suppress(FieldkitError):
         jobs.stop(shell, job, grace_s=_GRACE_S)

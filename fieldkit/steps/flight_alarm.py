@@ -1,4 +1,4 @@
-"""The alarm of a flight that ends without a landing: what is known of the drone, and what a person can do."""
+"""The alarm of a flight that ends without a landing: last known state of the drone, and the required action."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -9,72 +9,72 @@ from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.text import JSON_ERRORS, brief
 from fieldkit.remote import jobs
 from fieldkit.steps.flight_rescue import MANUAL_ACTION, FlightRescue
-from fieldkit.steps.piloting import Leash
+from fieldkit.steps.piloting import FlightLease
 from fieldkit.steps.scene import Announce, Planned
 
 
 @contextmanager
 def alarmed(
-    leash: Leash, guard: Planned, rescue: FlightRescue, log: str, announce: Announce, *, lands_s: float
+    flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, announce: Announce, *, lands_s: float
 ) -> Iterator[None]:
-    """Where the body fails, wait for the landing; report in capitals where the drone may still be in the air.
+    """If the body fails, wait for the landing; raise an alarm if the drone may still be in the air.
 
-    Only a failure of the robot is waited for: it does not delay Ctrl-C, and not a lost link.
+    It waits only after a `RobotError`, so that Ctrl-C and a lost link are not delayed.
 
     Args:
-        leash: Of the pilot.
-        guard: The job of the guard.
-        rescue: Of the same flight; it lasts longer than this.
-        log: The file of the drone's positions.
-        announce: Told the alarm.
-        lands_s: How long a landing takes at most.
+        flight: Lease of the pilot.
+        guard: Job of the guard.
+        rescue: Rescue of the same flight; must be active until this context is left.
+        log: File of the drone's positions.
+        announce: Receives the alarm.
+        lands_s: Maximum duration of a landing.
     """
     try:
         yield
     except BaseException as error:
-        if text := _alarm(leash, guard, rescue, log, lands_s if isinstance(error, RobotError) else 0.0):
+        if text := _alarm(flight, guard, rescue, log, lands_s if isinstance(error, RobotError) else 0.0):
             announce(text, None)
             if isinstance(error, FieldkitError):
                 error.what, error.remedy = f"{error.what}. {text}", f"{MANUAL_ACTION}; then {error.remedy}"
         raise
 
 
-def _alarm(leash: Leash, guard: Planned, rescue: FlightRescue, log: str, within_s: float) -> str:
-    """Return the alarm; empty if the drone is not in the air, or lands in this time.
+def _alarm(flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, within_s: float) -> str:
+    """Return the alarm; empty if the drone is on the ground or lands in this time.
 
-    If nothing lands a drone any more, that is reported without a wait: its pilot and its guard have both ended, and
-    there is no rescue, or that has ended, too.
+    It does not wait if no program can land the drone any more: its pilot and its guard have exited, and there is no
+    rescue or the rescue has exited, too.
     """
     deadline = Deadline.after(within_s)
     names = (log, guard.job.log, rescue.job.log, jobs.exit_file(guard.job), jobs.exit_file(rescue.job))
     tails: list[list[str]] = [[]] * len(names)
-    while leash.is_aloft:
+    while flight.is_aloft:
         with suppress(FieldkitError):
-            leash.refresh()
-            tails = leash.tails(names)
+            flight.refresh()
+            tails = flight.tails(names)
         _, guard_lines, rescue_lines, guard_code, rescue_code = tails
         if any(line.endswith(" landed") for line in (*guard_lines, *rescue_lines)):
             return ""
-        gave_up = any("ALARM:" in line for line in (*guard_lines, *rescue_lines, *leash.last_lines))
-        ended = leash.code and guard_code and (rescue_code or not rescue.may_land)
+        gave_up = any("ALARM:" in line for line in (*guard_lines, *rescue_lines, *flight.last_lines))
+        ended = flight.exit_code and guard_code and (rescue_code or not rescue.may_land)
         if deadline.expired or gave_up or ended:
             break
-        leash.pause()
-    if not leash.is_aloft:
+        flight.pause()
+    if not flight.is_aloft:
         return ""
     places, guard_lines, rescue_lines, *_ = tails
-    pilot_line = leash.last_lines[-1] if leash.last_lines else "none"
+    pilot_line = flight.last_lines[-1] if flight.last_lines else "none"
     guard_line, rescue_line = (
         brief(lines[-1].partition(" ")[2]) if lines else "none" for lines in (guard_lines, rescue_lines)
     )
     return (
-        f"ALARM: {leash.robot} MAY STILL BE IN THE AIR. LAST KNOWN: {_state(places)}. {MANUAL_ACTION}. "
+        f"ALARM: {flight.robot} MAY STILL BE IN THE AIR. LAST KNOWN: {_state(places)}. {MANUAL_ACTION}. "
         f"Last line of its pilot: {pilot_line}; of its guard: {guard_line}; of its rescue: {rescue_line}"
     )
 
 
 def _state(lines: Sequence[str]) -> str:
-    """Return the last known state of a drone in words, by lines of the file of its positions, which are untrusted."""
+    """Return the last known state of a drone as text, from the last lines of its position file (untrusted)."""
     for line in reversed(lines):
         with suppress(*JSON_ERRORS):
             values = json.loads(line)

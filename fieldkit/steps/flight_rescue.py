@@ -1,7 +1,7 @@
-"""The rescue of a drone from the laptop: lands it where its pilot and its guard are both ended or suspended.
+"""The rescue of a drone from the laptop: lands it if its pilot and its guard have both exited or are suspended.
 
-The pilot and the guard watch each other. This watches both: their counters in the file that they share. It looks
-several times a second, so it is used only where the control connection does not cross the radio under test.
+The pilot and the guard monitor each other. The rescue monitors both by the counters in the file that they share. It
+polls several times a second, so it is used only if the control connection does not cross the radio under test.
 """
 
 import threading
@@ -19,50 +19,50 @@ from fieldkit.remote.shell import Shell
 MANUAL_ACTION: Final = "TAKE IT OVER BY REMOTE CONTROL, OR COMMAND LAND OR RTL AT THE GROUND STATION"
 
 SILENT_S: Final = 0.6
-"""Programs whose counters do not change for this time, by the robot's clock, do not run; they count ten a second."""
-_LOOKS_S: Final = 0.15
-_MOST_S: Final = 0.4
-"""Two looks count for at most this time: a robot that slept meanwhile is not one whose programs do not run."""
+"""Programs whose counters do not change for this time of the robot's clock do not run; they count ten a second."""
+_POLL_S: Final = 0.15
+_MAX_STEP_S: Final = 0.4
+"""Maximum time that counts between two polls: after a suspension of the robot its programs still run."""
 
 
 class LifeSigns:
-    """Counters of a pilot and its guard, from one look to the next."""
+    """Detects from the counters of a pilot and its guard that neither of them runs."""
 
     def __init__(self) -> None:
         self._turns: tuple[int, int] | None = None
-        self._looked_s = self._silent_s = 0.0
+        self._polled_s = self._silent_s = 0.0
 
-    def take(self, look: bytes) -> bool:
-        """Take a look; return whether a drone in flight has neither of them.
+    def update(self, sample: bytes) -> bool:
+        """Evaluate a sample; return True if a drone is in flight and neither program runs.
 
         Args:
-            look: The file of liveness, then /proc/uptime; anything else is no look.
+            sample: The liveness file followed by /proc/uptime; other data is ignored.
         """
         try:
-            programs = entries(look[:SIZE])
-            now_s = float(look[SIZE:].split()[0])
+            programs = entries(sample[:SIZE])
+            now_s = float(sample[SIZE:].split()[0])
         except (ValueError, IndexError):
             return False
         turns = programs[PILOT].turns, programs[GUARD].turns
-        passed_s, self._looked_s = min(now_s - self._looked_s, _MOST_S), now_s
-        self._silent_s = self._silent_s + passed_s if turns == self._turns else 0.0
+        elapsed_s, self._polled_s = min(now_s - self._polled_s, _MAX_STEP_S), now_s
+        self._silent_s = self._silent_s + elapsed_s if turns == self._turns else 0.0
         self._turns = turns
         flies = programs[PILOT].state in {FLYING, LANDING} or programs[GUARD].state == LANDING
         return flies and self._silent_s >= SILENT_S
 
 
 class FlightRescue:
-    """Watches the pilot and the guard of a drone in flight, and starts the rescue once; use as a context manager.
+    """Monitors the pilot and the guard of a drone in flight, and starts the rescue once; use as a context manager.
 
     Args:
-        shell: The robot.
-        job: The rescue.
+        shell: Connection to the robot.
+        job: The job of the rescue.
         liveness: The file that pilot and guard share, in the folder of the job.
         alarm: Called with the alarm, from another thread.
-        sends: Whether the control connection may be used meanwhile; otherwise nothing is watched.
+        sends: Whether the control connection may be used during the flight; otherwise nothing is monitored.
 
     Attributes:
-        job: The rescue.
+        job: The job of the rescue.
         failure: Why the rescue could not be started; empty otherwise.
     """
 
@@ -88,25 +88,25 @@ class FlightRescue:
 
     @property
     def may_land(self) -> bool:
-        """Whether it watches, or has started the rescue."""
+        """Whether the rescue can still land the drone: it monitors, or has started the job."""
         return self._sends and not self.failure
 
     def _watch(self) -> None:
         signs = LifeSigns()
-        while not self._left.wait(_LOOKS_S):
+        while not self._left.wait(_POLL_S):
             try:
-                look = motion.life_signs(self._shell, self._file, Deadline.after(jobs.REPLY_S))
-            except FieldkitError:  # the link may come back
+                sample = motion.life_signs(self._shell, self._file, Deadline.after(jobs.REPLY_S))
+            except FieldkitError:  # the link may be restored
                 continue
-            if signs.take(look):
+            if signs.update(sample):
                 self._start()
                 return
 
     def _start(self) -> None:
-        """Start the rescue; a terminal that does not take the alarm does not delay it."""
+        """Start the rescue. The alarm is sent from a thread, so that a blocked terminal does not delay the rescue."""
         robot = self._shell.robot
-        lost = f"ALARM: THE PILOT AND THE GUARD OF {robot} DO NOT RUN. FIELDKIT LANDS IT. IF IT DOES NOT DESCEND: "
-        alarm = threading.Thread(target=self._alarm, args=(lost + MANUAL_ACTION,), name="alarm", daemon=True)
+        message = f"ALARM: THE PILOT AND THE GUARD OF {robot} DO NOT RUN. FIELDKIT LANDS IT. IF IT DOES NOT DESCEND: "
+        alarm = threading.Thread(target=self._alarm, args=(message + MANUAL_ACTION,), name="alarm", daemon=True)
         alarm.start()
         try:
             jobs.start(self._shell, self.job)

@@ -1,7 +1,8 @@
-"""A lease on what a robot does: a program on it follows an order for only as long as this laptop renews it.
+"""Leases of robot programs: a program on a robot follows an order only while this laptop renews it.
 
-If this process is killed, or the control link is cut for longer than the lease, the order lapses; the program defines
-what the robot does then (`fieldkit.agent.orders`). While one runs, its robot counts as moving (`steps.motions`).
+If this process is killed, or the control link is down for longer than the lease, the order expires; the program
+defines what the robot does then (`fieldkit.agent.orders`). While such a program runs, its robot counts as moving
+(`steps.motions`).
 """
 
 import threading
@@ -21,43 +22,43 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Scene
 
-_LOOKS_S: Final = 0.25
+_POLL_S: Final = 0.25
 
-# Writes $3 into the file $2, whole or not at all, and prints what the program has said in $4; on standard error its
-# exit code, which is in $1 once it has ended.
+# Writes the order $3 atomically into the file $2 and prints the program's output file $4; prints the exit code, which
+# is in the file $1 after the program has exited, to standard error.
 _ORDER: Final = (
     'printf "%s\\n" "$3" >"$2.$$" && mv -f "$2.$$" "$2" && { cat "$4" 2>/dev/null; [ ! -s "$1" ] || cat "$1" >&2; }'
 )
 
 
 def orders_file(name: str) -> str:
-    """Return the file of orders of the job `name`, in the folder of its attempt."""
+    """Return the name of the file with the orders for the job `name`, in the folder of its attempt."""
     return f"{name}.orders"
 
 
 @contextmanager
-def started(shell: Shell, job: Job) -> Iterator[None]:
-    """Bring the agent to a robot and start a program of it, which the body ends; errors as `jobs.start`."""
+def start_program(shell: Shell, job: Job) -> Iterator[None]:
+    """Install the agent on a robot and start a program of it; the body stops it. Errors as `jobs.start`."""
     agent.install(shell)
     jobs.start(shell, job)
     yield
 
 
-class HeldLease:
-    """Gives a program orders, and renews the last one until the context is left.
+class LeaseKeeper:
+    """Gives a program orders and renews the last order until the context is left.
 
     Args:
-        shell: The robot.
-        job: The program, which runs.
-        says: The file in the job's folder in which it says how far it is.
+        shell: Connection to the robot.
+        job: The running program.
+        output_file: File in the job's folder into which the program writes its progress.
         order: The first order.
-        lease_s: For how long an order holds.
-        renewals: How often it is renewed in that time.
-        unheard_s: For how long an order holds where nothing may be sent meanwhile; None where it is renewed.
+        lease_s: Time in seconds until an order expires.
+        renewals: Number of renewals in that time.
+        silent_lease_s: Time until an order expires if nothing may be sent meanwhile; None to renew the order.
 
     Attributes:
-        said: What the program had said when it was looked at last.
-        code: Its exit code then, as text; empty while it runs.
+        said: Content of the output file at the last renewal.
+        exit_code: Exit code of the program at the last renewal, as text; empty while it runs.
     """
 
     def __init__(
@@ -65,31 +66,31 @@ class HeldLease:
         shell: Shell,
         job: Job,
         *,
-        says: str,
+        output_file: str,
         order: str,
         lease_s: float,
         renewals: int,
-        unheard_s: float | None = None,
+        silent_lease_s: float | None = None,
     ) -> None:
         self.said = b""
-        self.code = ""
+        self.exit_code = ""
         self._shell = shell
         self._job = job
-        names = jobs.exit_file(job), orders_file(job.name), says
-        self._exit, self._orders, self._says = (f"{job.folder}/{name}" for name in names)
+        names = jobs.exit_file(job), orders_file(job.name), output_file
+        self._exit_file, self._orders_file, self._output_file = (f"{job.folder}/{name}" for name in names)
         self._order = order
         self._lease_s = lease_s
-        self._holds_s = lease_s if unheard_s is None else unheard_s
-        self._pause_s = None if unheard_s is not None else lease_s / renewals
+        self._expires_s = lease_s if silent_lease_s is None else silent_lease_s
+        self._renewal_s = None if silent_lease_s is not None else lease_s / renewals
         self._numbers = count(1)
-        self._said_s = time.monotonic()
-        self._end: Callable[[], None] | None = None
-        self._turn = threading.Lock()
+        self._changed_s = time.monotonic()
+        self._end_body: Callable[[], None] | None = None
+        self._lock = threading.Lock()
         self._left = threading.Event()
-        self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
+        self._thread = threading.Thread(target=self._renew_until_left, name="lease", daemon=True)
 
     def __enter__(self) -> Self:
-        self.look()
+        self.renew()
         self._thread.start()
         return self
 
@@ -97,100 +98,100 @@ class HeldLease:
         self._left.set()
         self._thread.join()
 
-    def order(self, order: str) -> None:
-        """Give an order, which holds from now on; where it is not taken now, it is with the next renewal.
+    def give_order(self, order: str) -> None:
+        """Give a new order. If this fails, the next renewal sends it again.
 
         Raises:
             LinkError: The robot did not answer.
-            RobotError: It could not take it.
+            RobotError: The order could not be written on the robot.
         """
-        with self._turn:
+        with self._lock:
             self._order = order
-        self.look()
+        self.renew()
 
-    def look(self) -> bytes:
-        """Give the last order again, and return what the program has said; errors as `order`."""
+    def renew(self) -> bytes:
+        """Renew the last order, and return the content of the output file; errors as `give_order`."""
         return self._send(jobs.REPLY_S)
 
     def pause(self) -> None:
-        """Wait a moment before the next look."""
-        time.sleep(_LOOKS_S)
+        """Wait for the interval between two polls."""
+        time.sleep(_POLL_S)
 
     @property
-    def over(self) -> str:
-        """Why the program is at its end before it was to be, as it or its exit code says; empty where it is not."""
-        return f"its program has ended with exit code {self.code}" if self.code else ""
+    def end_reason(self) -> str:
+        """Why the program has ended too early, from its output or exit code; empty while it runs."""
+        return f"its program has ended with exit code {self.exit_code}" if self.exit_code else ""
 
     def failure(self, why: str) -> RobotError:
-        """Return the error of a program that did not do what it was to."""
+        """Return the error of a program that failed for this reason."""
         return RobotError(why, where=self._shell.robot, remedy=f"see {self._job.log} of this attempt")
 
-    def demand(self) -> None:
-        """Go on only if the program does.
+    def check_running(self) -> None:
+        """Check that the program has not ended too early.
 
         Raises:
-            RobotError: It is at its end; says why.
+            RobotError: It has ended; the message is `end_reason`.
         """
-        if self.over:
-            raise self.failure(self.over)
+        if self.end_reason:
+            raise self.failure(self.end_reason)
 
     @contextmanager
-    def outlasting(self, end: Callable[[], None]) -> Iterator[None]:
-        """Run the body for as long as the program goes on; where nothing may be sent meanwhile, until its own end.
+    def run_while_leased(self, end: Callable[[], None]) -> Iterator[None]:
+        """Run the body; abort it if the program ends. Without renewals the end is noticed only after the body.
 
         Args:
-            end: Ends what the body waits for. With each renewal it is called anew: the body may have begun to wait
-                for something else.
+            end: Aborts the operations that the body waits for. It is called at each renewal, because the body may
+                have started to wait for another operation.
 
         Raises:
-            RobotError: The program ended before the body did. What the body raises then is the work of that.
+            RobotError: The program ended before the body. An error that the body raised then is the cause.
         """
-        self._end = end
+        self._end_body = end
         try:
             yield
         except FieldkitError as error:
-            if error.ends_trial or not self.over:
+            if error.ends_trial or not self.end_reason:
                 raise
-            raise self.failure(self.over) from error
+            raise self.failure(self.end_reason) from error
         finally:
-            self._end = None
-        self.demand()
+            self._end_body = None
+        self.check_running()
 
     @property
     def unchanged_s(self) -> float:
-        """For how long nobody has seen the program say anything new."""
-        return time.monotonic() - self._said_s
+        """Seconds since the content of the output file last changed."""
+        return time.monotonic() - self._changed_s
 
     def _send(self, within_s: float) -> bytes:
-        with self._turn:
-            line = f"{next(self._numbers)} {self._order} {self._holds_s:g}"
-        words = ("sh", "-c", _ORDER, "sh", self._exit, self._orders, line, self._says)
-        done = self._shell.run(words, deadline=Deadline.after(within_s))
-        *_, code = (b"", *done.stderr.splitlines())  # a login shell may say something, too
-        self.code = code.decode() if code.isdigit() else ""
-        if done.stdout != self.said:
-            self.said, self._said_s = done.stdout, time.monotonic()
-        return done.stdout
+        with self._lock:
+            line = f"{next(self._numbers)} {self._order} {self._expires_s:g}"
+        argv = ("sh", "-c", _ORDER, "sh", self._exit_file, self._orders_file, line, self._output_file)
+        result = self._shell.run(argv, deadline=Deadline.after(within_s))
+        *_, code = (b"", *result.stderr.splitlines())  # a login shell may print messages before it
+        self.exit_code = code.decode() if code.isdigit() else ""
+        if result.stdout != self.said:
+            self.said, self._changed_s = result.stdout, time.monotonic()
+        return result.stdout
 
-    def _renew(self) -> None:
-        while self._pause_s is not None and not self._left.wait(self._pause_s):
-            with suppress(FieldkitError):  # the link may come back before the order has lapsed
+    def _renew_until_left(self) -> None:
+        while self._renewal_s is not None and not self._left.wait(self._renewal_s):
+            with suppress(FieldkitError):  # the link may be restored before the order expires
                 self._send(min(self._lease_s, jobs.REPLY_S))
-            end = self._end
-            if end is not None and self.over:
-                end()
+            end_body = self._end_body
+            if end_body is not None and self.end_reason:
+                end_body()
 
 
-def run_inside(nest: Nest, held: HeldLease, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-    """Run the steps inside one for as long as the program goes on that it has on a robot; errors as `outlasting`."""
+def run_inside(nest: Nest, keeper: LeaseKeeper, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+    """Run the steps inside `nest`; abort them if its leased program ends. Errors as `run_while_leased`."""
     inner = replace(scene, halt=scene.halt.inside())
 
     def end() -> None:
         inner.halt.call()
-        with suppress(FieldkitError):  # it is called anew
+        with suppress(FieldkitError):  # it is called again at the next renewal
             nest.end_inside(inner, testbed)
 
-    with held.outlasting(end):
+    with keeper.run_while_leased(end):
         for entry in nest.during:
             if not inner.halt.called:
                 entry.step.run(inner, testbed, announce)

@@ -1,4 +1,4 @@
-"""The check of preflight which connection to its autopilot a drone has, and which programs use it."""
+"""Preflight check: does the connection of a drone's computer to its autopilot work, and which programs use it?"""
 
 import json
 from collections.abc import Sequence
@@ -19,35 +19,35 @@ _SHARED = {True: "use it through the link server", False: "uses it through the l
 
 
 def link_need(robot: Robot, role: Role, connection: str, programs: Sequence[str]) -> Need:
-    """Return the need of a connection to an autopilot that works.
+    """Return the preflight check of the connection to an autopilot.
 
     Args:
-        robot: Whose programs use it.
+        robot: The robot whose programs use it.
         role: Its role.
         connection: The connection.
-        programs: What the programs are: `pilot`, `guard`, `recorder`.
+        programs: Names of the programs: `pilot`, `guard`, `recorder`.
     """
 
-    def judge(said: Said) -> tuple[Verdict, str, str]:
-        return _judged(connection, programs, said)
+    def judge(result: Said) -> tuple[Verdict, str, str]:
+        return _judge(connection, programs, result)
 
     argv = streams.python(robot, agent.path_from_home(), "survey", streams.compact({"connection": connection}))
     return Need(role, "MAVLink", argv, judge, of=robot.profile.tools.python, agent=True)
 
 
-def _judged(connection: str, programs: Sequence[str], said: Said) -> tuple[Verdict, str, str]:
-    """Return whether the connection works, with its kind and its programs."""
+def _judge(connection: str, programs: Sequence[str], result: Said) -> tuple[Verdict, str, str]:
+    """Return verdict, detail and remedy from the output of the agent's `survey`."""
     kind = _KINDS.get(connection.partition(":")[0], "serial line")
     users = f"{' and '.join(programs)} {_SHARED[len(programs) > 1]}"
     try:
-        found = json.loads(said.text)
-        error, system = harmless(found["error"]), int(found["system"])
-        candidates = ", ".join(map(harmless, found["candidates"]))
+        survey = json.loads(result.text)
+        error, system = harmless(survey["error"]), int(survey["system"])
+        candidates = ", ".join(map(harmless, survey["candidates"]))
     except JSON_ERRORS:
-        last = harmless((said.text.splitlines() or ["no answer"])[-1]).removeprefix("error: ")
-        return Verdict.FAIL, f"{connection} ({kind}): {last}", "mavlink.connection of the profile"
-    there = f"this computer has {candidates}" if candidates else "this computer has no other one that is usual"
-    remedy = f"{there}; write what the autopilot is at as mavlink.connection in the profile"
+        last_line = harmless((result.text.splitlines() or ["no answer"])[-1]).removeprefix("error: ")
+        return Verdict.FAIL, f"{connection} ({kind}): {last_line}", "correct mavlink.connection of the profile"
+    available = f"this computer has {candidates}" if candidates else "this computer has no other common connection"
+    remedy = f"{available}; write the connection of the autopilot as mavlink.connection in the profile"
     if error:
         return Verdict.FAIL, f"{connection} ({kind}) cannot be opened: {error}", remedy
     if not system:

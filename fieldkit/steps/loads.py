@@ -1,6 +1,6 @@
-"""Loads that iperf3 makes between two robots: what they are in a procedure, and what is typed for them.
+"""Loads of iperf3 between two robots: their YAML keys and command lines.
 
-Of options, those that every version from 3.1 on knows.
+Only options of iperf3 3.1 are used.
 """
 
 from typing import Annotated, Final
@@ -15,10 +15,10 @@ from fieldkit.steps.scene import GOOD_BIT_S, Flow, Scene, frames
 PROGRAM: Final = "iperf3"
 
 DEFAULT_UDP_BIT_S: Final = 1e6
-"""iperf3's own."""
+"""Default rate of iperf3."""
 
 _BLOCK_BYTES: Final = 8192
-"""Of TCP at a rate: of iperf3's own, 128 KiB, 2 Mbit/s would be two bursts a second."""
+"""Block size of TCP with a rate. With iperf3's default of 128 KiB, 2 Mbit/s would be two bursts per second."""
 
 
 class LoadOptions(Strict):
@@ -50,15 +50,15 @@ class LoadOptions(Strict):
         return self
 
     def carried_by(self, protocol: Protocol) -> Protocol:
-        """Return what carries the load in repeats of a protocol."""
+        """Return the transport protocol of the load in repeats of `protocol`."""
         return self.protocol or protocol
 
     def server(self, *options: str) -> tuple[str, ...]:
-        """Return the command that serves one test."""
+        """Return the command of the server, which serves one test and exits."""
         return (PROGRAM, "-s", "-1", "-p", str(self.port), *options)
 
     def client(self, scene: Scene, *options: str) -> tuple[str, ...]:
-        """Return the command that sends the load."""
+        """Return the command of the client, which sends the load."""
         udp = self.carried_by(scene.protocol) is Protocol.UDP
         rate = self.rate or (DEFAULT_UDP_BIT_S if udp else None)
         return (
@@ -71,7 +71,7 @@ class LoadOptions(Strict):
         )
 
     def interval_s(self, protocol: Protocol) -> float:
-        """Return the time between two blocks or datagrams of a stream; 0 where it sends as much as goes."""
+        """Return the time between two blocks or datagrams of a stream; 0 without a rate limit."""
         udp = self.carried_by(protocol) is Protocol.UDP
         if self.rate is None and not udp:
             return 0.0
@@ -86,7 +86,7 @@ class LoadOptions(Strict):
         lasts_s: float | None = None,
         until_ns: int | None = None,
     ) -> LoadStreams:
-        """Return what tells the load's data in captures.
+        """Return the packet filter of the load's data streams in captures.
 
         Args:
             scene: The attempt.
@@ -116,13 +116,13 @@ class LoadOptions(Strict):
         )
 
     def expected_bit_s(self, protocol: Protocol) -> float:
-        """Return about how much the load is, in bits per second, in repeats of a protocol."""
+        """Return the approximate rate of the load in repeats of a protocol, in bits per second."""
         if self.rate is None and self.carried_by(protocol) is Protocol.TCP:
             return GOOD_BIT_S
         return self.streams * (self.rate or DEFAULT_UDP_BIT_S)
 
     def flow(self, protocol: Protocol, size_bytes: float) -> Flow:
-        """Return the load as packets on the radio, of so many bytes, in repeats of a protocol."""
+        """Return the traffic of `size_bytes` of the load on the radio, in repeats of a protocol."""
         carrier = self.carried_by(protocol)
-        sent = frames(carrier, size_bytes, self.payload_bytes)
-        return Flow(self.sender, self.receiver, self.port, sent, carrier)
+        frame_count = frames(carrier, size_bytes, self.payload_bytes)
+        return Flow(self.sender, self.receiver, self.port, frame_count, carrier)

@@ -1,4 +1,4 @@
-"""Middlewares that a topic can go over: how their ends find each other, and what a robot must have for them."""
+"""Middlewares of topics: their discovery methods, and the Python packages that a robot needs for them."""
 
 import re
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Over(StrEnum):
 
 
 class Discovery(StrEnum):
-    """How the ends of a topic find each other."""
+    """A discovery method: how publisher and subscriber find each other."""
 
     MULTICAST = "multicast"
     PEERS = "peers"
@@ -29,7 +29,7 @@ class Discovery(StrEnum):
     ENVIRONMENT = "environment"
 
 
-WAYS: Final = MappingProxyType(
+DISCOVERY_METHODS: Final = MappingProxyType(
     {
         Over.DDS: (Discovery.MULTICAST, Discovery.PEERS),
         Over.ZENOH: (Discovery.MULTICAST, Discovery.PEERS, Discovery.ROUTER),
@@ -37,17 +37,17 @@ WAYS: Final = MappingProxyType(
         Over.ROS2: (Discovery.ENVIRONMENT, Discovery.MULTICAST, Discovery.PEERS),
     }
 )
-"""Ways of discovery of each middleware, its usual one first."""
+"""Discovery methods of each middleware, the default first."""
 
 
 @dataclass(frozen=True)
 class Binding:
-    """What a robot's Python must have for a middleware.
+    """The Python package that a robot needs for a middleware.
 
     Attributes:
-        package: What it is called.
-        load: Python that fails where it is missing.
-        remedy: What brings it there.
+        package: Name of the package.
+        load: Python code that fails if the package is missing.
+        remedy: How to install it.
     """
 
     package: str
@@ -55,50 +55,50 @@ class Binding:
     remedy: str
 
 
-_HERE: Final = ", if it runs on this machine with the python3 beside fieldkit"
+_LAB_NOTE: Final = "; for a robot of a lab, into the Python that runs fieldkit"
 BINDINGS: Final = MappingProxyType(
     {
-        Over.DDS: Binding("cyclonedds", "import cyclonedds", f"python3 -m pip install cyclonedds{_HERE}"),
-        Over.ZENOH: Binding("eclipse-zenoh", "import zenoh", f"python3 -m pip install eclipse-zenoh{_HERE}"),
+        Over.DDS: Binding("cyclonedds", "import cyclonedds", f"python3 -m pip install cyclonedds{_LAB_NOTE}"),
+        Over.ZENOH: Binding("eclipse-zenoh", "import zenoh", f"python3 -m pip install eclipse-zenoh{_LAB_NOTE}"),
         Over.ROS1: Binding(
             "rospy",
-            # Where the agent looks, too.
+            # The agent searches this folder, too.
             "import sys; sys.path.append('/usr/lib/python3/dist-packages'); import rospy",
             "sudo apt-get install python3-rospy",
         ),
         Over.ROS2: Binding(
             "rclpy",
-            # It is asked for its name, for nothing else loads the RMW.
+            # The RMW is loaded only when its name is queried.
             "import rclpy, std_msgs.msg; print(rclpy.get_rmw_implementation_identifier())",
-            "install the RMW that its environment names; `setup` in its profile is for the setup files of its ROS 2",
+            "install the RMW that its environment names; list the setup files of its ROS 2 as `setup` in its profile",
         ),
     }
 )
 
-_SAID_OTHERWISE: Final = MappingProxyType(
+_KEY_OF_VARIABLE: Final = MappingProxyType(
     {"ROS_DOMAIN_ID": "domain", "ROS_AUTOMATIC_DISCOVERY_RANGE": "discovery", "ROS_STATIC_PEERS": "discovery"}
 )
-"""Variables of ROS 2's environment that are no settings, and the key that says each."""
+"""Environment variables of ROS 2 that are set by another key of the step, with this key."""
 
 OVER_DDS: Final = frozenset({Over.DDS, Over.ROS2})
-"""Those with ports by RTPS' own rule, if the RMW of ROS 2 is one over DDS."""
+"""Middlewares whose ports follow the rule of RTPS (for ROS 2, if its RMW uses DDS)."""
 
 _VARIABLE: Final = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _RMW: Final = re.compile(r"rmw_\w+", re.ASCII)
 
 
-def no_setting(name: str) -> str:
-    """Return why this is no setting of ROS 2, empty where it may be one."""
+def invalid_setting_reason(name: str) -> str:
+    """Return why `name` is not a setting of ROS 2; empty if it is valid."""
     if not _VARIABLE.fullmatch(name):
-        return f"settings of ros2 are variables of the environment, not {name!r}"
-    return f"{name} is said by {_SAID_OTHERWISE[name]}, not by settings" if name in _SAID_OTHERWISE else ""
+        return f"settings of ros2 are environment variables, not {name!r}"
+    return f"{name} is set by the key {_KEY_OF_VARIABLE[name]}, not in settings" if name in _KEY_OF_VARIABLE else ""
 
 
-def judged(over: Over, said: Said) -> tuple[Verdict, str, str]:
-    """Return whether a robot's Python has the middleware; of ROS 2 it says the RMW, too."""
-    lines = [line for line in said.text.splitlines() if line.strip()]
-    if said.ok:
+def judge_binding(over: Over, result: Said) -> tuple[Verdict, str, str]:
+    """Return verdict, detail and remedy from the output of `Binding.load`; for ROS 2 the detail includes the RMW."""
+    lines = [line for line in result.text.splitlines() if line.strip()]
+    if result.ok:
         rmw = [line for line in lines if over is Over.ROS2 and _RMW.fullmatch(line)]
         return Verdict.OK, ", ".join([BINDINGS[over].package, *rmw]), ""
-    remedy = f"on the robot: {BINDINGS[over].remedy}; another Python is python: in its profile"
-    return Verdict.FAIL, lines[-1] if lines else "it does not say why", remedy
+    remedy = f"on the robot: {BINDINGS[over].remedy}; to use another Python, write python: in its profile"
+    return Verdict.FAIL, lines[-1] if lines else "the program printed nothing", remedy

@@ -1,7 +1,7 @@
-"""Robots that a program of ours moves just now, and the order of the operator to stop them all at once.
+"""The robots that fieldkit currently moves, and the operator's order to stop all of them immediately.
 
-The order may come from a signal handler, from any thread, and more than once. It goes to each robot from a thread of
-its own, on the control connection that is open already, while the main thread waits for something else.
+The order may come from a signal handler, from any thread, and more than once. A separate thread sends it to each
+robot on the open control connection, while the main thread may be waiting for another operation.
 """
 
 import threading
@@ -14,126 +14,128 @@ if TYPE_CHECKING:
     from fieldkit.remote.motion import Halted
     from fieldkit.remote.shell import Shell
 
-WHO: Final = "the-operator"
-"""Named on a robot as who stopped it."""
+STOPPED_BY: Final = "the-operator"
+"""Recorded on a robot as the originator of the stop."""
 
 STOPPED: Final = "stopped by the operator"
-"""The reason of a void repeat, and of a hold, after the order to stop."""
+"""Reason of a void repeat, and of the block of motions, after the order to stop."""
 
-_ANSWERS_S: Final = 3.0
-"""After this long without an answer a robot is reported as out of reach; a control connection answers in 0.1 s."""
-_LOOKS_S: Final = 0.5
-_LANDS_S: Final = 600.0
-"""For this long a landing is awaited, as long as the pilot does (`fieldkit.agent.landing`)."""
-_WAKE_S: Final = 0.5
+_REPLY_S: Final = 3.0
+"""After this time without an answer a robot is reported as out of reach; a control connection answers in 0.1 s."""
+_POLL_S: Final = 0.5
+_LANDING_S: Final = 600.0
+"""Maximum wait for a landing, equal to that of the pilot (`fieldkit.agent.landing`)."""
+_SIGNAL_S: Final = 0.5
 
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 """Shows a line to the operator, from any thread."""
 
 
 class Mover(NamedTuple):
-    """A robot that a program of ours moves.
+    """A robot that a program of fieldkit moves.
 
     Attributes:
         robot: Its name.
         shell: Its control connection.
         folder: The folder of the attempt on it.
-        alone: What the robot does by itself where no order reaches it, as in "it stops by itself within 2 s".
+        fallback: Text on what the robot does if no order reaches it: "it stops automatically within 2 s".
     """
 
     robot: str
     shell: "Shell"
     folder: str
-    alone: str
+    fallback: str
 
 
 class Motions:
-    """The robots that move, and the order to stop.
+    """The moving robots, and the order to stop. After the order no robot starts to move.
 
     Attributes:
-        ahead: What robots do where they are stopped, a line for each, while the steps of a repeat run in which they
-            move by themselves; empty otherwise. No robot begins to move after the order.
-        called: Whether the order was given; for good.
+        ahead: A line for each robot on what it does when it is stopped, while steps run in which robots move
+            automatically; empty otherwise.
+        called: Whether the order was given; it cannot be withdrawn.
     """
 
     def __init__(self) -> None:
         self.ahead: tuple[str, ...] = ()
         self.called = False
         self._movers: list[Mover] = []
-        self._first = threading.Lock()  # acquired once, by whoever gives the order first
+        self._first = threading.Lock()  # acquired once, by the first order
         self._abandoned = threading.Event()
         self._done = threading.Event()
 
     @contextmanager
     def moving(self, mover: Mover) -> Iterator[None]:
-        """Let a robot move while the body runs; after an order to stop, wait for its confirmation.
+        """Register a robot as moving while the body runs; after an order to stop, wait for its confirmation.
 
         Raises:
-            KeyboardInterrupt: The order was given before: the robot does not begin to move.
+            KeyboardInterrupt: The order was given before; the robot must not start to move.
         """
-        self._movers.append(mover)  # before the look at `called`, which `order` sets before it looks at this
+        self._movers.append(mover)  # before `called` is read; `order` sets `called` before it reads the list
         try:
             if self.called:
                 raise KeyboardInterrupt
             yield
         finally:
-            while self.called and not self._done.wait(_WAKE_S):
-                pass  # Python sees a signal that came just before it blocked only when it wakes
+            while self.called and not self._done.wait(_SIGNAL_S):
+                pass  # Python handles a signal that arrived just before the wait only after the wait
             self._movers.remove(mover)
 
-    def order(self, tell: Tell) -> bool:
-        """Order all robots to stop if any moves or may begin to; return whether that is so.
+    def order(self, report: Report) -> bool:
+        """Order all robots to stop; return False and do nothing if no robot moves or may start to move.
 
         Args:
-            tell: Shows what becomes of each, in one line.
+            report: Receives a line for each change of state of a robot.
         """
         if not (self._movers or self.ahead):
             return False
         self.called = True
         if self._first.acquire(blocking=False):
             movers = {mover.robot: mover for mover in reversed(self._movers)}
-            threading.Thread(target=self._stop, args=(tuple(movers.values()), tell), name="stop", daemon=True).start()
+            threading.Thread(
+                target=self._stop, args=(tuple(movers.values()), report), name="stop", daemon=True
+            ).start()
         return True
 
     def abandon(self) -> None:
-        """Do not wait for confirmations any longer; the order to stop remains."""
+        """Stop waiting for confirmations; the order to stop remains in force."""
         self._abandoned.set()
         self._done.set()
 
-    def _stop(self, movers: tuple[Mover, ...], tell: Tell) -> None:
-        threads = [threading.Thread(target=self._halt, args=(mover, tell), daemon=True) for mover in movers]
+    def _stop(self, movers: tuple[Mover, ...], report: Report) -> None:
+        threads = [threading.Thread(target=self._halt, args=(mover, report), daemon=True) for mover in movers]
         for thread in threads:
             thread.start()
         for line in self.ahead if movers else ():
-            tell(f"stopping: {line}")
+            report(f"stopping: {line}")
         if not movers:
-            tell("stopping: no robot begins to move; ending what runs on the robots")
+            report("stopping: no robot moves; stopping the programs on the robots")
         for thread in threads:
             thread.join()
         self._done.set()
 
-    def _halt(self, mover: Mover, tell: Tell) -> None:
+    def _halt(self, mover: Mover, report: Report) -> None:
         """Stop one robot, and wait until it is stationary or on the ground."""
-        from fieldkit.core.deadline import Deadline  # noqa: PLC0415 (loaded where robots move)
+        from fieldkit.core.deadline import Deadline  # noqa: PLC0415 (needed only if robots move)
         from fieldkit.core.errors import FieldkitError  # noqa: PLC0415
         from fieldkit.remote import motion  # noqa: PLC0415
 
-        began_s = time.monotonic()
+        start_s = time.monotonic()
         try:
-            halted = motion.halt_attempt(mover.shell, mover.folder, WHO, Deadline.after(_ANSWERS_S))
-            tell(self._said(mover, halted, began_s))
-            while halted.state in motion.COMING_DOWN and time.monotonic() < began_s + _LANDS_S:
-                if self._abandoned.wait(_LOOKS_S):
+            halted = motion.halt_attempt(mover.shell, mover.folder, STOPPED_BY, Deadline.after(_REPLY_S))
+            report(self._report_line(mover, halted, start_s))
+            while halted.state in motion.COMING_DOWN and time.monotonic() < start_s + _LANDING_S:
+                if self._abandoned.wait(_POLL_S):
                     return
                 names = [name for name, _ in halted.programs]
-                halted = motion.look(mover.shell, names, Deadline.after(_ANSWERS_S))
+                halted = motion.look(mover.shell, names, Deadline.after(_REPLY_S))
                 if halted.state not in motion.COMING_DOWN:
-                    tell(self._said(mover, halted, began_s))
+                    report(self._report_line(mover, halted, start_s))
         except FieldkitError as error:
-            tell(f"no answer from {mover.robot}: {mover.alone} ({error.what})")
+            report(f"no answer from {mover.robot}: {mover.fallback} ({error.what})")
 
     @staticmethod
-    def _said(mover: Mover, halted: "Halted", began_s: float) -> str:
+    def _report_line(mover: Mover, halted: "Halted", start_s: float) -> str:
         from fieldkit.remote import motion  # noqa: PLC0415
 
-        return f"{mover.robot}: {motion.IN_WORDS[halted.state]}, {time.monotonic() - began_s:.1f} s after the order"
+        return f"{mover.robot}: {motion.IN_WORDS[halted.state]}, {time.monotonic() - start_s:.1f} s after the order"

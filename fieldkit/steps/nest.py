@@ -1,4 +1,4 @@
-"""A step that contains other steps."""
+"""Base class of steps that contain other steps."""
 
 from abc import ABC
 from collections.abc import Iterator, Mapping
@@ -20,9 +20,9 @@ class Nest(Step, ABC):
 
     Attributes:
         during: The steps inside.
-        disturbs: Whether the steps inside may fail because of it, so that their evidence may be incomplete.
+        disturbs: Whether the step may make the steps inside fail, so that their evidence may be incomplete.
         parallel: Whether the steps inside run at the same time.
-        leads: Whether it has a path, whose duration steps inside can take (`along: true`).
+        leads: Whether the step has a path whose duration steps inside can use (`along: true`).
     """
 
     disturbs: ClassVar[bool] = False
@@ -32,16 +32,16 @@ class Nest(Step, ABC):
     during: tuple[StepEntry, ...]
 
     def captures(self) -> Mapping[Role, str]:
-        """Return the files of what is captured while the steps inside run, by whose packets these are."""
+        """Return the capture file of each robot that captures while the steps inside run."""
         return {}
 
     def kept_bytes_inside(self) -> int:
-        """Return how many bytes of each frame a capture must keep for the steps inside, at any depth."""
+        """Return the maximum of `kept_bytes` of the steps inside, at any depth."""
         nests = (entry.step.kept_bytes_inside() for entry in self.during if isinstance(entry.step, Nest))
         return max((*nests, *(entry.step.kept_bytes for entry in self.during)), default=0)
 
     def leaves_inside(self) -> "Iterator[Step]":
-        """Yield the steps inside that have no steps inside themselves, at any depth."""
+        """Yield the steps inside, at any depth, that contain no steps."""
         for entry in self.during:
             if isinstance(entry.step, Nest):
                 yield from entry.step.leaves_inside()
@@ -55,13 +55,13 @@ class Nest(Step, ABC):
 
     @override
     def roles(self) -> frozenset[Role]:
-        """Those of the steps inside, too."""
+        """Return the roles of the step and of the steps inside."""
         return super().roles() | self.roles_inside()
 
     @override
     def own_jobs(self, scene: Scene) -> Iterator[Planned]:
-        others = {(planned.role, planned.job.name) for planned in self.inside(scene)}
-        return (planned for planned in self.jobs(scene) if (planned.role, planned.job.name) not in others)
+        inside = {(planned.role, planned.job.name) for planned in self.inside(scene)}
+        return (planned for planned in self.jobs(scene) if (planned.role, planned.job.name) not in inside)
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
@@ -84,8 +84,8 @@ class Nest(Step, ABC):
         return self.model_copy(update={"during": during})
 
     @override
-    def resolved(self, cast: Cast, way_s: float | None = None) -> Self:
-        during = tuple(StepEntry(entry.kind, entry.step.resolved(cast, way_s)) for entry in self.during)
+    def resolved(self, cast: Cast, path_s: float | None = None) -> Self:
+        during = tuple(StepEntry(entry.kind, entry.step.resolved(cast, path_s)) for entry in self.during)
         return self.model_copy(update={"during": during})
 
     @override
@@ -94,14 +94,14 @@ class Nest(Step, ABC):
             yield from entry.step.adjustments(cast)
 
     def flows_inside(self, scene: Scene) -> Iterator[Flow]:
-        """Yield what the steps inside send over the radio, at any depth."""
+        """Yield the traffic of the steps inside on the radio, at any depth."""
         for entry in self.during:
             yield from entry.step.flows(scene)
             if isinstance(entry.step, Nest):
                 yield from entry.step.flows_inside(scene)
 
     def end_inside(self, scene: Scene, testbed: Testbed) -> None:
-        """End every job of the steps inside that runs.
+        """Stop every running job of the steps inside.
 
         Raises:
             LinkError: A robot did not answer.
@@ -115,5 +115,5 @@ class Nest(Step, ABC):
         return frozenset().union(*(entry.step.roles() for entry in self.during))
 
     def inside_s(self, protocol: Protocol) -> float:
-        """Return about how many seconds the steps inside take on a good link."""
+        """Return the approximate duration of the steps inside on a good link, in seconds."""
         return sum(entry.step.expected_s(protocol) for entry in self.during)

@@ -1,4 +1,4 @@
-"""Origins of robots that move by themselves, and what became of each of their motions, as steps use them."""
+"""Origins of robots that move automatically, and the record of their motions: the interface for steps."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -11,7 +11,7 @@ class RobotMotion:
     """A motion in progress.
 
     Attributes:
-        at: Where the robot stopped, in the frame of its origin; None if it did not report it.
+        at: Pose at which the robot stopped, in the frame of its origin; None if it did not report one.
         is_over: Whether `ended` was called.
     """
 
@@ -20,7 +20,7 @@ class RobotMotion:
         self.is_over = False
 
     def ended(self, at: MotionOrigin | None = None) -> None:
-        """Enter that the motion ended as it was to end; `at` is as the attribute."""
+        """Record that the motion ended as planned; `at` is as the attribute."""
         self.at, self.is_over = at, True
 
 
@@ -28,19 +28,19 @@ class Origins(Protocol):
     """Origins of the robots of a trial, by role.
 
     Attributes:
-        kept: Whether robots stay where a motion left them: real robots do. Robots of a lab that puts them back to
-            their places after each motion do not.
-        may_return: Whether a ground robot that is not at its place, but within its fence, may drive back to it.
+        kept: Whether robots stay where a motion ended, as real robots do. False if the lab puts them back to their
+            places after each motion.
+        may_return: Whether a ground robot that is not at its place but within its fence may drive back to its place.
     """
 
     @property
     def kept(self) -> bool:
-        """See the class."""
+        """Whether robots stay where a motion ended."""
         ...
 
     @property
     def may_return(self) -> bool:
-        """See the class."""
+        """Whether a ground robot may drive back to its place."""
         ...
 
     def get(self, role: Role) -> MotionOrigin | None:
@@ -48,7 +48,7 @@ class Origins(Protocol):
         ...
 
     def last(self, role: Role) -> MotionOrigin | None:
-        """Return where the last motion of a robot ended, in the frame of its origin; None if unknown."""
+        """Return the pose at which the last motion of a robot ended, in the frame of its origin; None if unknown."""
         ...
 
     def record(self, role: Role, origin: MotionOrigin) -> None:
@@ -60,9 +60,9 @@ class Origins(Protocol):
         ...
 
     def refuse(self, role: Role, why: str) -> None:
-        """Record that a robot did not start, because it is not where it must be.
+        """Record that a robot refused to start because it is not at its start position.
 
-        No robot moves then before a person confirms it.
+        Then no robot moves until a person confirms.
 
         Raises:
             OSError: As `record`.
@@ -72,18 +72,18 @@ class Origins(Protocol):
     def moving(self, role: Role) -> AbstractContextManager[RobotMotion]:
         """Record that a robot moves while the body runs. The record is on disk before the body begins.
 
-        Unless the body calls `RobotMotion.ended`, no robot moves again before a person has confirmed it. After a
-        fault the body ends without that call; it also counts as a fault if this process ends within the body.
+        Unless the body calls `RobotMotion.ended`, no robot moves again before a person has confirmed. The call is
+        missing after a fault, and after this process was killed within the body.
 
         Raises:
-            MotionHeldError: A fault stopped a robot earlier, and nobody has confirmed since.
+            MotionHeldError: A fault stopped a robot earlier, and no person has confirmed since.
             OSError: As `record`.
         """
         ...
 
 
 class MemoryOrigins:
-    """Origins of the robots of a lab, which puts them back to their places: nothing is on disk, nothing is held."""
+    """Origins of the robots of a lab that puts them back to their places; kept in memory, without confirmations."""
 
     kept = False
     may_return = False
@@ -92,21 +92,21 @@ class MemoryOrigins:
         self._origins: dict[Role, MotionOrigin] = {}
 
     def get(self, role: Role) -> MotionOrigin | None:
-        """See `Origins.get`."""
+        """Return the origin of a robot; None before its first start at this place."""
         return self._origins.get(role)
 
-    def last(self, role: Role) -> MotionOrigin | None:  # noqa: ARG002 (the lab has moved it since)
-        """See `Origins.last`."""
+    def last(self, role: Role) -> MotionOrigin | None:  # noqa: ARG002 (the lab has moved the robot since)
+        """Return None: the lab has put the robot back to its place."""
         return None
 
     def record(self, role: Role, origin: MotionOrigin) -> None:
-        """See `Origins.record`."""
+        """Record the origin of a robot in memory."""
         self._origins[role] = origin
 
     def refuse(self, role: Role, why: str) -> None:
-        """See `Origins.refuse`."""
+        """Do nothing: no confirmation is needed in a lab."""
 
     @contextmanager
-    def moving(self, role: Role) -> Iterator[RobotMotion]:  # noqa: ARG002 (nothing is held)
-        """See `Origins.moving`."""
+    def moving(self, role: Role) -> Iterator[RobotMotion]:  # noqa: ARG002 (nothing is recorded)
+        """Yield a motion that is not recorded."""
         yield RobotMotion()

@@ -1,4 +1,4 @@
-"""A step that runs one program on one robot and reads what it prints: the shortest way to a new kind of step."""
+"""Base class of steps that run one program on one robot and parse its output: the simplest new kind of step."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,14 +19,14 @@ from fieldkit.steps.view import View
 
 
 class ProgramStep(Step):
-    """A step that runs one program on one robot and reads what it prints.
+    """A step that runs one program on one robot and parses its output.
 
-    A kind needs the fields that are its YAML keys, `columns`, and two methods: `argv` and `parse`. Its output is kept
-    in a file, at most `printed.MOST_BYTES` bytes of it.
+    A kind needs the fields that are its YAML keys, `columns`, and two methods: `argv` and `parse`. The output is
+    stored in a file of at most `printed.MOST_BYTES` bytes.
 
     Attributes:
-        exit_codes: Exit codes of a program that succeeded; another one makes the repeat void.
-        limit_s: Seconds after which the program is ended, which makes the repeat void.
+        exit_codes: Exit codes of success; any other one makes the repeat void.
+        limit_s: Seconds after which the program is stopped, which makes the repeat void.
         robot: The role of the robot that runs the program.
     """
 
@@ -37,20 +37,20 @@ class ProgramStep(Step):
 
     @abstractmethod
     def argv(self, scene: Scene) -> Sequence[str]:
-        """Return the command as words; no shell reads them.
+        """Return the command as a list of words; no shell interprets them.
 
         The address of the robot in another role is `scene.robot(role).address`.
         """
 
     @abstractmethod
     def parse(self, output: str) -> Mapping[str, Value]:
-        """Return the values of columns by name, read from what the program printed.
+        """Return the values of columns by name, from the output of the program.
 
-        A column that is left out has no value, which makes the repeat void.
+        A missing column makes the repeat void.
 
         Raises:
-            ValueError: The output is not as expected. So do LookupError and ArithmeticError; each makes the repeat
-                void.
+            ValueError: The output is not as expected. It may also raise LookupError or ArithmeticError; each of them
+                makes the repeat void.
         """
 
     @override
@@ -91,7 +91,7 @@ class ProgramStep(Step):
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """Yield why the program failed, or why its output has no value of a column."""
+        """Yield a reason if the program failed, and for each column without a value."""
         after = view.evidence.read_or_none(host.state, host.after(self.robot))
         ending = (after.endings or {}).get(self.own_name(self.kind_name())) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.exit_codes:
@@ -101,15 +101,15 @@ class ProgramStep(Step):
 
     @override
     def measure(self, view: View) -> Measured:
-        declared = self.output_columns()
+        columns = self.output_columns()
         try:
             values = self.parse(view.evidence.read(printed.text, self._output))
         except EvidenceError as error:
-            return Measured.nothing(declared, error.what)
+            return Measured.nothing(columns, error.what)
         except (ValueError, LookupError, ArithmeticError) as error:
-            return Measured.nothing(declared, f"the output is not as expected: {type(error).__name__}: {error}")
+            return Measured.nothing(columns, f"the output is not as expected: {type(error).__name__}: {error}")
         return Measured.of(
-            {column.name: values.get(column.name) for column in declared}, "the program did not print it"
+            {column.name: values.get(column.name) for column in columns}, "the program did not print it"
         )
 
     @property

@@ -1,4 +1,4 @@
-"""Preflight of robots that forward for each other: whether something on them finds the ways."""
+"""Preflight check of robots that forward packets for each other: does each run a routing protocol?"""
 
 from collections.abc import Iterator
 from typing import Final
@@ -7,10 +7,10 @@ from fieldkit.core.model import Verdict
 from fieldkit.steps.scene import Need, Said, Scene
 
 DAEMONS: Final = ("babeld", "bird", "olsrd", "olsrd2", "bmx7", "batmand")
-"""Routing daemons of ad-hoc networks in Debian and OpenWrt, as the kernel names their processes."""
+"""Routing daemons for ad-hoc networks in Debian and OpenWrt, by process name."""
 
-# Two others are no process: batman-adv is a module of the kernel, and stations of 802.11s forward by themselves.
-_LOOK: Final = """
+# Two others are not processes: batman-adv is a kernel module, and the driver forwards in 802.11s.
+_SEARCH: Final = """
 for file in /proc/[0-9]*/comm; do
     { read -r name <"$file"; } 2>/dev/null || continue
     for daemon; do [ "$name" = "$daemon" ] && echo "$name"; done
@@ -23,16 +23,16 @@ true
 
 
 def needs(scene: Scene) -> Iterator[Need]:
-    """Yield that each robot of the scene takes part in a mesh, those too that no step names."""
+    """Yield the check for a routing protocol for each robot of the scene, also for robots without a step."""
     for role, robot in scene.cast.items():
-        script = f"interface=$1; shift{_LOOK}"
-        yield Need(role, "routing", ("sh", "-c", script, "sh", robot.profile.radio.interface, *DAEMONS), judged)
+        script = f"interface=$1; shift{_SEARCH}"
+        yield Need(role, "routing", ("sh", "-c", script, "sh", robot.profile.radio.interface, *DAEMONS), judge)
 
 
-def judged(answer: Said) -> tuple[Verdict, str, str]:
-    """Return what it is worth that these were found, a word each."""
-    found = list(dict.fromkeys(answer.text.split()))
-    if answer.ok and found:
-        return Verdict.OK, ", ".join(found), ""
-    lack = "nothing on it finds ways over others: no babeld or the like runs, no batman-adv, no 802.11s"
-    return Verdict.FAIL, lack, "start one on each robot, see: fieldkit docs mesh"
+def judge(answer: Said) -> tuple[Verdict, str, str]:
+    """Return verdict, detail and remedy from the names of the routing protocols found on a robot."""
+    protocols = list(dict.fromkeys(answer.text.split()))
+    if answer.ok and protocols:
+        return Verdict.OK, ", ".join(protocols), ""
+    what = "no routing protocol runs on it: no daemon such as babeld, no batman-adv, no 802.11s"
+    return Verdict.FAIL, what, "start one on each robot, see: fieldkit docs mesh"

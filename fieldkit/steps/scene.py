@@ -1,4 +1,4 @@
-"""Data that steps and those who run them hand each other: scenes, jobs, needs, flows."""
+"""Data exchanged between steps and the code that runs them: attempts, jobs, preflight checks, traffic."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -23,17 +23,17 @@ from fieldkit.steps.variants import Tool, Variants
 
 Shells = Mapping[Role, Shell]
 Announce = Callable[[str, float | None], None]
-"""Told the name of a phase that begins, and how many seconds it should take where that is known."""
+"""Called with the name of a starting phase, and its expected duration in seconds or None."""
 
 _SEGMENT_BYTES: Final = 1448
-"""Payload of a full TCP segment in an Ethernet frame, with time stamps."""
+"""Payload of a full TCP segment with time stamps in an Ethernet frame."""
 
 GOOD_BIT_S: Final = 25e6
-"""About what TCP brings over a good link of 802.11n, with one stream in 20 MHz."""
+"""Approximate TCP throughput on a good 802.11n link with one stream in 20 MHz."""
 
 _HEADER_BYTES: Final = 8
 _FRAGMENT_BYTES: Final = 1480
-"""What an IPv4 packet carries in an Ethernet frame: of UDP and ICMP, their headers too."""
+"""Payload of an IPv4 packet in an Ethernet frame, including the UDP or ICMP header."""
 
 BY_ITSELF: Final = frozenset({Cause.ITSELF})
 BY_LIMIT: Final = frozenset({Cause.LIMIT})
@@ -43,13 +43,13 @@ BY_FIELDKIT: Final = frozenset({Cause.ASKED})
 
 @dataclass(frozen=True)
 class RecordedFile:
-    """A file that a step makes on a robot, for others to send.
+    """A file that a step records on a robot, and that other steps may send.
 
     Attributes:
-        role: On whose robot.
-        name: Its name, below the attempt's folder.
-        size_bytes: About how large it gets.
-        called: What a procedure may call it, too, whatever name its maker gives it.
+        role: Role of the robot.
+        name: Its path, relative to the attempt's folder.
+        size_bytes: Approximate size.
+        called: Alternative name in procedures, independent of the robot's recorder.
     """
 
     role: Role
@@ -60,22 +60,22 @@ class RecordedFile:
 
 @dataclass(frozen=True)
 class Scene:
-    """One attempt at one repeat, as far as command lines and measures depend on it.
+    """One attempt at one repeat, with all data on which command lines and measurements depend.
 
     Attributes:
         protocol: The transport protocol under test.
-        cast: Who plays which role.
+        cast: The robot in each role.
         folder: The attempt's folder on every robot.
-        recorded: The files that the procedure makes on each robot, in the order in which it does.
-        variants: Which tools the robots have, where that was looked up.
-        here: The attempt's folder on this machine, for what no robot can know; None where no attempt is made.
-        placement: Where the robots were placed; None where nobody placed them.
-        repeat: Number of the repeat of its protocol, from 1; None where it holds for all repeats.
-        flows: What all steps of the procedure send over the radio.
-        on_abort: What becomes of a drone where the attempt is cut short; those that are not there land.
-        halt: Ends what waits, where the steps are not to go on.
-        motions: The robots that move by themselves, which the operator may stop.
-        origins: Origins of the robots that move by themselves, and the record of each motion.
+        recorded: The files that the procedure records on each robot, in the order of recording.
+        variants: The detected tools of the robots; empty before the detection.
+        here: The attempt's folder on the laptop, for data that no robot has; None if no attempt is made.
+        placement: The placement of the robots; None if they were not placed.
+        repeat: Number of the repeat of its protocol, from 1; None if the scene is valid for all repeats.
+        flows: The traffic of all steps of the procedure on the radio.
+        on_abort: The action of each drone if the attempt is aborted; drones without an entry land.
+        halt: Interrupts waits when the steps must not continue.
+        motions: The robots that move automatically, which the operator may stop.
+        origins: Origins of the robots that move automatically, and the record of each motion.
     """
 
     protocol: Protocol
@@ -97,20 +97,20 @@ class Scene:
         return self.cast[role]
 
     def tools(self, role: Role) -> Variants:
-        """Return the tools of the robot in `role`: those found, or those that its profile lets expect."""
+        """Return the detected tools of the robot in `role`, or those expected from its profile."""
         return self.variants.get(role) or variants.expected(self.cast[role].profile)
 
     @property
     def places_m(self) -> Mapping[Role, Vector]:
-        """Where robots were placed, as `geometry.positions_m` has it; empty where nobody placed them."""
+        """Positions at which the robots were placed, from `geometry.positions_m`; empty if they were not placed."""
         return {} if self.placement is None else geometry.positions_m(self.placement)
 
     def failure(self, planned: "Planned", what: str) -> RobotError:
-        """Return what to raise where a job did not do what it was to; its log says more.
+        """Return the error of a job that failed, with its log as the remedy.
 
         Args:
             planned: The job.
-            what: In one sentence without a full stop.
+            what: What happened, a sentence without a full stop.
         """
         return RobotError(what, where=self.robot(planned.role).name, remedy=f"see {planned.job.log} of this repeat")
 
@@ -120,9 +120,9 @@ class PutProgram:
     """A program of the lab that is copied to a robot before the first step of an attempt.
 
     Attributes:
-        role: To whose robot.
+        role: Role of the robot.
         program: The program.
-        at: Its path there, below the attempt's folder.
+        at: Its path on the robot, relative to the attempt's folder.
     """
 
     role: Role
@@ -135,15 +135,15 @@ class Planned:
     """A job that a step will run.
 
     Attributes:
-        role: Whose robot runs it.
+        role: Role of the robot that runs it.
         job: The job.
-        program: The tool behind the command line, which preflight looks for.
-        setup: Shell files to source before looking for it.
-        tool: Which tool that is, if it is one that has variants.
-        ends: Who may end it; ended by anybody else its evidence is not whole.
-        least_s: How long it runs at least where it ends by itself and nothing cuts it short, in seconds.
-        remedy: What to do where the program is missing; empty where the profile or a package is to blame.
-        put: Program of the lab that the job needs on the robot; None where it needs none.
+        program: The program of the command line, for which preflight searches.
+        setup: Shell files to source before this search.
+        tool: The tool of the program; None if it has no variants.
+        ends: Permitted causes of its end; after another cause its evidence is incomplete.
+        least_s: Minimum duration in seconds of a job that ended normally.
+        remedy: What to do if the program is missing; empty for the default remedy on profile and package.
+        put: Program of the lab that the job needs on the robot; None if it needs no such program.
     """
 
     role: Role
@@ -159,12 +159,12 @@ class Planned:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why a step cannot work with the tools that a robot has.
+    """A reason why a step cannot run on a robot.
 
     Attributes:
-        role: Whose robot.
-        what: Why not, in one sentence without a full stop.
-        remedy: What to do about it.
+        role: Role of the robot.
+        what: The reason, a sentence without a full stop.
+        remedy: What to do.
     """
 
     role: Role
@@ -174,15 +174,15 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Said:
-    """Output of a command that preflight ran on a robot.
+    """Result of a command that preflight ran on a robot.
 
     Attributes:
-        text: Its output and errors.
+        text: Its standard output and standard error.
         code: Its exit code.
     """
 
     MISSING: ClassVar[int] = 127
-    """Exit code of a command that a shell does not find."""
+    """Exit code of a shell if the command is not found."""
 
     text: str
     code: int
@@ -195,16 +195,16 @@ class Said:
 
 @dataclass(frozen=True)
 class Need:
-    """A right or a setting that a step needs of a robot, beside programs; preflight asks for it.
+    """A permission or setting that a step needs on a robot, which preflight checks with a command.
 
     Attributes:
-        role: Of whose robot.
-        name: What is checked.
-        argv: Command that changes nothing.
-        judge: Makes of its answer a verdict, a detail, and a remedy that is empty where all is well.
-        of: Program that must be there for the answer to mean anything; empty where there is none.
-        explains: Program that is not found because this need is not met; empty where there is none.
-        agent: Whether the command is of the agent, which is put on the robot before.
+        role: Role of the robot.
+        name: Name of the check.
+        argv: Command that changes nothing on the robot.
+        judge: Converts the result to a verdict, a detail, and a remedy, which is empty if the need is met.
+        of: Program without which the check is skipped; empty if the check depends on no program.
+        explains: Program that is not found if this need is not met, so that it is not reported; empty without one.
+        agent: Whether the command runs the agent, which is then installed first.
     """
 
     role: Role
@@ -221,9 +221,9 @@ class Pinging:
     """Round-trip times that a step measures.
 
     Attributes:
-        role: Whose robot asks, and prints them.
-        file: What it printed, in an attempt's folder.
-        name: Name of the step, empty without one.
+        role: Role of the robot that sends the requests and prints the times.
+        file: File of the output in an attempt's folder.
+        name: Name of the step; empty if it has no name.
     """
 
     role: Role
@@ -236,13 +236,13 @@ class Flow:
     """Packets that a step sends from one robot to another.
 
     Attributes:
-        source: Who sends.
-        destination: Who receives.
-        port: Port that one of them listens on; None where the packets have none.
-        frames: About how many Ethernet frames they are, answers too: `frames`.
+        source: Role of the sender.
+        destination: Role of the receiver.
+        port: Listening port of one of them; None if the packets have no ports.
+        frames: Approximate number of Ethernet frames including answers, from `frames`.
         protocol: Transport protocol; None for the one under test.
-        group: A multicast group that either of them sends to as well; None where neither does.
-        served: Whether it is a program of the source that listens, which is there anyway.
+        group: A multicast group to which either of them also sends; None without multicast.
+        served: Whether an existing program on the source listens, which is not started by the step.
     """
 
     source: Role
@@ -256,16 +256,16 @@ class Flow:
 
 @dataclass(frozen=True)
 class ListeningPort:
-    """A port that a step listens on for another robot.
+    """A port on which a robot listens for another robot.
 
     Attributes:
-        role: Whose robot listens.
-        port: On which port.
-        peer: Who speaks to it.
-        source: Who of the two sends the data, where the step knows its connections by the ports of both ends; None
-            where it knows them by this port alone.
-        by: Key of the step that gives it another port.
-        shared: Whether others may listen there at the same time, for who else does.
+        role: Role of the listening robot.
+        port: The port.
+        peer: Role of the robot that connects or sends to it.
+        source: Role of the one of the two that sends the data, if the step identifies its connections by the ports of
+            both ends; None if it identifies them by this port alone.
+        by: Key of the step that changes the port.
+        shared: Whether several programs can listen on the port at the same time.
     """
 
     role: Role
@@ -276,19 +276,19 @@ class ListeningPort:
     shared: bool = False
 
     def looks_like(self, other: "ListeningPort") -> bool:
-        """Return whether packets of both in one capture cannot be told apart."""
-        alike = (self.role, self.port, self.peer) == (other.role, other.port, other.peer)
-        opposite = None not in {self.source, other.source} and self.source != other.source
-        return alike and not opposite
+        """Return True if the packets of both ports cannot be distinguished in a capture."""
+        is_same = (self.role, self.port, self.peer) == (other.role, other.port, other.peer)
+        is_opposite = None not in {self.source, other.source} and self.source != other.source
+        return is_same and not is_opposite
 
 
 def frames(protocol: Protocol, size_bytes: float, payload_bytes: int) -> float:
-    """Return about how many Ethernet frames carry so many bytes, with TCP's acknowledgements.
+    """Return the approximate number of Ethernet frames for a number of bytes, including acknowledgements of TCP.
 
     Args:
-        protocol: What carries them.
-        size_bytes: How many.
-        payload_bytes: How many of them are in one datagram, where they are in datagrams.
+        protocol: Transport protocol.
+        size_bytes: Number of bytes.
+        payload_bytes: Payload of one datagram, if the protocol is UDP.
     """
     if protocol is Protocol.TCP:
         return 2 * size_bytes / _SEGMENT_BYTES
@@ -296,5 +296,5 @@ def frames(protocol: Protocol, size_bytes: float, payload_bytes: int) -> float:
 
 
 def fragments(payload_bytes: int) -> int:
-    """Return how many Ethernet frames carry a datagram of UDP, or an echo request, with so much payload."""
+    """Return the number of Ethernet frames for a UDP datagram or an echo request with this payload."""
     return math.ceil((payload_bytes + _HEADER_BYTES) / _FRAGMENT_BYTES)

@@ -1,4 +1,4 @@
-"""Streams over a middleware: what they are in a procedure, and what the agents on robots are told of them."""
+"""Streams of samples over a middleware: their YAML keys, and the arguments of the agents on the robots."""
 
 import json
 from collections.abc import Mapping
@@ -14,7 +14,15 @@ from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
 from fieldkit.ros import ports, tuning
 from fieldkit.ros.ports import MiddlewarePorts
-from fieldkit.steps.middlewares import BINDINGS, OVER_DDS, WAYS, Discovery, Over, judged, no_setting
+from fieldkit.steps.middlewares import (
+    BINDINGS,
+    DISCOVERY_METHODS,
+    OVER_DDS,
+    Discovery,
+    Over,
+    invalid_setting_reason,
+    judge_binding,
+)
 from fieldkit.steps.scene import Need, Scene
 
 if TYPE_CHECKING:
@@ -27,7 +35,7 @@ LONGEST_S: Final = 3600.0
 
 
 def _is_profile(name: str) -> str:
-    # This and the types of messages take 50 ms to load, which only who has a topic shall wait for.
+    # This module and the message types take 50 ms to import, so only procedures with topics import them.
     from fieldkit.ros.qos import PROFILES  # noqa: PLC0415
 
     if name not in PROFILES:
@@ -36,7 +44,7 @@ def _is_profile(name: str) -> str:
 
 
 class StreamQos(Strict):
-    """A quality of service: a profile of ROS 2, and what differs from it.
+    """A quality of service: a profile of ROS 2, and values that override it.
 
     Attributes:
         profile: `default`, `sensor_data`, `services_default`, `parameters`, `parameter_events` or `system_default`,
@@ -56,7 +64,7 @@ class StreamQos(Strict):
     deadline: Annotated[Duration, Field(gt=0)] | None = None
 
     def resolved(self) -> "QosProfile":
-        """Return it in ROS 2's terms."""
+        """Return the complete quality of service."""
         from fieldkit.ros.qos import PROFILES, Durability, History, QosProfile, Reliability  # noqa: PLC0415
 
         base = PROFILES[self.profile]
@@ -72,9 +80,9 @@ class StreamQos(Strict):
 Settings = dict[Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(/[A-Za-z_]\w*)*(@[A-Za-z]+)?$")], str]
 
 
-def _is_known(settings: Settings | str) -> Settings | str:
+def _validate_settings(settings: Settings | str) -> Settings | str:
     if settings not in ("default", "tuned") and isinstance(settings, str):
-        raise schema.complaint(f"settings is default, tuned, or the settings by their path, not {settings!r}")
+        raise schema.complaint(f"settings must be default, tuned, or a mapping of settings by path, not {settings!r}")
     return settings
 
 
@@ -120,74 +128,76 @@ class StreamOptions(Strict):
     patience: Annotated[Duration, Field(gt=0, le=600)] = 20.0
     domain: Annotated[Int, Field(ge=0, le=ports.MOST_DOMAIN)] = 42
     transport: Annotated[str, Field(pattern="^(tcp|udp)$")] = "tcp"
-    settings: Annotated[Settings | str, AfterValidator(_is_known)] = "default"
+    settings: Annotated[Settings | str, AfterValidator(_validate_settings)] = "default"
 
     @schema.model_validator(mode="after")
-    def _can_be(self) -> "StreamOptions":
+    def _is_consistent(self) -> "StreamOptions":
         if self.sender == self.receiver:
             raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
-        ways = WAYS[self.over]
-        if self.discovery is not None and self.discovery not in ways:
-            raise schema.complaint(f"{self.over} has {' and '.join(ways)}, not {self.discovery}", "discovery")
+        methods = DISCOVERY_METHODS[self.over]
+        if self.discovery is not None and self.discovery not in methods:
+            raise schema.complaint(f"{self.over} has {' and '.join(methods)}, not {self.discovery}", "discovery")
         if self.transport != "tcp" and self.over is not Over.ZENOH:
-            raise schema.complaint("only Zenoh can be carried by another transport than its own", "transport")
+            raise schema.complaint("only zenoh has a choice of transport; leave it out", "transport")
         if self.over is Over.ROS1 and (self.qos.reliability or self.qos.profile) in {"best_effort", "sensor_data"}:
             raise schema.complaint("ROS 1 sends by TCP, which is reliable; leave it out", "qos")
         if self.rate * self.duration < 1:
-            raise schema.complaint("it is over before its second sample", "duration")
+            raise schema.complaint(
+                "it ends before its second sample; write a longer duration or a higher rate", "duration"
+            )
         for name in self.own_settings if self.over is Over.ROS2 else ():
-            if why := no_setting(name):
+            if why := invalid_setting_reason(name):
                 raise schema.complaint(why, "settings")
         return self
 
     @property
-    def way(self) -> Discovery:
-        """How the ends find each other."""
-        return self.discovery or WAYS[self.over][0]
+    def discovery_method(self) -> Discovery:
+        """The discovery method: the given or the default one."""
+        return self.discovery or DISCOVERY_METHODS[self.over][0]
 
     @property
-    def serves(self) -> Role | None:
-        """Who runs a router or a master; None where there is none."""
-        return self.server if self.way in {Discovery.ROUTER, Discovery.MASTER} else None
+    def server_role(self) -> Role | None:
+        """Role of the robot that runs the router or the master; None without such a program."""
+        return self.server if self.discovery_method in {Discovery.ROUTER, Discovery.MASTER} else None
 
     @property
-    def members(self) -> frozenset[Role]:
-        """All who take part."""
-        return frozenset({self.sender, self.receiver} | ({self.serves} if self.serves else set()))
+    def participants(self) -> frozenset[Role]:
+        """Roles of sender, receiver, and router or master."""
+        return frozenset({self.sender, self.receiver} | ({self.server_role} if self.server_role else set()))
 
     @property
-    def wire(self) -> MiddlewarePorts:
-        """What tells its packets."""
-        multicast = self.way in {Discovery.MULTICAST, Discovery.ENVIRONMENT}
+    def wire_ports(self) -> MiddlewarePorts:
+        """Ports that identify its packets in a capture."""
+        multicast = self.discovery_method in {Discovery.MULTICAST, Discovery.ENVIRONMENT}
         if self.over in OVER_DDS:
             return ports.dds(self.domain, multicast=multicast)
         return ports.zenoh(self.domain, multicast=multicast) if self.over is Over.ZENOH else ports.ros1(self.domain)
 
     @property
-    def served_on(self) -> int:
-        """Port of the router or the master, and of Zenoh's own listeners; 0 for DDS, which has neither."""
+    def listening_port(self) -> int:
+        """Port of the router, of the master, or of Zenoh's listeners; 0 for DDS, which has no fixed one."""
         if self.over in OVER_DDS:
             return 0
         return ports.zenoh_listener(self.domain) if self.over is Over.ZENOH else ports.ros1_master(self.domain)
 
     @property
     def own_settings(self) -> Mapping[str, str]:
-        """The middleware's own settings by their path."""
+        """Settings of the middleware by their path."""
         if isinstance(self.settings, dict):
             return self.settings
         return tuning.tuned(self.over, self.transport) if self.settings == "tuned" else {}
 
     def network(self, scene: Scene, role: Role) -> dict[str, Any]:
-        """Return how a robot takes part, as `fieldkit.agent.middleware.Network` has it."""
+        """Return the fields of a `fieldkit.agent.middleware.Network` for a robot."""
         other = self.receiver if role == self.sender else self.sender
-        of_node = ports.ros1_node(self.domain) if self.over is Over.ROS1 else {}
-        settings = {**{name: str(port) for name, port in of_node.items()}, **self.own_settings}
+        node_ports = ports.ros1_node(self.domain) if self.over is Over.ROS1 else {}
+        settings = {**{name: str(port) for name, port in node_ports.items()}, **self.own_settings}
         return {
             "address": scene.robot(role).address,
-            "discovery": self.way.value,
-            "peers": [scene.robot(other).address] if self.way is Discovery.PEERS else [],
-            "server": scene.robot(self.serves).address if self.serves else "",
-            "port": self.served_on,
+            "discovery": self.discovery_method.value,
+            "peers": [scene.robot(other).address] if self.discovery_method is Discovery.PEERS else [],
+            "server": scene.robot(self.server_role).address if self.server_role else "",
+            "port": self.listening_port,
             "domain": self.domain,
             "node": f"fieldkit_{role}",
             "transport": self.transport,
@@ -195,15 +205,15 @@ class StreamOptions(Strict):
         }
 
     def environment(self, robot: Robot) -> dict[str, str]:
-        """Return the variables that the agent runs with: of ROS 2 the robot's own, and the settings."""
+        """Return the agent's environment variables: for ROS 2 those of the robot and the settings, else empty."""
         return {**robot.ros_environment, **self.own_settings} if self.over is Over.ROS2 else {}
 
     def need(self, role: Role, robot: Robot) -> Need:
-        """Return what says whether a robot's Python has the middleware."""
+        """Return the preflight check that a robot's Python has the middleware."""
         return need(role, robot, self.over, self.environment(robot))
 
-    def told(self, scene: Scene, role: Role) -> str:
-        """Return what the agent of an end is told, as JSON."""
+    def agent_arguments(self, scene: Scene, role: Role) -> str:
+        """Return the argument of the publishing or subscribing agent, as JSON."""
         from fieldkit.ros import topics, types  # noqa: PLC0415
 
         network = self.network(scene, role)
@@ -220,27 +230,27 @@ class StreamOptions(Strict):
         return compact({"network": network, "topic": described, "stream": stream})
 
 
-def compact(what: Any) -> str:  # noqa: ANN401 (of JSON)
-    """Return JSON without blanks."""
-    return json.dumps(what, separators=(",", ":"))
+def compact(value: Any) -> str:  # noqa: ANN401 (any JSON value)
+    """Return a value as JSON without blanks."""
+    return json.dumps(value, separators=(",", ":"))
 
 
 def setup(robot: Robot) -> tuple[str, ...]:
-    """Return the files to source first: a robot's middleware may be known only behind them."""
+    """Return the shell files to source first, which may add the middleware to the search path."""
     return robot.profile.ros.command.setup if robot.profile.ros else ()
 
 
 def python(robot: Robot, *words: str, environment: Mapping[str, str] | None = None) -> tuple[str, ...]:
-    """Return a command of a robot's Python, with variables of the environment that setup files do not change."""
+    """Return a command for a robot's Python; `environment` overrides variables of the setup files."""
     return with_environment((robot.profile.tools.python, *words), setup=setup(robot), environment=environment)
 
 
 def agent_command(robot: Robot, *words: str, environment: Mapping[str, str] | None = None) -> tuple[str, ...]:
-    """Return a command of the agent on a robot, for a job."""
+    """Return a command for the agent on a robot, to be run as a job."""
     return python(robot, agent.path_from_job(), *words, environment=environment)
 
 
 def need(role: Role, robot: Robot, over: Over, environment: Mapping[str, str] | None = None) -> Need:
-    """Return what says whether a robot's Python has a middleware, with variables of the environment."""
+    """Return the preflight check that a robot's Python has a middleware, run with these environment variables."""
     argv = python(robot, "-c", BINDINGS[over].load, environment=environment)
-    return Need(role, f"{over} for Python", argv, partial(judged, over), of=robot.profile.tools.python)
+    return Need(role, f"{over} for Python", argv, partial(judge_binding, over), of=robot.profile.tools.python)

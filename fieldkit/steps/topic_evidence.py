@@ -1,4 +1,4 @@
-"""Evidence of a topic: the logs of its ends and the captures around it, and the contradictions between them."""
+"""Evidence of a topic: the logs of publisher and subscriber, the captures, and contradictions between them."""
 
 from collections.abc import Iterator, Mapping
 from typing import Final
@@ -22,13 +22,13 @@ from fieldkit.steps.view import View, capture_around
 _ENVELOPE_BYTES: Final = 12
 _CDR_BYTES: Final = 16
 _ROS1_QUEUE: Final = 1000
-"""Samples that the agent has ROS 1 keep if the history keeps all (`fieldkit.agent.ros1`)."""
+"""Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.ros1`)."""
 _LATE_S: Final = 0.1
-"""A discovery is withheld if the first sample came this much later after it than the publisher waits."""
+"""Permitted delay of the first sample after discovery and the publisher's wait; else discovery is withheld."""
 
 
 def plan(step: StreamOptions) -> TopicPlan:
-    """Return what a step asks of its topic."""
+    """Return the plan of a step's topic, with which its logs are compared."""
     quality = step.qos.resolved()
     keeps_last = quality.history is not History.KEEP_ALL and quality.depth > 0
     depth = quality.depth if keeps_last else _ROS1_QUEUE if step.over is Over.ROS1 else None
@@ -38,7 +38,7 @@ def plan(step: StreamOptions) -> TopicPlan:
         size_bytes=round(step.bytes),
         envelope_bytes=_ENVELOPE_BYTES if step.over is Over.ROS1 else _CDR_BYTES,
         reliable=step.over in {Over.ROS1, Over.ZENOH} or quality.reliability is not Reliability.BEST_EFFORT,
-        # Zenoh hands samples to its callback without a queue of its own.
+        # Zenoh passes samples to the callback without a queue.
         depth=None if step.over is Over.ZENOH else depth,
         in_order=step.over in {Over.DDS, Over.ROS1},
         on_ports=step.over is not Over.ROS2,
@@ -51,28 +51,28 @@ def problems(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog]) -> 
     Args:
         step: The topic.
         view: The attempt.
-        logs: Whole logs by role.
+        logs: Complete logs by role.
     """
     yield from topic_checks.of_window(logs, {role: view.attempt_window(role) for role in logs})
     if {step.sender, step.receiver} <= logs.keys():
-        sent, came = logs[step.sender], logs[step.receiver]
-        wanted = plan(step)
-        reasons = list(topic_checks.of_logs(wanted, sent, came))
+        sent, received = logs[step.sender], logs[step.receiver]
+        topic_plan = plan(step)
+        reasons = list(topic_checks.of_logs(topic_plan, sent, received))
         yield from reasons
-        # The same cause makes many contradictions with the captures, too.
+        # The same cause would also lead to many contradictions with the captures.
         if not reasons:
-            yield from topic_captures.of_captures(wanted, sent, came, captured(step, view))
+            yield from topic_captures.of_captures(topic_plan, sent, received, captured(step, view))
 
 
 def captured(step: StreamOptions, view: View) -> Captured:
-    """Return the topic in the captures of both ends."""
-    near, far = (_flow(step, view, role) for role in (step.sender, step.receiver))
-    complete = near is not None and far is not None and topic_captures.is_complete(near, far)
-    return Captured(near, far, complete)
+    """Return the samples of the topic in the captures of sender and receiver."""
+    sent, received = (_flow(step, view, role) for role in (step.sender, step.receiver))
+    complete = sent is not None and received is not None and topic_captures.is_complete(sent, received)
+    return Captured(sent, received, complete)
 
 
 def dropped(step: StreamOptions, view: View) -> str:
-    """Return why columns that depend on the captures are withheld; empty if no packet was dropped before tcpdump."""
+    """Return why columns that need captures are withheld; empty if the kernel dropped no packet before tcpdump."""
     counts = {role: view.dropped(role) for role in (step.sender, step.receiver)}
     return " and ".join(
         f"the capture of {role} lacks {format_count(count, 'packet')} that its kernel dropped"
@@ -82,25 +82,25 @@ def dropped(step: StreamOptions, view: View) -> str:
 
 
 def _flow(step: StreamOptions, view: View, role: Role) -> SampleFlow | None:
-    """Return the topic in the capture of one of its ends; None without a whole capture."""
+    """Return the samples of the topic in the capture of a robot; None without a complete capture."""
     name = capture_around(view.within, role)
     capture = view.capture(role)
     if name is None or capture is None:
         return None
-    found = view.evidence.read(sample_heads.find, name, round(step.bytes))
+    heads = view.evidence.read(sample_heads.find, name, round(step.bytes))
     address = view.scene.robot(role).address
     publishes = role == step.sender
     return sample_heads.flow(
         capture.packets,
-        found,
-        step.wire.data,
+        heads,
+        step.wire_ports.data,
         round(step.bytes),
         lambda packets: packets.are_from(address) if publishes else ~packets.are_from(address),
     )
 
 
 def checked(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog], measured: Measured) -> Measured:
-    """Return what was measured without the figures of time that the captures do not confirm."""
+    """Return the measurements without the times that the captures contradict."""
     if not {step.sender, step.receiver} <= logs.keys():
         return measured
     sent, arrived = logs[step.sender], first_arrivals(logs[step.receiver])
@@ -115,18 +115,18 @@ def checked(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog], meas
 
 
 def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
-    """Return the whole logs by role, and what is wrong with the others, a sentence each."""
-    logs, wrong = dict[Role, TopicLog](), list[str]()
+    """Return the complete logs by role, and a sentence for each other log on what is wrong."""
+    logs, errors = dict[Role, TopicLog](), list[str]()
     for role, name in files.items():
         try:
             log = view.evidence.read(topic_log.read, name)
         except EvidenceError as error:
-            wrong.append(f"{name}: {error.what}")
+            errors.append(f"{name}: {error.what}")
             continue
         if not log.whole:
-            wrong.append(f"{name} has no end: the agent was ended")
+            errors.append(f"{name} is incomplete: the agent was stopped")
         else:
             logs[role] = log
         if log.foreign:
-            wrong.append(f"{name}: somebody else publishes {step.topic}, too: take another topic or domain")
-    return logs, wrong
+            errors.append(f"{name}: another program also publishes {step.topic}: use another topic or domain")
+    return logs, errors

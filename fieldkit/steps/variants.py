@@ -1,4 +1,4 @@
-"""Variants of a robot's tools, which share names and differ in options, output and abilities."""
+"""Variants of a robot's tools: implementations with the same name but different options, output and features."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from fieldkit.config.profiles import RobotProfile
 
 
 class Tool(StrEnum):
-    """A tool of the robot that has variants."""
+    """A tool that has variants."""
 
     NETCAT = "netcat"
     PING = "ping"
@@ -19,7 +19,7 @@ class Tool(StrEnum):
 
 
 class Netcat(StrEnum):
-    """A netcat."""
+    """A variant of netcat."""
 
     TRADITIONAL = "traditional"
     OPENBSD = "openbsd"
@@ -28,7 +28,7 @@ class Netcat(StrEnum):
 
 
 class PingTool(StrEnum):
-    """A ping; the old iputils, before 20210722, lets only root send more often than every 200 ms."""
+    """A variant of ping; iputils before 20210722 allows intervals below 200 ms only for root."""
 
     IPUTILS = "iputils"
     IPUTILS_OLD = "iputils-old"
@@ -36,7 +36,7 @@ class PingTool(StrEnum):
 
 
 class Recorder(StrEnum):
-    """What the profile's record command writes; `NONE`: nothing, the command or its storage plugin is missing."""
+    """The format that the profile's record command writes; `NONE` if the command or its storage plugin is missing."""
 
     ROSBAG = "rosbag"
     SQLITE3 = "ros2-sqlite3"
@@ -49,12 +49,12 @@ class Variants:
     """The tools of one robot.
 
     Attributes:
-        netcat: Its netcat.
-        ping: Its ping.
-        immediate_mode: Whether its tcpdump knows `--immediate-mode` (from 4.7 on).
-        recorder: What its record command writes.
-        root: Whether its user is root.
-        versions: What the tools that were asked say of their version.
+        netcat: Variant of netcat.
+        ping: Variant of ping.
+        immediate_mode: Whether its tcpdump supports `--immediate-mode` (since 4.7).
+        recorder: Format that its record command writes.
+        root: Whether the login user is root.
+        versions: Version text of each tool whose version was queried.
     """
 
     netcat: Netcat
@@ -66,17 +66,17 @@ class Variants:
 
 
 def expected(profile: RobotProfile) -> Variants:
-    """Return what the profile's program names let expect; a plain `nc` is taken for the traditional one."""
+    """Return the variants expected from the program names of a profile; `nc` counts as the traditional netcat."""
     names = {"nc.openbsd": Netcat.OPENBSD, "ncat": Netcat.NCAT, "busybox": Netcat.BUSYBOX}
     return Variants(
         netcat=names.get(PurePosixPath(profile.tools.netcat).name, Netcat.TRADITIONAL),
         ping=PingTool.BUSYBOX if "busybox" in profile.tools.ping else PingTool.IPUTILS,
         immediate_mode=True,
-        recorder=_written(profile),
+        recorder=_expected_recorder(profile),
     )
 
 
-def _written(profile: RobotProfile) -> Recorder:
+def _expected_recorder(profile: RobotProfile) -> Recorder:
     if profile.ros is None:
         return Recorder.NONE
     if profile.ros.variant == "ros1":

@@ -1,4 +1,4 @@
-"""One attempt, as the measures of a step read it."""
+"""The view of one attempt from which a step checks and measures its evidence."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """One attempt as its measures see it.
+    """One attempt with its evidence, from the position of one step.
 
     Attributes:
         scene: The attempt.
-        evidence: What it left.
-        within: The steps that the one that is measured ran inside, the outermost first.
+        evidence: The files of the attempt.
+        within: The steps around the measured step, the outermost first.
     """
 
     scene: Scene
@@ -29,25 +29,25 @@ class View:
     within: Sequence["Nest"] = ()
 
     def capture(self, role: Role) -> Capture | None:
-        """Return what a robot captured while the step ran; None where it did not, or its capture is not complete."""
+        """Return the capture of a robot around the step; None if there is none or it is incomplete."""
         name = capture_around(self.within, role)
         return None if name is None or self.dropped(role) else self.evidence.whole_capture(name)
 
     def dropped(self, role: Role) -> int:
-        """Return how many packets a robot's kernel and interface dropped before tcpdump while the step ran.
+        """Return the number of packets that a robot's kernel and interface dropped before tcpdump.
 
-        It is 0 where no robot captured, or tcpdump gave no counters: such a capture is damaged in another way.
+        It is 0 without a capture around the step, and without counters of tcpdump, which other checks report.
         """
         name = capture_around(self.within, role)
         log = None if name is None else self.evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_of(name))
         return 0 if log is None else (log.dropped_by_kernel or 0) + (log.dropped_by_interface or 0)
 
     def captured(self, *roles: Role) -> bool:
-        """Return whether all of these robots captured while the step ran."""
+        """Return True if all of these robots captured while the step ran."""
         return all(capture_around(self.within, role) is not None for role in roles)
 
     def attempt_window(self, role: Role) -> tuple[int, int] | None:
-        """Return a robot's clock before and after the attempt, nanoseconds since 1970; None if it noted no clock."""
+        """Return a robot's clock before and after the attempt, in ns since 1970; None if it was not recorded."""
         before, after = (self.evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
         if before is None or after is None or before.clock is None or after.clock is None:
             return None
@@ -55,11 +55,11 @@ class View:
 
 
 def capture_around(within: Sequence["Nest"], role: Role) -> str | None:
-    """Return the file of the innermost capture of a robot around a step; None where it does not capture.
+    """Return the file of the innermost capture of a robot around a step; None if the robot does not capture.
 
     Args:
-        within: The steps that the one that is asked about stands inside, the outermost first.
-        role: Whose capture.
+        within: The steps around the step, the outermost first.
+        role: Role of the robot.
     """
     files = (nest.captures().get(role) for nest in reversed(within))
     return next((file for file in files if file is not None), None)

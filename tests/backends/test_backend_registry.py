@@ -1,4 +1,4 @@
-"""Backends by name: those that are not installed, cannot be loaded, or lack their site file."""
+"""Backends by name: errors for a backend that is not installed, cannot be loaded, or has no site file."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from fieldkit.core.errors import ConfigurationError
 from tests.helpers.outside_packages import write_package
 
 
-def test_no_site_file_and_an_unknown_backend_are_errors() -> None:
+def test_missing_site_file_and_unknown_backend_are_errors() -> None:
     with pytest.raises(ConfigurationError, match="needs a site file"):
         load_backend("field", None, None)
     with pytest.raises(ConfigurationError, match="no backend 'gazebo'") as caught:
@@ -18,7 +18,7 @@ def test_no_site_file_and_an_unknown_backend_are_errors() -> None:
     assert "emulated" in caught.value.remedy
 
 
-def test_a_backend_that_cannot_be_loaded_names_its_entry_point(
+def test_error_of_backend_that_cannot_be_loaded_names_entry_point(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_package(tmp_path, "bench", f"[{plugins.BACKENDS}]\nbench = no_such_package:Bench\n")

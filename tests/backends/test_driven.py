@@ -1,4 +1,4 @@
-"""Who can be driven by its topic alone: robots that share a master or a domain, and those that do not."""
+"""Conflicts of ROS topics between robots that share a ROS master or a domain, and between those that do not."""
 
 import pytest
 
@@ -15,9 +15,11 @@ def robot(name: str, profile: RobotProfile = TURTLEBOT, master: str = "") -> Rob
 
 
 def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str | None = None) -> RobotProfile:
-    """The TurtleBot, with topics of its own; in a domain it has ROS 2."""
+    """Return the profile of the TurtleBot with these topic names; with a domain it has ROS 2."""
     ros = ros_of(TURTLEBOT)
-    topics = tuple(one.model_copy(update={"name": odometry}) if one.name == "/odom" else one for one in ros.topics)
+    topics = tuple(
+        item.model_copy(update={"name": odometry}) if item.name == "/odom" else item for item in ros.topics
+    )
     update: dict[str, object] = {"topics": topics}
     if domain is not None:
         update |= {"variant": "ros2", "environment": {"ROS_DOMAIN_ID": domain} if domain else {}}
@@ -31,25 +33,25 @@ def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str |
     [
         (robot("other"), None),
         (robot("other", master="10.42.0.4"), None),
-        (robot("other", master=MASTER), "other listens to /cmd_vel of the ROS master at 10.42.0.3 too"),
-        (robot("other", turtlebot(topic="/other/cmd_vel"), MASTER), "other publishes /odom of the ROS master"),
+        (robot("other", master=MASTER), "other also subscribes to /cmd_vel of the ROS master at 10.42.0.3"),
+        (robot("other", turtlebot(topic="/other/cmd_vel"), MASTER), "other also publishes /odom of the ROS master"),
         (robot("other", turtlebot(topic="/other/cmd_vel", odometry="/other/odom"), MASTER), None),
         (robot("other", turtlebot(domain="0")), None),
         (robot("other", DUCKIEDRONE, MASTER), None),
         (robot("one", master=MASTER), None),
     ],
 )
-def test_robots_of_one_master_hear_each_other(other: Robot, why: str | None) -> None:
-    found = disturbed(robot("one", master=MASTER), [other])
-    assert found == why if why is None else found is not None and found.startswith(why)
+def test_conflicts_of_robots_with_one_master(other: Robot, why: str | None) -> None:
+    reason = disturbed(robot("one", master=MASTER), [other])
+    assert reason == why if why is None else reason is not None and reason.startswith(why)
 
 
 @pytest.mark.parametrize(("domain", "alone"), [("", False), ("0", False), ("7", True)])
-def test_robots_of_one_domain_hear_each_other(domain: str, alone: bool) -> None:
-    found = disturbed(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
-    assert (found is None) is alone
-    assert alone or found == "other listens to /cmd_vel of ROS domain 0 too, and would drive as well"
+def test_conflicts_of_robots_with_ros2_domains(domain: str, alone: bool) -> None:
+    reason = disturbed(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
+    assert (reason is None) is alone
+    assert alone or reason == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"
 
 
-def test_robots_with_masters_of_their_own_hear_nobody_else() -> None:
+def test_robots_with_separate_masters_have_no_conflict() -> None:
     assert disturbed(robot("one"), [robot("other")]) is None

@@ -1,4 +1,4 @@
-"""The field backend against a real sshd on loopback: it reads the site file, asks a person, and pins keys."""
+"""The field backend with a real sshd on loopback: site file, requests to the operator, pinned host keys."""
 
 import re
 from pathlib import Path
@@ -29,11 +29,13 @@ roles:
 
 
 def site(access: str) -> str:
-    """Return a site of two robots that one server plays, under the two names that it has."""
+    """Return a site file with two robots, which are one server under two host names."""
     return SITE.format(access=access, same=access.replace("127.0.0.1", "localhost"))
 
 
-class Listening:
+class RecordingOperator:
+    """An operator that records the requests."""
+
     def __init__(self) -> None:
         self.asked: list[str] = []
 
@@ -59,12 +61,12 @@ def backend(tmp_path: Path, access: str) -> Backend:
     return load_backend("field", *load_site(path))
 
 
-def test_robots_are_reached_and_a_person_places_them(tmp_path: Path, access: str) -> None:
+def test_robots_are_connected_and_placed_by_the_operator(tmp_path: Path, access: str) -> None:
     field = backend(tmp_path, access)
     cast = field.cast(Topology.MASTERLESS)
     assert cast[Role.SENDER].address == "10.0.0.2"
-    assert cast[Role.RECEIVER].address == "127.0.0.1", "without an address of its own, the host's"
-    operator = Listening()
+    assert cast[Role.RECEIVER].address == "127.0.0.1", "the host is the default of the address"
+    operator = RecordingOperator()
     with field.open(cast, seed=1, sink=lambda event: None, operator=operator) as lab:
         lab.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("30ft")))
         for shell in lab.shells.values():
@@ -72,7 +74,7 @@ def test_robots_are_reached_and_a_person_places_them(tmp_path: Path, access: str
     assert operator.asked == ["move turtlebot-1 to 30 ft (9.14 m) from duckiedrone-1, behind the wall"]
 
 
-def test_a_changed_host_key_stops_it(tmp_path: Path, access: str) -> None:
+def test_changed_host_key_is_an_error(tmp_path: Path, access: str) -> None:
     other = " ".join(make_key(tmp_path / "other").split()[:2])
     field = backend(tmp_path, re.sub(r"host_key: .*", f"host_key: {other}", access))
     cast = field.cast(Topology.MASTERLESS)
@@ -82,24 +84,24 @@ def test_a_changed_host_key_stops_it(tmp_path: Path, access: str) -> None:
     ):
         preflight.meet(cast, lab.shells, lambda event: None)
     assert "turtlebot-1" in caught.value.what
-    assert "duckiedrone-1" in caught.value.what, "every robot is tried"
+    assert "duckiedrone-1" in caught.value.what, "all robots are tried"
 
 
 @pytest.mark.parametrize("key", ["host", "user", "host_key"])
-def test_what_the_site_file_must_give_is_named_with_its_line(tmp_path: Path, access: str, key: str) -> None:
+def test_missing_key_of_site_file_is_reported_with_line(tmp_path: Path, access: str, key: str) -> None:
     less = re.sub(rf"\b{key}: [^,]+(, )?", "", access)
     with pytest.raises(ConfigurationError, match=f"'turtlebot-1' has no {key}") as caught:
         backend(tmp_path, less)
     assert caught.value.where.endswith("fieldkit.yaml:3")
 
 
-def test_a_topology_without_roles_says_what_to_add(tmp_path: Path, access: str) -> None:
+def test_error_of_topology_without_roles_names_the_key(tmp_path: Path, access: str) -> None:
     with pytest.raises(ConfigurationError, match="no roles for topology master") as caught:
         backend(tmp_path, access).cast(Topology.MASTER)
     assert "roles.master" in caught.value.remedy
 
 
-def test_a_key_file_that_cannot_be_read_is_named(tmp_path: Path, access: str) -> None:
+def test_unreadable_key_file_is_named(tmp_path: Path, access: str) -> None:
     field = backend(tmp_path, re.sub(r"key: \S+key,", "key: /no/such/key,", access))
     cast = field.cast(Topology.MASTERLESS)
     with (
@@ -109,13 +111,13 @@ def test_a_key_file_that_cannot_be_read_is_named(tmp_path: Path, access: str) ->
         raise AssertionError("opened")
 
 
-def test_robots_drive_by_themselves_where_that_is_allowed_alone(tmp_path: Path, access: str) -> None:
+def test_robots_drive_automatically_only_if_allowed(tmp_path: Path, access: str) -> None:
     field = backend(tmp_path, access)
     assert not any(robot.drives for robot in field.cast(Topology.MASTERLESS).values())
     field.allow_motion = True
     cast = field.cast(Topology.MASTERLESS)
-    assert {role for role, robot in cast.items() if robot.drives} == {Role.SENDER}, "a drone has no wheels"
-    operator = Listening()
+    assert {role for role, robot in cast.items() if robot.drives} == {Role.SENDER}, "a drone does not drive"
+    operator = RecordingOperator()
     with field.open(cast, seed=1, sink=lambda event: None, operator=operator) as lab:
         lab.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("5m")))
         lab.bring_back(Role.SENDER, by_itself=True)
@@ -123,7 +125,7 @@ def test_robots_drive_by_themselves_where_that_is_allowed_alone(tmp_path: Path, 
     assert operator.asked == [
         (
             "move turtlebot-1 to 5 m from duckiedrone-1, nothing between them; let turtlebot-1 face away from "
-            "duckiedrone-1, its way free: it drives by itself"
+            "duckiedrone-1 with a clear path: it drives automatically"
         ),
         "bring turtlebot-1 back to its place",
     ]

@@ -1,4 +1,4 @@
-"""In the field a person makes the faults and moves the robots: what is asked and in which order."""
+"""In the field the operator causes faults and moves robots: the requests and their order."""
 
 import pytest
 
@@ -10,14 +10,14 @@ from fieldkit.core.prompts import DONE, Answer, Question
 from tests.helpers.casts import CAST
 
 
-class Person:
-    """Does what is asked, and remembers it."""
+class RecordingOperator:
+    """An operator that fulfils and records each request."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
-        assert not may_skip, "a fault in the middle of a repeat cannot be left for later"
+        assert not may_skip, "a fault during a repeat cannot be postponed"
         self.asked.append(request)
         return DONE
 
@@ -32,19 +32,19 @@ class Person:
         (Fault(FaultKind.KILL, Role.SENDER, process="nc"), ["kill nc on turtlebot-1"], 0.0),
         (
             Fault(FaultKind.OUT_OF_RANGE, Role.SENDER, 10.0),
-            ["carry turtlebot-1 out of range, wait 10 s, and back"],
+            ["carry turtlebot-1 out of range, wait 10 s, and carry it back"],
             None,
         ),
     ],
 )
-def test_one_request(fault: Fault, asked: list[str], lasted_s: float | None) -> None:
-    person = Person()
-    assert FieldTestbed(CAST, {}, person).inject(fault) == lasted_s
-    assert person.asked == asked
+def test_request_and_duration_of_each_fault(fault: Fault, asked: list[str], lasted_s: float | None) -> None:
+    operator = RecordingOperator()
+    assert FieldTestbed(CAST, {}, operator).inject(fault) == lasted_s
+    assert operator.asked == asked
 
 
-class Hours(Person):
-    """Takes 2 s for each request, by a clock that nothing else moves but sleep."""
+class SlowOperator(RecordingOperator):
+    """An operator that needs 2 s for each request, and a simulated clock."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -61,29 +61,31 @@ class Hours(Person):
         return super().ask(request, may_skip=may_skip)
 
 
-def test_a_link_is_off_between_the_answers_to_two_requests(monkeypatch: pytest.MonkeyPatch) -> None:
-    person = Hours()
-    monkeypatch.setattr("fieldkit.backends.field.time", person)
-    assert FieldTestbed(CAST, {}, person).inject(Fault(FaultKind.LINK_DOWN, Role.SENDER, 10.0)) == 12.0
-    assert person.asked == ["switch the Wi-Fi of turtlebot-1 off", "switch the Wi-Fi of turtlebot-1 on again"]
+def test_link_down_lasts_from_first_to_second_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    operator = SlowOperator()
+    monkeypatch.setattr("fieldkit.backends.field.time", operator)
+    assert FieldTestbed(CAST, {}, operator).inject(Fault(FaultKind.LINK_DOWN, Role.SENDER, 10.0)) == 12.0
+    assert operator.asked == ["switch the Wi-Fi of turtlebot-1 off", "switch the Wi-Fi of turtlebot-1 on again"]
 
 
 AWAY = Move(Role.SENDER, (Leg(away_m=10.0), Leg(left_m=2.0)), 0.2)
-SET_OFF = "move turtlebot-1, as seen from {}: 10 m away, then 2 m left, at 0.2 m/s; answer as it sets off"
+START_REQUEST = (
+    "move turtlebot-1, as seen from {}: 10 m away, then 2 m left, at 0.2 m/s; answer when it starts to move"
+)
 
 
-def test_a_robot_is_driven_and_brought_back() -> None:
-    person = Person()
-    with FieldTestbed(CAST, {}, person).moving(AWAY):
-        assert person.asked == [SET_OFF.format("duckiedrone-1")]
-    assert person.asked[1:] == ["bring turtlebot-1 back to its place"]
+def test_operator_moves_robot_and_brings_it_back() -> None:
+    operator = RecordingOperator()
+    with FieldTestbed(CAST, {}, operator).moving(AWAY):
+        assert operator.asked == [START_REQUEST.format("duckiedrone-1")]
+    assert operator.asked[1:] == ["bring turtlebot-1 back to its place"]
 
 
 @pytest.mark.parametrize("error", [RobotError("x", remedy="y"), KeyboardInterrupt()])
-def test_an_attempt_that_failed_begins_again_from_the_place_and_ctrl_c_asks_nobody(error: BaseException) -> None:
-    person = Person()
+def test_robot_is_brought_back_after_error_but_not_after_ctrl_c(error: BaseException) -> None:
+    operator = RecordingOperator()
     direct: dict[Role, Robot] = {role: CAST[role] for role in (Role.SENDER, Role.RECEIVER)}
-    with pytest.raises(type(error)), FieldTestbed(direct, {}, person).moving(AWAY):
+    with pytest.raises(type(error)), FieldTestbed(direct, {}, operator).moving(AWAY):
         raise error
     back = ["bring turtlebot-1 back to its place"] if isinstance(error, Exception) else []
-    assert person.asked == [SET_OFF.format("turtlebot-2"), *back]
+    assert operator.asked == [START_REQUEST.format("turtlebot-2"), *back]

@@ -151,7 +151,7 @@ def test_two_robots_may_record_bags_of_two_names_and_not_of_one() -> None:
 
 def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
     document = schema.parse(PROCEDURE.replace("robot: sender", "robot: receiver", 1), source="los.yaml")
-    said = "the transfer from sender names no file, and no step before it records on sender"
+    said = "the transfer from sender names no file, but no step before it records on sender"
     with pytest.raises(ConfigurationError, match=said):
         schema.validate(document, Procedure)
 

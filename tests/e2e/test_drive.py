@@ -410,7 +410,7 @@ def test_ctrl_c_of_a_robot_out_of_reach_says_that_its_lease_stops_it(outside: Ou
         wait_until(lambda: (now := said(outside)) is not None and not now.moves, Deadline.after(60))
         run = finish(process)
     assert run.code == 130
-    assert f"no answer from rover-1: it stops by itself within {LEASE_S:g} s" in run.err
+    assert f"no answer from rover-1: it stops automatically within {LEASE_S:g} s" in run.err
 
 
 def test_stop_of_a_suspended_agent_lets_it_send_no_other_velocity(outside: Outside) -> None:

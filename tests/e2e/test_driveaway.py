@@ -135,4 +135,4 @@ def test_who_is_too_slow_is_refused_before_anything_moves(lab: Path) -> None:
     path.write_text(path.read_text().replace("      within_limits: true\n", ""))
     run = fieldkit(lab, "trial", "rush", "10m", "--repeats", "1")
     assert run.code == 3, run.err
-    assert "its top speed is 0.22 m/s, and it is to move at 4 m/s" in run.out + run.err
+    assert "its top speed is 0.22 m/s, but the move needs 4 m/s" in run.out + run.err

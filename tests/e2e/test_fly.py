@@ -175,7 +175,7 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(out
     stops, comes, ground = map(
         stopped.err.index,
         (
-            "stopping: copter-1 returns by itself, if it is in the air: for up to about ",
+            "stopping: copter-1 returns automatically, if it is in the air: this takes up to about ",
             "copter-1: coming down (return)",
             "copter-1: stopped (on the ground)",
         ),

@@ -94,7 +94,7 @@ def test_without_a_master_the_loss_of_the_drone_changes_nothing(tmp_path: Path) 
 def test_a_master_out_of_range_stops_the_trial_before_its_first_repeat(tmp_path: Path) -> None:
     """It is there when the robots start, side by side."""
     run = fieldkit(lab_with_one_master(tmp_path), "trial", "los", "900m", "--repeats", "1", "--protocol", "tcp")
-    assert_refused(run, 3, "turtlebot-1: ROS master: none answers at duckiedrone-1, 10.42.0.3:11311")
+    assert_refused(run, 3, "turtlebot-1: ROS master: no master answers at duckiedrone-1, 10.42.0.3:11311")
 
 
 def test_robots_with_the_built_in_ros_cannot_share_a_master(tmp_path: Path) -> None:

@@ -101,7 +101,7 @@ def test_busybox_sends_and_receives_by_tcp(tmp_path: Path) -> None:
     ("pair", "words"),
     [
         (Pair("netcat: busybox", "netcat: openbsd"), ("one: tools: busybox nc has no UDP", "netcat-traditional")),
-        (Pair("netcat: openbsd", "netcat: traditional"), ("two: tools: its netcat cuts off", "netcat-openbsd")),
+        (Pair("netcat: openbsd", "netcat: traditional"), ("two: tools: its netcat truncates", "netcat-openbsd")),
     ],
     ids=lambda value: f"{value.sender} to {value.receiver}" if isinstance(value, Pair) else "",
 )

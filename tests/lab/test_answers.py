@@ -1,4 +1,4 @@
-"""Messages of the lab's process: what one end packs, the other reads; what is none of them is refused."""
+"""Messages of the lab's process: packed messages are read unchanged, and invalid ones are refused."""
 
 from collections.abc import Callable
 
@@ -24,14 +24,14 @@ OVERVIEW = Overview(
 READERS = [answers.state, answers.overview, answers.place_m]
 
 
-def test_what_is_packed_is_read_as_it_was() -> None:
+def test_packed_answers_are_read_unchanged() -> None:
     assert answers.state(answers.pack_state(STATE)) == STATE
     assert answers.overview(answers.pack_overview(OVERVIEW)) == OVERVIEW
     assert answers.place_m(answers.pack_place((1.0, -2.0, 0.5))) == (1.0, -2.0, 0.5)
 
 
 @pytest.mark.parametrize("up_m", [None, 1.5])
-def test_a_destination_is_one_line(up_m: float | None) -> None:
+def test_destination_is_one_line(up_m: float | None) -> None:
     to = Destination(east_m=3.0, north_m=-1.0, up_m=up_m, relative=True)
     request = answers.pack_destination(to)
     assert "\n" not in request
@@ -43,7 +43,7 @@ def test_a_destination_is_one_line(up_m: float | None) -> None:
     ("packed", "raised"),
     [(ConfigurationError, ConfigurationError), (LinkError, LinkError), (RobotError, LinkError)],
 )
-def test_an_error_is_raised_where_it_was_asked(
+def test_packed_error_is_raised_by_reader(
     read: Callable[[bytes], object], packed: type[FieldkitError], raised: type[FieldkitError]
 ) -> None:
     with pytest.raises(raised, match="no such place") as caught:
@@ -54,7 +54,7 @@ def test_an_error_is_raised_where_it_was_asked(
 
 @pytest.mark.parametrize("read", READERS)
 @pytest.mark.parametrize("answer", [b"", b"{", b"[]", b"null", b"{}", b'{"error": 3}', b'{"place_m": ["1", 2, 3]}'])
-def test_what_is_no_answer_is_a_value_error(read: Callable[[bytes], object], answer: bytes) -> None:
+def test_invalid_answer_is_value_error(read: Callable[[bytes], object], answer: bytes) -> None:
     with pytest.raises(ValueError, match=r"\S"):
         read(answer)
 
@@ -62,6 +62,6 @@ def test_what_is_no_answer_is_a_value_error(read: Callable[[bytes], object], ans
 @pytest.mark.parametrize(
     "request_", ["", "{}", "[1, 2]", '{"east_m": "1", "north_m": 2, "up_m": 0, "relative": false}']
 )
-def test_what_is_no_destination_is_a_value_error(request_: str) -> None:
+def test_invalid_destination_is_value_error(request_: str) -> None:
     with pytest.raises(ValueError, match=r"\S"):
         answers.destination(request_)

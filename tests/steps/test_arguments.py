@@ -1,4 +1,4 @@
-"""Variables in arguments: only theirs are replaced, and one argument stays one, whatever it holds."""
+"""Variables in arguments: only known names are replaced, and an argument stays one argument."""
 
 import pytest
 from hypothesis import given
@@ -9,11 +9,11 @@ from fieldkit.steps import arguments
 VALUES = {"distance": "30ft", "repeat": "7", "put": ".put/run/probe"}
 
 
-def filled(word: str) -> str:
-    return arguments.filled(word, VALUES, lambda role: f"<{role}>")
+def fill_in(word: str) -> str:
+    return arguments.fill_in(word, VALUES, lambda role: f"<{role}>")
 
 
-# What each piece of an argument becomes, written down by hand.
+# Expected result of each piece of an argument, written by hand.
 PIECES = {
     "{distance}": "30ft",
     "{repeat}": "7",
@@ -43,26 +43,26 @@ PIECES = {
 
 
 @given(st.lists(st.sampled_from(sorted(PIECES))))
-def test_each_piece_becomes_what_it_stands_for_and_nothing_else(pieces: list[str]) -> None:
-    assert filled(" ".join(pieces)) == " ".join(PIECES[piece] for piece in pieces)
+def test_variables_are_replaced_and_other_text_is_unchanged(pieces: list[str]) -> None:
+    assert fill_in(" ".join(pieces)) == " ".join(PIECES[piece] for piece in pieces)
     assert arguments.problem(" ".join(pieces), has_program=True) is None
 
 
 @given(st.text(alphabet="{}$ a.distncerpu", max_size=40))
-def test_a_text_without_a_variable_stays_as_it_is(text: str) -> None:
+def test_text_without_variable_is_unchanged(text: str) -> None:
     if not any(f"{name}}}" in text for name in ("distance", "repeat", "put")) and "address." not in text:
         literals = [name for name in ("{{", "}}") if name in text]
-        assert literals or filled(text) == text
+        assert literals or fill_in(text) == text
 
 
 @given(st.text(max_size=30))
-def test_a_value_is_not_looked_at_again(value: str) -> None:
-    word = arguments.filled("a{distance}b{repeat}", {"distance": value, "repeat": "{distance}"}, str)
+def test_values_are_not_expanded_again(value: str) -> None:
+    word = arguments.fill_in("a{distance}b{repeat}", {"distance": value, "repeat": "{distance}"}, str)
     assert word == f"a{value}b{{distance}}"
 
 
 @pytest.mark.parametrize(
-    ("word", "meant"),
+    ("word", "suggested"),
     [
         ("{distanse}", "{distance}"),
         ("{Distance}", "{distance}"),
@@ -75,13 +75,13 @@ def test_a_value_is_not_looked_at_again(value: str) -> None:
         ("{adress.receiver}", "{address.receiver}"),
     ],
 )
-def test_what_is_almost_a_variable_is_refused_with_the_nearest_name(word: str, meant: str) -> None:
+def test_misspelled_variable_is_refused_with_suggestion(word: str, suggested: str) -> None:
     why = arguments.problem(f"--x={word}", has_program=True)
     assert why is not None
-    assert f"there is no variable {word}; did you mean '{meant}'? write {{{word}}} for the text {word}" == why
-    assert filled(f"{{{word}}}") == word, "the remedy works when it is typed"
+    assert f"there is no variable {word}; did you mean '{suggested}'? write {{{word}}} for the text {word}" == why
+    assert fill_in(f"{{{word}}}") == word, "the remedy works when it is typed"
 
 
-def test_the_path_of_a_program_that_is_not_copied_is_refused() -> None:
-    assert "there is no put:" in (arguments.problem("{put}", has_program=False) or "")
+def test_put_without_copied_program_is_refused() -> None:
+    assert "the step has no put:" in (arguments.problem("{put}", has_program=False) or "")
     assert arguments.problem("{{put}}", has_program=False) is None

@@ -1,4 +1,4 @@
-"""A lease: what is written on the robot, how often, and what becomes of it where the link is cut."""
+"""A lease: orders on the robot, their renewals, and errors of the link and the program."""
 
 from collections.abc import Sequence
 from threading import Event
@@ -10,14 +10,14 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, LockLostError, RobotError
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed, Shell
-from fieldkit.steps.lease import HeldLease, orders_file
+from fieldkit.steps.lease import LeaseKeeper, orders_file
 
 JOB = Job(folder="f", name="up.fly", argv=(), limit_s=1.0, log="up.fly.log")
-SOON_S = 0.05
+SHORT_S = 0.05
 
 
 class Link:
-    """A shell that notes each line that is written, and is broken for a while."""
+    """A shell that records each written line, and fails for a number of calls."""
 
     robot = "r"
 
@@ -40,18 +40,25 @@ class Link:
         return [words[-2] for words in self.words]
 
 
-def held(link: Link, unheard_s: float | None = None) -> HeldLease:
-    shell = cast("Shell", link)
-    return HeldLease(shell, JOB, says="log", order="stay", lease_s=SOON_S, renewals=2, unheard_s=unheard_s)
+def keeper(link: Link, silent_lease_s: float | None = None) -> LeaseKeeper:
+    return LeaseKeeper(
+        cast("Shell", link),
+        JOB,
+        output_file="log",
+        order="stay",
+        lease_s=SHORT_S,
+        renewals=2,
+        silent_lease_s=silent_lease_s,
+    )
 
 
-def test_an_order_is_renewed_over_a_link_that_breaks_until_the_context_is_left() -> None:
+def test_order_is_renewed_over_interrupted_link_until_context_is_left() -> None:
     link = Link()
-    with held(link) as lease:
+    with keeper(link) as lease:
         assert lease.said == b"said"
         link.broken = 2
         assert link.many.wait(60)
-        lease.order("go")
+        lease.give_order("go")
     count = len(link.lines)
     numbers, orders, seconds = zip(*(line.split() for line in link.lines), strict=True)
     assert sorted(map(int, numbers)) == list(range(1, count + 1))
@@ -62,63 +69,64 @@ def test_an_order_is_renewed_over_a_link_that_breaks_until_the_context_is_left()
     assert orders_file("up.fly") == "up.fly.orders"
 
 
-def test_where_nothing_may_be_sent_an_order_holds_longer_and_is_not_renewed() -> None:
+def test_silent_lease_lasts_longer_and_is_not_renewed() -> None:
     link = Link()
-    with held(link, unheard_s=90.0) as lease:
-        lease.order("go")
-        assert not any(thread_renews(lease))
+    with keeper(link, silent_lease_s=90.0) as lease:
+        lease.give_order("go")
+        assert not any(renewal_threads(lease))
     assert link.lines == ["1 stay 90", "2 go 90"]
 
 
-def thread_renews(lease: HeldLease) -> list[bool]:
+def renewal_threads(lease: LeaseKeeper) -> list[bool]:
+    """Return whether the thread of renewals is alive."""
     lease._thread.join(60)
     return [lease._thread.is_alive()]
 
 
-def test_an_order_that_is_not_taken_is_an_error() -> None:
+def test_order_that_cannot_be_written_is_an_error() -> None:
     link = Link()
-    with held(link, unheard_s=90.0) as lease:
+    with keeper(link, silent_lease_s=90.0) as lease:
         link.broken = 1
         with pytest.raises(LinkError):
-            lease.order("go")
-        lease.look()
+            lease.give_order("go")
+        lease.renew()
     assert link.lines[-1] == "3 go 90"
 
 
-def test_who_cannot_be_reached_at_first_is_an_error() -> None:
+def test_unreachable_robot_at_start_is_an_error() -> None:
     link = Link()
     link.broken = 1
-    with pytest.raises(LinkError), held(link):
-        pytest.fail("nobody has a lease")
+    with pytest.raises(LinkError), keeper(link):
+        pytest.fail("the lease was entered")
 
 
 class Ending(Link):
-    """A shell whose program has ended when it is looked at for the third time."""
+    """A shell whose program has exited at the third query."""
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        done = super().run(argv, deadline=deadline)
-        said = b"bash: warning: no locale\n7\n" if len(self.words) > 2 else b"bash: warning: no locale\n"
-        return Completed(done.argv, 0, done.stdout, said)
+        result = super().run(argv, deadline=deadline)
+        stderr = b"bash: warning: no locale\n7\n" if len(self.words) > 2 else b"bash: warning: no locale\n"
+        return Completed(result.argv, 0, result.stdout, stderr)
 
 
-def test_a_body_ends_with_the_program_and_says_why() -> None:
+def test_body_is_aborted_when_program_ends() -> None:
     ended = Event()
 
     def wait() -> None:
         assert ended.wait(60)
-        raise LinkError("it broke off", where="r", remedy="wait")
+        raise LinkError("the connection broke", where="r", remedy="wait")
 
-    with held(Ending()) as lease:
-        assert lease.over == ""
-        with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.outlasting(ended.set):
+    with keeper(Ending()) as lease:
+        assert lease.end_reason == ""
+        with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.run_while_leased(ended.set):
             wait()
-        assert "it broke off" in str(caught.value.__cause__)
-        with pytest.raises(RobotError, match="ended with exit code 7"), lease.outlasting(ended.set):
+        assert "the connection broke" in str(caught.value.__cause__)
+        with pytest.raises(RobotError, match="ended with exit code 7"), lease.run_while_leased(ended.set):
             pass
-        with pytest.raises(LockLostError), lease.outlasting(ended.set):
+        with pytest.raises(LockLostError), lease.run_while_leased(ended.set):
             raise LockLostError("aborted", where="r", remedy="ask")
 
 
-def test_a_body_that_fails_by_itself_says_why_itself() -> None:
-    with held(Link()) as lease, pytest.raises(LinkError), lease.outlasting(pytest.fail):
-        raise LinkError("it broke off", where="r", remedy="wait")
+def test_error_of_body_is_raised_while_program_runs() -> None:
+    with keeper(Link()) as lease, pytest.raises(LinkError), lease.run_while_leased(pytest.fail):
+        raise LinkError("the connection broke", where="r", remedy="wait")

@@ -1,4 +1,4 @@
-"""Preflight names the connection of a drone, its kind, and the programs that use it."""
+"""Preflight check of the connection to an autopilot: its kind, and the programs that use it."""
 
 import json
 
@@ -23,7 +23,7 @@ SILENT = json.dumps({"error": "", "system": 0, "candidates": []})
         ("/dev/ttyAMA0:921600", "serial line"),
     ],
 )
-def test_it_names_the_connection_and_its_programs(connection: str, kind: str) -> None:
+def test_detail_names_connection_and_programs(connection: str, kind: str) -> None:
     need = link_need(CAST[Role.RECEIVER], Role.RECEIVER, connection, ("pilot", "guard"))
     assert connection in need.argv[-1]
     assert need.judge(Said(GOOD, 0)) == (
@@ -37,13 +37,13 @@ def test_it_names_the_connection_and_its_programs(connection: str, kind: str) ->
     ("text", "detail", "remedy"),
     [
         (CLOSED, "cannot be opened: Connection refused", "this computer has TCP port 5760, /dev/ttyACM0; write"),
-        (SILENT, "no heartbeat of an autopilot", "no other one that is usual"),
+        (SILENT, "no heartbeat of an autopilot", "no other common connection"),
         ("error: MAVLink by usb: is not a connection", "is not a connection", "mavlink.connection"),
         ("", "no answer", "mavlink.connection"),
         ("[]", "[]", "mavlink.connection"),
     ],
 )
-def test_what_does_not_work_fails_and_names_what_is_there(text: str, detail: str, remedy: str) -> None:
+def test_failure_names_available_connections(text: str, detail: str, remedy: str) -> None:
     need = link_need(CAST[Role.RECEIVER], Role.RECEIVER, "tcp:127.0.0.1:5760", ("recorder",))
     verdict, what, how = need.judge(Said(text, 0))
     assert verdict is Verdict.FAIL

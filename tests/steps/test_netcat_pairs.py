@@ -1,4 +1,4 @@
-"""A real transfer between each pair of netcats: the file arrives, and both ends end by themselves."""
+"""A real transfer between each pair of netcats: the file arrives, and both ends exit."""
 
 import shutil
 import subprocess
@@ -19,9 +19,9 @@ pytestmark = pytest.mark.emulated
 LIMIT_S = 60.0
 IDLE_S = 3
 """How long a listener waits for the first datagram, and after the last."""
-# More than a pipe and both socket buffers hold: the sender must wait for the reader.
+# Larger than a pipe and both socket buffers, so that the sender must wait for the reader.
 TCP_BYTES = 24_000_000
-# Less than a socket buffer holds: on the loopback nothing else paces UDP.
+# Smaller than a socket buffer, because nothing limits the rate of UDP on loopback.
 UDP_BYTES = 60_001
 
 UDP = list(product(netcat.DATAGRAM_BYTES, repeat=2))
@@ -29,13 +29,13 @@ UDP = list(product(netcat.DATAGRAM_BYTES, repeat=2))
 
 @cache
 def version(kind: Netcat) -> str:
-    """Return what a netcat of this machine prints of its version; the others than ncat have nothing for it."""
-    words = ("ncat", "--version")
-    return subprocess.run(words, capture_output=True, text=True, check=True).stderr if kind is Netcat.NCAT else ""
+    """Return the version text of a netcat of this machine; empty except for ncat, which alone prints one."""
+    argv = ("ncat", "--version")
+    return subprocess.run(argv, capture_output=True, text=True, check=True).stderr if kind is Netcat.NCAT else ""
 
 
 def program(kind: Netcat, folder: Path) -> str:
-    """The program of that kind, by the name that it goes by."""
+    """Return the program of a variant under the name with which it is called."""
     if kind is Netcat.BUSYBOX:
         link = folder / "nc"
         if not link.is_symlink():
@@ -45,17 +45,17 @@ def program(kind: Netcat, folder: Path) -> str:
 
 
 def wait_for_listener(protocol: Protocol, port: int) -> None:
-    """Return when a socket is bound to `port`, as the robot's job script sees it."""
+    """Wait until a socket is bound to `port`, as the robot's job script does."""
     state = "0A" if protocol is Protocol.TCP else "07"
-    ends = time.monotonic() + LIMIT_S
+    end_s = time.monotonic() + LIMIT_S
     tables = [Path(f"/proc/net/{protocol}{version}") for version in ("", "6")]
-    while not any(f":{port:04X} " in line and f" {state} " in line for one in tables for line in one.open()):
-        assert time.monotonic() < ends, f"nothing listens on {port}"
+    while not any(f":{port:04X} " in line and f" {state} " in line for table in tables for line in table.open()):
+        assert time.monotonic() < end_s, f"nothing listens on {port}"
         time.sleep(0.01)
 
 
 def transfer(sender: Netcat, receiver: Netcat, protocol: Protocol, content: bytes, folder: Path) -> bytes:
-    """Send `content`, read it slowly, and return what arrived when both ends had ended."""
+    """Send `content`, read it slowly, and return the received bytes after both ends have exited."""
     port = free_port()
     (folder / "sent").write_bytes(content)
     listen = netcat.listen(receiver, program(receiver, folder), protocol, port, IDLE_S)
@@ -78,19 +78,19 @@ def transfer(sender: Netcat, receiver: Netcat, protocol: Protocol, content: byte
 
 
 @pytest.mark.parametrize(("sender", "receiver"), list(product(Netcat, repeat=2)))
-def test_tcp_delivers_the_whole_file(sender: Netcat, receiver: Netcat, tmp_path: Path) -> None:
+def test_tcp_delivers_complete_file(sender: Netcat, receiver: Netcat, tmp_path: Path) -> None:
     content = bytes(range(256)) * (TCP_BYTES // 256)
     assert transfer(sender, receiver, Protocol.TCP, content, tmp_path) == content
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "nc") == ["sent"]
 
 
 @pytest.mark.parametrize(("sender", "receiver"), UDP)
-def test_udp_delivers_the_whole_file_or_the_pair_is_refused(sender: Netcat, receiver: Netcat, tmp_path: Path) -> None:
+def test_udp_delivers_complete_file_or_pair_is_refused(sender: Netcat, receiver: Netcat, tmp_path: Path) -> None:
     content = (bytes(range(256)) * (UDP_BYTES // 256 + 1))[:UDP_BYTES]
-    whole = transfer(sender, receiver, Protocol.UDP, content, tmp_path) == content
-    assert whole != netcat.cut_short(sender, receiver, version(receiver))
+    is_complete = transfer(sender, receiver, Protocol.UDP, content, tmp_path) == content
+    assert is_complete != netcat.truncates_datagrams(sender, receiver, version(receiver))
 
 
-def test_a_pair_that_is_refused_would_lose_half_of_the_file(tmp_path: Path) -> None:
+def test_refused_pair_loses_half_of_the_file(tmp_path: Path) -> None:
     received = transfer(Netcat.OPENBSD, Netcat.TRADITIONAL, Protocol.UDP, b"x" * 4 * 16384, tmp_path)
     assert len(received) == 4 * 8192

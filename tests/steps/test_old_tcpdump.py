@@ -1,4 +1,4 @@
-"""A repeat with a tcpdump that knows no immediate mode: nothing of the capture is missing."""
+"""A repeat with a tcpdump without immediate mode: the captures are complete."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from tests.helpers.plans import problems
 pytestmark = pytest.mark.emulated
 
 
-def test_the_kernels_ring_is_drained(tmp_path: Path) -> None:
+def test_kernel_ring_is_drained(tmp_path: Path) -> None:
     plan = los_plan(record_s=0.5, protocols=(Protocol.TCP,))
     old = replace(variants.expected(TURTLEBOT), immediate_mode=False)
     folder = jobs.work_folder(plan.trial, "tcp-01-1")
@@ -31,12 +31,12 @@ def test_the_kernels_ring_is_drained(tmp_path: Path) -> None:
         cast, options=EmulatedOptions(radio=radio), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
     ) as robots:
         robots.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("30ft")))
-        where = {role: (robots.shells[role], folder, role, "wlan0") for role in (Role.SENDER, Role.RECEIVER)}
-        for role, at in where.items():
+        targets = {role: (robots.shells[role], folder, role, "wlan0") for role in (Role.SENDER, Role.RECEIVER)}
+        for role, target in targets.items():
             jobs.install(robots.shells[role], Deadline.after(jobs.REPLY_S))
-            evidence.begin(*at)
+            evidence.begin(*target)
         for entry in plan.procedure.steps:
             entry.step.run(scene, robots, lambda *_: None)
-        for at in where.values():
-            fetching.fetch(*at, tmp_path)
+        for target in targets.values():
+            fetching.fetch(*target, tmp_path)
     assert problems(plan, Protocol.TCP, tmp_path) == ()

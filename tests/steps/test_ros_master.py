@@ -1,4 +1,4 @@
-"""One ROS master for all robots: who is told of it, what preflight asks it, and what a site file may say."""
+"""A shared ROS master: environment of robots, preflight check, and errors of the site file."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,7 +44,7 @@ def site(text: str) -> tuple[Site, schema.Document]:
     return schema.validate(document, Site), document
 
 
-def test_every_robot_is_told_where_the_master_is_and_its_own_address_on_the_radio() -> None:
+def test_commands_have_address_of_master_and_own_radio_address() -> None:
     (record,) = steps_of(load_procedure("los"), RecordStep)
     (planned,) = record.jobs(Scene(Protocol.TCP, SHARED, "f"))
     assert in_shell(planned.job) == (
@@ -53,12 +53,12 @@ def test_every_robot_is_told_where_the_master_is_and_its_own_address_on_the_radi
     )
 
 
-def test_the_profile_s_own_variables_stay_and_yield_where_they_say_otherwise() -> None:
+def test_shared_master_overrides_variables_of_profile() -> None:
     assert TURTLEBOT.ros is not None
-    said = {"ROS_HOSTNAME": "localhost", "ROS_NAMESPACE": "tb1"}
-    profile = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"environment": said})})
+    answer = {"ROS_HOSTNAME": "localhost", "ROS_NAMESPACE": "tb1"}
+    profile = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"environment": answer})})
     robot = CAST[Role.SENDER].model_copy(update={"profile": profile})
-    assert robot.ros_environment == said
+    assert robot.ros_environment == answer
     shared = robot.model_copy(update={"ros_master": "10.42.0.3"}).ros_environment
     assert shared == {
         "ROS_HOSTNAME": "10.42.0.1",
@@ -67,7 +67,7 @@ def test_the_profile_s_own_variables_stay_and_yield_where_they_say_otherwise() -
     }
 
 
-def test_the_site_file_gives_a_master_where_somebody_plays_its_role() -> None:
+def test_master_is_set_only_if_its_role_is_cast() -> None:
     robots = registry.cast_of(*site(SITE), Topology.MASTER, ADDRESSES)
     assert {robot.ros_master for robot in robots.values()} == {"10.0.0.3"}
     alone = registry.cast_of(*site(SITE), Topology.MASTERLESS, ADDRESSES)
@@ -75,7 +75,7 @@ def test_the_site_file_gives_a_master_where_somebody_plays_its_role() -> None:
 
 
 @pytest.mark.parametrize("role", ["drone", "rival"])
-def test_a_master_that_nobody_plays_is_refused(role: str) -> None:
+def test_master_role_without_robot_is_refused(role: str) -> None:
     text = SITE.replace("ros_master: relay", f"ros_master: {role}")
     with pytest.raises(
         ConfigurationError, match="one of the roles that robots play: sender, receiver, relay"
@@ -84,18 +84,18 @@ def test_a_master_that_nobody_plays_is_refused(role: str) -> None:
     assert caught.value.where == "fieldkit.yaml:9"
 
 
-def test_a_master_on_a_robot_without_ros_1_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_master_on_robot_without_ros_1_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
-        ConfigurationError, match="duckiedrone-1 plays relay, and its profile box has no ROS 1"
+        ConfigurationError, match="duckiedrone-1 plays relay, but its profile box has no ROS 1"
     ) as caught:
         registry.cast_of(*site(SITE.replace("profile: duckiedrone}", "profile: box}")), Topology.MASTER, ADDRESSES)
     assert caught.value.where == "fieldkit.yaml:9"
 
 
-def test_preflight_asks_the_master_only_where_robots_share_one() -> None:
+def test_preflight_checks_only_shared_masters() -> None:
     record = RecordStep.model_validate({"robot": "receiver", "topics": ("/scan",), "duration": "1s"})
     own, shared = (
         {need.name: need for need in record.needs(Scene(Protocol.TCP, cast, "f"))} for cast in (CAST, SHARED)
@@ -107,34 +107,34 @@ def test_preflight_asks_the_master_only_where_robots_share_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "detail"),
+    ("answer", "detail"),
     [
         (
             Said("bash: connect: No route to host\nbash: line 1: /dev/tcp/10.42.0.3/11311: No route to host", 1),
             "route",
         ),
-        (Said("", 124), "silence"),
+        (Said("", 124), "no output"),
         (Said("HTTP/1.0 404 Not Found", 0), "404"),
         (Said("SSH-2.0-OpenSSH_9.2p1", 0), "SSH"),
     ],
 )
-def test_a_master_that_does_not_answer_as_one_fails_with_what_starts_it(said: Said, detail: str) -> None:
-    verdict, told, remedy = ros_master.judged(SHARED[Role.RELAY], said)
+def test_invalid_answer_of_master_fails_with_remedy(answer: Said, detail: str) -> None:
+    verdict, detail_text, remedy = ros_master.judge(SHARED[Role.RELAY], answer)
     assert verdict is Verdict.FAIL
-    assert told.startswith("none answers at duckiedrone-1, 10.42.0.3:11311: ")
-    assert detail in told
+    assert detail_text.startswith("no master answers at duckiedrone-1, 10.42.0.3:11311: ")
+    assert detail in detail_text
     assert remedy.startswith("on duckiedrone-1: ROS_HOSTNAME=10.42.0.3 roscore ")
 
 
-def test_a_battery_of_which_nobody_knows_whose_it_is_is_not_looked_at() -> None:
+def test_battery_topics_of_shared_master_are_ambiguous() -> None:
     plan = los_plan()
     assert not any(topics.has_shared_battery(plan, role) for role in plan.cast)
     shared = plan.model_copy(update={"cast": SHARED})
-    found = {role: topics.has_shared_battery(shared, role) for role in SHARED}
-    assert found == {Role.SENDER: True, Role.RECEIVER: True, Role.RELAY: False}
+    has_shared = {role: topics.has_shared_battery(shared, role) for role in SHARED}
+    assert has_shared == {Role.SENDER: True, Role.RECEIVER: True, Role.RELAY: False}
 
 
-def test_trials_with_one_master_and_with_many_are_not_alike_but_the_master_s_address_is_no_matter() -> None:
+def test_profiles_hash_depends_on_sharing_but_not_on_addresses() -> None:
     own, shared = (plan_of(cast).profiles_sha256 for cast in (CAST, SHARED))
     assert own != shared
     moved = {
@@ -149,7 +149,7 @@ def plan_of(cast: Cast, procedure: str = "los") -> Plan:
     return make_plan(request, backend="field", cast=cast, now=datetime(2026, 11, 20, 12, 0, tzinfo=UTC))
 
 
-def test_masterloss_wants_the_master_that_it_takes_away() -> None:
+def test_masterloss_requires_a_shared_master() -> None:
     with pytest.raises(ConfigurationError, match="procedure masterloss is about one ROS master") as caught:
         plan_of(CAST, "masterloss")
     assert "ros_master: relay" in caught.value.remedy

@@ -1,4 +1,4 @@
-"""What preflight looks for on robots that forward for each other."""
+"""Preflight check for routing protocols on robots that forward packets for each other."""
 
 import shlex
 import shutil
@@ -16,7 +16,7 @@ from tests.helpers.casts import CAST
 SCENE = Scene(Protocol.UDP, CAST, "f")
 
 
-def test_a_ping_that_is_forwarded_asks_each_robot_of_the_trial_those_that_no_step_names_too() -> None:
+def test_forwarded_ping_checks_all_robots_of_the_trial() -> None:
     plain = {"from": "sender", "to": "receiver"}
     step = PingStep.model_validate(plain | {"forwarded": True})
     assert [need.role for need in step.needs(SCENE)] == list(CAST)
@@ -27,32 +27,32 @@ def test_a_ping_that_is_forwarded_asks_each_robot_of_the_trial_those_that_no_ste
 @pytest.mark.emulated
 @pytest.mark.parametrize("shell", ["dash", "bash", "busybox sh"])
 @pytest.mark.parametrize("daemon", ["babeld", "olsrd", "nobabeld", ""])
-def test_a_daemon_is_found_by_its_whole_name_in_any_shell(tmp_path: Path, shell: str, daemon: str) -> None:
+def test_daemon_is_found_by_exact_name_in_each_shell(tmp_path: Path, shell: str, daemon: str) -> None:
     need = next(routing.needs(SCENE))
     assert need.argv[:2] == ("sh", "-c")
-    look = f"{shell} {shlex.join(need.argv[1:])}"
+    search = f"{shell} {shlex.join(need.argv[1:])}"
     if daemon:
         shutil.copy("/usr/bin/sleep", tmp_path / daemon)
-        look = f"./{daemon} 60 & until grep -qx {daemon} /proc/$!/comm; do :; done; {look}"
-    alone = ("unshare", "--pid", "--fork", "--kill-child", "--mount", "--mount-proc")
-    done = subprocess.run((*alone, "sh", "-c", look), cwd=tmp_path, capture_output=True, text=True, check=False)
-    words = done.stdout.split()
-    # A module of the kernel is this machine's, whatever runs in the namespace.
-    assert [word for word in words if word != "batman-adv"] == ([daemon] if daemon in routing.DAEMONS else [])
+        search = f"./{daemon} 60 & until grep -qx {daemon} /proc/$!/comm; do :; done; {search}"
+    namespace = ("unshare", "--pid", "--fork", "--kill-child", "--mount", "--mount-proc")
+    done = subprocess.run((*namespace, "sh", "-c", search), cwd=tmp_path, capture_output=True, text=True, check=False)
+    names = done.stdout.split()
+    # Kernel modules are those of this machine, independent of the namespace.
+    assert [name for name in names if name != "batman-adv"] == ([daemon] if daemon in routing.DAEMONS else [])
     assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize(
-    ("said", "verdict", "told"),
+    ("result", "verdict", "detail"),
     [
         (Said("babeld\n", 0), Verdict.OK, "babeld"),
         (Said("babeld\nbabeld\nbatman-adv\n", 0), Verdict.OK, "babeld, batman-adv"),
-        (Said("", 0), Verdict.FAIL, "nothing on it finds ways over others"),
-        (Said("sh: not found", 127), Verdict.FAIL, "nothing on it finds ways over others"),
+        (Said("", 0), Verdict.FAIL, "no routing protocol runs on it"),
+        (Said("sh: not found", 127), Verdict.FAIL, "no routing protocol runs on it"),
     ],
 )
-def test_what_was_found_is_told(said: Said, verdict: Verdict, told: str) -> None:
-    found, detail, remedy = routing.judged(said)
-    assert found is verdict
-    assert detail.startswith(told)
+def test_verdict_and_detail(result: Said, verdict: Verdict, detail: str) -> None:
+    actual, detail_text, remedy = routing.judge(result)
+    assert actual is verdict
+    assert detail_text.startswith(detail)
     assert ("fieldkit docs mesh" in remedy) == (verdict is Verdict.FAIL)

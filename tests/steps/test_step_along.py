@@ -1,4 +1,4 @@
-"""Steps that last as long as the way of the move around them: ping, wait, topics, iperf3."""
+"""Steps that last as long as the move around them (`along: true`): ping, wait, topics, iperf3."""
 
 import math
 from typing import Any
@@ -18,7 +18,7 @@ from tests.helpers.casts import CAST
 ENDS = "from: sender, to: receiver"
 TEXT = """\
 name: along
-summary: As long as the way
+summary: As long as the path
 scenario: los
 topology: masterless
 protocols: [udp]
@@ -29,80 +29,82 @@ steps:
       path: [{away: AWAY}]
       speed: 0.2m/s
       during:
-        - capture: {robots: [sender], during: [{KIND: {WORDS}}]}
+        - capture: {robots: [sender], during: [{KIND: {KEYS}}]}
 """
 
 
-def procedure(kind: str, words: str, away: str = "2m") -> Procedure:
-    text = TEXT.replace("KIND", kind).replace("WORDS", words).replace("AWAY", away)
+def procedure(kind: str, keys: str, away: str = "2m") -> Procedure:
+    text = TEXT.replace("KIND", kind).replace("KEYS", keys).replace("AWAY", away)
     return schema.validate(schema.parse(text, source="x.yaml"), Procedure)
 
 
-def fitted(kind: str, words: str, away: str = "2m") -> Any:  # noqa: ANN401 (a step of the kind)
-    return list(procedure(kind, words, away).resolved(CAST).walk())[-1].step
+def resolved_step(kind: str, keys: str, away: str = "2m") -> Any:  # noqa: ANN401 (a step of the kind)
+    return list(procedure(kind, keys, away).resolved(CAST).walk())[-1].step
 
 
-def test_each_lasts_as_long_as_the_way() -> None:
-    ping = fitted("ping", f"{ENDS}, along: true, interval: 300ms")
+def test_each_kind_lasts_as_long_as_the_path() -> None:
+    ping = resolved_step("ping", f"{ENDS}, along: true, interval: 300ms")
     assert isinstance(ping, PingStep)
-    assert (ping.count, ping.along) == (34, False), "10 s are 33 intervals and a bit"
-    assert fitted("ping", f"{ENDS}, along: true", away="1cm").count == 1
-    wait = fitted("wait", "along: true")
+    assert (ping.count, ping.along) == (34, False), "10 s are more than 33 intervals"
+    assert resolved_step("ping", f"{ENDS}, along: true", away="1cm").count == 1
+    wait = resolved_step("wait", "along: true")
     assert isinstance(wait, WaitStep)
     assert wait.duration == 10.0
-    topics = fitted("topics", f"{ENDS}, along: true")
+    topics = resolved_step("topics", f"{ENDS}, along: true")
     assert isinstance(topics, TopicsStep)
     assert topics.duration == 10.0
-    iperf3 = fitted("iperf3", f"{ENDS}, along: true, limit: 30s", away="2.1m")
+    iperf3 = resolved_step("iperf3", f"{ENDS}, along: true, limit: 30s", away="2.1m")
     assert isinstance(iperf3, Iperf3Step)
     assert (iperf3.duration, iperf3.limit) == (11.0, 41.0), "whole seconds"
-    assert fitted("ping", f"{ENDS}, count: 7").count == 7
+    assert resolved_step("ping", f"{ENDS}, count: 7").count == 7
 
 
-def test_a_robot_that_drives_by_itself_needs_time_for_its_turns() -> None:
-    text = TEXT.replace("AWAY", "1m}, {left: 1m").replace("KIND: {WORDS}", "wait: {along: true}")
-    own = schema.validate(schema.parse(text, source="x.yaml"), Procedure)
-    drives = {role: one.model_copy(update={"drives": one.profile.drive is not None}) for role, one in CAST.items()}
-    moved, driven = (list(own.resolved(cast).walk())[-1].step for cast in (CAST, drives))
+def test_driving_robot_needs_time_for_turns() -> None:
+    text = TEXT.replace("AWAY", "1m}, {left: 1m").replace("KIND: {KEYS}", "wait: {along: true}")
+    turning = schema.validate(schema.parse(text, source="x.yaml"), Procedure)
+    drives = {
+        role: robot.model_copy(update={"drives": robot.profile.drive is not None}) for role, robot in CAST.items()
+    }
+    moved, driven = (list(turning.resolved(cast).walk())[-1].step for cast in (CAST, drives))
     assert isinstance(moved, WaitStep)
     assert isinstance(driven, WaitStep)
     assert moved.duration == 10.0
-    # A quarter of a turn at 1 rad/s at most, and it brakes twice.
+    # It needs a quarter of a turn at up to 1 rad/s, and brakes twice.
     assert driven.duration == pytest.approx(10.0 + math.pi / 2 + 2.0, abs=1.0)
 
 
-def test_what_is_fitted_reads_back() -> None:
-    for kind, words in (("ping", ENDS), ("wait", ""), ("topics", ENDS), ("iperf3", ENDS)):
-        one = procedure(kind, f"{words}{', ' if words else ''}along: true", "1.23m").resolved(CAST)
-        assert schema.validate(schema.parse(schema.dump(one), source="trial.yaml"), Procedure) == one
+def test_resolved_procedure_is_read_again() -> None:
+    for kind, keys in (("ping", ENDS), ("wait", ""), ("topics", ENDS), ("iperf3", ENDS)):
+        written = procedure(kind, f"{keys}{', ' if keys else ''}along: true", "1.23m").resolved(CAST)
+        assert schema.validate(schema.parse(schema.dump(written), source="trial.yaml"), Procedure) == written
 
 
 @pytest.mark.parametrize(
-    ("kind", "words", "complaint"),
+    ("kind", "keys", "complaint"),
     [
-        ("ping", f"{ENDS}, along: true, count: 3", "as count says; leave one out"),
-        ("topics", f"{ENDS}, along: true, duration: 3s", "as duration says; leave one out"),
-        ("iperf3", f"{ENDS}, along: true, duration: 3s", "as duration says; leave one out"),
-        ("iperf3", f"{ENDS}, along: true, size: 3MB", "until its size is sent; leave one out"),
-        ("wait", "along: true, until: open the door", "or along: true"),
+        ("ping", f"{ENDS}, along: true, count: 3", "along and count exclude each other"),
+        ("topics", f"{ENDS}, along: true, duration: 3s", "along and duration exclude each other"),
+        ("iperf3", f"{ENDS}, along: true, duration: 3s", "along and duration exclude each other"),
+        ("iperf3", f"{ENDS}, along: true, size: 3MB", "a test has along: true or a size, not both"),
+        ("wait", "along: true, until: open the door", "until and along: true"),
         ("wait", "along: true, duration: 3s", "leave one out"),
     ],
 )
-def test_a_step_lasts_one_time(kind: str, words: str, complaint: str) -> None:
+def test_second_duration_is_refused(kind: str, keys: str, complaint: str) -> None:
     with pytest.raises(ConfigurationError, match=complaint) as caught:
-        procedure(kind, words)
+        procedure(kind, keys)
     assert caught.value.where == "x.yaml:13"
 
 
-def test_a_step_that_no_way_is_around_lasts_along_none() -> None:
+def test_along_without_move_is_refused() -> None:
     text = TEXT[: TEXT.index("  - move")] + f"  - ping: {{{ENDS}, along: true}}\n"
-    with pytest.raises(ConfigurationError, match="nothing moves around it") as caught:
+    with pytest.raises(ConfigurationError, match="needs a move around it") as caught:
         schema.validate(schema.parse(text, source="x.yaml"), Procedure)
     assert caught.value.where == "x.yaml:8"
 
 
-def test_of_two_ways_the_inner_one_counts() -> None:
-    text = TEXT.replace("capture: {robots: [sender], during: [{KIND: {WORDS}}]}", "move: INNER")
+def test_innermost_move_determines_the_duration() -> None:
+    text = TEXT.replace("capture: {robots: [sender], during: [{KIND: {KEYS}}]}", "move: INNER")
     ping = f"ping: {{{ENDS}, along: true}}"
     inner = f"{{name: inner, robot: sender, path: [{{away: 1m}}], speed: 0.1m/s, during: [{{{ping}}}]}}"
     text = text.replace("INNER", inner).replace("AWAY", "1m")

@@ -1,4 +1,4 @@
-"""Golden command lines: what the robots of each profile are told, to the letter."""
+"""Golden command lines of the robots of each profile."""
 
 import pytest
 
@@ -46,21 +46,21 @@ GOLDEN = {
 
 
 @pytest.mark.parametrize("protocol", Protocol)
-def test_commands_of_the_papers_trial(protocol: Protocol) -> None:
+def test_commands_of_the_paper_trial(protocol: Protocol) -> None:
     plan = los_plan()
     scene = plan.scene(RepeatId(protocol, 1), ".fieldkit/t/r")
-    planned = [one for entry in plan.procedure.steps for one in entry.step.jobs(scene)]
-    assert [(one.role, in_shell(one.job)) for one in planned] == GOLDEN[protocol]
+    jobs_planned = [planned for entry in plan.procedure.steps for planned in entry.step.jobs(scene)]
+    assert [(planned.role, in_shell(planned.job)) for planned in jobs_planned] == GOLDEN[protocol]
 
 
-def test_a_record_override_reaches_the_command_and_nothing_else() -> None:
+def test_record_override_changes_only_the_duration() -> None:
     (record,) = steps_of(load_procedure("los").with_record(2.5), RecordStep)
     (planned,) = record.jobs(Scene(Protocol.TCP, CAST, "f"))
     assert "--duration=2.5" in planned.job.argv
     assert list(load_procedure("los").with_record(15.0)) == list(load_procedure("los"))
 
 
-def test_ros2_records_until_sigint_which_is_its_limit() -> None:
+def test_ros2_recording_ends_by_sigint_at_the_limit() -> None:
     ros2 = TURTLEBOT.model_copy(update={"ros": ros_of(TURTLEBOT).model_copy(update={"variant": "ros2"})})
     cast = {Role.SENDER: Robot(name="a", address="10.42.0.1", profile=ros2)}
     text = "{robot: sender, topics: [/scan, /imu], duration: 15s}"
@@ -68,38 +68,38 @@ def test_ros2_records_until_sigint_which_is_its_limit() -> None:
     (planned,) = record.jobs(Scene(Protocol.TCP, cast, "f"))
     assert planned.job.argv[-7:] == ("ros2", "bag", "record", "-o", "scan", "/scan", "/imu")
     assert planned.job.limit_s == 15.0
-    assert planned.job.ready == "log:Subscribed to topic", "what it takes to start is not recorded"
+    assert planned.job.ready == "log:Subscribed to topic", "the start does not count as recording time"
     assert record.bag(cast[Role.SENDER]) == "scan/scan_0.db3"
 
 
-def test_capture_by_sudo_runs_the_whole_job_as_root() -> None:
+def test_capture_with_sudo_runs_the_job_as_root() -> None:
     text = schema.dump(TURTLEBOT).replace("capture_right: direct", "capture_right: sudo")
     profile = schema.validate(schema.parse(text, source="x"), RobotProfile)
     cast = {role: robot.model_copy(update={"profile": profile}) for role, robot in CAST.items()}
-    (entry,) = [one for one in load_procedure("los").steps if one.kind == "capture"]
+    (entry,) = [entry for entry in load_procedure("los").steps if entry.kind == "capture"]
     first = next(
         entry.step.jobs(Scene(Protocol.TCP, cast, "f", {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e6),)}))
     )
     assert jobs.command("start", first.job)[:4] == ("sudo", "-n", "sh", jobs.SCRIPT_PATH)
 
 
-def test_a_started_job_is_one_line_of_words() -> None:
+def test_command_that_starts_a_job() -> None:
     scene = los_plan().scene(RepeatId(Protocol.UDP, 1), ".fieldkit/t/udp-01-1")
-    planned = [one for entry in los_plan().procedure.steps for one in entry.step.jobs(scene)]
-    listen = next(one.job for one in planned if one.job.name == "listen")
+    jobs_planned = [planned for entry in los_plan().procedure.steps for planned in entry.step.jobs(scene)]
+    listen = next(planned.job for planned in jobs_planned if planned.job.name == "listen")
     files = ("/dev/null", "recv.bag", "receiver-listen.log")
     command = ("nc.traditional", "-u", "-l", "-p", "1234", "-w", "2")
     expected = ("sh", jobs.SCRIPT_PATH, "start", ".fieldkit/t/udp-01-1", "listen", "120", "udp:04D2", "8", *files)
     assert jobs.command("start", listen) == (*expected, *command)
 
 
-def test_a_procedure_survives_being_written_and_read_again() -> None:
+def test_written_procedure_is_read_unchanged() -> None:
     procedure = load_procedure("nlos")
     text = schema.dump(procedure)
     assert schema.validate(schema.parse(text, source="x"), Procedure) == procedure
 
 
-def test_a_capture_never_ends_before_what_it_captures() -> None:
+def test_limit_of_capture_exceeds_those_of_steps_inside() -> None:
     text = "during: [{transfer: {from: sender, to: receiver, file: a.bag, limit: 30min}}]"
     step = schema.validate(schema.parse(text, source="x"), CaptureStep)
     first, _, listen, send = step.jobs(
@@ -109,7 +109,7 @@ def test_a_capture_never_ends_before_what_it_captures() -> None:
 
 
 @pytest.mark.parametrize(
-    ("during", "among"),
+    ("during", "filter_text"),
     [
         ("ping: {from: sender, to: relay}", "host 10.42.0.1 and host 10.42.0.3 and (icmp"),
         (
@@ -122,8 +122,8 @@ def test_a_capture_never_ends_before_what_it_captures() -> None:
         ),
     ],
 )
-def test_a_capture_takes_what_the_steps_inside_send(during: str, among: str) -> None:
+def test_capture_filter_follows_steps_inside(during: str, filter_text: str) -> None:
     step = schema.validate(schema.parse(f"during: [{{{during}}}]", source="x"), CaptureStep)
     recorded = {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e6),)}
     first = next(step.jobs(Scene(Protocol.TCP, CAST, "f", recorded)))
-    assert first.job.argv[-1] == f"{among} or ip[6:2] & 0x1fff != 0)"
+    assert first.job.argv[-1] == f"{filter_text} or ip[6:2] & 0x1fff != 0)"

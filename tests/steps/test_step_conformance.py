@@ -1,4 +1,4 @@
-"""Every kind of step keeps the contract, on emulated robots: an example of each, and what is asked of all of them.
+"""Conformance of every kind of step to the contract, with one example of each kind on emulated robots.
 
 A new kind adds its example to `EXAMPLES`.
 """
@@ -52,14 +52,14 @@ PING = "ping: {from: sender, to: receiver, count: 5}"
 
 @dataclass(frozen=True)
 class Example:
-    """A step, and what is particular to it.
+    """An example of a kind of step.
 
     Attributes:
-        steps: It, and what it needs before it, as a list of YAML.
-        spare: Files that its evidence is whole without, logs apart.
-        outlives: Jobs of which it is a measurement, no fault, that they end at their limit.
-        brief: Jobs that are over before anybody could end them: they get a second more.
-        absent: The same with a program that begins with `no-such`; empty where its programs are others' to name.
+        steps: The step and the steps that it needs before it, as a YAML list.
+        spare: Files other than logs without which the evidence is still complete.
+        outlives: Jobs whose end at their limit is a measurement and not an error.
+        brief: Jobs that are too short to be killed, so that a second is added.
+        absent: The steps with a program that begins with `no-such`; empty if profiles name its programs.
     """
 
     steps: str
@@ -80,7 +80,7 @@ EXAMPLES: Mapping[str, Example] = {
     "ping": Example(f"[{PING}]"),
     "fault": Example(
         f"[fault: {{robot: sender, kind: link-down, for: 1s, limit: 4s, during: [{PING}]}}]",
-        spare=frozenset({"fault-link-down-times.txt"}),  # which recoveries of flows alone need
+        spare=frozenset({"fault-link-down-times.txt"}),  # needed only for recoveries of flows
     ),
     "move": Example(f"[move: {{robot: sender, path: [away: 1m], speed: 0.2m/s, during: [{PING}]}}]"),
     "wait": Example("[wait: {duration: 100ms}]"),
@@ -126,22 +126,21 @@ emulated:
   ros: builtin
   radio: {loss: 0%, rate: 500kbit/s}
 """
-"""So slow that a bag takes over a second: something can be ended in the middle."""
+"""The rate is so low that the transfer of a bag takes more than a second and can be interrupted."""
 
-# Ends the program that a job started as soon as it runs: the last child of the job's leader, behind one that watches
-# its limit.
+# Kills the program of a job as soon as it runs: the last child of the job's leader; the first one enforces the limit.
 KILL = """
 until [ -s "$1/pid" ]; do sleep 0.02; done
 read -r leader _ <"$1/pid"
 until [ "$children" -ge 2 ]; do
     sleep 0.05
     children=0 last=0
-    for one in /proc/[0-9]*; do
-        read -r line <"$one/stat" || continue
+    for process in /proc/[0-9]*; do
+        read -r line <"$process/stat" || continue
         rest=${line##*) }; rest=${rest#* }
         [ "${rest%% *}" = "$leader" ] || continue
         children=$((children + 1))
-        [ "$last" -gt "${one#/proc/}" ] || last=${one#/proc/}
+        [ "$last" -gt "${process#/proc/}" ] || last=${process#/proc/}
     done 2>/dev/null
 done 2>/dev/null
 kill -9 "$last"
@@ -155,7 +154,7 @@ def procedure(kind: str, steps: str = "") -> Procedure:
 
 
 def of_kind(kind: str, plan: Plan) -> PlacedStep:
-    """Return the step that the example is of."""
+    """Return the step of this kind."""
     return next(placed for placed in plan.procedure.walk() if placed.kind == kind)
 
 
@@ -165,7 +164,7 @@ def own_jobs(kind: str, plan: Plan) -> list[Planned]:
 
 @dataclass
 class Bench:
-    """Emulated robots that stay, and trials on them."""
+    """Emulated robots that are shared by all tests, and trials on them."""
 
     testbed: EmulatedTestbed
     backend: EmulatedBackend
@@ -173,16 +172,19 @@ class Bench:
     numbers: Iterator[int] = field(default_factory=count)
 
     def plan(
-        self, kind: str, profile: Callable[[RobotProfile], RobotProfile] = lambda one: one, steps: str = ""
+        self,
+        kind: str,
+        profile: Callable[[RobotProfile], RobotProfile] = lambda unchanged: unchanged,
+        steps: str = "",
     ) -> Plan:
         cast = cast_of(self.backend)
-        cast = {role: one.model_copy(update={"profile": profile(one.profile)}) for role, one in cast.items()}
+        cast = {role: robot.model_copy(update={"profile": profile(robot.profile)}) for role, robot in cast.items()}
         now = datetime.fromtimestamp(1_700_000_000 + next(self.numbers), tz=UTC)
         request = TrialRequest(procedure=procedure(kind, steps), distance=parse_distance("5m"))
         return make_plan(request, backend="emulated", cast=cast, now=now, lab_bytes=self.backend.lab_bytes)
 
     def run(self, plan: Plan, sink: Callable[[Event], None] = lambda event: None) -> tuple[str, str, Path]:
-        """Run a trial of one attempt; return its status, the reason, and where its evidence is."""
+        """Run a trial of one attempt; return its status, the reason, and the folder of its evidence."""
         self.testbed.place(plan.placement)
         with locks.held(self.testbed.shells, Holder(plan.session, runtime.me(), plan.trial), sink=sink):
             runner.begin(plan, self.testbed, self.out, sink, Stop())
@@ -210,13 +212,13 @@ FLYING = {
 
 
 def cast_of(backend: EmulatedBackend) -> dict[Role, Robot]:
-    """Return who plays: robots that have an autopilot and fly; nothing drives them, as their ROS is built in."""
+    """Return a cast of robots that fly but do not drive, because they use the built-in ROS."""
     cast = backend.cast(Topology.MASTERLESS)
     return {
-        role: one.model_copy(
-            update={"flies": True, "drives": False, "profile": one.profile.model_copy(update=FLYING)}
+        role: robot.model_copy(
+            update={"flies": True, "drives": False, "profile": robot.profile.model_copy(update=FLYING)}
         )
-        for role, one in cast.items()
+        for role, robot in cast.items()
     }
 
 
@@ -245,31 +247,32 @@ class Valid:
 
 @pytest.fixture(scope="module", params=KINDS)
 def valid(request: pytest.FixtureRequest, bench: Bench) -> Valid:
-    """Make a valid attempt of each kind, once for all who look at it."""
+    """Make one valid attempt of each kind for all tests."""
     plan = bench.plan(request.param)
     status, reason, evidence = bench.run(plan)
     assert (status, reason) == ("valid", "")
     return Valid(request.param, plan, evidence)
 
 
-def test_every_kind_has_its_example() -> None:
-    own = [point.name for point, _ in kinds.load() if point.value.startswith("fieldkit.")]
-    assert sorted(own) == KINDS
+def test_every_builtin_kind_has_an_example() -> None:
+    builtin = [point.name for point, _ in kinds.load() if point.value.startswith("fieldkit.")]
+    assert sorted(builtin) == KINDS
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_dry_run_prints_every_job(
+def test_dry_run_prints_every_job(
     kind: str, bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (bench.out / "procedures").mkdir(exist_ok=True)
     (bench.out / "procedures" / f"{kind}.yaml").write_text(schema.dump(procedure(kind)), encoding="utf-8")
     monkeypatch.chdir(bench.out)
     assert main(["trial", kind, "5m", "--dry-run"]) == 0
-    said = capsys.readouterr().out
-    assert [one.job.name for one in own_jobs(kind, bench.plan(kind)) if f" {one.job.name}: " not in said] == []
+    output = capsys.readouterr().out
+    names = [planned.job.name for planned in own_jobs(kind, bench.plan(kind))]
+    assert [name for name in names if f" {name}: " not in output] == []
 
 
-def test_what_lacks_a_file_is_void(valid: Valid, tmp_path: Path) -> None:
+def test_attempt_without_a_file_is_void(valid: Valid, tmp_path: Path) -> None:
     plan, evidence = valid.plan, valid.evidence
     step = of_kind(valid.kind, plan).step
     spare = {prefixed(step.prefix, name) for name in EXAMPLES[valid.kind].spare}
@@ -283,19 +286,19 @@ def test_what_lacks_a_file_is_void(valid: Valid, tmp_path: Path) -> None:
         assert gates.judge(plan, repeat, AttemptEvidence(copy)).problems, name
 
 
-def test_every_column_is_measured_or_missing_for_a_reason(valid: Valid) -> None:
+def test_every_column_has_a_value_or_a_reason(valid: Valid) -> None:
     step = of_kind(valid.kind, valid.plan).step
-    found = gates.judge(valid.plan, next(valid.plan.order()), AttemptEvidence(valid.evidence)).measured
+    measured = gates.judge(valid.plan, next(valid.plan.order()), AttemptEvidence(valid.evidence)).measured
     for column in step.output_columns():
         name = prefixed(step.prefix, column.name)
-        assert name in found.values or found.missing[name]
-    assert not step.output_columns() or found.values.keys() & {
-        prefixed(step.prefix, one.name) for one in step.output_columns()
+        assert name in measured.values or measured.missing[name]
+    assert not step.output_columns() or measured.values.keys() & {
+        prefixed(step.prefix, column.name) for column in step.output_columns()
     }
 
 
-def test_the_size_estimate_is_within_a_factor_of_two(valid: Valid) -> None:
-    """Texts apart, for which every robot has room anyway."""
+def test_size_estimate_is_within_a_factor_of_two(valid: Valid) -> None:
+    """Small text files do not count."""
     step, scene = of_kind(valid.kind, valid.plan).step, valid.plan.scenes()[0]
     estimate = sum(step.bytes_left(scene, role) for role in valid.plan.cast)
     actual = sum((valid.evidence / name).stat().st_size for name in step.files() if (valid.evidence / name).is_file())
@@ -304,22 +307,22 @@ def test_the_size_estimate_is_within_a_factor_of_two(valid: Valid) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_missing_program_is_found_by_check(
+def test_check_finds_missing_program(
     kind: str, bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (iperf3, soak):
         monkeypatch.setattr(module, "PROGRAM", "no-such-iperf3")
     plan = bench.plan(kind, _without_tools, EXAMPLES[kind].absent)
     findings = preflight.check(plan, bench.testbed.shells, tmp_path, whole=False).findings
-    failed = {(one.robot, one.check) for one in findings if one.status is Verdict.FAIL}
-    programs = {(one.role, one.program) for one in own_jobs(kind, plan)}
-    wanted = {(plan.cast[role].name, program) for role, program in programs if program.startswith("no-such")}
-    assert wanted <= failed
-    assert wanted or not own_jobs(kind, plan)
+    failed = {(finding.robot, finding.check) for finding in findings if finding.status is Verdict.FAIL}
+    programs = {(planned.role, planned.program) for planned in own_jobs(kind, plan)}
+    expected = {(plan.cast[role].name, program) for role, program in programs if program.startswith("no-such")}
+    assert expected <= failed
+    assert expected or not own_jobs(kind, plan)
 
 
 def _without_tools(profile: RobotProfile) -> RobotProfile:
-    """Return a profile whose tools have names that no program has."""
+    """Return a profile with nonexistent programs as tools."""
     names = {
         name: f"no-such-{name}"
         for name, value in vars(profile.tools).items()
@@ -334,33 +337,32 @@ def _without_tools(profile: RobotProfile) -> RobotProfile:
 
 def every_job() -> list[tuple[str, str]]:
     """Return each kind with each of its own jobs."""
-    # As the bench's, whose ROS is built in.
+    # As the robots of the bench, which use the built-in ROS.
     cast = {
         role: robot.model_copy(update={"drives": False})
         for role, robot in cast_of(EmulatedBackend(None, None)).items()
     }
-    found = []
+    pairs = []
     for kind in KINDS:
         request = TrialRequest(procedure=procedure(kind), distance=parse_distance("5m"))
         plan = make_plan(request, backend="emulated", cast=cast, now=datetime.fromtimestamp(0, tz=UTC))
-        found += [(kind, f"{one.role} {one.job.name}") for one in own_jobs(kind, plan)]
-    return found
+        pairs += [(kind, f"{planned.role} {planned.job.name}") for planned in own_jobs(kind, plan)]
+    return pairs
 
 
 def change(monkeypatch: pytest.MonkeyPatch, name: str, changed: Callable[[Job], Job]) -> None:
-    """Have robots get another job in place of that of this name."""
+    """Replace the job of this name on the robots."""
     real = jobs.command
     monkeypatch.setattr(jobs, "command", lambda verb, job: real(verb, changed(job) if job.name == name else job))
 
 
 @pytest.mark.parametrize(("kind", "job"), every_job())
-def test_a_tool_that_somebody_kills_makes_it_void(
-    kind: str, job: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_tool_makes_attempt_void(kind: str, job: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = bench.plan(kind)
     role, _, name = job.partition(" ")
     if name in EXAMPLES[kind].brief:
-        change(monkeypatch, name, lambda one: replace(one, argv=("sh", "-c", 'sleep 1; exec "$@"', "sh", *one.argv)))
+        slow = ("sh", "-c", 'sleep 1; exec "$@"', "sh")
+        change(monkeypatch, name, lambda original: replace(original, argv=(*slow, *original.argv)))
     folder = jobs.work_folder(plan.trial, f"{next(plan.order())}-1")
     shell = bench.testbed.shells[Role(role)]
     argv = ("sh", "-c", KILL, "sh", f"{folder}/.jobs/{name}")
@@ -373,27 +375,27 @@ def test_a_tool_that_somebody_kills_makes_it_void(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_trial_that_was_interrupted_meanwhile_is_resumed(kind: str, bench: Bench) -> None:
-    plan, begun = bench.plan(kind), threading.Event()
+def test_interrupted_trial_is_resumed(kind: str, bench: Bench) -> None:
+    plan, started = bench.plan(kind), threading.Event()
 
     def interrupt(event: Event) -> None:
-        if isinstance(event, PhaseStarted) and event.repeat and not begun.is_set():
-            begun.set()
+        if isinstance(event, PhaseStarted) and event.repeat and not started.is_set():
+            started.set()
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         bench.run(plan, interrupt)
-    assert begun.is_set()
+    assert started.is_set()
     assert not bench.left()
     assert bench.resume(plan)[:2] == ("valid", "")
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if any(one == kind for one, _ in every_job())])
-def test_a_tool_that_hangs_ends_at_its_limit(kind: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if any(other == kind for other, _ in every_job())])
+def test_hanging_tool_is_stopped_at_its_limit(kind: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = bench.plan(kind)
     hanging = own_jobs(kind, plan)[0].job.name
-    # What hangs is never up.
-    change(monkeypatch, hanging, lambda one: replace(one, argv=("sleep", "600"), limit_s=1.0, ready_s=2))
+    # A program that hangs is never ready.
+    change(monkeypatch, hanging, lambda original: replace(original, argv=("sleep", "600"), limit_s=1.0, ready_s=2))
     status, reason, _ = bench.run(plan)
     if hanging not in EXAMPLES[kind].outlives:
         assert (status, bool(reason)) == ("failed", True)

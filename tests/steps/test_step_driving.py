@@ -1,4 +1,4 @@
-"""A robot that drives by itself in a step move: its job, what is refused before it starts, and its lease."""
+"""A robot that drives automatically in a step move: its job, refusals before the start, and its lease."""
 
 import json
 import shlex
@@ -42,29 +42,29 @@ def move(text: str) -> MoveStep:
 STEP = move("robot: receiver, path: [{away: 2m}, {right: 1m, towards: 1m}], speed: 0.2m/s, name: out")
 
 
-def test_the_log_of_a_longer_drive_is_larger_and_is_on_the_robot_that_drives_alone() -> None:
+def test_size_of_log_grows_with_drive_and_is_on_driving_robot_only() -> None:
     short, long = (move(f"robot: receiver, path: [{{away: {far}m}}], speed: 0.1m/s") for far in (10, 60))
     assert [role for role in DRIVES if long.bytes_left(SCENE, role)] == [Role.RECEIVER]
-    # Both ways take 500 s more, and the log has ten lines a second, each of 200 to 250 bytes.
+    # Each direction takes 500 s more, and the log has ten lines per second, each of 200 to 250 bytes.
     grown_bytes = long.bytes_left(SCENE, Role.RECEIVER) - short.bytes_left(SCENE, Role.RECEIVER)
     assert 200 * 10_000 < grown_bytes < 250 * 10_000
-    assert not long.bytes_left(replace(SCENE, cast=CAST), Role.RECEIVER), "who moves it writes nothing down"
+    assert not long.bytes_left(replace(SCENE, cast=CAST), Role.RECEIVER), "a robot moved by a person has no log"
 
 
-def test_the_driver_is_told_legs_limits_and_topics() -> None:
+def test_argument_of_driver_has_legs_limits_and_topics() -> None:
     first, *_ = STEP.jobs(SCENE)
     assert (first.role, first.job.name, first.job.log) == (Role.RECEIVER, "out.drive", "out.drive.log")
-    words = list(first.job.argv)
-    assert words[0] == "bash"
-    assert shlex.split(words[2])[:2] == [".", "/opt/ros/noetic/setup.bash"]
-    assert words[-3:-2] + words[-1:] == ["drive", "out.drive.jsonl"]
-    told = json.loads(words[-2])
-    assert (told["over"], told["cdr"], told["orders"]) == ("ros1", False, "out.drive.orders")
-    assert (told["command"]["name"], told["odometry"]["name"]) == ("/cmd_vel", "/odom")
+    argv = list(first.job.argv)
+    assert argv[0] == "bash"
+    assert shlex.split(argv[2])[:2] == [".", "/opt/ros/noetic/setup.bash"]
+    assert argv[-3:-2] + argv[-1:] == ["drive", "out.drive.jsonl"]
+    argument = json.loads(argv[-2])
+    assert (argument["over"], argument["cdr"], argument["orders"]) == ("ros1", False, "out.drive.orders")
+    assert (argument["command"]["name"], argument["odometry"]["name"]) == ("/cmd_vel", "/odom")
     # As `rosmsg md5` prints them.
-    assert told["command"]["md5"] == "9f195f881246fdfa2798d1d3eebca84a"
-    assert told["odometry"]["md5"] == "cd5e73d190d741a2f92e81eda573aca7"
-    task = DriveTask.from_json(told["task"])
+    assert argument["command"]["md5"] == "9f195f881246fdfa2798d1d3eebca84a"
+    assert argument["odometry"]["md5"] == "cd5e73d190d741a2f92e81eda573aca7"
+    task = DriveTask.from_json(argument["task"])
     assert list(task.legs) == [(2.0, 0.0), (-1.0, -1.0)]
     assert (task.speed_m_s, task.turn_rad_s, task.fence_m, task.lease_s) == (0.2, 1.0, 30, 2.0)
     assert task.limit_s > 3.4 / 0.2
@@ -74,36 +74,37 @@ def test_the_driver_is_told_legs_limits_and_topics() -> None:
     assert need.name == "ros1 for Python"
 
 
-def test_without_leave_there_is_no_job() -> None:
+def test_without_permission_there_is_no_driver() -> None:
     scene = replace(SCENE, cast=CAST)
-    assert "drive" not in [one.job.name for one in STEP.jobs(scene)]
+    assert "drive" not in [planned.job.name for planned in STEP.jobs(scene)]
     assert not list(STEP.needs(scene))
     (line, *_) = STEP.dry_run_notes(scene)
-    assert "by itself" not in line
+    assert "automatically" not in line
     (line, *_) = STEP.dry_run_notes(SCENE)
-    assert "it stops where the laptop is silent for 2 s, and 30 m from its place" in line
+    assert "it stops if the laptop is silent for 2 s, and 30 m from its place" in line
 
 
-def test_beyond_the_fence_or_its_speed_nothing_starts() -> None:
+def test_path_beyond_fence_or_speed_is_refused() -> None:
     far = move("robot: receiver, path: [{away: 25m}, {left: 20m}], speed: 0.3m/s")
     speed, fence = far.refusals(SCENE)
-    assert speed.what == "its top speed is 0.22 m/s, and it is to move at 0.3 m/s"
-    assert fence.what == "its fence is 30 m from its place, and it is to drive 32.0156 m away"
-    assert [one.what for one in far.refusals(replace(SCENE, cast=CAST))] == [speed.what], "a person has eyes"
+    assert speed.what == "its top speed is 0.22 m/s, but the move needs 0.3 m/s"
+    assert fence.what == "its fence is 30 m from its place, but its path leads 32.0156 m away"
+    by_person = far.refusals(replace(SCENE, cast=CAST))
+    assert [refusal.what for refusal in by_person] == [speed.what], "no fence if a person moves it"
     round_trip = move("robot: receiver, path: [{away: 25m}, {towards: 25m}, {away: 25m}], speed: 0.2m/s")
-    assert not list(round_trip.refusals(SCENE)), "how far, not how long"
+    assert not list(round_trip.refusals(SCENE)), "the fence limits the distance, not the length of the path"
 
 
-def test_two_robots_that_hear_one_topic_are_not_driven() -> None:
+def test_robots_with_one_velocity_topic_are_refused() -> None:
     shared = {role: robot.model_copy(update={"ros_master": "10.42.0.3"}) for role, robot in DRIVES.items()}
     (refusal,) = STEP.refusals(replace(SCENE, cast=shared))
     assert refusal.what == (
-        "turtlebot-1 listens to /cmd_vel of the ROS master at 10.42.0.3 too, and would drive as well"
+        "turtlebot-1 also subscribes to /cmd_vel of the ROS master at 10.42.0.3 and would drive, too"
     )
 
 
-def told_with_ros_2(**environment: str) -> Any:  # noqa: ANN401 (of JSON)
-    """Return what the driver of a robot with ROS 2 is told."""
+def argument_with_ros_2(**environment: str) -> Any:  # noqa: ANN401 (of JSON)
+    """Return the argument of the driver of a robot with ROS 2."""
     ros2 = ros_of(TURTLEBOT).model_copy(update={"variant": "ros2", "environment": environment})
     profile = TURTLEBOT.model_copy(update={"ros": ros2})
     cast_of = {**DRIVES, Role.RECEIVER: DRIVES[Role.RECEIVER].model_copy(update={"profile": profile})}
@@ -111,33 +112,33 @@ def told_with_ros_2(**environment: str) -> Any:  # noqa: ANN401 (of JSON)
     assert not list(STEP.refusals(scene))
     first, *_ = STEP.jobs(scene)
     (need, *_) = STEP.needs(scene)
-    told = json.loads(first.job.argv[-2])
-    assert need.name == f"{told['over']} for Python"
-    return told
+    argument = json.loads(first.job.argv[-2])
+    assert need.name == f"{argument['over']} for Python"
+    return argument
 
 
-def test_over_zenoh_the_driver_asks_the_router_of_its_own_robot() -> None:
-    told = told_with_ros_2(RMW_IMPLEMENTATION="rmw_zenoh_cpp", ROS_DOMAIN_ID="7")
-    assert (told["over"], told["cdr"]) == ("zenoh", True)
-    # ROS 2 Foxy, which this profile has, has no hashes of types.
-    assert told["command"]["key"] == "7/cmd_vel/geometry_msgs::msg::dds_::Twist_/TypeHashNotSupported"
-    assert "tcp/127.0.0.1:7447" in told["network"]["settings"]["connect/endpoints"]
-    ends = told["command"]["tokens"]["publisher"], told["odometry"]["tokens"]["subscription"]
+def test_driver_uses_zenoh_router_of_its_robot() -> None:
+    argument = argument_with_ros_2(RMW_IMPLEMENTATION="rmw_zenoh_cpp", ROS_DOMAIN_ID="7")
+    assert (argument["over"], argument["cdr"]) == ("zenoh", True)
+    # The profile has ROS 2 Foxy, which has no type hashes.
+    assert argument["command"]["key"] == "7/cmd_vel/geometry_msgs::msg::dds_::Twist_/TypeHashNotSupported"
+    assert "tcp/127.0.0.1:7447" in argument["network"]["settings"]["connect/endpoints"]
+    ends = argument["command"]["tokens"]["publisher"], argument["odometry"]["tokens"]["subscription"]
     assert ends[0][0] == ends[1][0], "one node"
     assert ends[0][1] != ends[1][1]
 
 
 @pytest.mark.parametrize("rmw", ["", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds"])
-def test_over_dds_the_driver_finds_its_own_robot_without_multicast(rmw: str) -> None:
-    told = told_with_ros_2(RMW_IMPLEMENTATION=rmw, ROS_DOMAIN_ID="7")
-    assert (told["over"], told["cdr"], told["command"]["dds_topic"]) == ("dds", True, "rt/cmd_vel")
-    assert told["network"]["peers"] == [told["network"]["address"]] == [DRIVES[Role.RECEIVER].address]
-    assert told["network"]["domain"] == 7
-    assert told["network"]["gid_bytes"] == 24, "of Foxy"
+def test_driver_discovers_its_robot_over_dds_without_multicast(rmw: str) -> None:
+    argument = argument_with_ros_2(RMW_IMPLEMENTATION=rmw, ROS_DOMAIN_ID="7")
+    assert (argument["over"], argument["cdr"], argument["command"]["dds_topic"]) == ("dds", True, "rt/cmd_vel")
+    assert argument["network"]["peers"] == [argument["network"]["address"]] == [DRIVES[Role.RECEIVER].address]
+    assert argument["network"]["domain"] == 7
+    assert argument["network"]["gid_bytes"] == 24, "of Foxy"
 
 
 @pytest.mark.parametrize("domain", ["seven", "-1", "233", "1.5", "٣"])
-def test_what_is_no_domain_is_told_where_the_profile_says_it(domain: str) -> None:
+def test_invalid_domain_is_reported_with_line_of_profile(domain: str) -> None:
     data = TURTLEBOT.model_dump(mode="json", by_alias=True)
     data["ros"]["environment"] = {"ROS_DOMAIN_ID": domain}
     text = json.dumps(data, indent=1, ensure_ascii=False)
@@ -147,19 +148,19 @@ def test_what_is_no_domain_is_told_where_the_profile_says_it(domain: str) -> Non
     assert caught.value.where == f"robots/x.yaml:{line}"
 
 
-def test_a_drive_whose_log_is_not_whole_does_not_count(tmp_path: Path) -> None:
+def test_missing_log_makes_the_drive_void(tmp_path: Path) -> None:
     step = STEP.resolved(DRIVES)
     view = View(SCENE, AttemptEvidence(tmp_path))
     (problem,) = step.check(view)
     assert problem.startswith("out.drive.jsonl: cannot be read")
     assert {"drive_out_m", "drive_ended"} <= step.measure(view).missing.keys()
-    assert not list(STEP.check(view)), "who does not tell how it drove, as trials of before"
+    assert not list(STEP.check(view)), "trials of older versions have no columns of the drive"
     moved = STEP.resolved(CAST)
     assert not list(moved.check(View(replace(SCENE, cast=CAST), AttemptEvidence(tmp_path))))
     assert not moved.measure(view).missing
 
 
-def test_a_profile_that_drives_has_a_fence() -> None:
+def test_profile_with_drive_needs_a_fence() -> None:
     data = TURTLEBOT.model_dump(mode="json", by_alias=True)
     del data["limits"]["fence_m"]
     with pytest.raises(ConfigurationError, match=r"limits\.fence_m"):
@@ -167,7 +168,7 @@ def test_a_profile_that_drives_has_a_fence() -> None:
 
 
 class Link:
-    """A shell that notes what is written into the lease, and answers with a status."""
+    """A shell that records each order, and answers with a status."""
 
     robot = "turtlebot-2"
 
@@ -190,37 +191,37 @@ class Link:
 JOB = Job(folder="f", name="drive", argv=(), limit_s=1.0, log="drive.log")
 
 
-def held(link: Link) -> DriveLease:
+def lease_of(link: Link) -> DriveLease:
     return DriveLease(cast("Shell", link), JOB, "{}", LEASE_S)
 
 
-def test_a_lease_says_what_is_wanted_until_the_robot_is_home() -> None:
+def test_lease_repeats_the_order_until_robot_is_home() -> None:
     link = Link(status=["", '{"ended": ""}', "{", '{"ended": "home"}'])
-    with held(link) as lease:
+    with lease_of(link) as lease:
         assert (lease.status, lease.why) == ({}, "")
-        lease.order("back")
+        lease.give_order("back")
         lease.wait(lambda: lease.why, Deadline.after(60))
         assert lease.status == {"ended": "home"}
     assert [text.split()[1] for text in link.written[:2]] == ["wait", "back"]
 
 
-@pytest.mark.parametrize("said", ["[1]", "[" * 100_000, '{"ended": ["home"]}'])
-def test_what_a_driver_says_that_is_no_status_is_none(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    with held(Link(status=[said])) as lease:
+@pytest.mark.parametrize("status_text", ["[1]", "[" * 100_000, '{"ended": ["home"]}'])
+def test_invalid_status_is_ignored(status_text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with lease_of(Link(status=[status_text])) as lease:
         assert lease.why == ""
         monkeypatch.setattr(DriveLease, "unchanged_s", 41.0)
-        assert lease.why == "nothing was heard of its driver for 41 s"
+        assert lease.why == "its driver sent no status for 41 s"
 
 
-def test_why_a_driver_stopped_is_a_line_that_fits_into_a_table() -> None:
-    with held(Link(status=[json.dumps({"ended": "\ud800\x1b[2J" + "long\n" * 1000})])) as lease:
+def test_reason_of_driver_is_one_short_line() -> None:
+    with lease_of(Link(status=[json.dumps({"ended": "\ud800\x1b[2J" + "long\n" * 1000})])) as lease:
         assert lease.why.startswith("??[2Jlong long ")
         assert len(lease.why) == 200
 
 
-def test_a_link_that_is_gone_ends_no_wait() -> None:
+def test_lost_link_does_not_end_the_wait() -> None:
     link = Link(status=['{"phase": "out"}'])
-    with held(link) as lease:
+    with lease_of(link) as lease:
         link.broken = True
         link.asked.clear()
         lease.wait(link.asked.is_set, Deadline.after(60))
@@ -229,34 +230,34 @@ def test_a_link_that_is_gone_ends_no_wait() -> None:
 
 
 class Field(IdleTestbed):
-    """A testbed whose robot drives, and that notes who brings it back."""
+    """A testbed with a robot that drives; records each call of `bring_back`."""
 
     def __init__(self, link: Link) -> None:
         super().__init__({Role.RECEIVER: cast("Shell", link)})
-        self.brought: list[bool] = []
+        self.returns: list[bool] = []
 
     def bring_back(self, role: Role, *, by_itself: bool) -> None:
         assert role is Role.RECEIVER
-        self.brought.append(by_itself)
+        self.returns.append(by_itself)
 
 
 @pytest.fixture
 def stopped(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the jobs that were stopped."""
-    found: list[str] = []
+    """Return the names of the jobs that were stopped."""
+    names: list[str] = []
 
     def stop(shell: Shell, job: Job, **_: object) -> int:
-        found.append(job.name)
+        names.append(job.name)
         return 0
 
     monkeypatch.setattr(agent, "install", lambda shell: None)
     monkeypatch.setattr(jobs, "start", lambda shell, job: None)
     monkeypatch.setattr(jobs, "stop", stop)
-    return found
+    return names
 
 
-def quick() -> Scene:
-    """The scene, with a lease that is soon over."""
+def quick_scene() -> Scene:
+    """Return the scene with a short lease."""
     profile = TURTLEBOT.model_copy(
         update={"drive": TURTLEBOT.drive and TURTLEBOT.drive.model_copy(update={"lease": LEASE_S})}
     )
@@ -265,39 +266,39 @@ def quick() -> Scene:
 
 
 def driven(field: Field, body: Any) -> None:  # noqa: ANN401
-    scene = quick()
+    scene = quick_scene()
     first, *_ = STEP.jobs(scene)
     with driving.driven(scene, field, first, STEP.motion, "out.{}"):
         body()
 
 
-def test_one_that_comes_home_is_not_brought(stopped: list[str]) -> None:
+def test_robot_that_returns_is_not_brought_back(stopped: list[str]) -> None:
     field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home"}']))
     driven(field, lambda: None)
-    assert field.brought == [True]
+    assert field.returns == [True]
     assert stopped == ["out.drive"]
 
 
-def test_one_that_stopped_is_brought_and_the_attempt_fails(stopped: list[str]) -> None:
+def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]) -> None:
     field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "odometry was silent for 0.5 s"}']))
-    with pytest.raises(RobotError, match="it stopped on its way: odometry was silent"):
+    with pytest.raises(RobotError, match="it stopped on its path: odometry was silent"):
         driven(field, lambda: None)
-    assert field.brought == [False]
+    assert field.returns == [False]
     assert stopped == ["out.drive"]
 
 
-def test_one_that_stops_early_ends_the_steps_inside(stopped: list[str]) -> None:
+def test_early_stop_aborts_steps_inside(stopped: list[str]) -> None:
     waits = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
     step = schema.validate(schema.parse(json.dumps(waits), source="x.yaml"), MoveStep)
     field = Field(Link(status=['{"ended": "", "ready": true}'] * 4 + ['{"ended": "beyond the fence"}']))
-    with pytest.raises(RobotError, match="it stopped on its way: beyond the fence") as caught:
-        step.run(quick(), field, lambda *_: None)
-    assert "the wait was cut short" in str(caught.value.__cause__)
-    assert field.brought == [False]
+    with pytest.raises(RobotError, match="it stopped on its path: beyond the fence") as caught:
+        step.run(quick_scene(), field, lambda *_: None)
+    assert "the wait was interrupted" in str(caught.value.__cause__)
+    assert field.returns == [False]
     assert stopped == ["out.drive"]
 
 
-def test_an_interrupted_one_stands_where_it_is(stopped: list[str]) -> None:
+def test_interrupted_robot_stays_where_it_is(stopped: list[str]) -> None:
     link = Link(status=['{"ended": "", "ready": true}'])
     field = Field(link)
 
@@ -306,18 +307,18 @@ def test_an_interrupted_one_stands_where_it_is(stopped: list[str]) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         driven(field, interrupt)
-    assert field.brought == []
+    assert field.returns == []
     assert stopped == ["out.drive"]
     assert not any(" back " in text for text in link.written)
 
 
-def test_an_error_inside_brings_it_back(stopped: list[str]) -> None:
+def test_robot_returns_after_error_inside(stopped: list[str]) -> None:
     field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home"}']))
 
     def fail() -> None:
-        raise RobotError("it broke", remedy="mend it")
+        raise RobotError("it broke", remedy="repair it")
 
     with pytest.raises(RobotError, match="it broke"):
         driven(field, fail)
-    assert field.brought == [True]
+    assert field.returns == [True]
     assert stopped == ["out.drive"]

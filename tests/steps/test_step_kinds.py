@@ -1,4 +1,4 @@
-"""Kinds of step: fieldkit's own, those of entry points, and entry points that cannot be used."""
+"""Kinds of step: built-in kinds, kinds of entry points, and errors of entry points."""
 
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
@@ -14,44 +14,44 @@ from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.trial.columns import installed
 from tests.helpers.outside_packages import write_package
 
-OWN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask", "together"]
-OWN += ["run", "iperf3", "soak", "send", "track", "topics", "mavlink", "fly"]
+BUILTIN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask", "together"]
+BUILTIN += ["run", "iperf3", "soak", "send", "track", "topics", "mavlink", "fly"]
 
 Install = Callable[..., None]
 
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Install a package with entry points: names and what they point to."""
+    """Return a function that installs a package with entry points: target by name."""
 
     def entries(**targets: str) -> None:
         points = "".join(f"{name} = {target}\n" for name, target in targets.items())
         write_package(tmp_path / "installed", "more-steps", f"[{plugins.STEPS}]\n{points}")
         monkeypatch.syspath_prepend(tmp_path / "installed")
 
-    cached = (step_types, installed)
-    for one in cached:
-        one.cache_clear()
+    cached_functions = (step_types, installed)
+    for function in cached_functions:
+        function.cache_clear()
     yield entries
-    for one in cached:
-        one.cache_clear()
+    for function in cached_functions:
+        function.cache_clear()
 
 
-def test_own_kinds_come_in_their_order_each_by_the_module_of_its_name(install: Install) -> None:
+def test_builtin_kinds_are_in_order_and_in_modules_of_their_names(install: Install) -> None:
     install()
-    assert list(step_types()) == OWN
+    assert list(step_types()) == BUILTIN
     for kind, step in step_types().items():
         assert (step.__module__, step.__name__) == (f"fieldkit.steps.kinds.{kind}", f"{kind.capitalize()}Step")
 
 
-def test_others_follow_by_name(install: Install) -> None:
+def test_kinds_of_packages_follow_by_name(install: Install) -> None:
     install(zoom="fieldkit.steps.kinds.ping:PingStep", load="fieldkit.steps.kinds.ping:PingStep")
-    assert list(step_types()) == [*OWN, "load", "zoom"]
+    assert list(step_types()) == [*BUILTIN, "load", "zoom"]
     assert step_types()["load"] is PingStep
 
 
 @pytest.mark.parametrize(
-    ("target", "said"),
+    ("target", "message"),
     [
         ("no_such_package.steps:Load", "No module named 'no_such_package'"),
         ("fieldkit.steps.kinds.ping:NoSuchStep", "has no attribute 'NoSuchStep'"),
@@ -59,14 +59,14 @@ def test_others_follow_by_name(install: Install) -> None:
         ("unmet:Load", "ZeroDivisionError"),
     ],
 )
-def test_what_cannot_be_loaded_names_its_entry_point(
-    install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, said: str
+def test_error_of_entry_point_that_cannot_be_loaded_names_it(
+    install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, message: str
 ) -> None:
     (tmp_path / "half_written.py").write_text("class Load(", encoding="utf-8")
     (tmp_path / "unmet.py").write_text("1 / 0", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     install(load=target)
-    with pytest.raises(ConfigurationError, match=said) as caught:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         step_types()
     assert caught.value.what.startswith("it cannot be loaded: ")
     assert caught.value.where == f"entry point load = {target}"
@@ -74,28 +74,28 @@ def test_what_cannot_be_loaded_names_its_entry_point(
 
 
 @pytest.mark.parametrize("target", ["os.path:join", "fieldkit.steps.base:View", "fieldkit.steps.kinds.ping"])
-def test_what_is_no_step_is_refused(install: Install, target: str) -> None:
+def test_entry_point_without_step_class_is_refused(install: Install, target: str) -> None:
     install(load=target)
-    with pytest.raises(ConfigurationError, match="a kind of step is a subclass of Step") as caught:
+    with pytest.raises(ConfigurationError, match="a kind of step must be a subclass of Step") as caught:
         step_types()
     assert caught.value.where == f"entry point load = {target}"
 
 
-def test_a_kind_of_fieldkits_own_is_not_replaced(install: Install) -> None:
+def test_builtin_kind_cannot_be_replaced(install: Install) -> None:
     install(ping="no_such_package.steps:Ping")
-    with pytest.raises(ConfigurationError, match="there is a kind of step 'ping' already") as caught:
+    with pytest.raises(ConfigurationError, match="there is already a kind of step 'ping'") as caught:
         step_types()
     assert caught.value.where == "entry point ping = no_such_package.steps:Ping"
 
 
-def test_what_lacks_a_part_of_the_contract_is_refused(install: Install) -> None:
+def test_abstract_class_is_refused(install: Install) -> None:
     install(load="fieldkit.steps.program:ProgramStep")
     with pytest.raises(ConfigurationError, match="the kind of step lacks argv, parse"):
         step_types()
 
 
 @pytest.mark.parametrize("name", ["rtt_sent", "status"])
-def test_a_column_that_stands_for_something_else_is_refused(
+def test_column_name_that_is_already_used_is_refused(
     install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     (tmp_path / f"declares_{name}.py").write_text(
@@ -110,19 +110,19 @@ def test_a_column_that_stands_for_something_else_is_refused(
     assert caught.value.remedy == "rename it there, or uninstall its package"
 
 
-def test_a_kind_may_have_any_name(install: Install) -> None:
+def test_kind_has_the_name_of_its_entry_point(install: Install) -> None:
     install(copy="fieldkit.steps.kinds.ping:PingStep")
     ping = {"from": "sender", "to": "receiver"}
     (entry,) = TypeAdapter(tuple[StepEntry, ...]).validate_python([{"copy": ping}])
     assert (entry.kind, type(entry.step)) == ("copy", PingStep)
 
 
-def test_a_kind_that_is_not_installed_asks_for_its_package(install: Install) -> None:
+def test_error_of_unknown_kind_mentions_packages(install: Install) -> None:
     install()
     with pytest.raises(ValidationError, match=r"unknown key zoom; .* comes with a package to be installed"):
         TypeAdapter(tuple[StepEntry, ...]).validate_python([{"zoom": {}}])
 
 
-def test_packages_that_add_kinds_are_written_down(install: Install) -> None:
+def test_versions_include_packages_that_add_kinds(install: Install) -> None:
     install(copy="fieldkit.steps.kinds.ping:PingStep")
     assert plugins.versions() == {"fieldkit": version("fieldkit"), "more-steps": "1.0"}

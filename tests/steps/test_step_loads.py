@@ -1,4 +1,4 @@
-"""Loads of iperf3: what the robots are told, what is refused, what is made of what they say."""
+"""Loads of iperf3: command lines, refusals, and measurements from the reports."""
 
 import shutil
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def procedure(text: str) -> Procedure:
 
 
 def lines(step: Step, protocol: Protocol) -> list[tuple[Role, str]]:
-    return [(one.role, in_shell(one.job)) for one in step.jobs(Scene(protocol, CAST, "f"))]
+    return [(planned.role, in_shell(planned.job)) for planned in step.jobs(Scene(protocol, CAST, "f"))]
 
 
 SERVER = "iperf3 -s -1 -p 5201 -i 1 --json > receiver-iperf3.json 2> receiver-iperf3.log"
@@ -53,15 +53,15 @@ KEPT = "-i 1 --json > sender-iperf3.json 2> sender-iperf3.log"
         (", protocol: udp, payload_bytes: 200, reverse: true", Protocol.TCP, "-u -l 200 -b 1000000 -t 10 -R"),
     ],
 )
-def test_what_both_ends_are_told(keys: str, protocol: Protocol, options: str) -> None:
+def test_command_lines_of_both_ends(keys: str, protocol: Protocol, options: str) -> None:
     step = step_of(f"iperf3: {{from: sender, to: receiver{keys}}}")
     client = f"iperf3 -c 10.42.0.2 -p 5201 {options} {KEPT}"
     assert lines(step, protocol) == [(Role.RECEIVER, SERVER), (Role.SENDER, client)]
     server, _ = step.jobs(Scene(protocol, CAST, "f"))
-    assert server.job.ready == "tcp:1451", "its control connection is TCP's"
+    assert server.job.ready == "tcp:1451", "its control connection uses TCP"
 
 
-def test_a_soak_surrounds_the_steps_inside() -> None:
+def test_soak_runs_around_the_steps_inside() -> None:
     inside = "ping: {from: sender, to: receiver}"
     step = step_of(f"soak: {{from: receiver, to: sender, rate: 3Mbit/s, during: [{inside}]}}")
     server, client, ping = lines(step, Protocol.UDP)
@@ -70,7 +70,7 @@ def test_a_soak_surrounds_the_steps_inside() -> None:
         "sh wlan0 iperf3 -c 10.42.0.1 -p 5202 -u -l 1400 -b 3000000 -t 86400 2> receiver-soak.log"
     )
     assert "ping" in ping[1]
-    jobs_of = [one.job for one in step.jobs(Scene(Protocol.UDP, CAST, "f"))]
+    jobs_of = [planned.job for planned in step.jobs(Scene(Protocol.UDP, CAST, "f"))]
     assert jobs_of[0].limit_s == jobs_of[1].limit_s > jobs_of[2].limit_s
 
 
@@ -82,7 +82,7 @@ def test_a_soak_surrounds_the_steps_inside() -> None:
         ("iperf3: {from: sender, to: receiver, size: 0MB}", "greater than 0"),
         ("iperf3: {from: sender, to: receiver, size: 10}", "write for example 10B"),
         ("iperf3: {from: sender, to: receiver, duration: 1500ms}", "whole seconds, not 1.5 s"),
-        ("iperf3: {from: sender, to: receiver, duration: 130s}", "would be ended before"),
+        ("iperf3: {from: sender, to: receiver, duration: 130s}", "so its limit must be longer"),
         ("iperf3: {from: sender, to: receiver, rate: 5}", "write for example 5bit/s"),
         ("iperf3: {from: sender, to: receiver, protocol: sctp}", "tcp"),
         (
@@ -91,7 +91,7 @@ def test_a_soak_surrounds_the_steps_inside() -> None:
         ),
     ],
 )
-def test_what_cannot_be_is_refused_at_its_line(text: str, why: str) -> None:
+def test_invalid_keys_are_refused_with_line(text: str, why: str) -> None:
     with pytest.raises(ConfigurationError, match=why) as caught:
         procedure(text)
     assert caught.value.where == "x.yaml:8"
@@ -110,13 +110,13 @@ def test_an_iperf3_inside_a_soak_has_another_port() -> None:
         ("protocol: tcp, size: 1448kB", 2 * 1000),
     ],
 )
-def test_flows_have_as_many_frames_as_what_is_sent(keys: str, frames: float) -> None:
+def test_number_of_frames_of_a_flow(keys: str, frames: float) -> None:
     (flow,) = step_of(f"iperf3: {{from: sender, to: receiver, {keys}}}").flows(Scene(Protocol.UDP, CAST, "f"))
     assert flow.port == 5201
     assert flow.frames == pytest.approx(frames)
 
 
-def test_its_filter_is_that_of_a_capture_around_it() -> None:
+def test_capture_around_it_uses_its_port() -> None:
     step = step_of("capture: {during: [{iperf3: {from: sender, to: receiver, port: 7000}}]}")
     first = next(step.jobs(Scene(Protocol.UDP, CAST, "f")))
     assert "port 7000" in first.job.argv[-1]
@@ -128,21 +128,21 @@ def evidence(folder: Path, version: str, test: str) -> AttemptEvidence:
     return AttemptEvidence(folder)
 
 
-def test_figures_are_those_of_the_end_that_sends_and_the_one_that_receives(tmp_path: Path) -> None:
+def test_values_are_from_reports_of_sending_and_receiving_end(tmp_path: Path) -> None:
     scene = Scene(Protocol.UDP, CAST, "f")
     step = step_of("iperf3: {from: sender, to: receiver, protocol: udp, reverse: true, duration: 3s}")
     view = View(scene, evidence(tmp_path, "3.12", "udp-reverse"))
-    found = step.measure(view)
+    measured = step.measure(view)
     assert not list(step.check(view))
-    assert (found.values["iperf3_sent_bytes"], found.values["iperf3_received_bytes"]) == (751800, 704200)
-    assert "captures" in found.missing["iperf3_captured_bit_s"]
-    assert list(step.summary(found.values)) == ["iperf3 loss 6.2 %", "iperf3 1.87 Mbit/s"]
+    assert (measured.values["iperf3_sent_bytes"], measured.values["iperf3_received_bytes"]) == (751800, 704200)
+    assert "captures" in measured.missing["iperf3_captured_bit_s"]
+    assert list(step.summary(measured.values)) == ["iperf3 loss 6.2 %", "iperf3 1.87 Mbit/s"]
     declared = {column.name for column in step.output_columns()}
-    assert found.values.keys() | found.missing.keys() == declared
+    assert measured.values.keys() | measured.missing.keys() == declared
 
 
 @pytest.mark.parametrize(
-    ("spoil", "problem"),
+    ("damage", "problem"),
     [
         (lambda path: path.unlink(), "receiver-iperf3.json: cannot be read"),
         (
@@ -151,7 +151,7 @@ def test_figures_are_those_of_the_end_that_sends_and_the_one_that_receives(tmp_p
         ),
         (
             lambda path: shutil.copy(DATA / "iperf3" / "3.7" / "refused-client.json", path),
-            "receiver-iperf3.json: iperf3 says: error - unable to connect to server: Connection refused",
+            "receiver-iperf3.json: iperf3 reports: error - unable to connect to server: Connection refused",
         ),
         (
             lambda path: path.write_text('{"start": {}, "intervals": []}'),
@@ -159,25 +159,25 @@ def test_figures_are_those_of_the_end_that_sends_and_the_one_that_receives(tmp_p
         ),
     ],
 )
-def test_an_end_that_was_cut_or_failed_voids_the_repeat(
-    tmp_path: Path, spoil: Callable[[Path], object], problem: str
+def test_incomplete_or_failed_report_makes_repeat_void(
+    tmp_path: Path, damage: Callable[[Path], object], problem: str
 ) -> None:
-    found = evidence(tmp_path, "3.12", "udp")
-    spoil(tmp_path / "receiver-iperf3.json")
-    view = View(Scene(Protocol.UDP, CAST, "f"), found)
+    files = evidence(tmp_path, "3.12", "udp")
+    damage(tmp_path / "receiver-iperf3.json")
+    view = View(Scene(Protocol.UDP, CAST, "f"), files)
     step = step_of("iperf3: {from: sender, to: receiver}")
-    (said,) = step.check(view)
-    assert said.startswith(problem)
+    (reason,) = step.check(view)
+    assert reason.startswith(problem)
     measured = step.measure(view)
     assert set(measured.values) == {"iperf3_sent_bytes"}
 
 
-Played = tuple[list[str], dict[str, int]]
+Calls = tuple[list[str], dict[str, int]]
 
 
 @pytest.fixture
-def played(monkeypatch: pytest.MonkeyPatch) -> Played:
-    """Jobs that only say what became of them, and what each verb says of them."""
+def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
+    """Replace the functions of `jobs`; return the list of their calls, and the exit codes to return by call."""
     done: list[str] = []
     codes: dict[str, int] = {}
 
@@ -202,39 +202,39 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Played:
     return done, codes
 
 
-def play(step: Step, tmp_path: Path) -> None:
+def run_step(step: Step, tmp_path: Path) -> None:
     testbed = IdleTestbed({role: LocalShell(tmp_path) for role in FIXED_ROLES})
     step.run(Scene(Protocol.UDP, CAST, "f"), testbed, lambda name, expected_s: None)
 
 
-def test_a_server_that_is_not_told_of_the_end_is_ended(played: Played, tmp_path: Path) -> None:
-    done, codes = played
+def test_server_that_does_not_exit_is_stopped(calls: Calls, tmp_path: Path) -> None:
+    done, codes = calls
     step = step_of("iperf3: {from: sender, to: receiver}")
-    told = ["start iperf3-server receiver", "run iperf3-client sender", "wait iperf3-server receiver"]
-    play(step, tmp_path)
-    assert done == told
+    expected = ["start iperf3-server receiver", "run iperf3-client sender", "wait iperf3-server receiver"]
+    run_step(step, tmp_path)
+    assert done == expected
     done.clear()
     codes["wait iperf3-server"] = jobs.STILL_RUNNING
-    with pytest.raises(RobotError, match="turtlebot-2: iperf3-server was not told of its end"):
-        play(step, tmp_path)
-    assert done == [*told, "stop iperf3-server receiver"]
+    with pytest.raises(RobotError, match="turtlebot-2: iperf3-server did not exit"):
+        run_step(step, tmp_path)
+    assert done == [*expected, "stop iperf3-server receiver"]
 
 
-def test_a_client_that_fails_is_the_reason(played: Played, tmp_path: Path) -> None:
-    _, codes = played
+def test_failure_of_client_is_the_reason(calls: Calls, tmp_path: Path) -> None:
+    _, codes = calls
     codes["run iperf3-client"] = jobs.KILLED
     with pytest.raises(RobotError, match="turtlebot-1: iperf3-client ended with exit code 137"):
-        play(step_of("iperf3: {from: sender, to: receiver}"), tmp_path)
+        run_step(step_of("iperf3: {from: sender, to: receiver}"), tmp_path)
 
 
-def test_a_soak_ends_its_load_whatever_happens_inside(played: Played, tmp_path: Path) -> None:
-    done, codes = played
+def test_soak_stops_its_load_also_after_an_error_inside(calls: Calls, tmp_path: Path) -> None:
+    done, codes = calls
     step = step_of("soak: {from: sender, to: receiver, during: [{ping: {from: sender, to: receiver}}]}")
-    play(step, tmp_path)
+    run_step(step, tmp_path)
     load = ["start soak receiver", "start soak sender", "run ping sender", "stop soak sender", "stop soak receiver"]
     assert done == load
     done.clear()
     codes["run ping"] = 2
     with pytest.raises(RobotError, match="ping ended with exit code 2"):
-        play(step, tmp_path)
+        run_step(step, tmp_path)
     assert done == load

@@ -1,4 +1,4 @@
-"""Steps with names: what begins with them, which capture and which ping is theirs, and what a plan tells of each."""
+"""Steps with names: prefixes of jobs, files and columns, the capture and ping of each step, and lists of a plan."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -64,22 +64,22 @@ def steps_by_name(plan: Plan) -> dict[tuple[str, str], Step]:
     return {(placed.kind, placed.step.name): placed.step for placed in plan.procedure.walk()}
 
 
-def test_jobs_and_files_of_a_step_with_a_name_begin_with_it() -> None:
+def test_jobs_and_files_of_named_step_have_its_prefix() -> None:
     plan = plan_of()
     scene = plan.scene(REPEAT, "folder")
     for (kind, name), step in steps_by_name(plan).items():
-        begin = "" if name in {"", "scan"} else f"{name}."
-        own = [one.job for one in step.own_jobs(scene)]
-        assert own
-        said = {job.name for job in own} | {file for job in own for file in (job.log, job.stdout) if file}
-        assert {one for one in said if not one.startswith(begin)} == set(), kind
-        written = {file for job in own for file in (job.log, job.stdout) if file}
-        assert written <= set(step.files())
+        prefix = "" if name in {"", "scan"} else f"{name}."
+        jobs = [planned.job for planned in step.own_jobs(scene)]
+        assert jobs
+        files = {file for job in jobs for file in (job.log, job.stdout) if file}
+        names = {job.name for job in jobs} | files
+        assert {text for text in names if not text.startswith(prefix)} == set(), kind
+        assert files <= set(step.files())
 
 
-def test_a_step_without_a_name_has_the_files_that_it_always_had() -> None:
+def test_step_without_name_has_unprefixed_files() -> None:
     scene = los_plan().scene(REPEAT, "folder")
-    assert [(one.job.name, one.job.log) for one in los_plan().jobs(scene)] == [
+    assert [(planned.job.name, planned.job.log) for planned in los_plan().jobs(scene)] == [
         ("record", "sender-record.log"),
         ("capture", "sender-capture.log"),
         ("capture", "receiver-capture.log"),
@@ -90,14 +90,17 @@ def test_a_step_without_a_name_has_the_files_that_it_always_had() -> None:
     assert "name" not in los_plan().procedure.model_dump(mode="json")["steps"][1]["capture"]
 
 
-def test_a_plan_tells_every_transfer_ping_and_capture() -> None:
+def test_plan_lists_transfers_pings_and_captures() -> None:
     plan = plan_of()
-    found = [(one.name, one.sent_file, one.received_file, one.captures) for one in plan.transfers(Protocol.UDP)]
-    assert found == [
+    transfers = [
+        (transfer.name, transfer.sent_file, transfer.received_file, transfer.captures)
+        for transfer in plan.transfers(Protocol.UDP)
+    ]
+    assert transfers == [
         ("up", "imu.bag", "up.recv.bag", ("sender.pcap", "receiver.pcap")),
         ("bare", "scan.bag", "bare.recv.bag", (None, None)),
     ]
-    pings = [(one.name, one.role, one.file) for one in plan.pingings()]
+    pings = [(ping.name, ping.role, ping.file) for ping in plan.pingings()]
     assert pings == [("up", Role.SENDER, "up.ping.txt"), ("", Role.RECEIVER, "ping.txt")]
     assert plan.captures() == {
         "sender.pcap": Role.SENDER,
@@ -105,10 +108,10 @@ def test_a_plan_tells_every_transfer_ping_and_capture() -> None:
         "receiver.pcap": Role.RECEIVER,
     }
     assert plan.bags() == {Role.SENDER: "scan.bag"}
-    assert [made.name for made in plan.scenes()[0].recorded[Role.SENDER]] == ["scan.bag", "imu.bag"]
+    assert [file.name for file in plan.scenes()[0].recorded[Role.SENDER]] == ["scan.bag", "imu.bag"]
 
 
-def test_the_innermost_capture_of_a_robot_is_the_one_around_a_step(tmp_path: Path) -> None:
+def test_step_uses_innermost_capture_around_it(tmp_path: Path) -> None:
     within = {placed.step.name or placed.kind: placed.within for placed in plan_of().procedure.walk()}["ping"]
     assert capture_around(within, Role.SENDER) == "inner.sender.pcap"
     assert capture_around(within, Role.RECEIVER) == "receiver.pcap"
@@ -124,13 +127,13 @@ def test_the_innermost_capture_of_a_robot_is_the_one_around_a_step(tmp_path: Pat
     assert view.capture(Role.RELAY) is None
 
 
-def test_gates_put_names_before_columns_and_reasons_and_rows_before_words(tmp_path: Path) -> None:
+def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> None:
     for name in ("scan.bag", "imu.bag"):
         write_bag(tmp_path / name, {"/scan": 11, "/imu": 11})
     (tmp_path / "up.recv.bag").write_bytes((tmp_path / "imu.bag").read_bytes())
     (tmp_path / "up.ping.txt").write_text(PING.format(ms="16.0"), encoding="ascii")
     (tmp_path / "ping.txt").write_text(PING.format(ms="4.0"), encoding="ascii")
-    frames = timed([one for number in range(4) for one in datagram(number, 8192)])
+    frames = timed([packet for number in range(4) for packet in datagram(number, 8192)])
     for name in ("sender", "receiver", "inner.sender"):
         (tmp_path / f"{name}.pcap").write_bytes(file_bytes(frames))
         log = name.replace("sender", "sender-capture.log").replace("receiver", "receiver-capture.log")
@@ -141,14 +144,14 @@ def test_gates_put_names_before_columns_and_reasons_and_rows_before_words(tmp_pa
     assert (values["up.file_loss"], values["up.rtt_median_s"], values["rtt_median_s"]) == (0, 0.016, 0.004)
     assert (values["sender_captured"], values["inner.sender_captured"]) == (len(frames), len(frames))
     assert missing["inner.receiver_captured"] == "the receiver does not capture"
-    # The paper's figures are of the ping of the same name: the other transfer has none.
+    # The paper's values use the ping of the same name; the other transfer has no such ping.
     assert values["up.paper_delay_s"] == 0.016
     assert "bare.paper_delay_s" in missing
     assert {name for name in (*values, *missing) if name.startswith(("file_loss", "link_down"))} == set()
     assert "bare: bare.recv.bag is missing" in judged.problems
     assert "cut.link_down_outage_s" in missing
-    said = rows.in_words(plan, values)
-    assert said.startswith("up: file loss 0.0 %, up: ping loss 90.0 %, ping loss 90.0 %, up: RTT 16.0 ms, RTT 4.0 ms")
+    text = rows.in_words(plan, values)
+    assert text.startswith("up: file loss 0.0 %, up: ping loss 90.0 %, ping loss 90.0 %, up: RTT 16.0 ms, RTT 4.0 ms")
 
 
 @pytest.mark.parametrize(
@@ -159,13 +162,13 @@ def test_gates_put_names_before_columns_and_reasons_and_rows_before_words(tmp_pa
         ("ping: {name: up, ", "ping: {", "a ping comes twice; tell them apart by name:"),
         ("transfer: {name: bare", "transfer: {name: up", "a transfer named up comes twice; give one another name"),
         ("name: imu}", "name: scan}", "a recording on sender comes twice; tell them apart by name:"),
-        ("file: imu", "file: odom", "sends odom, and nothing of that name is recorded on sender before it"),
-        (", file: imu", "", "names no file, and 2 are recorded there before it: write file:"),
+        ("file: imu", "file: odom", "sends odom, but no recording of that name is made on sender before it"),
+        (", file: imu", "", "names no file, but 2 files are recorded there before it: write file:"),
         ("            name: inner\n", "", "a capture on sender comes twice; tell them apart by name:"),
         ("robots: [sender]", "robots: [sender, sender]", "a robot is named twice"),
     ],
 )
-def test_what_nobody_could_tell_apart_is_refused(old: str, new: str, what: str) -> None:
+def test_ambiguous_steps_are_refused(old: str, new: str, what: str) -> None:
     assert old in STEPS
     with pytest.raises(ConfigurationError) as caught:
         load(STEPS.replace(old, new))
@@ -173,22 +176,22 @@ def test_what_nobody_could_tell_apart_is_refused(old: str, new: str, what: str) 
 
 
 @pytest.mark.parametrize("file", ["imu", "imu.bag"])
-def test_a_transfer_names_its_bag_or_its_file(file: str) -> None:
+def test_transfer_names_bag_or_file(file: str) -> None:
     plan = plan_of(STEPS.replace("file: imu", f"file: {file}"))
     assert plan.transfers(Protocol.UDP)[0].sent_file == "imu.bag"
     assert plan.refusals({}) == ()
 
 
-def test_a_file_that_no_recorder_writes_so_is_refused_with_those_that_there_are() -> None:
+def test_refusal_of_unknown_file_lists_recorded_files() -> None:
     (refusal,) = plan_of(STEPS.replace("file: imu", "file: imu/imu_0.db3")).refusals({})
-    assert refusal.what == "it is to send imu/imu_0.db3, and its recorder writes scan.bag, imu.bag"
+    assert refusal.what == "it cannot send imu/imu_0.db3: its recorder writes scan.bag, imu.bag"
     assert refusal.remedy == "write file: scan.bag"
 
 
-def test_a_line_for_people_begins_with_the_gap_of_the_ping_and_not_with_that_of_the_robot() -> None:
+def test_summary_starts_with_gap_of_ping() -> None:
     ping = "{ping: {from: sender, to: receiver, gap: true}}"
     plan = plan_of(f"  - fault: {{name: cut, robot: sender, kind: link-down, for: 7s, during: [{ping}]}}\n")
     outage_s, recovered = (of_fault(FaultKind.LINK_DOWN, what) for what in ("outage_s", "recovered"))
-    gone = {f"cut.{outage_s}": 7.2, f"cut.{recovered}": True}
-    said = rows.in_words(plan, {**gone, "rtt_gap_s": 3.2, "rtt_gap_lost": 29, "rtt_median_s": 0.0032})
-    assert said == "longest gap 3.2 s with 29 lost, RTT 3.2 ms, cut: link-down: gone for 7.2 s"
+    fault_values = {f"cut.{outage_s}": 7.2, f"cut.{recovered}": True}
+    text = rows.in_words(plan, {**fault_values, "rtt_gap_s": 3.2, "rtt_gap_lost": 29, "rtt_median_s": 0.0032})
+    assert text == "longest gap 3.2 s with 29 lost, RTT 3.2 ms, cut: link-down: gone for 7.2 s"

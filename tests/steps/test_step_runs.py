@@ -1,4 +1,4 @@
-"""How the programs of a step ended: what is a measurement, and what makes the attempt fail."""
+"""Exit codes of the programs of steps: which are measurements, and which make the attempt fail."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,78 +35,76 @@ def scene(cast: Cast = CAST) -> Scene:
     return Scene(Protocol.TCP, cast, "folder", {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e5),)})
 
 
-def quiet(name: str, expected_s: float | None) -> None:
-    """Tell nobody."""
+def ignore(name: str, expected_s: float | None) -> None:
+    """Ignore a phase."""
 
 
-def ended(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
-    """Let every job that is run end with an exit code."""
+def set_exit_code(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    """Let every job exit with this code."""
     monkeypatch.setattr(jobs, "run", lambda shell, job: code)
 
 
 @pytest.mark.parametrize("code", [0, 1])
 def test_missing_replies_are_a_measurement(testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
-    ended(monkeypatch, code)
+    set_exit_code(monkeypatch, code)
     (ping,) = steps_of(LOS, PingStep)
-    ping.run(scene(), testbed, quiet)
+    ping.run(scene(), testbed, ignore)
 
 
-def test_a_ping_that_could_not_send_is_an_error(testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch) -> None:
-    ended(monkeypatch, 2)
+def test_ping_that_cannot_send_is_an_error(testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch) -> None:
+    set_exit_code(monkeypatch, 2)
     (ping,) = steps_of(LOS, PingStep)
     with pytest.raises(RobotError, match="turtlebot-1: ping ended with exit code 2"):
-        ping.run(scene(), testbed, quiet)
+        ping.run(scene(), testbed, ignore)
 
 
-def test_a_recorder_that_ends_by_itself_says_by_its_code_whether_it_recorded(
+def test_exit_code_counts_only_for_recorder_with_duration(
     testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ended(monkeypatch, 1)
+    set_exit_code(monkeypatch, 1)
     (record,) = steps_of(LOS, RecordStep)
     with pytest.raises(RobotError, match="turtlebot-1: recording ended with exit code 1"):
-        record.run(scene(), testbed, quiet)
-    ended(monkeypatch, 2)
-    record.run(scene(OF_ROS2), testbed, quiet)
+        record.run(scene(), testbed, ignore)
+    set_exit_code(monkeypatch, 2)
+    record.run(scene(OF_ROS2), testbed, ignore)
 
 
-def captured(monkeypatch: pytest.MonkeyPatch, code: int) -> list[str]:
-    """Let captures start and stop with an exit code; return what is done."""
-    done: list[str] = []
+def replace_captures(monkeypatch: pytest.MonkeyPatch, code: int) -> list[str]:
+    """Let captures exit with this code; return the list of starts and stops."""
+    calls: list[str] = []
 
     def start(shell: Shell, job: Job) -> None:
-        done.append(f"start {job.log}")
+        calls.append(f"start {job.log}")
 
     def stop(shell: Shell, job: Job, **how: object) -> int:
-        done.append(f"stop {job.log}")
+        calls.append(f"stop {job.log}")
         return code
 
     monkeypatch.setattr(jobs, "start", start)
     monkeypatch.setattr(jobs, "stop", stop)
-    return done
+    return calls
 
 
-def both(verb: str) -> Sequence[str]:
+def on_both(verb: str) -> Sequence[str]:
     return [f"{verb} receiver-capture.log", f"{verb} sender-capture.log"]
 
 
-def test_a_capture_that_ended_badly_is_an_error(testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch) -> None:
-    done = captured(monkeypatch, 1)
-    ended(monkeypatch, 0)
+def test_failed_capture_is_an_error(testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = replace_captures(monkeypatch, 1)
+    set_exit_code(monkeypatch, 0)
     (capture,) = steps_of(LOS, CaptureStep)
     pings = [entry for entry in capture.during if entry.kind == "ping"]
     with pytest.raises(RobotError, match="turtlebot-1: tcpdump ended with exit code 1"):
-        capture.model_copy(update={"during": pings}).run(scene(), testbed, quiet)
-    assert sorted(done[:2]) == both("start")
-    assert sorted(done[2:]) == both("stop")
+        capture.model_copy(update={"during": pings}).run(scene(), testbed, ignore)
+    assert sorted(calls[:2]) == on_both("start")
+    assert sorted(calls[2:]) == on_both("stop")
 
 
-def test_what_was_captured_until_a_step_inside_failed_is_kept(
-    testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done = captured(monkeypatch, 0)
-    ended(monkeypatch, 2)
+def test_captures_are_stopped_after_error_inside(testbed: IdleTestbed, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = replace_captures(monkeypatch, 0)
+    set_exit_code(monkeypatch, 2)
     (capture,) = steps_of(LOS, CaptureStep)
     pings = [entry for entry in capture.during if entry.kind == "ping"]
     with pytest.raises(RobotError, match="ping ended with exit code 2"):
-        capture.model_copy(update={"during": pings}).run(scene(), testbed, quiet)
-    assert sorted(done[2:]) == both("stop")
+        capture.model_copy(update={"during": pings}).run(scene(), testbed, ignore)
+    assert sorted(calls[2:]) == on_both("stop")

@@ -1,4 +1,4 @@
-"""Golden command lines of each variant of a tool, and what is refused before repeat 1."""
+"""Golden command lines of each variant of a tool, and refusals before the first repeat."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -18,7 +18,7 @@ from tests.helpers.casts import TURTLEBOT, los_plan, ros_of
 from tests.helpers.paths import DATA
 from tests.helpers.plans import steps_of
 
-USUAL = variants.expected(TURTLEBOT)
+DEFAULT = variants.expected(TURTLEBOT)
 ENDLESS = """sh -c 'mkfifo .endless && exec <>.endless && rm .endless && exec "$@"' sh """
 
 LISTEN = {
@@ -42,47 +42,50 @@ SEND = {
 PING = "-c 10 -i 0.2 -s 502 -W 2 10.42.0.2 > ping.txt 2> sender-ping.log"
 
 
-def lines(protocol: Protocol, found: Mapping[Role, Variants], plan: Plan | None = None) -> dict[str, str]:
-    """The command of each job with these tools, by name; of two captures the receiver's."""
+def lines(protocol: Protocol, detected: Mapping[Role, Variants], plan: Plan | None = None) -> dict[str, str]:
+    """Return the command of each job with these tools by name; for the captures, that of the receiver."""
     plan = plan or los_plan()
-    scene = plan.scene(RepeatId(protocol, 1), "f", found)
-    planned = [one for entry in plan.procedure.steps for one in entry.step.jobs(scene)]
-    return {one.job.name: in_shell(one.job) for one in planned}
+    scene = plan.scene(RepeatId(protocol, 1), "f", detected)
+    jobs = [planned.job for entry in plan.procedure.steps for planned in entry.step.jobs(scene)]
+    return {job.name: in_shell(job) for job in jobs}
 
 
-def both(**changes: object) -> dict[Role, Variants]:
-    """Sender and receiver with other tools than usual."""
-    return dict.fromkeys((Role.SENDER, Role.RECEIVER), replace(USUAL, **changes))  # type: ignore[arg-type]
+def on_both(**changes: object) -> dict[Role, Variants]:
+    """Return these changed tools for sender and receiver."""
+    return dict.fromkeys((Role.SENDER, Role.RECEIVER), replace(DEFAULT, **changes))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("netcat", "protocol"), LISTEN)
 def test_transfer_with_each_netcat(netcat: Netcat, protocol: Protocol) -> None:
-    said = lines(protocol, both(netcat=netcat))
-    assert said["listen"] == f"{LISTEN[netcat, protocol]} > recv.bag 2> receiver-listen.log"
-    assert said["send"] == f"{SEND[netcat, protocol]} < scan.bag 2> sender-send.log"
+    text_of = lines(protocol, on_both(netcat=netcat))
+    assert text_of["listen"] == f"{LISTEN[netcat, protocol]} > recv.bag 2> receiver-listen.log"
+    assert text_of["send"] == f"{SEND[netcat, protocol]} < scan.bag 2> sender-send.log"
 
 
-def test_each_end_types_for_its_own_netcat() -> None:
-    found = {Role.SENDER: replace(USUAL, netcat=Netcat.NCAT), Role.RECEIVER: replace(USUAL, netcat=Netcat.OPENBSD)}
-    said = lines(Protocol.TCP, found)
-    assert said["listen"].startswith(LISTEN[Netcat.OPENBSD, Protocol.TCP])
-    assert said["send"].startswith(SEND[Netcat.NCAT, Protocol.TCP])
+def test_each_end_uses_options_of_its_netcat() -> None:
+    detected = {
+        Role.SENDER: replace(DEFAULT, netcat=Netcat.NCAT),
+        Role.RECEIVER: replace(DEFAULT, netcat=Netcat.OPENBSD),
+    }
+    text_of = lines(Protocol.TCP, detected)
+    assert text_of["listen"].startswith(LISTEN[Netcat.OPENBSD, Protocol.TCP])
+    assert text_of["send"].startswith(SEND[Netcat.NCAT, Protocol.TCP])
 
 
 def test_ping_with_each_variant() -> None:
-    assert lines(Protocol.TCP, both())["ping"] == f"env LC_ALL=C ping -n -D {PING}"
-    assert lines(Protocol.TCP, both(ping=PingTool.IPUTILS_OLD))["ping"] == f"env LC_ALL=C ping -n -D {PING}"
-    assert lines(Protocol.TCP, both(ping=PingTool.BUSYBOX))["ping"] == f"env LC_ALL=C ping {PING}"
+    assert lines(Protocol.TCP, on_both())["ping"] == f"env LC_ALL=C ping -n -D {PING}"
+    assert lines(Protocol.TCP, on_both(ping=PingTool.IPUTILS_OLD))["ping"] == f"env LC_ALL=C ping -n -D {PING}"
+    assert lines(Protocol.TCP, on_both(ping=PingTool.BUSYBOX))["ping"] == f"env LC_ALL=C ping {PING}"
 
 
-def test_an_old_tcpdump_is_not_told_of_immediate_mode() -> None:
-    assert lines(Protocol.TCP, both(immediate_mode=False))["capture"].startswith(
+def test_old_tcpdump_has_no_immediate_mode() -> None:
+    assert lines(Protocol.TCP, on_both(immediate_mode=False))["capture"].startswith(
         "tcpdump -i wlan0 -n -U -s 128 -B 4096 -w receiver.pcap"
     )
 
 
 def with_recorder(text: str) -> RobotProfile:
-    """The TurtleBot with ROS 2: options of its record command, and the file that it is said to leave."""
+    """Return the TurtleBot with ROS 2, from options of its record command and the path that it writes."""
     options, writes = text.split(" > ")
     ros2 = ros_of(TURTLEBOT).variants["ros2"]
     record = (*ros2.record[:3], *options.split(), *ros2.record[3:])
@@ -98,28 +101,28 @@ def ros2_plan(text: str) -> Plan:
 
 
 @pytest.mark.parametrize("suffix", ["db3", "mcap"])
-def test_what_ros2_writes_is_what_is_sent_and_measured(suffix: str) -> None:
+def test_file_of_ros2_recorder_is_sent_and_measured(suffix: str) -> None:
     plan = ros2_plan(f"--no-discovery > {{name}}/{{name}}_0.{suffix}")
     assert lines(Protocol.TCP, {}, plan)["send"].endswith(f"< scan/scan_0.{suffix} 2> sender-send.log")
     (transfer,) = plan.transfers(Protocol.TCP)
     assert transfer.sent_file == f"scan/scan_0.{suffix}"
 
 
-def test_the_papers_tools_are_refused_nothing() -> None:
-    assert los_plan().refusals(both()) == ()
+def test_tools_of_the_paper_are_not_refused() -> None:
+    assert los_plan().refusals(on_both()) == ()
 
 
-def test_busybox_is_refused_udp_on_each_robot_that_has_it() -> None:
-    refused = los_plan().refusals(both(netcat=Netcat.BUSYBOX))
-    assert [(one.role, one.what) for one in refused] == [
+def test_busybox_netcat_is_refused_for_udp() -> None:
+    refused = los_plan().refusals(on_both(netcat=Netcat.BUSYBOX))
+    assert [(refusal.role, refusal.what) for refusal in refused] == [
         (Role.SENDER, "busybox nc has no UDP"),
         (Role.RECEIVER, "busybox nc has no UDP"),
     ]
-    assert all("apt-get install netcat-traditional" in one.remedy for one in refused)
-    assert los_plan(protocols=(Protocol.TCP,)).refusals(both(netcat=Netcat.BUSYBOX)) == ()
+    assert all("apt-get install netcat-traditional" in refusal.remedy for refusal in refused)
+    assert los_plan(protocols=(Protocol.TCP,)).refusals(on_both(netcat=Netcat.BUSYBOX)) == ()
 
 
-def test_a_dry_run_tells_what_will_be_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_dry_run_shows_refusals(capsys: pytest.CaptureFixture[str]) -> None:
     plan = los_plan()
     receiver = plan.cast[Role.RECEIVER]
     named = receiver.profile.tools.model_copy(update={"netcat": "/opt/busybox"})
@@ -143,9 +146,9 @@ def test_a_dry_run_tells_what_will_be_refused(capsys: pytest.CaptureFixture[str]
         (Netcat.BUSYBOX, Netcat.TRADITIONAL, [Role.SENDER]),
     ],
 )
-def test_a_pair_that_cannot_do_udp_is_refused_once(sender: Netcat, receiver: Netcat, refused: list[Role]) -> None:
-    found = {Role.SENDER: replace(USUAL, netcat=sender), Role.RECEIVER: replace(USUAL, netcat=receiver)}
-    assert [one.role for one in los_plan().refusals(found)] == refused
+def test_pair_without_udp_is_refused_once(sender: Netcat, receiver: Netcat, refused: list[Role]) -> None:
+    detected = {Role.SENDER: replace(DEFAULT, netcat=sender), Role.RECEIVER: replace(DEFAULT, netcat=receiver)}
+    assert [refusal.role for refusal in los_plan().refusals(detected)] == refused
 
 
 @pytest.mark.parametrize(
@@ -159,12 +162,12 @@ def test_a_pair_that_cannot_do_udp_is_refused_once(sender: Netcat, receiver: Net
         ("", True),
     ],
 )
-def test_an_ncat_that_reads_half_of_the_datagrams_of_openbsd_is_refused(version: str, is_refused: bool) -> None:
-    receiver = replace(USUAL, netcat=Netcat.NCAT, versions={Tool.NETCAT: version})
-    found = {Role.SENDER: replace(USUAL, netcat=Netcat.OPENBSD), Role.RECEIVER: receiver}
-    refusals = list(los_plan().refusals(found))
+def test_ncat_that_truncates_datagrams_is_refused(version: str, is_refused: bool) -> None:
+    receiver = replace(DEFAULT, netcat=Netcat.NCAT, versions={Tool.NETCAT: version})
+    detected = {Role.SENDER: replace(DEFAULT, netcat=Netcat.OPENBSD), Role.RECEIVER: receiver}
+    refusals = list(los_plan().refusals(detected))
     assert bool(refusals) == is_refused
-    assert all("cuts off the datagrams of 16384 bytes" in refusal.what for refusal in refusals)
+    assert all("truncates the datagrams of 16384 bytes" in refusal.what for refusal in refusals)
 
 
 @pytest.mark.parametrize(
@@ -177,36 +180,36 @@ def test_an_ncat_that_reads_half_of_the_datagrams_of_openbsd_is_refused(version:
         ({"ping": PingTool.BUSYBOX}, 0.1, False),
     ],
 )
-def test_only_root_may_ping_fast_with_old_iputils(
+def test_short_interval_of_old_iputils_needs_root(
     changes: dict[str, object], interval_s: float, is_refused: bool
 ) -> None:
     plan = los_plan()
     (ping,) = steps_of(plan.procedure, PingStep)
-    scene = plan.scene(RepeatId(Protocol.TCP, 1), "f", both(**changes))
+    scene = plan.scene(RepeatId(Protocol.TCP, 1), "f", on_both(**changes))
     refused = list(ping.model_copy(update={"interval": interval_s}).refusals(scene))
-    assert [one.role for one in refused] == [Role.SENDER] * is_refused
-    assert all("every 100 ms" in one.what for one in refused)
+    assert [refusal.role for refusal in refused] == [Role.SENDER] * is_refused
+    assert all("an interval of 100 ms" in refusal.what for refusal in refused)
 
 
 MCAP = "--storage mcap > {name}/{name}_0.mcap"
 
 
 @pytest.mark.parametrize(
-    ("text", "found", "what"),
+    ("text", "detected", "what"),
     [
         (MCAP, Recorder.MCAP, None),
         (MCAP, Recorder.NONE, "its record command cannot write ros2-mcap"),
-        (MCAP, Recorder.SQLITE3, "its record command writes ros2-sqlite3, its profile says {name}/{name}_0.mcap"),
+        (MCAP, Recorder.SQLITE3, "its record command writes ros2-sqlite3, but its profile has {name}/{name}_0.mcap"),
     ],
 )
-def test_a_recorder_that_writes_no_bag_or_another_is_refused(text: str, found: Recorder, what: str | None) -> None:
-    refused = ros2_plan(text).refusals(both(recorder=found))
-    assert [one.what for one in refused] == ([] if what is None else [what])
-    assert all(isinstance(one, Refusal) and one.role is Role.SENDER and one.remedy for one in refused)
+def test_recorder_with_wrong_format_is_refused(text: str, detected: Recorder, what: str | None) -> None:
+    refused = ros2_plan(text).refusals(on_both(recorder=detected))
+    assert [refusal.what for refusal in refused] == ([] if what is None else [what])
+    assert all(isinstance(item, Refusal) and item.role is Role.SENDER and item.remedy for item in refused)
 
 
 @pytest.mark.parametrize(
-    ("help_file", "command", "found"),
+    ("help_file", "command", "detected"),
     [
         ("eloquent", "--no-discovery", Recorder.SQLITE3),
         ("eloquent", "--storage mcap", Recorder.MCAP),
@@ -217,13 +220,13 @@ def test_a_recorder_that_writes_no_bag_or_another_is_refused(text: str, found: R
         ("humble", "--storage rosbag_v2", Recorder.NONE),
     ],
 )
-def test_what_a_ros2_recorder_writes_is_told_by_its_help(help_file: str, command: str, found: Recorder) -> None:
-    said = (DATA / "ros2-bag" / help_file / "record-help.txt").read_bytes()
-    output = b"==> user <==\n1000\n\n==> exit 0 <==\n==> recorder <==\n%s\n==> exit 0 <==\n" % said
+def test_format_of_ros2_recorder_is_read_from_its_help(help_file: str, command: str, detected: Recorder) -> None:
+    help_text = (DATA / "ros2-bag" / help_file / "record-help.txt").read_bytes()
+    output = b"==> user <==\n1000\n\n==> exit 0 <==\n==> recorder <==\n%s\n==> exit 0 <==\n" % help_text
     profile = with_recorder(f"{command} > {{name}}/{{name}}_0.db3")
-    assert tools.parse(output, profile).recorder is found
+    assert tools.parse(output, profile).recorder is detected
 
 
-def test_a_recorder_that_is_not_there_writes_nothing() -> None:
+def test_missing_recorder_writes_nothing() -> None:
     output = b"==> user <==\n1000\n\n==> exit 0 <==\n==> recorder <==\nsh: ros2: not found\n\n==> exit 127 <==\n"
     assert tools.parse(output, with_recorder(MCAP)).recorder is Recorder.NONE

@@ -266,7 +266,7 @@ def test_a_whole_file_beside_lost_packets_that_copies_make_up_for(udp: Attempt) 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
 def test_answers_that_are_in_no_capture(attempt: Attempt, role: str) -> None:
     attempt.capture(role, lambda packets: packets[:-30])
-    demand(attempt, f"and the {role}'s capture holds")
+    demand(attempt, f"but the {role}'s capture has only")
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
@@ -282,7 +282,7 @@ def test_answers_that_only_another_pings_packets_could_make_up_for(attempt: Atte
         return [(time_us, others.get(at, rest)) for at, (time_us, rest) in enumerate(packets)]
 
     attempt.capture(role, shared)
-    demand(attempt, f"and the {role}'s capture holds")
+    demand(attempt, f"but the {role}'s capture has only")
 
 
 def _is_later(rest: bytes) -> bool:
@@ -302,12 +302,12 @@ def test_an_answer_that_took_no_time(udp: Attempt) -> None:
     told = re.search(r"time=[0-9.]+ ms", lines)
     assert told
     udp.text("ping.txt", told[0], "time=0.000 ms")
-    reason = "ping.txt has an answer that took no time: the clock was set back while ping waited"
+    reason = "ping.txt has a round-trip time of 0: the clock was set back while ping waited"
     assert reason in udp.problems(), "beside others"
 
 
 @pytest.mark.parametrize(
-    ("shift_s", "reason"), [(-3600, "before the attempt began"), (3600, "after the attempt had")]
+    ("shift_s", "reason"), [(-3600, "before the start of the attempt"), (3600, "after the end of the attempt")]
 )
 def test_a_capture_of_another_time(attempt: Attempt, shift_s: int, reason: str) -> None:
     attempt.capture("receiver", lambda packets: [(at + shift_s * 10**6, rest) for at, rest in packets])
@@ -366,7 +366,7 @@ def test_a_job_that_somebody_else_ended(attempt: Attempt, name: str, old: str, n
 def test_a_traditional_netcat_that_caught_a_signal(attempt: Attempt) -> None:
     attempt.text("sender-after.txt", "send itself 0", "send itself 1")
     (attempt.folder / "sender-send.log").write_text("\n", encoding="ascii")
-    assert attempt.problems() == ("sender-send.log: netcat was ended by a signal",)
+    assert attempt.problems() == ("sender-send.log: netcat was terminated by a signal",)
 
 
 @pytest.mark.parametrize(
@@ -384,5 +384,5 @@ def test_a_traditional_netcat_that_caught_a_signal(attempt: Attempt) -> None:
 def test_a_listener_that_was_ended_or_could_not_write(attempt: Attempt, code: int, log: str, *, cut: bool) -> None:
     attempt.text("receiver-after.txt", "listen itself 0", f"listen itself {code}")
     (attempt.folder / "receiver-listen.log").write_text(log, encoding="ascii")
-    reason = "receiver-listen.log: netcat was ended by a signal, or could not write recv.bag"
+    reason = "receiver-listen.log: netcat was terminated by a signal, or could not write recv.bag"
     assert attempt.problems() == ((reason,) if cut else ())

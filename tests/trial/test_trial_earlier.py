@@ -110,7 +110,7 @@ def test_fragments_of_which_the_first_came_before_the_capture_void(tmp_path: Pat
     waiting = _waiting(attempt, "sender", _is_later_echo)
     attempt.capture("receiver", lambda packets: [*waiting[:3], *packets])
     (reason,) = attempt.problems()
-    assert reason.startswith(f"{EARLIER}: 3 packets came of a ping")
+    assert reason.startswith(f"{EARLIER}: 3 packets of a ping")
 
 
 @pytest.mark.parametrize("chosen", [_is_load, _is_icmp], ids=["transfer", "pings"])

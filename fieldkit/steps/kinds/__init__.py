@@ -1,4 +1,4 @@
-"""The kinds of step that a procedure can name: fieldkit's own, and those of entry points."""
+"""The kinds of step: the built-in ones, and those of entry points."""
 
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
@@ -29,28 +29,28 @@ _OWN: Final = MappingProxyType(
         "fly": "FlyStep",
     }
 )
-"""Class by kind, in the module of this room that is called like it; in the order in which messages list them."""
+"""Class of each built-in kind, in the module of that name in this package; in the order of messages."""
 
 
 def own() -> frozenset[str]:
-    """Return the names of fieldkit's own kinds."""
+    """Return the names of the built-in kinds."""
     return frozenset(_OWN)
 
 
 def load() -> Iterator[tuple[EntryPoint, Any]]:
-    """Yield every kind of step and what stands for it, fieldkit's own first.
+    """Yield every kind of step as its entry point and its loaded object, built-in kinds first.
 
     Raises:
-        ConfigurationError: An entry point names what cannot be loaded, or a kind that there is already.
+        ConfigurationError: An entry point cannot be loaded, or its name is already used.
     """
-    taken = set()
-    own = [EntryPoint(kind, f"fieldkit.steps.kinds.{kind}:{name}", plugins.STEPS) for kind, name in _OWN.items()]
-    for point in (*own, *plugins.points(plugins.STEPS)):
-        if point.name in taken:
+    used_names = set()
+    builtin = [EntryPoint(kind, f"fieldkit.steps.kinds.{kind}:{name}", plugins.STEPS) for kind, name in _OWN.items()]
+    for point in (*builtin, *plugins.points(plugins.STEPS)):
+        if point.name in used_names:
             raise ConfigurationError(
-                f"there is a kind of step {point.name!r} already",
+                f"there is already a kind of step {point.name!r}",
                 where=plugins.where(point),
                 remedy="uninstall it, or rename it",
             )
-        taken.add(point.name)
+        used_names.add(point.name)
         yield point, plugins.load(point)

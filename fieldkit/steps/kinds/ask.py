@@ -1,4 +1,4 @@
-"""Ask the operator for what no robot measures: wind, people, grass."""
+"""Ask the operator for values that no robot measures: wind, people, grass."""
 
 import math
 import sys
@@ -24,14 +24,14 @@ from fieldkit.steps.base import Step, StepName
 from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
 
-_MOST_LETTERS: Final = 31
+_MAX_LETTERS: Final = 31
 
 
 def _can_be_chosen(word: str) -> str:
-    """Return a word that is neither a place in the list of choices nor what says that nobody knows."""
-    fits = 0 < len(word) <= _MOST_LETTERS and word.isprintable() and word == word.strip()
+    """Return a word that can be a choice: neither a number, a position in the list, nor an answer for *unknown*."""
+    fits = 0 < len(word) <= _MAX_LETTERS and word.isprintable() and word == word.strip()
     if not fits or word.isdigit() or word in {UNKNOWN, *MISSING}:
-        raise schema.complaint(f"{word[:40]!r} cannot be a choice: write words, {_MOST_LETTERS} characters at most")
+        raise schema.complaint(f"{word[:40]!r} cannot be a choice: write words of at most {_MAX_LETTERS} characters")
     return word
 
 
@@ -41,8 +41,8 @@ _Word = Annotated[str, AfterValidator(_can_be_chosen)]
 class AskStep(Step):
     """Asks the operator for a number or for one of several words, which becomes a column.
 
-    The answer `-` means unknown: the column is then empty, as it is where no operator is asked (`--yes`) and there is
-    no `usual` answer. Leaves `answer-COLUMN.txt`.
+    The answer `-` means unknown: the column is then empty. It is also empty if no operator is asked (`--yes`) and
+    there is no `usual` answer. Leaves `answer-COLUMN.txt`.
 
     Attributes:
         column: Name of the column.
@@ -52,7 +52,7 @@ class AskStep(Step):
             types a word or its position in the list.
         least: Smallest possible number.
         most: Largest possible number.
-        usual: Default answer: for Enter alone, and where no operator is asked.
+        usual: Default answer: for Enter alone, and if no operator is asked.
         each: `trial`: asked once, before the first repeat that contains the step; `repeat`: asked in each.
     """
 
@@ -70,18 +70,18 @@ class AskStep(Step):
     @schema.model_validator(mode="after")
     def _can_be_answered(self) -> "AskStep":
         if self.choices and (self.unit or self.least is not None or self.most is not None):
-            raise schema.complaint("choices are words: they take no unit, least or most", "choices")
+            raise schema.complaint("choices are words: they have no unit, least or most", "choices")
         if self.least is not None and self.most is not None and self.least > self.most:
-            raise schema.complaint("least is above most", "least")
+            raise schema.complaint("least is greater than most", "least")
         if self.choices and len(set(self.choices)) < len(self.choices):
-            raise schema.complaint("a choice comes twice", "choices")
-        if self.usual and self._asked.read(self.usual) is None:
-            how = replace(self._asked, usual="").how
-            raise schema.complaint(f"usual is {self.usual!r}, and what can be answered is {how}", "usual")
+            raise schema.complaint("a choice is listed twice", "choices")
+        if self.usual and self._full_question.read(self.usual) is None:
+            permitted = replace(self._full_question, usual="").how
+            raise schema.complaint(f"usual is {self.usual!r}; permitted answers: {permitted}", "usual")
         return self
 
     @property
-    def _asked(self) -> Question:
+    def _full_question(self) -> Question:
         bounds = (-math.inf if self.least is None else self.least, math.inf if self.most is None else self.most)
         return Question(self.question, self.unit or "", self.choices or (), bounds, self.usual or "")
 
@@ -91,32 +91,30 @@ class AskStep(Step):
 
     @override
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
-        yield f"the operator is asked: {self.question}? {self._asked.how}"
+        yield f"the operator is asked: {self.question}? {self._full_question.how}"
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`.
+        """Ask the operator, or use the answer of an earlier attempt of the trial; see `Step.run`.
 
         Raises:
-            ConfigurationError: There is nobody to ask.
+            ConfigurationError: There is no operator, because the input is not a terminal.
         """
-        answer = self._earlier(scene) if self.each == "trial" else None
+        answer = self._earlier_answer(scene) if self.each == "trial" else None
         if answer is None:
             announce("ask", None)
-            answer = testbed.operator.enter(self._asked)
+            answer = testbed.operator.enter(self._full_question)
         if scene.here is not None:
             (scene.here / self._file).write_text(f"{answer}\n", encoding="utf-8")
 
-    def _earlier(self, scene: Scene) -> str | None:
-        """Return what was answered in an earlier attempt of the trial, None where that is the first."""
-        for kept in sorted(scene.here.parent.glob(f"*/{self._file}")) if scene.here else ():
+    def _earlier_answer(self, scene: Scene) -> str | None:
+        """Return the answer in an earlier attempt of the trial; None in the first attempt."""
+        for path in sorted(scene.here.parent.glob(f"*/{self._file}")) if scene.here else ():
             with suppress(EvidenceError):
-                return _read(kept, self._asked)
+                return _read(path, self._full_question)
         return None
 
     cross_checks = (
-        CrossCheck(
-            "answer", ("*",), "`answer-COLUMN.txt`", (), "the operator alone knows it", CheckOutcome.UNCHECKED
-        ),
+        CrossCheck("answer", ("*",), "`answer-COLUMN.txt`", (), "only the operator knows it", CheckOutcome.UNCHECKED),
     )
 
     @override
@@ -138,24 +136,24 @@ class AskStep(Step):
     @override
     def output_columns(self) -> tuple[Column, ...]:
         unit = "text" if self.choices else self.unit or "number"
-        meaning = f"What the operator answered to: {self.question}? Empty where nobody knew."
+        meaning = f"Answer of the operator to: {self.question}? Empty if unknown."
         label = self.column.replace("_", " ")
         if self.choices:
             return (Column(self.column, unit, meaning, figure=Figure(label, Kind.WORDS)),)
-        low, high = self._asked.bounds
+        low, high = self._full_question.bounds
         bounds = (max(low, -sys.float_info.max), min(high, sys.float_info.max))
         return (Column(self.column, unit, meaning, bounds=bounds, figure=Figure(label, Kind.MEDIAN)),)
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        if view.evidence.read_or_none(_read, self._file, self._asked) is None:
-            yield f"{self._file} does not say what the operator answered"
+        if view.evidence.read_or_none(_read, self._file, self._full_question) is None:
+            yield f"{self._file} has no valid answer of the operator"
 
     @override
     def measure(self, view: View) -> Measured:
-        answer = view.evidence.read_or_none(_read, self._file, self._asked)
-        known = answer if answer != UNKNOWN else None
-        value: Value | None = known if known is None or self.choices else float(known)
+        answer = view.evidence.read_or_none(_read, self._file, self._full_question)
+        text = answer if answer != UNKNOWN else None
+        value: Value | None = text if text is None or self.choices else float(text)
         return Measured.of({self.column: value}, "the operator did not know")
 
     @override
@@ -178,9 +176,9 @@ def _read(path: Path, question: Question) -> str:
     """Return the answer in a file.
 
     Raises:
-        EvidenceError: There is none, or none to this question.
+        EvidenceError: The file has no answer, or its answer does not fit the question.
     """
     answer = question.read(reading.text(path))
     if answer is None:
-        raise EvidenceError("does not say what the operator answered", where=str(path))
+        raise EvidenceError("has no valid answer of the operator", where=str(path))
     return answer

@@ -1,4 +1,4 @@
-"""Capture packets on both ends while other steps run."""
+"""Capture packets on several robots while other steps run."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -31,36 +31,36 @@ from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Need, Planned, Sai
 from fieldkit.steps.variants import Tool
 from fieldkit.steps.view import View
 
-# Immediate mode with the default snap length dropped 177 of 215 packets in a burst; with these, none (field notes).
+# Immediate mode with the default snap length dropped 177 of 215 packets of a burst; with these values none.
 SNAP_BYTES: Final = 128
 BUFFER_KIB: Final = 4096
 
 LIMIT_S: Final = 900.0
 
-# Each frame is captured with a header.
+# Size of the header of each captured frame in the file.
 _RECORD_BYTES: Final = 16
 
-# Without immediate mode the kernel hands a packet over within a second: of 215, none 0.5 s later, all 1.0 s later.
+# Without immediate mode the kernel delivers packets within a second: of 215, none after 0.5 s, all after 1.0 s.
 RING_S: Final = 2
 
-# The last that tcpdump says; what is left is for the kernel to take its socket down, 15 to 31 ms.
+# Last line of tcpdump; after it the kernel needs 15 to 31 ms to close the socket.
 COUNTED: Final = "dropped by kernel"
 
 BACK_S: Final = 0.1
-"""Packets that two processors took in may stand in another order, if one of them was held up meanwhile."""
+"""Maximum step backwards between time stamps: packets received by two processors may be recorded out of order."""
 
 STAMP_NS: Final = 1_000
-"""tcpdump cuts times off to microseconds."""
+"""Resolution of time stamps: tcpdump truncates them to microseconds."""
 
 
 class CaptureStep(Nest):
     """Runs tcpdump on each robot, from before the steps in `during` begin until they have ended.
 
-    The filter takes the ports of the steps inside, ICMP, and every later IP fragment between their ends (a filter by
-    port matches first fragments only). Losses and delays of a transfer need a capture on both of its ends around it;
-    without, these columns are empty. With a `ping` inside, after the transfer, the captures give the offset between
-    the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP transfer has no answer, and the
-    offset needs packets in both directions. Leaves `ROLE.pcap` and `ROLE-capture.log`.
+    The filter accepts the ports of the steps inside, ICMP, and every later IP fragment between their ends (a port
+    filter matches first fragments only). Losses and delays of a transfer need a capture on both of its ends around
+    it; without, these columns are empty. With a `ping` inside, after the transfer, the captures give the offset
+    between the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP transfer has no
+    answer, and the offset needs packets in both directions. Leaves `ROLE.pcap` and `ROLE-capture.log`.
 
     Attributes:
         robots: Roles that capture.
@@ -82,7 +82,7 @@ class CaptureStep(Nest):
             ("*_captured", "*_capture_dropped"),
             "`ROLE.pcap`, `ROLE-capture.log`",
             ("each other", "each robot's clock before and after", "the order of times in the file"),
-            "0.1 s backwards between two packets, because two processors take them in; packets dropped before "
+            "0.1 s backwards between two packets, because two processors receive them; packets dropped before "
             "tcpdump where only topics and pings run inside, which withhold what depends on them",
         ),
     )
@@ -114,7 +114,7 @@ class CaptureStep(Nest):
                 *(profile.tools.capture, "-i", profile.radio.interface, *options, "-w", self._file(role)),
                 self._filter(scene),
             ),
-            # Never sooner than what it captures: a capture that ends at its limit looks whole.
+            # Longer than the captured jobs, because a capture that was stopped at its limit looks complete.
             limit_s=LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log(role),
             ready="log:listening on",
@@ -131,8 +131,8 @@ class CaptureStep(Nest):
         return max(BUFFER_KIB, *(step.capture_buffer_kib for step in self.leaves_inside()))
 
     @property
-    def _needs_all(self) -> bool:
-        """Whether a packet that was dropped before tcpdump makes a figure of a step inside wrong."""
+    def _needs_all_packets(self) -> bool:
+        """Whether a packet dropped before tcpdump falsifies a measurement of a step inside."""
         return any(step.needs_complete_capture for step in self.leaves_inside())
 
     def _filter(self, scene: Scene) -> str:
@@ -149,15 +149,15 @@ class CaptureStep(Nest):
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """The right to capture."""
+        """Yield the check of the permission to capture."""
         for role in self.robots:
             profile = scene.robot(role).profile
             names = profile.tools
-            # A capture by sudo runs the job script as root, to signal what it started.
+            # A capture with sudo runs the job script as root, so that the script can signal its children.
             prefix = ("sudo", "-n", "sh", "-c", 'exec "$@"', "sh") if names.capture_right == "sudo" else ()
-            # Listing link types opens the interface, which needs the same right as a capture.
+            # The list of link types needs the same permission as a capture, because it opens the interface.
             argv = (*prefix, names.capture, "-L", "-i", profile.radio.interface)
-            yield Need(role, "right to capture", argv, partial(_judged, profile), of=names.capture)
+            yield Need(role, "right to capture", argv, partial(_judge, profile), of=names.capture)
 
     @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
@@ -187,7 +187,7 @@ class CaptureStep(Nest):
         starts: list[Callable[[], None]] = [
             partial(jobs.start, testbed.shells[capture.role], capture.job) for capture in captures
         ]
-        # sudo may take seconds, where nothing resolves its host's name, and a UDP listener waits no longer.
+        # sudo may take seconds if its host name cannot be resolved, which is too long for a waiting UDP listener.
         rounds = ([*starts], [prepare]) if any(capture.job.as_root for capture in captures) else ([*starts, prepare],)
         announce("start captures", None)
         try:
@@ -198,7 +198,7 @@ class CaptureStep(Nest):
             for step in others:
                 step.run(scene, testbed, announce)
         except FieldkitError:
-            # What was captured is kept with the attempt that failed, whose reason is what failed first.
+            # The captures are kept with the failed attempt; its reason is the first error.
             with suppress(FieldkitError):
                 self._stop(scene, testbed, captures)
             raise
@@ -225,21 +225,23 @@ class CaptureStep(Nest):
         return tuple(name for role in self.robots for name in (self._file(role), self._log(role)))
 
     def check(self, view: View) -> Iterator[str]:
-        """See `Step.check`: whole files that hold what tcpdump counted, nothing dropped.
+        """Yield a reason for each incomplete capture file, and for dropped packets; see `Step.check`.
 
-        Packets dropped before tcpdump are no problem if each step inside withholds what depends on them.
+        Dropped packets are permitted if each step inside withholds the columns that depend on them.
         """
         for role in self.robots:
-            for problem in _problems(role, self._file(role), self._log(role), view, needs_all=self._needs_all):
+            for problem in _problems(
+                role, self._file(role), self._log(role), view, needs_all=self._needs_all_packets
+            ):
                 yield f"{role} capture: {problem}"
 
     @override
     def measure(self, view: View) -> Measured:
-        found = Measured()
+        measured = Measured()
         for role in (Role.SENDER, Role.RECEIVER):
             if role not in self.robots:
-                mine = [column for column in self.columns if column.name.startswith(f"{role}_")]
-                found |= Measured.nothing(mine, f"the {role} does not capture")
+                role_columns = [column for column in self.columns if column.name.startswith(f"{role}_")]
+                measured |= Measured.nothing(role_columns, f"the {role} does not capture")
                 continue
             capture = view.evidence.whole_capture(self._file(role))
             log = view.evidence.read_or_none(tcpdump_log.read, self._log(role))
@@ -247,8 +249,8 @@ class CaptureStep(Nest):
                 f"{role}_captured": capture.frames if capture else None,
                 f"{role}_capture_dropped": log.dropped_by_kernel if log else None,
             }
-            found |= Measured.of(values, "its capture is not whole")
-        return found
+            measured |= Measured.of(values, "its capture is incomplete")
+        return measured
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
@@ -258,7 +260,7 @@ class CaptureStep(Nest):
 def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bool) -> Iterator[str]:
     try:
         log = view.evidence.read(tcpdump_log.read, log_file)
-        read = view.evidence.read(pcap.read, file)
+        capture = view.evidence.read(pcap.read, file)
     except EvidenceError as error:
         yield error.what
         return
@@ -269,20 +271,20 @@ def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bo
         return
     if needs_all and (log.dropped_by_kernel or log.dropped_by_interface):
         yield f"dropped {log.dropped_by_kernel} packets, its interface {log.dropped_by_interface}"
-    # More may have matched than were written: see `CaptureLog.received_by_filter`.
+    # The filter may have matched more packets than were written: see `CaptureLog.received_by_filter`.
     if log.received_by_filter is not None and log.received_by_filter < log.captured:
         yield f"{log.received_by_filter} packets matched, {log.captured} were written"
-    if read.damage is not None:
-        yield read.damage
-    elif read.frames != log.captured:
-        yield f"the file holds {read.frames} packets, tcpdump counted {log.captured}"
+    if capture.damage is not None:
+        yield capture.damage
+    elif capture.frames != log.captured:
+        yield f"the file has {capture.frames} packets, tcpdump counted {log.captured}"
     else:
-        yield from _problems_of_time(role, read, view)
+        yield from _time_problems(role, capture, view)
 
 
-def _problems_of_time(role: Role, read: Capture, view: View) -> Iterator[str]:
-    """Yield where times of packets contradict each other, or the robot's clock before and after the attempt."""
-    times_ns = read.packets.time_ns[read.packets.time_ns != NO_TIME]
+def _time_problems(role: Role, capture: Capture, view: View) -> Iterator[str]:
+    """Yield contradictions of the packets' times with each other and with the robot's clock around the attempt."""
+    times_ns = capture.packets.time_ns[capture.packets.time_ns != NO_TIME]
     if not len(times_ns):
         return
     back_s = float(-np.diff(times_ns).min(initial=0)) / 1e9
@@ -291,17 +293,17 @@ def _problems_of_time(role: Role, read: Capture, view: View) -> Iterator[str]:
     before, after = (view.evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
     if before and before.clock and times_ns.min() < before.clock.first_ns - STAMP_NS:
         early_s = (before.clock.first_ns - int(times_ns.min())) / 1e9
-        yield f"holds a packet of {early_s:.3f} s before the attempt began, by the robot's clock"
+        yield f"has a packet from {early_s:.3f} s before the start of the attempt, by the robot's clock"
     if after and after.clock and times_ns.max() > after.clock.last_ns + STAMP_NS:
         late_s = (int(times_ns.max()) - after.clock.last_ns) / 1e9
-        yield f"holds a packet of {late_s:.3f} s after the attempt had ended, by the robot's clock"
+        yield f"has a packet from {late_s:.3f} s after the end of the attempt, by the robot's clock"
 
 
-def _judged(profile: RobotProfile, answer: Said) -> tuple[Verdict, str, str]:
-    """Return whether a robot may capture."""
+def _judge(profile: RobotProfile, answer: Said) -> tuple[Verdict, str, str]:
+    """Return verdict, detail and remedy on the permission of a robot's user to capture."""
     names = profile.tools
     if answer.ok:
-        return Verdict.OK, "by sudo -n" if names.capture_right == "sudo" else "the user's own", ""
+        return Verdict.OK, "by sudo -n" if names.capture_right == "sudo" else "permission of the user", ""
     if names.capture_right == "direct":
         remedy = f"sudo setcap cap_net_raw,cap_net_admin+eip $(command -v {quote((names.capture,))})"
     elif answer.code == Said.MISSING:

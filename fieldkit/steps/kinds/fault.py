@@ -1,4 +1,4 @@
-"""Do something to a robot on purpose, and watch from outside how long it is gone."""
+"""Cause a fault of a robot, and measure from outside how long the robot does not answer."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -35,11 +35,11 @@ from fieldkit.steps.view import View
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-# How long an operator may take for what a fault asks of him.
+# Time allowed for the operator to cause a fault.
 PATIENCE_S: Final = 600.0
 
 _CLOCK_S: Final = 5.0
-"""How long a robot may take to tell the time."""
+"""Timeout of a time query."""
 
 _LASTING: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
 
@@ -102,12 +102,12 @@ class FaultStep(Nest):
             ("process", self.process is not None, self.kind is FaultKind.KILL),
         ):
             if given != wanted:
-                raise schema.complaint(f"a {self.kind} {'needs' if wanted else 'takes no'} {key}:")
+                raise schema.complaint(f"a {self.kind} {'needs' if wanted else 'does not allow'} {key}:")
         return self
 
     @property
     def cause(self) -> model.Fault:
-        """The fault that the testbed is asked for."""
+        """The fault, as passed to the testbed."""
         return model.Fault(self.kind, self.robot, self.lasts or 0.0, self.process or "")
 
     @override
@@ -131,7 +131,7 @@ class FaultStep(Nest):
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """The testbed acts in this thread, where a person can be asked."""
+        """Cause the fault in this thread, in which the operator can be prompted; the steps inside run in another."""
         from concurrent.futures import ThreadPoolExecutor, wait  # noqa: PLC0415 (with logging, 5 ms)
 
         watch, observer = self._watch(scene), self._observer(scene)
@@ -141,7 +141,7 @@ class FaultStep(Nest):
         ahead = {} if scene.here is None else self._clocks(testbed)
         inner = replace(scene, halt=scene.halt.inside())
         pool = ThreadPoolExecutor(max_workers=1)
-        steps = pool.submit(self._steps, inner, testbed, announce)
+        steps = pool.submit(self._run_inside, inner, testbed, announce)
         try:
             self._lead_in(steps)
             announce(f"{self.kind} of {scene.robot(self.robot).name}", self.lasts)
@@ -150,9 +150,9 @@ class FaultStep(Nest):
             self._note_times(scene, asked_ns, lasted_s, ahead)
             announce("recovery", None)
             heals = observer.heals("unknown" if lasted_s is None else f"{lasted_s:.3f}", self.limit)
-            jobs.run(shell, heals.job)  # whether it healed is for the measures to say
+            jobs.run(shell, heals.job)  # `measure` evaluates whether the robot recovered
             jobs.stop(shell, watch.job)
-            self._outlast(steps, scene, testbed)
+            self._wait_for_steps(steps, scene, testbed)
         except Exception:
             inner.halt.call()
             with suppress(FieldkitError):
@@ -161,42 +161,45 @@ class FaultStep(Nest):
             raise
         finally:
             inner.halt.call()
-            pool.shutdown(wait=False)  # after Ctrl-C: whoever catches it ends what the steps wait for
+            pool.shutdown(wait=False)  # after Ctrl-C its handler stops the jobs for which the steps wait
 
     def _clocks(self, testbed: Testbed) -> dict[Role, Offset]:
-        """Return how far the clocks of robots are ahead; a robot that does not tell has no recoveries of flows."""
+        """Return the offset of each robot's clock.
 
-        def ask(role: Role) -> Offset | None:
+        A robot that does not answer is omitted; its columns on the recovery of flows are then empty.
+        """
+
+        def query(role: Role) -> Offset | None:
             with suppress(LinkError):
                 if exchanges := clocks.exchanges(testbed.shells[role], _CLOCK_S):
                     return offset(exchanges)
             return None
 
         roles = list(testbed.shells)
-        return {role: ahead for role, ahead in zip(roles, together(ask, roles), strict=True) if ahead is not None}
+        return {role: ahead for role, ahead in zip(roles, together(query, roles), strict=True) if ahead is not None}
 
     def _note_times(self, scene: Scene, asked_ns: int, lasted_s: float | None, ahead: Mapping[Role, Offset]) -> None:
-        """Write down when the fault was, by the laptop's clock, now that its cause is over."""
+        """Record the times of the fault by the laptop's clock, when its cause is over."""
         if scene.here is None:
             return
         now_ns = time.time_ns()
-        # What lasts begins when the operator has answered; a reboot and a kill take as long as they are asked for.
+        # A lasting fault started `lasted_s` ago; a reboot or a kill lasts from the request until now.
         began_ns = now_ns - round(1e9 * lasted_s) if lasted_s else asked_ns
         times = FaultTimes(began_ns, None if lasted_s is None else now_ns, ahead)
         path = scene.here / self.own_name(fault_times.file(self.kind))
         path.write_text(fault_times.text(times), encoding="ascii")
 
     def times(self, evidence: AttemptEvidence) -> FaultTimes | None:
-        """See `CausesFault.times`."""
+        """Return the recorded times of the fault; see `CausesFault.times`."""
         return evidence.read_or_none(fault_times.read, self.own_name(fault_times.file(self.kind)))
 
-    def _steps(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+    def _run_inside(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         for entry in self.during:
             if not scene.halt.called:
                 entry.step.run(scene, testbed, announce)
 
     def _lead_in(self, steps: "Future[None]") -> None:
-        """Let the steps inside run undisturbed; what they raise now is no work of the fault."""
+        """Let the steps inside run before the fault; an error now is not caused by the fault and is raised."""
         from concurrent.futures import wait  # noqa: PLC0415 (as above)
 
         until = Deadline.after(self.after)
@@ -204,8 +207,8 @@ class FaultStep(Nest):
             steps.result()
             time.sleep(until.remaining_s)
 
-    def _outlast(self, steps: "Future[None]", scene: Scene, testbed: Testbed) -> None:
-        """Wait for the steps inside; where the fault made them fail, end what they left running."""
+    def _wait_for_steps(self, steps: "Future[None]", scene: Scene, testbed: Testbed) -> None:
+        """Wait for the steps inside; if the fault made them fail, stop their jobs."""
         try:
             steps.result()
         except (RobotError, LinkError) as error:
@@ -236,7 +239,7 @@ class FaultStep(Nest):
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """The observer's files are whole, and the fault left a mark in them."""
+        """Yield a reason if the observer's files are incomplete or do not show the fault."""
         try:
             view.evidence.read(recovery.read, "", self.kind, self.prefix)
         except EvidenceError as error:
@@ -244,7 +247,7 @@ class FaultStep(Nest):
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        """Columns of other kinds of fault are for their steps to fill."""
+        """Return the columns of this kind of fault, and of the recoveries of the flows inside."""
         return (*recovery.declared(self.kind), *across.declared(self))
 
     @override

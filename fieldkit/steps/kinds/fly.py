@@ -1,4 +1,4 @@
-"""Fly a drone over MAVLink while other steps run, within the limits of its profile; it comes down at the end."""
+"""Fly a drone over MAVLink while other steps run, within the limits of its profile; it lands at the end."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,44 +32,44 @@ from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
 from fieldkit.steps.view import View
 
-_Way = Annotated[Length, Field(gt=0)] | None
+_Distance = Annotated[Length, Field(gt=0)] | None
 
 STANDS_S: Final = 60.0
-"""How long its motors may go on turning: after an attempt that was cut short it is still coming down."""
+"""Timeout until the motors are off; after an aborted attempt the drone may still be landing."""
 _SLACK_S: Final = 30.0
-"""For the mode, the motors and the last metre of a flight, and as much again where it lands."""
+"""Additional time for the change of mode, the motors and the last metre; again for the landing."""
 _SLOWEST_M_S: Final = 0.3
-"""PX4's land speed is 0.7 m/s (MPC_LAND_SPEED), and less near the ground (MPC_LAND_CRWL)."""
+"""Lower bound of the landing speed. PX4 lands at 0.7 m/s (MPC_LAND_SPEED), slower near the ground (MPC_LAND_CRWL)."""
 _LIMIT_S: Final = 3600.0
 _AT_REST_S: Final = 3.0
-"""About how long the log has lines of a drone that has not risen yet or has landed."""
+"""Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0
 """Ten lines a second (`agent/flight_log.py`), each of about 200 bytes."""
 
 
 class FlyLeg(PathLeg):
-    """A straight piece of a way in the air; along, across and up together are a slant.
+    """A straight segment of a path in the air; several keys together are one diagonal segment.
 
     Attributes:
-        up: Distance up; the keys of one entry together are one diagonal segment.
+        up: Distance up.
         down: Distance down, but not to the ground.
     """
 
-    up: _Way = None
-    down: _Way = None
+    up: _Distance = None
+    down: _Distance = None
 
     @schema.model_validator(mode="after")
     def _one_direction(self) -> "FlyLeg":
-        for one, other in (("away", "towards"), ("left", "right"), ("up", "down")):
-            if getattr(self, one) is not None and getattr(self, other) is not None:
-                raise schema.complaint(f"a piece of a way goes {one} or {other}; make two pieces", other)
+        for key, opposite in (("away", "towards"), ("left", "right"), ("up", "down")):
+            if getattr(self, key) is not None and getattr(self, opposite) is not None:
+                raise schema.complaint(f"a segment has {key} or {opposite}, not both; make two segments", opposite)
         if not any((self.away, self.towards, self.left, self.right, self.up, self.down)):
-            raise schema.complaint("say how far, and whether away, towards, left, right, up or down")
+            raise schema.complaint("a segment needs a distance: away, towards, left, right, up or down")
         return self
 
     @property
     def metres(self) -> tuple[float, float, float]:
-        """How far away, to the left and up."""
+        """Distances forward, to the left and up, in metres."""
         return self.leg.away_m, self.leg.left_m, (self.up or 0.0) - (self.down or 0.0)
 
 
@@ -113,21 +113,21 @@ class FlyStep(Nest):
     @schema.model_validator(mode="after")
     def _stays_in_the_air(self) -> "FlyStep":
         if min(up_m for _, _, up_m in self._corners_m()) <= 0:
-            raise schema.complaint("its way leads to the ground, or below it", "path")
+            raise schema.complaint("the path leads to the ground, or below it", "path")
         return self
 
     def _corners_m(self) -> list[tuple[float, float, float]]:
-        """Return the points of its way, seen from where it stands: away, to the left, up."""
+        """Return the corners of the path relative to the take-off point, in metres: forward, left, up."""
         away_m, left_m, up_m = 0.0, 0.0, self.height
-        found = [(away_m, left_m, up_m)]
+        corners = [(away_m, left_m, up_m)]
         for leg in self.path:
             away_m, left_m, up_m = (a + b for a, b in zip((away_m, left_m, up_m), leg.metres, strict=True))
-            found.append((away_m, left_m, up_m))
-        return found
+            corners.append((away_m, left_m, up_m))
+        return corners
 
     @property
-    def _back_m(self) -> float:
-        """How far its way is at the end of it, at most, from where it rose."""
+    def _farthest_m(self) -> float:
+        """Maximum horizontal distance of a corner from the take-off point."""
         return max(math.hypot(*corner[:2]) for corner in self._corners_m())
 
     @property
@@ -135,12 +135,12 @@ class FlyStep(Nest):
         return max(up_m for _, _, up_m in self._corners_m())
 
     @property
-    def _rises_s(self) -> float:
+    def _climb_s(self) -> float:
         return self.height / self.climb
 
     @property
-    def _comes_down_s(self) -> float:
-        return self._back_m / self.speed + self._highest_m / _SLOWEST_M_S
+    def _descent_s(self) -> float:
+        return self._farthest_m / self.speed + self._highest_m / _SLOWEST_M_S
 
     def _plan(self, scene: Scene) -> FlightPlan:
         limits, mavlink = scene.robot(self.robot).profile.limits, scene.robot(self.robot).profile.mavlink
@@ -173,75 +173,79 @@ class FlyStep(Nest):
 
     @property
     def _lease_s(self) -> float:
-        """The lease of the guard, which must not end before the pilot's."""
+        """Lease of the guard, which must not expire before the pilot's."""
         return max(self.lease, piloting.LEASE_S)
 
     def _guard(self, scene: Scene) -> Planned:
-        return piloting.guard(scene, self.robot, self.own_name("guard"), lease_s=self._lease_s, flown=True)
+        return piloting.guard(scene, self.robot, self.own_name("guard"), lease_s=self._lease_s, has_pilot=True)
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        if scene.robot(self.robot).profile.mavlink is not None:  # it is refused then
+        if scene.robot(self.robot).profile.mavlink is not None:  # otherwise `refusals` reports it
             yield self._guard(scene)
             yield self._pilot(scene)
         yield from self.inside(scene)
 
     @override
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
-        way_m = sum(math.hypot(*leg.metres) for leg in self.path)
-        name, then = scene.robot(self.robot).name, {"return": "comes back", "land": "lands there"}[self.then]
-        way = f"rises to {self.height:g} m, flies {way_m:g} m at {self.speed:g} m/s, and {then}"
-        yield f"{name} {way}; cut short, by Ctrl-C for example, it {self._given_up(scene)}"
+        path_m = sum(math.hypot(*leg.metres) for leg in self.path)
+        name, then = scene.robot(self.robot).name, {"return": "returns", "land": "lands there"}[self.then]
+        flight = f"climbs to {self.height:g} m, flies {path_m:g} m at {self.speed:g} m/s, and {then}"
+        yield f"{name} {flight}; after an abort, for example by Ctrl-C, it {self._abort_action(scene)}"
         yield from super().dry_run_notes(scene)
 
-    def _given_up(self, scene: Scene) -> str:
-        return {"return": "returns by itself", "land": "lands"}[piloting.abort_of(scene, self.robot)]
+    def _abort_action(self, scene: Scene) -> str:
+        return {"return": "returns automatically", "land": "lands"}[piloting.abort_of(scene, self.robot)]
 
     @override
     def abort_notes(self, scene: Scene) -> Iterator[str]:
-        takes = format_duration(self._comes_down_s + _SLACK_S)
-        when = f"if it is in the air: for up to about {takes}, also when fieldkit has ended"
-        yield f"{scene.robot(self.robot).name} {self._given_up(scene)}, {when}"
+        takes = format_duration(self._descent_s + _SLACK_S)
+        note = f"if it is in the air: this takes up to about {takes}, also after fieldkit has exited"
+        yield f"{scene.robot(self.robot).name} {self._abort_action(scene)}, {note}"
         yield from super().abort_notes(scene)
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """It flies within the limits of its profile, or not at all."""
+        """Yield a reason for each limit of the profile that the flight exceeds or that is missing."""
         profile, name = scene.robot(self.robot).profile, scene.robot(self.robot).profile.name
         limits = profile.limits
         if profile.mavlink is None:
-            yield Refusal(self.robot, "its profile has no mavlink: nothing flies it", "a drone in this role")
+            yield Refusal(self.robot, "it cannot fly: its profile has no mavlink", "use a drone in this role")
         elif not scene.robot(self.robot).flies:
-            remedy = "--allow-motion, where its way is free and somebody can take it over; see: fieldkit docs mavlink"
-            yield Refusal(self.robot, "it is real, and fieldkit is to fly it", remedy)
-        for what, asked, most, key in (
-            ("high", self._highest_m, limits.max_height_m, "max_height_m"),
-            ("far from where it rises", self._back_m, limits.fence_m, "fence_m"),
+            remedy = "--allow-motion, if its path is clear and a pilot can take over; see: fieldkit docs mavlink"
+            yield Refusal(self.robot, "it is a real drone, and flights are not allowed", remedy)
+        for quantity, planned_m, limit_m, key in (
+            ("height", self._highest_m, limits.max_height_m, "max_height_m"),
+            ("distance from the take-off point", self._farthest_m, limits.fence_m, "fence_m"),
         ):
-            if most is None:
-                why = f"its profile does not say how {what} it may fly"
-                yield Refusal(self.robot, why, f"limits: {{{key}: ...}} in robots/{name}.yaml")
-            elif asked > most:
-                why = f"it may fly {most:g} m {what}, and it is to fly {asked:g} m"
-                yield Refusal(self.robot, why, f"less in the procedure; limits.{key} in its profile says it")
+            if limit_m is None:
+                why = f"its profile has no limit for the {quantity}"
+                yield Refusal(self.robot, why, f"write limits: {{{key}: ...}} in robots/{name}.yaml")
+            elif planned_m > limit_m:
+                why = f"its {quantity} is limited to {limit_m:g} m, but the flight needs {planned_m:g} m"
+                yield Refusal(
+                    self.robot, why, f"reduce it in the procedure; the limit is limits.{key} in its profile"
+                )
         speed_m_s = max(self.speed, self.climb)
         if speed_m_s > limits.max_speed_m_s:
-            why = f"its top speed is {limits.max_speed_m_s:g} m/s, and it is to fly at {speed_m_s:g} m/s"
-            remedy = "a lower speed in the procedure; limits.max_speed_m_s in its profile says it"
+            why = f"its top speed is {limits.max_speed_m_s:g} m/s, but the flight needs {speed_m_s:g} m/s"
+            remedy = "reduce the speed in the procedure; the limit is limits.max_speed_m_s in its profile"
             yield Refusal(self.robot, why, remedy)
         yield from super().refusals(scene)
 
     @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
-        """Its log has lines from before the drone rises until its motors have stopped."""
+        """Return the size of the log, which covers the time from before the take-off until the motors are off."""
         lasts_s = self.expected_s(scene.protocol) + _AT_REST_S
         return _LOG_BYTES_PER_S * lasts_s if role == self.robot else 0.0
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """An autopilot that may be armed for this flight."""
+        """Yield the checks of the connection to the autopilot, and that it can be armed for this flight."""
         robot = scene.robot(self.robot)
-        if robot.profile.mavlink is not None and robot.profile.limits.max_height_m is not None:  # refused otherwise
+        if (
+            robot.profile.mavlink is not None and robot.profile.limits.max_height_m is not None
+        ):  # otherwise `refusals` reports it
             plan = self._plan(scene)
             yield link_need(robot, self.robot, plan.connection, ("pilot", "guard"))
             yield arming_need(robot, self.robot, plan)
@@ -252,52 +256,52 @@ class FlyStep(Nest):
         flight_s, body_s = self.expected_s(scene.protocol), self.inside_s(scene.protocol)
         with (
             piloting.guarding(scene, shell, guard, lease_s=self._lease_s, body_s=flight_s),
-            piloting.leashed(
+            piloting.leased_program(
                 scene, shell, self._pilot(scene), lease_s=self.lease, body_s=body_s, ends_s=_SLACK_S
-            ) as leash,
-            self._rescue(scene, shell, leash, announce) as rescue,
-            alarmed(leash, guard, rescue, self._log, announce, lands_s=self._comes_down_s + _SLACK_S),
+            ) as flight,
+            self._rescue(scene, shell, flight, announce) as rescue,
+            alarmed(flight, guard, rescue, self._log, announce, lands_s=self._descent_s + _SLACK_S),
         ):
-            self._fly(scene, testbed, announce, leash)
+            self._fly(scene, testbed, announce, flight)
 
-    def _rescue(self, scene: Scene, shell: Shell, leash: piloting.Leash, announce: Announce) -> FlightRescue:
-        """Return the rescue of the drone; nothing may be sent over a radio under test."""
+    def _rescue(self, scene: Scene, shell: Shell, flight: piloting.FlightLease, announce: Announce) -> FlightRescue:
+        """Return the rescue, which is inactive if the control connection crosses the radio under test."""
 
-        def lose(text: str) -> None:
-            leash.lost = "neither its pilot nor its guard runs"
+        def raise_alarm(text: str) -> None:
+            flight.lost = "neither its pilot nor its guard runs"
             announce(text, None)
 
         guard_name = self.own_name("guard")
         job = piloting.rescue(scene, self.robot, self.own_name("rescue"), guard_name)
         sends = scene.robot(self.robot).control is not Control.RADIO
-        return FlightRescue(shell, job, piloting.liveness_file(guard_name), lose, sends=sends)
+        return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, sends=sends)
 
-    def _fly(self, scene: Scene, testbed: Testbed, announce: Announce, leash: piloting.Leash) -> None:
+    def _fly(self, scene: Scene, testbed: Testbed, announce: Announce, flight: piloting.FlightLease) -> None:
         """Give the orders of the flight; the origin is stored before the first one that moves the drone."""
         name = scene.robot(self.robot).name
-        self._wait_for_start(scene, leash)
+        self._wait_for_start(scene, flight)
         with scene.origins.moving(self.robot) as motion:
-            announce(f"take off with {name}", self._rises_s)
-            leash.order(CLIMB)
-            leash.until("up", self._rises_s + _SLACK_S)
+            announce(f"take off with {name}", self._climb_s)
+            flight.give_order(CLIMB)
+            flight.wait_for("up", self._climb_s + _SLACK_S)
             announce(f"fly {name}", None)
-            leash.order(GO)
-            run_inside(self, leash, scene, testbed, announce)
-            announce(f"land {name}", self._comes_down_s)
-            leash.order(HOME)
-            leash.until("landed", self._comes_down_s + _SLACK_S)
+            flight.give_order(GO)
+            run_inside(self, flight, scene, testbed, announce)
+            announce(f"land {name}", self._descent_s)
+            flight.give_order(HOME)
+            flight.wait_for("landed", self._descent_s + _SLACK_S)
             motion.ended()
 
-    def _wait_for_start(self, scene: Scene, leash: piloting.Leash) -> None:
-        """Wait until the drone is ready at its origin; record the origin of a first start."""
+    def _wait_for_start(self, scene: Scene, flight: piloting.FlightLease) -> None:
+        """Wait until the drone is ready at its origin; record the origin before the first start."""
         try:
-            leash.until("standing", STANDS_S)
+            flight.wait_for("standing", STANDS_S)
         except RobotError as error:
-            if leash.is_misplaced:
+            if flight.is_misplaced:
                 scene.origins.refuse(self.robot, error.what)
             raise
         if scene.origins.get(self.robot) is None:
-            scene.origins.record(self.robot, leash.origin())
+            scene.origins.record(self.robot, flight.origin())
 
     @override
     def moves(self) -> frozenset[Role]:
@@ -316,12 +320,12 @@ class FlyStep(Nest):
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        """A trial without a flight has no columns for it."""
+        """Return the columns of a flight, which only trials with a flight have."""
         return fly_log.COLUMNS
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """Where it flew is written down, and it can have flown so."""
+        """Yield a reason if the log of the flight is damaged, or contradicts the plan or the telemetry."""
         try:
             log = view.evidence.read(fly_log.read, self._log)
             damage = view.evidence.read(numbered_lines.problem, self._log)
@@ -331,7 +335,7 @@ class FlyStep(Nest):
         limits = view.scene.robot(self.robot).profile.limits
         plan = fly_checks.FlyPlan(
             highest_m=self._highest_m,
-            farthest_m=self._back_m,
+            farthest_m=self._farthest_m,
             fastest_m_s=max(self.speed, self.climb, limits.max_speed_m_s),
             window=view.attempt_window(self.robot),
         )
@@ -355,11 +359,11 @@ class FlyStep(Nest):
     @override
     def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         if any(nest.disturbs for nest in within):
-            return "a fault has no flight inside: put the fault into the flight"
+            return "a flight must not be inside a fault: put the fault into the flight"
         if any(nest.parallel for nest in within):
-            return "a flight does not stand in together: put together into the flight"
+            return "a flight must not be inside a together: put the together into the flight"
         return None
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        return self._rises_s + self.inside_s(protocol) + self._comes_down_s
+        return self._climb_s + self.inside_s(protocol) + self._descent_s

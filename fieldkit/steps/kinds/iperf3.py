@@ -1,4 +1,4 @@
-"""Measure how fast and how well iperf3 gets its packets from one robot to another."""
+"""Measure throughput, loss and jitter between two robots with iperf3."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,14 +33,14 @@ from fieldkit.steps.loads import PROGRAM, LoadOptions
 from fieldkit.steps.scene import Announce, Flow, ListeningPort, Planned, Scene
 from fieldkit.steps.view import View
 
-_LEAVES_S: Final = 5
-"""How much longer than its client a server may run that has been told of the end."""
+_SERVER_EXIT_S: Final = 5
+"""Maximum time between the exits of client and server."""
 
-_LASTS_S: Final = 10.0
-"""iperf3's own."""
+_DEFAULT_S: Final = 10.0
+"""Default duration of iperf3."""
 
 _INTERVAL_BYTES: Final = 600
-"""What iperf3 says of each second and stream."""
+"""Size of iperf3's report on one second of one stream."""
 
 _STALLS: Final = stalls.declared("iperf3", "iperf3", 67)
 
@@ -56,7 +56,7 @@ class Iperf3Step(LoadOptions, AlongStep):
         duration: How long it sends, in whole seconds; 10 s without `size`.
         size: How much it sends, `10MB`, in place of `duration`.
         reverse: Whether the server sends and the client receives.
-        limit: A test that takes longer is ended, and the repeat is void. With `along` it is added to the duration.
+        limit: A test that takes longer is stopped, and the repeat is void. With `along` it is added to the duration.
     """
 
     flow_kind: ClassVar[str] = "iperf3"
@@ -72,40 +72,40 @@ class Iperf3Step(LoadOptions, AlongStep):
     limit: Annotated[Duration, Field(gt=0)] = 120.0
 
     @schema.model_validator(mode="after")
-    def _ends(self) -> "Iperf3Step":
+    def _has_one_end(self) -> "Iperf3Step":
         if self.size is not None and self.duration is not None:
-            raise schema.complaint("a test lasts for its duration, or until its size is sent; leave one out", "size")
+            raise schema.complaint("a test has a duration or a size, not both; leave one out", "size")
         if self.size is not None and self.along:
-            raise schema.complaint("a test lasts along a way, or until its size is sent; leave one out", "size")
-        if self._lasts_s % 1:
-            raise schema.complaint(f"iperf3 counts whole seconds, not {self._lasts_s:g} s", "duration")
-        if self.size is None and self._lasts_s >= self.limit:
-            raise schema.complaint(f"it is to last {self._lasts_s:g} s and would be ended before", "limit")
+            raise schema.complaint("a test has along: true or a size, not both; leave one out", "size")
+        if self._duration_s % 1:
+            raise schema.complaint(f"iperf3 needs whole seconds, not {self._duration_s:g} s", "duration")
+        if self.size is None and self._duration_s >= self.limit:
+            raise schema.complaint(f"the test lasts {self._duration_s:g} s, so its limit must be longer", "limit")
         return self
 
     @property
-    def _lasts_s(self) -> float:
-        return _LASTS_S if self.duration is None else self.duration
+    def _duration_s(self) -> float:
+        return _DEFAULT_S if self.duration is None else self.duration
 
     @property
     def source(self) -> Role:
-        """Who sends."""
+        """Role of the robot that sends the data."""
         return self.receiver if self.reverse else self.sender
 
     @property
     def destination(self) -> Role:
-        """Who receives."""
+        """Role of the robot that receives the data."""
         return self.sender if self.reverse else self.receiver
 
     @override
-    def lasting(self, seconds: float) -> Self:
-        """In whole seconds, with the limit after them."""
-        lasts_s = float(max(math.ceil(seconds), 1))
-        return self.model_copy(update={"duration": lasts_s, "limit": lasts_s + self.limit})
+    def with_duration(self, seconds: float) -> Self:
+        """Return the step with the duration rounded up to whole seconds, and added to the limit."""
+        duration_s = float(max(math.ceil(seconds), 1))
+        return self.model_copy(update={"duration": duration_s, "limit": duration_s + self.limit})
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        until = ("-t", f"{self._lasts_s:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
+        until = ("-t", f"{self._duration_s:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
         client = self.client(scene, *until, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
         yield self._planned(scene, self.receiver, "server", self.server("-i", "1", "--json"))
         yield self._planned(scene, self.sender, "client", client)
@@ -116,17 +116,17 @@ class Iperf3Step(LoadOptions, AlongStep):
             folder=scene.folder,
             name=self.own_name(f"iperf3-{name}"),
             argv=argv,
-            limit_s=self.limit + _LEAVES_S * serves,
+            limit_s=self.limit + _SERVER_EXIT_S * serves,
             log=self._log(role),
             stdout=self._json(role),
             ready=jobs.bound(Protocol.TCP, self.port) if serves else None,
         )
-        least_s = 0.0 if serves or self.size is not None else self._lasts_s
+        least_s = 0.0 if serves or self.size is not None else self._duration_s
         return Planned(role, job, program=PROGRAM, least_s=least_s)
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        """The server is up."""
+        """Start the server; return the function that runs the client."""
         server, _ = self.jobs(scene)
         jobs.start(testbed.shells[self.receiver], server.job)
         return partial(self._test, scene, testbed)
@@ -137,19 +137,19 @@ class Iperf3Step(LoadOptions, AlongStep):
 
     def _test(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         server, client = self.jobs(scene)
-        listening, asking = (testbed.shells[planned.role] for planned in (server, client))
+        server_shell, client_shell = (testbed.shells[planned.role] for planned in (server, client))
         announce("iperf3", self.expected_s(scene.protocol))
         with ExitStack() as silent:
-            for shell in (listening, asking):
+            for shell in (server_shell, client_shell):
                 silent.enter_context(shell.silence(self.limit))
-            code = jobs.run(asking, client.job)
-        # With --json some versions end with 0 whatever happened: what they wrote is judged with the evidence.
-        left = jobs.begin_wait(listening, server.job, _LEAVES_S).end(_LEAVES_S + jobs.REPLY_S)
-        if left == jobs.STILL_RUNNING:
-            jobs.stop(listening, server.job)
-        for planned, ended in ((client, code), (server, left)):
-            if ended != 0:
-                how = "was not told of its end" if ended == jobs.STILL_RUNNING else f"ended with exit code {ended}"
+            code = jobs.run(client_shell, client.job)
+        # With --json some versions exit with 0 after any error; `check` evaluates their output.
+        server_code = jobs.begin_wait(server_shell, server.job, _SERVER_EXIT_S).end(_SERVER_EXIT_S + jobs.REPLY_S)
+        if server_code == jobs.STILL_RUNNING:
+            jobs.stop(server_shell, server.job)
+        for planned, exit_code in ((client, code), (server, server_code)):
+            if exit_code != 0:
+                how = "did not exit" if exit_code == jobs.STILL_RUNNING else f"ended with exit code {exit_code}"
                 raise RobotError(
                     f"{planned.job.name} {how}",
                     where=scene.robot(planned.role).name,
@@ -158,8 +158,8 @@ class Iperf3Step(LoadOptions, AlongStep):
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        lasts_s = self._lasts_s if self.size is None else 8 * self.size / self.expected_bit_s(protocol)
-        return lasts_s + 0.5
+        duration_s = self._duration_s if self.size is None else 8 * self.size / self.expected_bit_s(protocol)
+        return duration_s + 0.5
 
     @override
     def files(self) -> tuple[str, ...]:
@@ -173,12 +173,12 @@ class Iperf3Step(LoadOptions, AlongStep):
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """Both ends say by which ports they spoke."""
+        """Return the port of the server; the reports contain the ports of both ends, so the source is given."""
         return (ListeningPort(self.receiver, self.port, self.sender, self.source),)
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        size_bytes = self.size or self._lasts_s * self.expected_bit_s(scene.protocol) / 8
+        size_bytes = self.size or self._duration_s * self.expected_bit_s(scene.protocol) / 8
         yield replace(self.flow(scene.protocol, size_bytes), source=self.source, destination=self.destination)
 
     @override
@@ -188,12 +188,12 @@ class Iperf3Step(LoadOptions, AlongStep):
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        """A trial without iperf3 has no columns for it."""
+        """Return the columns of iperf3, which only trials with this step have."""
         return (*iperf3.COLUMNS, *load.COLUMNS, *load_streams.JITTER, *_STALLS)
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """Both ends wrote their JSON to its end, and no other evidence contradicts it."""
+        """Yield a reason if a JSON report is incomplete or contradicts other evidence."""
         tests: dict[Role, IperfTest] = {}
         for role in (self.sender, self.receiver):
             file = self._json(role)
@@ -203,30 +203,30 @@ class Iperf3Step(LoadOptions, AlongStep):
                 yield f"{file}: {error.what}"
                 continue
             if test.error:
-                yield f"{file}: iperf3 says: {test.error}"
+                yield f"{file}: iperf3 reports: {test.error}"
             elif not test.intervals:
                 yield f"{file}: iperf3 measured nothing"
             else:
                 tests[role] = test
-                own = iperf3_checks.within(test, sends=role == self.source)
-                yield from (f"{file}: {why}" for why in own)
+                reasons = iperf3_checks.within(test, sends=role == self.source)
+                yield from (f"{file}: {why}" for why in reasons)
                 if why := iperf3_checks.misdated(test, view.attempt_window(role)):
                     yield f"{file}: {why}"
         if len(tests) > 1:
             yield from self._contradictions(view, tests)
 
     def _contradictions(self, view: View, tests: Mapping[Role, IperfTest]) -> Iterator[str]:
-        """Yield the contradictions between the JSON of both ends, the procedure, captures and interface counters."""
+        """Yield the contradictions between both JSON reports, the procedure, captures and interface counters."""
         protocol = self.carried_by(view.scene.protocol)
-        lasts_s = self._lasts_s if self.size is None else None
-        order = IperfOrder(protocol, self.streams, self.payload_bytes, self.reverse, lasts_s)
+        duration_s = self._duration_s if self.size is None else None
+        order = IperfOrder(protocol, self.streams, self.payload_bytes, self.reverse, duration_s)
         yield from iperf3_checks.between(tests[self.sender], tests[self.receiver], order)
         sent, received = tests[self.source], tests[self.destination]
-        left, came = (view.capture(role) for role in (self.source, self.destination))
-        if left is not None and came is not None:
+        source_capture, destination_capture = (view.capture(role) for role in (self.source, self.destination))
+        if source_capture is not None and destination_capture is not None:
             witness = LoadWitness(
-                sender=left.packets,
-                receiver=came.packets,
+                sender=source_capture.packets,
+                receiver=destination_capture.packets,
                 server_port=self.port,
                 reverse=self.reverse,
                 sender_counters=view.evidence.counters(self.source),
@@ -234,11 +234,11 @@ class Iperf3Step(LoadOptions, AlongStep):
             )
             yield from load_checks.find(self._flow(view, sent, received), sent, received, witness)
         interface = view.scene.robot(self.destination).profile.radio.interface
-        moved = view.evidence.interface_bytes(self.destination, interface)
+        interface_bytes = view.evidence.interface_bytes(self.destination, interface)
         payload_bytes = sum(interval.payload_bytes for interval in received.intervals)
-        if moved is not None and payload_bytes > moved:
-            what = f"iperf3 received {payload_bytes} bytes, and the interface of the {self.destination}"
-            yield f"{what} {moved} in the whole attempt"
+        if interface_bytes is not None and payload_bytes > interface_bytes:
+            what = f"iperf3 received {payload_bytes} bytes, but the interface of the {self.destination} only"
+            yield f"{what} {interface_bytes} in the whole attempt"
 
     def _flow(self, view: View, sent: IperfTest | None, received: IperfTest | None) -> LoadFlow:
         return LoadFlow(
@@ -253,39 +253,41 @@ class Iperf3Step(LoadOptions, AlongStep):
     @override
     def measure(self, view: View) -> Measured:
         protocol = self.carried_by(view.scene.protocol)
-        sent, received = (self._said(view, role) for role in (self.source, self.destination))
+        sent, received = (self._report(view, role) for role in (self.source, self.destination))
         flow = self._flow(view, sent, received)
-        left, came = self._packets(view)
+        packets = self._packets(view)
         data = self._data_streams(view)
         return (
             iperf3.measure(protocol, sent, received)
-            | load.measure(flow, left, came)
-            | load_streams.measure_jitter(data, left, came)
-            | load_streams.measure("iperf3", data, left, came)
+            | load.measure(flow, *packets)
+            | load_streams.measure_jitter(data, *packets)
+            | load_streams.measure("iperf3", data, *packets)
         )
 
     def deliveries(self, view: View) -> Sequence[Delivery]:
-        """See `SendsFlow.deliveries`."""
+        """Return the deliveries of each stream; see `SendsFlow.deliveries`."""
         return load_streams.read(self._data_streams(view), *self._packets(view))
 
     def _packets(self, view: View) -> tuple[Packets | None, Packets | None]:
-        """Return what the robot that sends captured, and the one that receives."""
-        left, came = (view.capture(role) for role in (self.source, self.destination))
-        return left.packets if left else None, came.packets if came else None
+        """Return the packets in the captures of source and destination."""
+        source, destination = (view.capture(role) for role in (self.source, self.destination))
+        return source.packets if source else None, destination.packets if destination else None
 
     def _data_streams(self, view: View) -> LoadStreams:
-        sent, received = (self._said(view, role) for role in (self.source, self.destination))
-        ports = sent.ports if sent else tuple((other, own) for own, other in received.ports) if received else ()
+        sent, received = (self._report(view, role) for role in (self.source, self.destination))
+        swapped = tuple((remote, local) for local, remote in received.ports) if received else ()
+        ports = sent.ports if sent else swapped
         job = self.own_name(f"iperf3-{'client' if self.reverse else 'server'}")
         return self.data_streams(
             view.scene,
             reverse=self.reverse,
             ports=ports,
-            lasts_s=self._lasts_s if self.size is None else None,
+            lasts_s=self._duration_s if self.size is None else None,
             until_ns=job_times.ended_ns(view.evidence, self.destination, job),
         )
 
-    def _said(self, view: View, role: Role) -> IperfTest | None:
+    def _report(self, view: View, role: Role) -> IperfTest | None:
+        """Return the valid report of a robot; None if it is missing or is an error."""
         test = view.evidence.read_or_none(iperf3.read, self._json(role))
         return None if test is None or test.error else test
 

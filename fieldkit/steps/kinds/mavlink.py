@@ -1,4 +1,4 @@
-"""Record what an autopilot tells over MAVLink while other steps run: place, speed, attitude, battery, losses."""
+"""Record the MAVLink telemetry of an autopilot while other steps run: position, speed, attitude, battery, losses."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -46,25 +46,25 @@ MESSAGES: Final = MappingProxyType(
         "EXTENDED_SYS_STATE": 245,
     }
 )
-"""Ids of the messages whose rate a procedure may ask for (https://mavlink.io/en/messages/common.html)."""
+"""Ids of the messages whose rate a procedure may request (https://mavlink.io/en/messages/common.html)."""
 
 _POSITIONS: Final = MappingProxyType({"local": LOCAL, "global": GLOBAL})
-_USUAL_HZ: Final = 40.0
-"""About how many messages a second an autopilot sends to whom it is not asked by."""
+_DEFAULT_HZ: Final = 40.0
+"""Approximate number of messages per second that an autopilot sends without a request."""
 _FRAME_BYTES: Final = 40
 _STAMP_BYTES: Final = 8
-_BEGINS_S: Final = 2.0
+_START_S: Final = 2.0
 _READY_S: Final = 75
-"""An ArduCopter sends LOCAL_POSITION_NED about 30 s after its boot; the recorder itself gives up after 60 s."""
+"""Longer than the timeout of the recorder, 60 s. ArduCopter sends LOCAL_POSITION_NED about 30 s after its boot."""
 _ON_GROUND_M: Final = 0.1
-"""A lower height is noise of the estimate of a drone that did not fly."""
-_OUTLASTS_S: Final = 2
-"""Behind the last step a message of each kind is to come, at the usual rates."""
+"""Lower heights are noise of the position estimate of a drone on the ground."""
+_EXTRA_S: Final = 2
+"""Recording time after the last step, enough for a message of each kind at default rates."""
 
 
 def _is_message(name: str) -> str:
     if name not in MESSAGES:
-        raise schema.complaint(f"no rate can be asked for {name!r}; there are {', '.join(MESSAGES)}")
+        raise schema.complaint(f"no rate can be requested for {name!r}; possible: {', '.join(MESSAGES)}")
     return name
 
 
@@ -78,7 +78,7 @@ class MavlinkStep(Nest):
     Attributes:
         robot: Role of the robot with the autopilot.
         at: Role of the robot that records, over the radio; without it, the robot's own computer.
-        system: The autopilot's system id; 0 for the first one that is heard, which is then the only one in the log.
+        system: The autopilot's system id; 0 for the first one received, which is then the only one in the log.
         rates: Requested messages per second, of `SYS_STATUS`, `GPS_RAW_INT`, `ATTITUDE`, `LOCAL_POSITION_NED`,
             `GLOBAL_POSITION_INT`, `VFR_HUD`, `RADIO_STATUS`, `BATTERY_STATUS`, `ESTIMATOR_STATUS`, `HOME_POSITION`
             and `EXTENDED_SYS_STATE`: `{ATTITUDE: 20Hz}`. Every message received is recorded.
@@ -108,14 +108,14 @@ class MavlinkStep(Nest):
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @schema.model_validator(mode="after")
-    def _faces_somewhere(self) -> "MavlinkStep":
+    def _has_direction(self) -> "MavlinkStep":
         if (self.positions == "local") is (self.facing is None):
-            raise schema.complaint("with positions: local, and only then, say where it faces", "facing")
+            raise schema.complaint("facing is required with positions: local, and not allowed otherwise", "facing")
         return self
 
     @property
     def recorder(self) -> Role:
-        """On whose robot it is recorded."""
+        """Role of the robot that records."""
         return self.at or self.robot
 
     @override
@@ -124,17 +124,17 @@ class MavlinkStep(Nest):
         yield from self.inside(scene)
 
     def _recording(self, scene: Scene) -> Planned:
-        """Return what records until it is stopped."""
+        """Return the job that records until it is stopped."""
         robot = scene.robot(self.recorder)
         intervals_us = {str(MESSAGES[name]): round(1e6 / rate) for name, rate in self.rates.items()}
-        told = {"connection": self._connection(scene), "intervals_us": intervals_us, "system": self.system}
+        arguments = {"connection": self._connection(scene), "intervals_us": intervals_us, "system": self.system}
         job = Job(
             folder=scene.folder,
             name=self.own_name("mavlink"),
-            argv=streams.agent_command(robot, "mavlink", streams.compact(told), self._file),
+            argv=streams.agent_command(robot, "mavlink", streams.compact(arguments), self._file),
             limit_s=follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log,
-            stdout=self._told,
+            stdout=self._counters_file,
             ready="log:up,",
             ready_s=_READY_S,
         )
@@ -142,15 +142,15 @@ class MavlinkStep(Nest):
         return Planned(self.recorder, job, program=program, setup=setup, ends=BY_FIELDKIT)
 
     def _connection(self, scene: Scene) -> str:
-        """Return how the recorder reaches the autopilot.
+        """Return the connection from the recorder to the autopilot.
 
         Raises:
-            ConfigurationError: Its robot has none.
+            ConfigurationError: The profile of the robot has no `mavlink`.
         """
         robot = scene.robot(self.robot)
         if (mavlink := robot.profile.mavlink) is None:
             raise ConfigurationError(
-                f"{robot.name} is to tell of its flight, and its profile {robot.profile.name} has no mavlink",
+                f"telemetry of {robot.name} cannot be recorded: its profile {robot.profile.name} has no mavlink",
                 remedy="write mavlink: {port: 14550} in the profile, or name another robot in the step mavlink",
             )
         if self.recorder != self.robot:
@@ -159,7 +159,7 @@ class MavlinkStep(Nest):
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """A connection by which the autopilot is heard; over the radio its loss is measured."""
+        """Yield the check of the connection to the autopilot; over the radio its loss is a measurement instead."""
         if self.recorder == self.robot:
             yield link_need(scene.robot(self.recorder), self.recorder, self._connection(scene), ("recorder",))
 
@@ -173,14 +173,14 @@ class MavlinkStep(Nest):
             testbed,
             announce,
             [self._recording(scene)],
-            tell=partial(self._accounts, scene) if self.positions else None,
-            outlast=lambda _: _OUTLASTS_S,
+            make_accounts=partial(self._accounts, scene) if self.positions else None,
+            extra_s=lambda _: _EXTRA_S,
         )
         if code != 0:
             raise scene.failure(planned, f"{planned.job.name} ended with exit code {code}")
 
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
-        """Return who tells where robots were in an attempt."""
+        """Return the sources of the robots' positions in an attempt."""
         account = Account(
             file=self._file,
             topic=_POSITIONS[self.positions or "local"],
@@ -192,7 +192,7 @@ class MavlinkStep(Nest):
             clock="" if self.recorder == self.robot else self.recorder,
             system=self.system,
         )
-        return Accounts({**follow.standing(self, scene), self.robot: account}, offsets, self.heights)
+        return Accounts({**follow.stationary_robots(self, scene), self.robot: account}, offsets, self.heights)
 
     @override
     def roles(self) -> frozenset[Role]:
@@ -204,7 +204,7 @@ class MavlinkStep(Nest):
 
     @override
     def files(self) -> tuple[str, ...]:
-        return (self._file, self._told, self._log, *self.laptop_files())
+        return (self._file, self._counters_file, self._log, *self.laptop_files())
 
     @override
     def laptop_files(self) -> tuple[str, ...]:
@@ -215,7 +215,7 @@ class MavlinkStep(Nest):
         return self.own_name(f"mavlink{tlog.SUFFIX}")
 
     @property
-    def _told(self) -> str:
+    def _counters_file(self) -> str:
         return self.own_name("mavlink.json")
 
     @property
@@ -224,7 +224,7 @@ class MavlinkStep(Nest):
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        """Over the radio, where another robot records it."""
+        """Yield the telemetry, if another robot records it over the radio."""
         mavlink = scene.robot(self.robot).profile.mavlink
         if self.recorder != self.robot and mavlink is not None:
             frames = self._messages(scene)
@@ -235,8 +235,8 @@ class MavlinkStep(Nest):
         return (_FRAME_BYTES + _STAMP_BYTES) * self._messages(scene) if role == self.recorder else 0.0
 
     def _messages(self, scene: Scene) -> float:
-        """Return about how many messages are recorded."""
-        return (_USUAL_HZ + sum(self.rates.values())) * self.expected_s(scene.protocol)
+        """Return the approximate number of recorded messages."""
+        return (_DEFAULT_HZ + sum(self.rates.values())) * self.expected_s(scene.protocol)
 
     @override
     def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
@@ -244,42 +244,42 @@ class MavlinkStep(Nest):
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """The log is whole, of one autopilot, and has what was asked for."""
+        """Yield a reason if the log is incomplete, lacks requested messages, or contradicts its recorder."""
         try:
-            told = view.evidence.read(tlog.told, self._told)
+            counters = view.evidence.read(tlog.told, self._counters_file)
             log = self._read(view)
             total = view.evidence.read(tlog.sum_of, self._file)
         except EvidenceError as error:
             yield f"{self._file}: {error.what}"
             return
-        if told.left_out:
-            yield f"{self._file}: {told.left_out} frames more came than it has room for"
-        if log.frames != told.frames:
-            yield f"{self._file} has {log.frames} frames, its recorder wrote {told.frames}"
+        if counters.left_out:
+            yield f"{self._file} lacks {counters.left_out} received frames, because it reached its maximum size"
+        if log.frames != counters.frames:
+            yield f"{self._file} has {log.frames} frames, its recorder wrote {counters.frames}"
         window = view.attempt_window(self.recorder)
-        yield from (f"{self._file} {why}" for why in tlog.contradictions(log, told, total, window))
+        yield from (f"{self._file} {why}" for why in tlog.contradictions(log, counters, total, window))
         for name in self.rates:
-            if (result := told.refused.get(MESSAGES[name])) is not None:
-                yield f"the autopilot does not send {name} as asked (MAV_RESULT {result})"
+            if (result := counters.refused.get(MESSAGES[name])) is not None:
+                yield f"the autopilot refused the request for {name} (MAV_RESULT {result})"
             elif name not in log.kinds:
-                yield f"{self._file}: no {name}, which was asked for"
+                yield f"{self._file}: no {name}, which was requested"
         if self.positions:
             yield from follow.problems(view, (self.robot,))
 
     def places_m(self, view: View) -> Floats:
-        """Return where LOCAL_POSITION_NED had the autopilot: metres north, east and up. Shape (n, 3)."""
+        """Return the positions in the messages LOCAL_POSITION_NED: metres north, east and up. Shape (n, 3)."""
         rows = view.evidence.read_or_none(tlog.positions, self._file, self.system, LOCAL) or []
         return np.array([row[2:5] for row in rows], dtype=float).reshape(-1, 3)
 
     def _read(self, view: View) -> Tlog:
-        """Return what the log says.
+        """Return the content of the log.
 
         Raises:
-            EvidenceError: It, or what its recorder says of it, cannot be read.
+            EvidenceError: The log or the counters of its recorder cannot be read.
         """
-        told = view.evidence.read(tlog.told, self._told)
+        counters = view.evidence.read(tlog.told, self._counters_file)
         intervals_us = tuple((name, round(1e6 / rate)) for name, rate in self.rates.items())
-        return view.evidence.read(tlog.read, self._file, self.system, told.ended_us, intervals_us)
+        return view.evidence.read(tlog.read, self._file, self.system, counters.ended_us, intervals_us)
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
@@ -288,10 +288,10 @@ class MavlinkStep(Nest):
     @override
     def measure(self, view: View) -> Measured:
         try:
-            found = tlog.measure(self._read(view), view.evidence.read(tlog.told, self._told).slow_s)
+            measured = tlog.measure(self._read(view), view.evidence.read(tlog.told, self._counters_file).slow_s)
         except EvidenceError:
-            found = tlog.measure(None)
-        return found | follow.measure(view) if self.positions else found
+            measured = tlog.measure(None)
+        return measured | follow.measure(view) if self.positions else measured
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
@@ -302,4 +302,4 @@ class MavlinkStep(Nest):
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        return _BEGINS_S + _OUTLASTS_S + self.inside_s(protocol)
+        return _START_S + _EXTRA_S + self.inside_s(protocol)

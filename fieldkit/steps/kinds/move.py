@@ -1,4 +1,4 @@
-"""Let a robot move away from its place, or about it, while other steps run."""
+"""Move a robot along a path while other steps run, and bring it back to its place."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,16 +23,16 @@ from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
 from fieldkit.steps.view import View
 
-_Way = Annotated[Length, Field(gt=0)] | None
+_Distance = Annotated[Length, Field(gt=0)] | None
 
 _LOG_BYTES_PER_S: Final = 2200.0
 """Ten lines a second (`agent/drive.py`), each of about 220 bytes."""
-_SHORT_OF_FENCE_M: Final = 0.5
-"""So far before its fence a way ends that is cut short: who steers along it may overshoot."""
+_FENCE_MARGIN_M: Final = 0.5
+"""Distance between the fence and the end of a shortened path, because the robot may overshoot."""
 
 
 class PathLeg(Strict):
-    """A straight piece of a way; along and across together are a slant.
+    """A straight segment of a path; several keys together are one diagonal segment.
 
     Attributes:
         away: Distance away from the robot at the other end of the link, along the line between them (the relay: from
@@ -43,26 +43,26 @@ class PathLeg(Strict):
         right: Distance to the right.
     """
 
-    away: _Way = None
-    towards: _Way = None
-    left: _Way = None
-    right: _Way = None
+    away: _Distance = None
+    towards: _Distance = None
+    left: _Distance = None
+    right: _Distance = None
 
     @schema.model_validator(mode="after")
     def _one_direction(self) -> "PathLeg":
-        for one, other in (("away", "towards"), ("left", "right")):
-            if getattr(self, one) is not None and getattr(self, other) is not None:
-                raise schema.complaint(f"a piece of a way goes {one} or {other}; make two pieces", other)
+        for key, opposite in (("away", "towards"), ("left", "right")):
+            if getattr(self, key) is not None and getattr(self, opposite) is not None:
+                raise schema.complaint(f"a segment has {key} or {opposite}, not both; make two segments", opposite)
         if not any((self.away, self.towards, self.left, self.right)):
-            raise schema.complaint("say how far, and whether away, towards, left or right")
+            raise schema.complaint("a segment needs a distance: away, towards, left or right")
         return self
 
     @classmethod
     def of(cls, leg: model.Leg) -> "PathLeg | None":
-        """Return a leg as a procedure has it, to the centimetre and no longer; None where nothing is left of it."""
-        named = (("away", "towards", leg.away_m), ("left", "right", leg.left_m))
+        """Return a leg as a segment of a procedure, rounded down to centimetres; None if its length is then 0."""
+        keys = (("away", "towards", leg.away_m), ("left", "right", leg.left_m))
         lengths = {
-            (one if metres > 0 else other): math.floor(100 * abs(metres)) / 100 for one, other, metres in named
+            (key if metres > 0 else opposite): math.floor(100 * abs(metres)) / 100 for key, opposite, metres in keys
         }
         if not any(lengths.values()):
             return None
@@ -70,18 +70,19 @@ class PathLeg(Strict):
 
     @property
     def leg(self) -> model.Leg:
-        """The leg of the way as the testbed is asked for it."""
+        """The segment, as passed to the testbed."""
         return model.Leg((self.away or 0.0) - (self.towards or 0.0), (self.left or 0.0) - (self.right or 0.0))
 
 
 class MoveStep(Nest):
     """Moves a robot while the steps in `during` run; afterwards the robot is at its place again.
 
-    So each repeat begins alike. At the end of its path the robot stops and waits. Robots of a lab move on the ground
-    of their world, and return instantly; in the field the operator is asked to start the motion and to bring the
-    robot back. Ground robots that [drive by themselves](motion.md) do both, with `--allow-motion`, and leave
-    `drive.jsonl`. `--dry-run` describes the path. A move may be inside another one of another robot, with a `name`
-    for one of them, since each may leave such a file; a `fault` may be inside a move, but not a move inside a fault.
+    So all repeats start from the same place. At the end of its path the robot stops and waits. Robots of a lab move
+    on the ground of their world, and return instantly; in the field the operator is asked to start the motion and
+    to bring the robot back. Ground robots that [drive by themselves](motion.md) do both, with `--allow-motion`, and
+    leave `drive.jsonl`. `--dry-run` describes the path. A move may be inside another one of another robot, with a
+    `name` for one of them, since each may leave such a file; a `fault` may be inside a move, but not a move inside
+    a fault.
 
     Attributes:
         robot: Role that moves.
@@ -107,69 +108,70 @@ class MoveStep(Nest):
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @override
-    def resolved(self, cast: Cast, way_s: float | None = None) -> Self:
-        """With a speed, and within the robot's limits where that is asked for."""
+    def resolved(self, cast: Cast, path_s: float | None = None) -> Self:
+        """Return the step with a speed, and with `within_limits` reduced to the robot's limits."""
         robot = cast[self.robot]
         fastest_m_s, fence_m = robot.profile.limits.max_speed_m_s, robot.profile.limits.fence_m
         speed_m_s = fastest_m_s if self.speed is None else self.speed
-        legs = tuple(one.leg for one in self.path)
+        legs = tuple(segment.leg for segment in self.path)
         path = self.path
         if self.within_limits:
             speed_m_s = min(speed_m_s, fastest_m_s)
             if fence_m is not None and geometry.farthest_m(legs) > fence_m:
-                short_m = min(_SHORT_OF_FENCE_M, fence_m / 2)
-                path = tuple(filter(None, map(PathLeg.of, geometry.within(legs, fence_m - short_m)))) or path
+                margin_m = min(_FENCE_MARGIN_M, fence_m / 2)
+                path = tuple(filter(None, map(PathLeg.of, geometry.within(legs, fence_m - margin_m)))) or path
         update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or robot.drives}
-        own = self.model_copy(update=update)
-        return super(MoveStep, own).resolved(cast, own.way_s(robot))
+        step = self.model_copy(update=update)
+        return super(MoveStep, step).resolved(cast, step.path_s(robot))
 
     @override
     def adjustments(self, cast: Cast) -> Iterator[str]:
         if self.within_limits:
-            asked = self.model_copy(update={"within_limits": False}).resolved(cast).motion
-            may = self.resolved(cast).motion
-            if may != asked:
+            requested = self.model_copy(update={"within_limits": False}).resolved(cast).motion
+            permitted = self.resolved(cast).motion
+            if permitted != requested:
                 yield (
-                    f"{cast[self.robot].name} moves {geometry.in_words(may)}; {geometry.in_words(asked)} is beyond "
-                    "its limits"
+                    f"{cast[self.robot].name} moves {geometry.in_words(permitted)}; {geometry.in_words(requested)} "
+                    "is beyond its limits"
                 )
         yield from super().adjustments(cast)
 
     @property
     def motion(self) -> model.Move:
-        """The move that the testbed is asked for.
+        """The move, as passed to the testbed.
 
         Raises:
-            ValueError: The step has no speed: it is not fitted to its robot.
+            ValueError: The step has no speed, because it is not resolved.
         """
         if self.speed is None:
-            raise ValueError("a step without a speed is not fitted to its robot")
-        return model.Move(self.robot, tuple(one.leg for one in self.path), self.speed)
+            raise ValueError("the step has no speed: call resolved() first")
+        return model.Move(self.robot, tuple(segment.leg for segment in self.path), self.speed)
 
     @property
-    def lasts_s(self) -> float:
-        """How long its way takes at its speed, to the millisecond; what a robot needs to turn comes to it."""
+    def straight_s(self) -> float:
+        """Duration of the path at its speed without the time for turns, in seconds, to the millisecond."""
         motion = self.motion
         return round(geometry.length_m(motion) / motion.speed_m_s, 3)
 
-    def way_s(self, robot: Robot) -> float:
-        """Return how long its way takes: of a robot that drives by itself with all turns, else `lasts_s`."""
-        return driving.way_s(robot, self.motion) if robot.drives else self.lasts_s
+    def path_s(self, robot: Robot) -> float:
+        """Return the duration of the path in seconds, including turns if the robot drives automatically."""
+        return driving.path_duration_s(robot, self.motion) if robot.drives else self.straight_s
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        """A robot that is moved takes none."""
+        """Yield the job that drives the robot, unless the testbed moves it, and the jobs of the steps inside."""
         if scene.robot(self.robot).drives:
             yield self._driving(scene)
         yield from self.inside(scene)
 
     def _driving(self, scene: Scene) -> Planned:
         """Return the job that drives the robot."""
-        inside_s = sum(one.job.limit_s for one in self.inside(scene))
-        return driving.planned(scene, self.motion, inside_s, self._form)
+        inside_s = sum(planned.job.limit_s for planned in self.inside(scene))
+        return driving.planned(scene, self.motion, inside_s, self._name_pattern)
 
     @property
-    def _form(self) -> str:
+    def _name_pattern(self) -> str:
+        """Pattern of the names of jobs and files, see `driving.planned`."""
         return self.own_name("{}")
 
     @property
@@ -179,15 +181,15 @@ class MoveStep(Nest):
     @override
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         robot = scene.robot(self.robot)
-        by_itself = ""
+        driving_note = ""
         if robot.drives and robot.profile.drive is not None:
             drive = robot.profile.drive
-            by_itself = (
-                f", and back, by itself: velocities on {drive.topic}, odometry of {drive.odometry}; it stops where "
+            driving_note = (
+                f", and back, automatically: velocities on {drive.topic}, odometry of {drive.odometry}; it stops if "
                 f"the laptop is silent for {drive.lease:g} s, and {robot.profile.limits.fence_m:g} m from its place"
             )
-        lasts = f"for up to {round(self.way_s(robot), 1):g} s"
-        yield f"{robot.name} moves {geometry.in_words(self.motion)}, {lasts}{by_itself}"
+        duration = f"for up to {round(self.path_s(robot), 1):g} s"
+        yield f"{robot.name} moves {geometry.in_words(self.motion)}, {duration}{driving_note}"
         yield from super().dry_run_notes(scene)
 
     @override
@@ -204,8 +206,9 @@ class MoveStep(Nest):
         if speed_m_s > fastest_m_s:
             yield Refusal(
                 self.robot,
-                f"its top speed is {fastest_m_s:g} m/s, and it is to move at {speed_m_s:g} m/s",
-                "a lower speed in the procedure, or within_limits: true; limits.max_speed_m_s in its profile says it",
+                f"its top speed is {fastest_m_s:g} m/s, but the move needs {speed_m_s:g} m/s",
+                "reduce the speed in the procedure, or write within_limits: true; the limit is "
+                "limits.max_speed_m_s in its profile",
             )
         if robot.drives:
             yield from driving.refusals(scene, self.motion)
@@ -213,27 +216,27 @@ class MoveStep(Nest):
 
     @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
-        """The log of a robot that drives has its way, the steps inside and its way back."""
+        """Return the size of the log of a driving robot, which covers path, steps inside and the return."""
         robot = scene.robot(role)
         if role != self.robot or not robot.drives or robot.profile.drive is None:
             return 0.0
-        return _LOG_BYTES_PER_S * (2 * self.way_s(robot) + self.inside_s(scene.protocol))
+        return _LOG_BYTES_PER_S * (2 * self.path_s(robot) + self.inside_s(scene.protocol))
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """A robot that drives by itself needs its middleware's Python package."""
+        """Yield the check of the middleware's Python package for a robot that drives automatically."""
         robot = scene.robot(self.robot)
         if robot.drives:
-            yield streams.need(self.robot, robot, driving.over(robot))
+            yield streams.need(self.robot, robot, driving.middleware_of(robot))
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         robot = scene.robot(self.robot)
         announce(f"move {robot.name}", None)
         if robot.drives:
-            with driving.driven(scene, testbed, self._driving(scene), self.motion, self._form) as held:
-                run_inside(self, held, scene, testbed, announce)
-                announce(f"drive {robot.name} back", self.way_s(robot))
+            with driving.driven(scene, testbed, self._driving(scene), self.motion, self._name_pattern) as drive_lease:
+                run_inside(self, drive_lease, scene, testbed, announce)
+                announce(f"drive {robot.name} back", self.path_s(robot))
             return
         with testbed.moving(self.motion):
             for entry in self.during:
@@ -245,17 +248,17 @@ class MoveStep(Nest):
 
     @override
     def files(self) -> tuple[str, ...]:
-        """What the driver of a robot writes, where that drives by itself."""
-        return driving.files(self._form)
+        """Return the files of the driver, which exist only if the robot drives automatically."""
+        return driving.files(self._name_pattern)
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        """A trial whose robots are moved has no columns for it."""
+        """Return the columns of the drive, if the robot drives automatically."""
         return drive_log.COLUMNS if self.driven else ()
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """A robot that drove by itself has written down how, and it can have driven so."""
+        """Yield a reason if the log of the drive is damaged or contradicts the plan."""
         if not (self.driven and view.scene.robot(self.robot).drives):
             return
         try:
@@ -271,7 +274,7 @@ class MoveStep(Nest):
 
     @override
     def measure(self, view: View) -> Measured:
-        """Nothing of a drive that other sources of the robot's position contradict."""
+        """Return the values of the drive, without those that other sources of the robot's position contradict."""
         if not self.driven:
             return Measured()
         log = view.evidence.read_or_none(drive_log.read, self._log)
@@ -291,9 +294,9 @@ class MoveStep(Nest):
     @override
     def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         if any(nest.disturbs for nest in within):
-            return "a fault has no move inside: put the fault into the move"
+            return "a move must not be inside a fault: put the fault into the move"
         if any(nest.parallel for nest in within):
-            return "a move does not stand in together: put together into the move"
+            return "a move must not be inside a together: put the together into the move"
         return None
 
     @override
@@ -302,4 +305,4 @@ class MoveStep(Nest):
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        return self.inside_s(protocol) + (self.lasts_s if self.driven else 0.0)
+        return self.inside_s(protocol) + (self.straight_s if self.driven else 0.0)

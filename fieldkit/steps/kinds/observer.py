@@ -1,4 +1,4 @@
-"""Observers of a robot while a fault befalls it: jobs that write down when it answered."""
+"""Observers of a robot during a fault: jobs that record when the robot answered."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -12,11 +12,12 @@ from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF_OR_LIMIT, Planned, Scene
 from fieldkit.steps.variants import PingTool, Tool
 
 HEALED_S: Final = 1.0
-"""A robot has healed when it has answered as often as it does in this time."""
+"""A robot has recovered when it has given as many answers as it normally gives in this time."""
 
 _INTERVAL_S: Final = 0.1
 
-# Seconds since boot, `up` and the process ids while processes of the name $1 live (a zombie does not), every $2 s.
+# Prints every $2 s the seconds since boot, followed by `up` and the process ids while processes named $1 run (zombies
+# do not count).
 _WATCH: Final = (
     'echo "watching $1"; while :; do pids=; for file in /proc/[0-9]*/comm; do '
     'read -r name <"$file" && [ "$name" = "$1" ] && read -r stat <"${file%comm}stat" || continue; '
@@ -24,7 +25,7 @@ _WATCH: Final = (
     'read -r now _ </proc/uptime; echo "$now${pids:+ up}$pids"; sleep "$2"; done'
 )
 
-# Writes down how long the cause lasted ($1) and the interval ($2), then waits for $5 more lines with $4 in file $3.
+# Prints the duration of the cause ($1) and the interval ($2), then waits for $5 more lines with text $4 in file $3.
 _HEALS: Final = (
     'echo "lasted_s $1"; echo "interval_s $2"; enough=$(($(grep -c "$4" "$3") + $5)); '
     'until [ "$(grep -c "$4" "$3")" -ge "$enough" ]; do sleep 0.1; done'
@@ -32,7 +33,7 @@ _HEALS: Final = (
 
 
 def observed_from(fault: Fault) -> Role:
-    """Return who observes: the other end of the pair, or for a killed process the robot itself."""
+    """Return the role of the observing robot: the other end of the pair, or the robot itself for `kill`."""
     if fault.kind is FaultKind.KILL:
         return fault.role
     return Role.RECEIVER if fault.role == Role.SENDER else Role.SENDER
@@ -40,12 +41,12 @@ def observed_from(fault: Fault) -> Role:
 
 @dataclass(frozen=True)
 class Observer:
-    """Sees a robot go and come back: pings it from the other end, or watches its process on the robot itself.
+    """Records when a robot answers: pings it from the other end, or polls its process on the robot itself.
 
     Attributes:
         scene: The attempt.
-        fault: What befalls the robot.
-        name: Name of the step, which jobs and files begin with; empty without one.
+        fault: The fault of the robot.
+        name: Name of the step, the prefix of its jobs and files; empty if it has no name.
     """
 
     scene: Scene
@@ -54,13 +55,13 @@ class Observer:
 
     @property
     def role(self) -> Role:
-        """The role that observes."""
+        """Role of the observing robot."""
         return observed_from(self.fault)
 
     def watch(self, limit_s: float) -> Planned:
-        """Return the job that observes, up once the robot has answered; it runs until it is stopped."""
+        """Return the job that observes until it is stopped; it is ready when the robot has answered."""
         interval = f"{self._interval_s:g}"
-        if self._kills:
+        if self._is_kill:
             argv: tuple[str, ...] = ("sh", "-c", _WATCH, "sh", self.fault.process, interval)
         else:
             argv = ping.command_line(
@@ -72,26 +73,26 @@ class Observer:
             argv=argv,
             limit_s=limit_s,
             log=self._file,
-            ready="log:watching" if self._kills else "log:bytes from",
+            ready="log:watching" if self._is_kill else "log:bytes from",
         )
-        if self._kills:
+        if self._is_kill:
             return Planned(self.role, job, program="sh", ends=BY_FIELDKIT)
         program = self.scene.robot(self.role).profile.tools.ping
         return Planned(self.role, job, program=program, tool=Tool.PING, ends=BY_FIELDKIT)
 
     def heals(self, lasted_s: str, limit_s: float) -> Planned:
-        """Return the job that ends when the robot has healed; first it writes down what only the testbed knows.
+        """Return the job that records the duration of the cause and ends when the robot has recovered.
 
         Args:
-            lasted_s: How many seconds the cause lasted, `unknown` where nobody knows.
-            limit_s: When to give up.
+            lasted_s: Duration of the cause in seconds, as text, or `unknown`.
+            limit_s: Timeout.
         """
-        answer = " up " if self._kills else "bytes from"
-        words = (lasted_s, f"{self._interval_s:g}", self._file, answer, str(round(HEALED_S / self._interval_s)))
+        answer = " up " if self._is_kill else "bytes from"
+        arguments = (lasted_s, f"{self._interval_s:g}", self._file, answer, str(round(HEALED_S / self._interval_s)))
         job = Job(
             folder=self.scene.folder,
             name=prefixed(self.name, f"fault-{self.fault.kind}-heals"),
-            argv=("sh", "-c", _HEALS, "sh", *words),
+            argv=("sh", "-c", _HEALS, "sh", *arguments),
             limit_s=limit_s,
             log=prefixed(self.name, recovery.log_file(self.fault.kind)),
             stdout=prefixed(self.name, recovery.note_file(self.fault.kind)),
@@ -99,7 +100,7 @@ class Observer:
         return Planned(self.role, job, program="grep", ends=BY_ITSELF_OR_LIMIT)
 
     @property
-    def _kills(self) -> bool:
+    def _is_kill(self) -> bool:
         return self.fault.kind is FaultKind.KILL
 
     @property
@@ -108,7 +109,7 @@ class Observer:
 
     @property
     def _interval_s(self) -> float:
-        """Time between two looks; an old ping lets only root ask more often than every 200 ms."""
+        """Time between two requests; old iputils allow less than 200 ms only for root."""
         tools = self.scene.tools(self.role)
-        slow = not self._kills and tools.ping is PingTool.IPUTILS_OLD and not tools.root
+        slow = not self._is_kill and tools.ping is PingTool.IPUTILS_OLD and not tools.root
         return ping.OLD_INTERVAL_S if slow else _INTERVAL_S

@@ -40,14 +40,14 @@ Payload = Annotated[Int, Field(ge=0, le=65507)]
 
 
 def command_line(scene: Scene, role: Role, options: Iterable[str], address: str) -> tuple[str, ...]:
-    """Return how the robot in `role` pings `address`, for output that can be read: no names, time stamps, English."""
-    # busybox has no time stamps, and resolves no names anyway.
+    """Return the ping command of a robot, with output that can be parsed: addresses, time stamps, in English."""
+    # busybox has no time stamps and never resolves names.
     stamps = () if scene.tools(role).ping is PingTool.BUSYBOX else ("-n", "-D")
     return ("env", "LC_ALL=C", scene.robot(role).profile.tools.ping, *stamps, *options, address)
 
 
 class Payloads(Strict):
-    """ICMP payload in bytes per protocol; the defaults are what the paper calls each protocol's window.
+    """ICMP payload in bytes per protocol; the defaults are the values that the paper calls the protocol's window.
 
     Attributes:
         tcp: In TCP repeats.
@@ -59,8 +59,8 @@ class Payloads(Strict):
 
     @schema.model_validator(mode="before")
     @classmethod
-    def _of_both(cls, data: object) -> object:
-        """Take a single number for both."""
+    def _expand_number(cls, data: object) -> object:
+        """Accept a single number for both."""
         return {"tcp": data, "udp": data} if isinstance(data, int) and not isinstance(data, bool) else data
 
 
@@ -74,7 +74,7 @@ class PingStep(AlongStep):
         interval: Time between them; below `200ms` iputils before 20210722 needs root.
         payload_bytes: ICMP payload per protocol; one number sets both.
         gap: Whether columns report the longest time without an answer, `rtt_gap_s`, and the requests lost in it,
-            `rtt_gap_lost`. If the ping began or ended in the gap, the columns have lower bounds
+            `rtt_gap_lost`. If the ping started or ended in the gap, the columns have lower bounds
             (`rtt_gap_at_least_s`).
         forwarded: Whether robots forward for each other; preflight then looks for a routing daemon on all of them.
     """
@@ -82,7 +82,7 @@ class PingStep(AlongStep):
     columns = (*ping.COLUMNS, *ping.SENT_COLUMNS, *ping.WAY_COLUMNS)
     cross_checks = ping_checks.CROSS_CHECKS
     needs_complete_capture = False
-    lasts_by = "count"
+    duration_key = "count"
 
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
@@ -99,14 +99,14 @@ class PingStep(AlongStep):
         return self
 
     @override
-    def lasting(self, seconds: float) -> Self:
+    def with_duration(self, seconds: float) -> Self:
         count = math.ceil(seconds / self.interval - _ROUNDING)
         return self.model_copy(update={"count": min(max(count, 1), MOST)})
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        sends = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(self._payload_bytes(scene.protocol)))
-        options = (*sends, "-W", str(LAST_REPLY_S))
+        requests = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(self._payload_bytes(scene.protocol)))
+        options = (*requests, "-W", str(LAST_REPLY_S))
         yield Planned(
             self.sender,
             Job(
@@ -130,7 +130,7 @@ class PingStep(AlongStep):
         if tools.ping is PingTool.IPUTILS_OLD and not tools.root and self.interval < OLD_INTERVAL_S:
             yield Refusal(
                 self.sender,
-                f"its ping lets only root send every {1e3 * self.interval:g} ms (iputils before 20210722)",
+                f"its ping allows an interval of {1e3 * self.interval:g} ms only for root (iputils before 20210722)",
                 "interval: 200ms in the procedure, or user: root in the site file",
             )
 
@@ -146,7 +146,7 @@ class PingStep(AlongStep):
         shell = testbed.shells[self.sender]
         with shell.silence(planned.job.limit_s):
             code = jobs.run(shell, planned.job)
-        if code not in {0, 1}:  # 1: some or all replies are missing, which is a measurement
+        if code not in {0, 1}:  # 1: replies are missing, which is a measurement
             raise scene.failure(planned, f"ping ended with exit code {code}")
 
     @override
@@ -163,8 +163,8 @@ class PingStep(AlongStep):
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        there_and_back = 2 * self.count * fragments(self._payload_bytes(scene.protocol))
-        yield Flow(self.sender, self.receiver, frames=there_and_back)
+        frame_count = 2 * self.count * fragments(self._payload_bytes(scene.protocol))
+        yield Flow(self.sender, self.receiver, frames=frame_count)
 
     @override
     def pinging(self) -> Pinging:
@@ -172,83 +172,89 @@ class PingStep(AlongStep):
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """Every request was sent, and ping said so."""
+        """Yield a reason if requests are missing, or the output contradicts the captures."""
         try:
-            found = view.evidence.read(ping.read, self._file)
+            result = view.evidence.read(ping.read, self._file)
         except EvidenceError:
             yield f"{self._file} is missing"
             return
-        if found.transmitted is None:
-            yield f"{self._file}: ping was cut short, its summary is missing"
-        elif found.transmitted < self.count:
-            yield f"{self._file}: ping sent {found.transmitted} of {self.count} requests"
-        asked_bytes, window = self._payload_bytes(view.scene.protocol), view.attempt_window(self.sender)
-        yield from (f"{self._file}: {why}" for why in ping_checks.within(found, self.count, asked_bytes, window))
-        if found.received is not None and found.received != len(found.answers):
-            yield f"{self._file}: ping counted {found.received} answers and printed {len(found.answers)}"
-        # iputils takes 0 for a time below it, and says "time of day goes back" in its log.
-        if 0.0 in found.rtt_s:
-            yield f"{self._file} has an answer that took no time: the clock was set back while ping waited"
+        if result.transmitted is None:
+            yield f"{self._file}: ping was stopped early, its summary is missing"
+        elif result.transmitted < self.count:
+            yield f"{self._file}: ping sent {result.transmitted} of {self.count} requests"
+        payload_bytes, window = self._payload_bytes(view.scene.protocol), view.attempt_window(self.sender)
+        yield from (f"{self._file}: {why}" for why in ping_checks.within(result, self.count, payload_bytes, window))
+        if result.received is not None and result.received != len(result.answers):
+            yield f"{self._file}: ping counted {result.received} answers and printed {len(result.answers)}"
+        # iputils reports 0 for a negative time, and "time of day goes back" in its log.
+        if 0.0 in result.rtt_s:
+            yield f"{self._file} has a round-trip time of 0: the clock was set back while ping waited"
         roles = (self.sender, self.receiver)
-        unseen = [what for role in roles if view.captured(role) for what in self._unseen(found, role, view)]
-        yield from unseen or self._contradictions(found, view)
-        # A capture that lacks this attempt's own packets does not tell whose others are.
-        if not unseen and view.captured(*roles) and (earlier := self._earlier(view)):
-            of = f"{format_count(earlier, 'packet')} came of a ping that sent none in this one"
-            yield f"packets of an earlier attempt were still on the way: {of}"
+        uncaptured = [why for role in roles if view.captured(role) for why in self._uncaptured(result, role, view)]
+        yield from uncaptured or self._contradictions(result, view)
+        # If the captures lack packets of this ping, the origin of other packets cannot be determined.
+        if not uncaptured and view.captured(*roles) and (earlier := self._earlier_packets(view)):
+            what = f"{format_count(earlier, 'packet')} of a ping that sent no request in this attempt arrived"
+            yield f"packets of an earlier attempt were still on the way: {what}"
 
-    def _contradictions(self, found: Ping, view: View) -> Iterator[str]:
-        """Yield the contradictions with the ping in each capture that has the fewest, where several run."""
-        asks, answers = (view.scene.robot(end).address for end in (self.sender, self.receiver))
+    def _contradictions(self, result: Ping, view: View) -> Iterator[str]:
+        """Yield the contradictions with each capture.
+
+        If several pings ran, the one with the fewest contradictions is assumed to be this one.
+        """
+        source, destination = (view.scene.robot(end).address for end in (self.sender, self.receiver))
         for role in (self.sender, self.receiver):
             capture = view.capture(role)
-            if capture is None or found.payload_bytes is None or (capture.packets.time_ns == NO_TIME).any():
+            if capture is None or result.payload_bytes is None or (capture.packets.time_ns == NO_TIME).any():
                 continue
-            pings = echoes.of_each_ping(capture.packets, asks, answers, found.payload_bytes)
+            candidates = echoes.of_each_ping(capture.packets, source, destination, result.payload_bytes)
             on_sender = role == self.sender
-            reasons = [list(ping_checks.beside(found, one, self.interval, role, asks=on_sender)) for one in pings]
+            reasons = [
+                list(ping_checks.beside(result, candidate, self.interval, role, asks=on_sender))
+                for candidate in candidates
+            ]
             yield from (f"{self._file}: {why}" for why in min(reasons, key=len, default=[]))
 
-    def _unseen(self, found: Ping, role: Role, view: View) -> Iterator[str]:
-        """Yield what ping printed more of than there is in a capture: answers, and requests that were answered.
+    def _uncaptured(self, result: Ping, role: Role, view: View) -> Iterator[str]:
+        """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
 
-        A ping that runs beside has another identifier, most often another size, or both: whichever of those in the
-        capture this one is, none has more than the fullest.
+        The capture may contain other pings, with other identifiers or sizes. The number of packets is compared with
+        the identifier that has the most packets, so that the check holds for any of them.
         """
         capture = view.capture(role)
         if capture is None:
             return
-        asks, answers = (view.scene.robot(end).address for end in (self.sender, self.receiver))
+        source, destination = (view.scene.robot(end).address for end in (self.sender, self.receiver))
         packets = capture.packets
-        echoes = packets.where((packets.echo != NO_ECHO) & _fits(packets, found.payload_bytes))
-        seen = (
-            (len(found.replies), "answer", _fullest(_icmp(echoes, answers, asks))),
-            (len(found.answers), "answered request", _fullest(_icmp(echoes, asks, answers))),
+        echoes = packets.where((packets.echo != NO_ECHO) & _has_payload(packets, result.payload_bytes))
+        counts = (
+            (len(result.replies), "answer", _max_count(_icmp(echoes, destination, source))),
+            (len(result.answers), "answered request", _max_count(_icmp(echoes, source, destination))),
         )
-        for printed, what, captured in seen:
+        for printed, what, captured in counts:
             if printed > captured:
-                yield f"{self._file} has {format_count(printed, what)}, and the {role}'s capture holds {captured}"
+                yield f"{self._file} has {format_count(printed, what)}, but the {role}'s capture has only {captured}"
                 return
 
-    def _earlier(self, view: View) -> int:
-        """Return how many packets arrived of pings of which no request left while this one was captured.
+    def _earlier_packets(self, view: View) -> int:
+        """Return the number of received packets of pings that sent no request during the captures.
 
-        A ping that runs beside is none, nor is a reply that its sender's capture missed at its end. Of fragments
-        that came without their first one those of requests count: captures outlive the ping that sends them.
+        Packets of another ping of this attempt do not count, since its requests were captured. Fragments without
+        their first fragment count only if they are of requests, because the captures end after the ping.
         """
-        near, far = (view.capture(role) for role in (self.sender, self.receiver))
-        if near is None or far is None:
+        sender, receiver = (view.capture(role) for role in (self.sender, self.receiver))
+        if sender is None or receiver is None:
             return 0
-        asks, answers = (view.scene.robot(role).address for role in (self.sender, self.receiver))
-        left, came = (_icmp(capture.packets, asks, answers) for capture in (near, far))
-        back = _icmp(near.packets, answers, asks)
-        asked = (came.echo != NO_ECHO) & (came.echo < ECHO_REPLY)
-        own = np.isin(came.echo, left.echo)
-        earlier = int((asked & ~own).sum())
-        earlier += int(((back.echo >= ECHO_REPLY) & ~np.isin(back.echo - ECHO_REPLY, left.echo)).sum())
-        # A router may give other ids, by which fragments are known.
-        if np.isin(came.ip_id[asked & own], left.ip_id).all():
-            earlier += int(((came.fragment_offset > 0) & ~np.isin(came.ip_id, left.ip_id)).sum())
+        source, destination = (view.scene.robot(role).address for role in (self.sender, self.receiver))
+        sent, received = (_icmp(capture.packets, source, destination) for capture in (sender, receiver))
+        returned = _icmp(sender.packets, destination, source)
+        is_request = (received.echo != NO_ECHO) & (received.echo < ECHO_REPLY)
+        was_sent = np.isin(received.echo, sent.echo)
+        earlier = int((is_request & ~was_sent).sum())
+        earlier += int(((returned.echo >= ECHO_REPLY) & ~np.isin(returned.echo - ECHO_REPLY, sent.echo)).sum())
+        # Fragments are identified by their IP ids, unless a router has changed these.
+        if np.isin(received.ip_id[is_request & was_sent], sent.ip_id).all():
+            earlier += int(((received.fragment_offset > 0) & ~np.isin(received.ip_id, sent.ip_id)).sum())
         return earlier
 
     @override
@@ -257,11 +263,11 @@ class PingStep(AlongStep):
 
     @override
     def measure(self, view: View) -> Measured:
-        found = view.evidence.read_or_none(ping.read, self._file)
-        replied_ns = [at_ns for reply in found.answers if (at_ns := reply.at_utc_ns)] if found else []
+        result = view.evidence.read_or_none(ping.read, self._file)
+        replied_ns = [at_ns for reply in result.answers if (at_ns := reply.at_utc_ns)] if result else []
         ends = self.sender, self.receiver
-        gap = ping.measure_gap(found, self.interval) if self.gap else Measured()
-        return ping.measure(found) | gap | where.measure(view.evidence, ping.WAY_COLUMNS, ends, replied_ns)
+        gap = ping.measure_gap(result, self.interval) if self.gap else Measured()
+        return ping.measure(result) | gap | where.measure(view.evidence, ping.WAY_COLUMNS, ends, replied_ns)
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
@@ -280,17 +286,17 @@ class PingStep(AlongStep):
         return (self.count - 1) * self.interval
 
 
-def _fits(packets: Packets, payload_bytes: int | None) -> Mask:
-    """Return which packets may be echoes with so much payload: whole ones, or first fragments."""
+def _has_payload(packets: Packets, payload_bytes: int | None) -> Mask:
+    """Return a mask of the packets that can be echoes with this payload: unfragmented ones and first fragments."""
     if payload_bytes is None:
         return np.ones(len(packets), dtype=np.bool_)
     size = payload_bytes + _HEADER_BYTES
-    fits: Mask = np.where(packets.more_fragments, packets.ip_payload_bytes < size, packets.ip_payload_bytes == size)
-    return fits
+    mask: Mask = np.where(packets.more_fragments, packets.ip_payload_bytes < size, packets.ip_payload_bytes == size)
+    return mask
 
 
-def _fullest(echoes: Packets) -> int:
-    """Return how many packets the identifier has that has the most."""
+def _max_count(echoes: Packets) -> int:
+    """Return the number of packets of the identifier with the most packets."""
     _, counts = np.unique(echoes.echo, return_counts=True)
     return int(counts.max(initial=0))
 

@@ -24,20 +24,20 @@ from fieldkit.steps.scene import BY_ITSELF, BY_LIMIT, Announce, Need, Planned, R
 from fieldkit.steps.variants import Recorder, Tool
 from fieldkit.steps.view import View
 
-USUAL_BAG: Final = "scan"
+DEFAULT_BAG: Final = "scan"
 
-# rosbag took 0.6 to 0.8 s longer than its duration (facts, section 1), 3.2 s on a lossy interface.
+# Measured: rosbag took 0.6 to 0.8 s longer than its duration, and 3.2 s longer on a lossy interface.
 START_AND_CLOSE_S: Final = 20.0
 
-# A recorder needs up to a second to subscribe, more on a small computer under load; beyond that, half the asked
-# time means that something broke.
+# A recorder needs up to a second to subscribe, more on a small computer under load. If a bag then spans less than
+# half of its duration, the recording has failed.
 SUBSCRIBE_S: Final = 1.0
 MIN_RECORDED_SHARE: Final = 0.5
 
 ROSBAG_RESERVE_BYTES: Final = 1 << 30
-"""ROS 1's rosbag records nothing where less is free, and says so in its log alone (ros_comm 1.15, recorder.cpp)."""
+"""Free space below which ROS 1's rosbag records nothing and reports it only in its log (ros_comm 1.15)."""
 
-# A message without its arrays, and with those that it usually has; see the ROS message definitions.
+# Approximate size of a message without its variable arrays; see the ROS message definitions.
 _MESSAGE_BYTES: Final = {
     "sensor_msgs/LaserScan": 100,
     "sensor_msgs/Imu": 340,
@@ -45,16 +45,16 @@ _MESSAGE_BYTES: Final = {
     "nav_msgs/Odometry": 720,
 }
 _OTHER_MESSAGE_BYTES: Final = 1_000
-# A range and an intensity per beam, 4 bytes each.
+# Range and intensity of a beam, 4 bytes each.
 _BEAM_BYTES: Final = 8
-# Of a topic that the profile does not describe.
+# Assumed for a topic that is not in the profile.
 _UNKNOWN_BYTES_PER_S: Final = 100_000
-# Of rosbag's format 2.0: a record header and an index entry per message; chunks and message definitions once.
+# Format 2.0 of rosbag: record header and index entry per message, and chunks and message definitions per bag.
 _RECORD_BYTES: Final = 60
 _BAG_BYTES: Final = 16_384
 
 SUBSCRIBED: Final = "log:Subscribed to topic"
-"""What `ros2 bag record` says when it begins to record; it takes seconds to start, which must not count."""
+"""Line of `ros2 bag record` when it starts to record. Its start takes seconds, which must not count."""
 
 
 class RecordStep(Step):
@@ -84,20 +84,20 @@ class RecordStep(Step):
     robot: Role
     topics: Annotated[tuple[TopicName, ...], Field(min_length=1)]
     duration: Annotated[Duration, Field(gt=0)]
-    name: StepName = USUAL_BAG
+    name: StepName = DEFAULT_BAG
     reception: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @property
     @override
     def prefix(self) -> str:
-        """The bag has the name anyway."""
-        return "" if self.name == USUAL_BAG else self.name
+        """Prefix of its job and log; empty for the default name of the bag."""
+        return "" if self.name == DEFAULT_BAG else self.name
 
     def bag(self, robot: Robot) -> str:
-        """Return the name of the file, below the attempt's folder, that the robot's recorder leaves behind.
+        """Return the path of the recorded file, relative to the attempt's folder.
 
         Raises:
-            ConfigurationError: It is a robot without ROS.
+            ConfigurationError: The profile of the robot has no `ros`.
         """
         return _ros(robot).command.writes.format(name=self.name)
 
@@ -111,30 +111,30 @@ class RecordStep(Step):
                 argv += self.topics
             else:
                 argv.append(word.format(duration_s=f"{self.duration:g}", name=self.name))
-        ends_itself = ros.command.ends == "itself"
+        has_duration = ros.command.ends == "itself"
         yield Planned(
             self.robot,
             Job(
                 folder=scene.folder,
                 name=self.own_name("record"),
                 argv=with_environment(argv, setup=ros.command.setup, environment=robot.ros_environment),
-                # A recorder without a duration is ended by SIGINT, which is how the robot enforces a job's limit.
-                limit_s=self.duration + START_AND_CLOSE_S if ends_itself else self.duration,
-                ready=None if ends_itself else SUBSCRIBED,
+                # A recorder without an option for the duration is stopped by SIGINT at the limit of the job.
+                limit_s=self.duration + START_AND_CLOSE_S if has_duration else self.duration,
+                ready=None if has_duration else SUBSCRIBED,
                 log=self._log,
             ),
             program=ros.command.record[0],
             setup=ros.command.setup,
             tool=Tool.RECORDER,
-            ends=BY_ITSELF if ends_itself else BY_LIMIT,
+            ends=BY_ITSELF if has_duration else BY_LIMIT,
             least_s=self.duration,
         )
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         profile = scene.robot(self.robot).profile
-        found, wanted = scene.tools(self.robot).recorder, variants.expected(profile).recorder
-        if found is wanted:
+        actual, expected = scene.tools(self.robot).recorder, variants.expected(profile).recorder
+        if actual is expected:
             return
         command = _ros(scene.robot(self.robot)).command
         ros = f"ros-{command.distribution}"
@@ -143,19 +143,19 @@ class RecordStep(Step):
             Recorder.SQLITE3: f"{ros}-ros2bag {ros}-rosbag2-storage-default-plugins",
             Recorder.MCAP: f"{ros}-ros2bag {ros}-rosbag2-storage-mcap",
         }
-        install = f"sudo apt-get install {packages[wanted]}, and look at record and setup in its profile"
-        if found is Recorder.NONE:
-            yield Refusal(self.robot, f"its record command cannot write {wanted}", install)
+        install = f"sudo apt-get install {packages[expected]}, and check record and setup in its profile"
+        if actual is Recorder.NONE:
+            yield Refusal(self.robot, f"its record command cannot write {expected}", install)
         else:
-            what = f"its record command writes {found}, its profile says {command.writes}"
-            yield Refusal(self.robot, what, f"--storage in record, or writes, in the profile {profile.name}")
+            what = f"its record command writes {actual}, but its profile has {command.writes}"
+            yield Refusal(self.robot, what, f"correct --storage in record, or writes, in the profile {profile.name}")
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         (planned,) = self.jobs(scene)
         announce("record", self.duration)
         code = jobs.run(testbed.shells[self.robot], planned.job)
-        # What a recorder ended by SIGINT returns differs from version to version; the bag tells whether it recorded.
+        # After SIGINT the exit code of a recorder depends on its version; `check` reads the bag instead.
         if code != 0 and _ros(scene.robot(self.robot)).command.ends == "itself":
             raise RobotError(
                 f"recording ended with exit code {code}",
@@ -165,12 +165,12 @@ class RecordStep(Step):
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """The environment that the setup files make."""
+        """Yield the checks of the ROS environment and of a shared ROS master."""
         robot = scene.robot(self.robot)
         ros = _ros(robot)
-        said = ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
-        argv = with_environment(said, setup=ros.command.setup, environment=robot.ros_environment)
-        yield Need(self.robot, "ROS", argv, lambda answer: _judged(robot, answer), explains=ros.command.record[0])
+        command = ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
+        argv = with_environment(command, setup=ros.command.setup, environment=robot.ros_environment)
+        yield Need(self.robot, "ROS", argv, lambda answer: _judge(robot, answer), explains=ros.command.record[0])
         yield from ros_master.needs(scene, self.robot, explains=ros.command.record[0])
 
     @override
@@ -201,7 +201,7 @@ class RecordStep(Step):
 
     @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
-        return sum(made.size_bytes for made in self.recorded(scene.cast) if made.role is role)
+        return sum(file.size_bytes for file in self.recorded(scene.cast) if file.role is role)
 
     @override
     def reserve_bytes(self, scene: Scene, role: Role) -> int:
@@ -214,7 +214,7 @@ class RecordStep(Step):
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """A bag that can be read, each topic in it, long enough."""
+        """Yield a reason if the bag is unreadable, lacks messages of a topic, or is too short."""
         path = self.bag(view.scene.robot(self.robot))
         name = PurePosixPath(path).name
         try:
@@ -226,7 +226,7 @@ class RecordStep(Step):
         if silent:
             yield f"{name}: no message of {', '.join(silent)}"
         if content.duration_s + SUBSCRIBE_S < MIN_RECORDED_SHARE * self.duration:
-            yield f"{name}: spans {content.duration_s:.1f} s of the {self.duration:g} s asked for"
+            yield f"{name}: spans only {content.duration_s:.1f} s of {self.duration:g} s"
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
@@ -236,14 +236,14 @@ class RecordStep(Step):
     def measure(self, view: View) -> Measured:
         if not self.reception:
             return Measured()
-        what = self._log, self.bag(view.scene.robot(self.robot)), self.topics, self.duration
-        return reception.measure(view.evidence.read_or_none(reception.read, "", *what))
+        arguments = self._log, self.bag(view.scene.robot(self.robot)), self.topics, self.duration
+        return reception.measure(view.evidence.read_or_none(reception.read, "", *arguments))
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
-        heard_s = values.get("bag_discovery_s")
+        discovery_s = values.get("bag_discovery_s")
         if "bag_discovered" in values:
-            yield f"heard after {heard_s:.2f} s" if isinstance(heard_s, float) else "heard nothing"
+            yield f"received after {discovery_s:.2f} s" if isinstance(discovery_s, float) else "received nothing"
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
@@ -251,10 +251,14 @@ class RecordStep(Step):
 
 
 def _ros(robot: Robot) -> Ros:
-    """Return the ROS side of a robot that is to record."""
+    """Return the section `ros` of the profile of a robot.
+
+    Raises:
+        ConfigurationError: The profile has no such section.
+    """
     if robot.profile.ros is None:
         raise ConfigurationError(
-            f"{robot.name} is to record, and its profile {robot.profile.name} has no ros",
+            f"{robot.name} cannot record: its profile {robot.profile.name} has no ros",
             remedy="let another robot record, or describe its ROS under ros: in the profile: "
             + locations.own_copy(robot.profile.name),
         )
@@ -262,7 +266,7 @@ def _ros(robot: Robot) -> Ros:
 
 
 def _bytes_per_s(robot: Robot, name: str) -> float:
-    """Return how fast a bag grows by a topic, at the rate and type that the profile gives."""
+    """Return the growth of a bag by a topic in bytes per second, from the topic's rate and type in the profile."""
     for topic in _ros(robot).topics:
         if topic.name == name:
             arrays = topic.payload_bytes or _BEAM_BYTES * (topic.points or 0)
@@ -271,8 +275,8 @@ def _bytes_per_s(robot: Robot, name: str) -> float:
     return _UNKNOWN_BYTES_PER_S
 
 
-def _judged(robot: Robot, answer: Said) -> tuple[Verdict, str, str]:
-    """Return what the environment that the setup files make is worth."""
+def _judge(robot: Robot, answer: Said) -> tuple[Verdict, str, str]:
+    """Return verdict, detail and remedy on the ROS environment after the setup files."""
     ros, profile = _ros(robot), robot.profile.name
     command = ros.command
     distribution, _, master = answer.text.partition(" ")
@@ -283,5 +287,5 @@ def _judged(robot: Robot, answer: Said) -> tuple[Verdict, str, str]:
         return Verdict.WARN, "ROS_MASTER_URI is not set", remedy
     if distribution and distribution != command.distribution:
         remedy = f"write distribution: {distribution} in profile {profile}"
-        return Verdict.WARN, f"{distribution}; the profile says {command.distribution}", remedy
-    return Verdict.OK, ", master ".join(answer.text.split()) or "no environment of its own", ""
+        return Verdict.WARN, f"{distribution}; the profile has {command.distribution}", remedy
+    return Verdict.OK, ", master ".join(answer.text.split()) or "no ROS environment", ""

@@ -1,4 +1,4 @@
-"""Run any program on a robot, and make columns of what it prints."""
+"""Run any program on a robot, and read columns from its output."""
 
 import shlex
 from collections.abc import Iterator, Mapping
@@ -23,26 +23,26 @@ from fieldkit.steps.base import FileName, Step
 from fieldkit.steps.scene import Announce, Planned, PutProgram, Scene
 from fieldkit.steps.view import View
 
-_OF_SHELLS: Final = frozenset({"|", "||", "&", "&&", ";", "<", ">", ">>", "2>", "2>&1", "&>"})
-"""Words that a program gets by mistake alone; who means one writes `argv`."""
+_SHELL_OPERATORS: Final = frozenset({"|", "||", "&", "&&", ";", "<", ">", ">>", "2>", "2>&1", "&>"})
+"""Words that are almost certainly mistakes in `command`; as real arguments they can be written in `argv`."""
 
 _Word = Annotated[str, Field(pattern=r"^[^\x00]*$")]
 
 
 def _is_path(text: str) -> str:
     if why := printed.problem_of_path(text):
-        raise schema.complaint(f"{text!r} is no path into JSON (JMESPath): {why}")
+        raise schema.complaint(f"{text!r} is not a valid JMESPath: {why}")
     return text
 
 
 def _is_expression(text: str) -> str:
     if why := printed.problem_of_expression(text):
-        raise schema.complaint(f"{text!r} is no regular expression (RE2) with one group: {why}")
+        raise schema.complaint(f"{text!r} is not a regular expression (RE2) with one group: {why}")
     return text
 
 
 class PrintedColumn(Strict):
-    """A column, and where its value stands in what a program prints.
+    """A column that is read from the output of a program.
 
     Attributes:
         name: Name of the column.
@@ -73,45 +73,45 @@ class PrintedColumn(Strict):
     label: Annotated[str, Field(max_length=40)] = ""
 
     @schema.model_validator(mode="after")
-    def _stands_somewhere(self) -> "PrintedColumn":
+    def _has_one_source(self) -> "PrintedColumn":
         if (self.path is None) == (self.expression is None):
-            raise schema.complaint(f"the column {self.name} stands at json: or is found by regex:, one of them")
+            raise schema.complaint(f"the column {self.name} needs either json: or regex:")
         return self
 
     @property
     def column(self) -> Column:
         """The column as it is declared."""
-        how = f"at {self.path} of the JSON" if self.path else "by a regular expression in the text"
-        column = Column(self.name, self.unit, self.meaning or f"Found {how} that a program printed.")
+        source = f"at {self.path} in the JSON output" if self.path else "by a regular expression in the output"
+        column = Column(self.name, self.unit, self.meaning or f"Found {source} of a program.")
         kind = {bool: Kind.FLAG, str: Kind.WORDS}.get(column.type, Kind.MEDIAN)
         return replace(column, figure=Figure(self.label or self.name, kind))
 
     def value(self, view: View, file: str) -> Value:
-        """Return its value in what was printed.
+        """Return its value in an output file.
 
         Raises:
-            EvidenceError: There is none.
+            EvidenceError: The file has no valid value.
         """
         if self.path is not None:
-            found = view.evidence.read(printed.at_path, file, self.path)
+            content = view.evidence.read(printed.at_path, file, self.path)
         else:
-            found = view.evidence.read(printed.by_expression, file, self.expression or "")
-        return printed.value(self.column, found)
+            content = view.evidence.read(printed.by_expression, file, self.expression or "")
+        return printed.value(self.column, content)
 
 
 class Bounds(Strict):
-    """What a value must be for a repeat to be valid.
+    """Bounds of a value, outside of which the repeat is void.
 
     Attributes:
-        min: No less.
-        max: No more.
+        min: Minimum.
+        max: Maximum.
     """
 
     min: Number | Int | None = None
     max: Number | Int | None = None
 
     def problem(self, value: Value) -> str | None:
-        """Return why a value is not within, None where it is."""
+        """Return why a value is out of bounds; None if it is within."""
         if isinstance(value, str):
             return None
         if self.min is not None and value < self.min:
@@ -120,7 +120,7 @@ class Bounds(Strict):
 
 
 class Expected(Strict):
-    """What a program must do for a repeat to be valid.
+    """Conditions on exit code and values, without which the repeat is void.
 
     Attributes:
         code: Permitted exit codes, 0 to 125.
@@ -136,7 +136,7 @@ class RunStep(Step):
 
     The program is found in the PATH of a session without a terminal, or by its absolute path; it runs in the folder
     of the attempt. No shell is involved: for one, write `sh -c '...'`. At most 1 MiB each of output and of errors is
-    kept; a program that prints more is ended. Leaves `run.txt` and `ROLE-run.log`.
+    kept; a program that prints more is stopped. Leaves `run.txt` and `ROLE-run.log`.
 
     Variables in `command` and `argv`: `{address.ROLE}` is the address of a robot on the radio, `{distance}` the
     distance as typed (`30ft`), `{repeat}` the number of the repeat of its protocol, from 1, and `{put}` the path of
@@ -152,7 +152,7 @@ class RunStep(Step):
             to the folder of the procedure, else of the lab; links must not lead out of them. `{put}` is its path on
             the robot. In `trial.yaml` it is a mapping with the keys below; in a procedure it is a path.
         takes: Approximate duration, for the estimate of the time left.
-        limit: A program that runs longer is ended, and the repeat is void.
+        limit: A program that runs longer is stopped, and the repeat is void.
         output: File for its standard output.
         prints: Approximate size of the output, for the estimate of disk space.
         figures: Columns of the repeat, read from the output.
@@ -168,21 +168,25 @@ class RunStep(Step):
     output: FileName = "run.txt"
     prints: Bytes = 10_000.0
     figures: tuple[PrintedColumn, ...] = Field(default=(), alias="columns")
-    expect: Expected = Field(default_factory=Expected)  # made, it would be built for whoever names no such step
+    expect: Expected = Field(default_factory=Expected)  # a default object would be built at every import
 
     @schema.model_validator(mode="after")
     def _can_be_run(self) -> "RunStep":
         if bool(self.command.strip()) == bool(self.argv):
-            raise schema.complaint("a program is named by command: or by argv:, one of them")
+            raise schema.complaint("the step needs either command: or argv:")
         try:
             words = self.words
         except ValueError as error:
             raise schema.complaint(f"{self.command!r} cannot be split into words: {error}", "command") from None
         self._check_roles()
-        if alien := next((word for word in shlex.split(self.command) if word in _OF_SHELLS), None):
-            raise schema.complaint(f"no shell sees this command, and {alien} is a shell's: sh -c '...'", "command")
+        if operator := next((word for word in shlex.split(self.command) if word in _SHELL_OPERATORS), None):
+            raise schema.complaint(
+                f"{operator} is a shell operator, but no shell runs this command; write sh -c '...'", "command"
+            )
         if not words[0]:
-            raise schema.complaint("the first word, the program, is empty", "argv" if self.argv else "command")
+            raise schema.complaint(
+                "the program, which is the first word, is empty", "argv" if self.argv else "command"
+            )
         self._check_variables()
         return self
 
@@ -191,38 +195,38 @@ class RunStep(Step):
             if why := arguments.problem(word, has_program=self.put is not None):
                 raise schema.complaint(why, *(("argv", index) if self.argv else ("command",)))
         program = self.words[0]
-        if arguments.varies(program):
-            what = f"the program cannot depend on a variable, and {program} does; write it as an argument"
-            raise schema.complaint(what, "argv" if self.argv else "command")
+        if arguments.depends_on_repeat(program):
+            why = f"the name of the program must not depend on a variable, but {program} does; use an argument"
+            raise schema.complaint(why, "argv" if self.argv else "command")
         if self.put is None:
             return
         if not any(arguments.PUT in arguments.names(word) for word in self.words):
-            what = f"nothing runs {self.put.name}: write {{put}} in the command where its path is to be"
-            raise schema.complaint(what, "put")
+            why = f"the command does not run {self.put.name}: write {{put}} in the command for its path"
+            raise schema.complaint(why, "put")
         if program == f"{{{arguments.PUT}}}" and not self.put.executable:
-            what = f"{self.put.file} is not executable: chmod +x it, or name its interpreter: python3 {{put}}"
-            raise schema.complaint(what, "put")
+            why = f"{self.put.file} is not executable: chmod +x it, or name its interpreter: python3 {{put}}"
+            raise schema.complaint(why, "put")
 
     def _check_roles(self) -> None:
         try:
             self.roles()
         except ValueError as error:
-            raise schema.complaint(f"an address is that of a role, {{address.receiver}}: {error}") from None
+            raise schema.complaint(f"an address needs a valid role, as in {{address.receiver}}: {error}") from None
 
     @schema.model_validator(mode="after")
-    def _has_columns(self) -> "RunStep":
+    def _has_valid_columns(self) -> "RunStep":
         names = [column.name for column in self.figures]
-        for at, name in enumerate(names):
-            if name in names[:at]:
-                raise schema.complaint(f"a column {name} is there already", "columns", at, "name")
+        for index, name in enumerate(names):
+            if name in names[:index]:
+                raise schema.complaint(f"there is already a column {name}", "columns", index, "name")
         for name in self.expect.values:
             if name not in names:
-                raise schema.complaint(f"there is no column {name} to expect something of", "expect", "values", name)
+                raise schema.complaint(f"there is no column {name}", "expect", "values", name)
         return self
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The command as words, variables not filled in."""
+        """The words of the command, with variables."""
         return self.argv or tuple(shlex.split(self.command))
 
     @override
@@ -231,14 +235,14 @@ class RunStep(Step):
         def address(role: str) -> str:
             return scene.robot(Role(role)).address
 
-        put, values = self._copied, dict[str, str]()
+        put, values = self._copied_program, dict[str, str]()
         if put is not None:
             values[arguments.PUT] = put.at
         if scene.placement is not None:
             values["distance"] = scene.placement.distance.label
         if scene.repeat is not None:
             values["repeat"] = str(scene.repeat)
-        argv = [arguments.filled(word, values, address) for word in self.words]
+        argv = [arguments.fill_in(word, values, address) for word in self.words]
         job = Job(
             folder=scene.folder,
             name=self.own_name("run"),
@@ -249,12 +253,12 @@ class RunStep(Step):
             output_limit_bytes=printed.MOST_BYTES,
         )
         remedy = f"install {argv[0]}, or correct the command of this run in the procedure"
-        # Preflight looks for the program; one that is copied is not there yet.
+        # Preflight searches for the program; a copied program does not exist on the robot yet.
         program = "sh" if self.words[0] == f"{{{arguments.PUT}}}" else argv[0]
         yield Planned(self.robot, job, program=program, remedy=remedy, put=put)
 
     @property
-    def _copied(self) -> PutProgram | None:
+    def _copied_program(self) -> PutProgram | None:
         if self.put is None:
             return None
         return PutProgram(self.robot, self.put, programs.path(self.own_name("run"), self.put.name))
@@ -262,13 +266,13 @@ class RunStep(Step):
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         (planned,) = self.jobs(scene)
-        announce(self._called, self.takes)
+        announce(self._program_name, self.takes)
         shell = testbed.shells[self.robot]
         with shell.silence(self.limit):
             code = jobs.run(shell, planned.job)
         if code not in self.expect.code:
             raise RobotError(
-                f"{self._called} ended with exit code {code}",
+                f"{self._program_name} ended with exit code {code}",
                 where=scene.robot(self.robot).name,
                 remedy=f"see {self._log} and {self._output} of this repeat",
             )
@@ -279,7 +283,7 @@ class RunStep(Step):
             ("*",),
             "the step's output file",
             (),
-            "fieldkit does not know the program; `expect:` bounds its values",
+            "fieldkit cannot check the program; `expect:` bounds its values",
             CheckOutcome.UNCHECKED,
         ),
     )
@@ -302,8 +306,8 @@ class RunStep(Step):
         return self.prints if role == self.robot else 0.0
 
     @property
-    def _called(self) -> str:
-        """What the program is called in messages."""
+    def _program_name(self) -> str:
+        """Name of the program in messages."""
         return self.put.name if self.put and self.words[0] == f"{{{arguments.PUT}}}" else self.words[0]
 
     @property
@@ -316,27 +320,27 @@ class RunStep(Step):
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        """What the procedure says."""
+        """Return the columns that the procedure declares."""
         return tuple(column.column for column in self.figures)
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """The program ended as it is to, and printed what is to be read, within bounds."""
+        """Yield a reason for a wrong exit code, unreadable output, and each missing value or value out of bounds."""
         after = view.evidence.read_or_none(host.state, host.after(self.robot))
         ending = (after.endings or {}).get(self.own_name("run")) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.expect.code:
-            yield f"{view.scene.robot(self.robot).name}: {self._called} ended with exit code {ending.code}"
+            yield f"{view.scene.robot(self.robot).name}: {self._program_name} ended with exit code {ending.code}"
         try:
             view.evidence.read(printed.text, self._output)
         except EvidenceError as error:
             yield f"{self._output}: {error.what}"
             return
-        found = self.measure(view)
+        measured = self.measure(view)
         for column in self.figures:
-            if column.name in found.missing and not column.optional:
-                yield f"{self._output}: no {column.name}: {found.missing[column.name]}"
-            elif column.name in found.values and (bounds := self.expect.values.get(column.name)):
-                value = found.values[column.name]
+            if column.name in measured.missing and not column.optional:
+                yield f"{self._output}: no {column.name}: {measured.missing[column.name]}"
+            elif column.name in measured.values and (bounds := self.expect.values.get(column.name)):
+                value = measured.values[column.name]
                 if why := bounds.problem(value):
                     yield f"{self._output}: {column.name} is {value}, {why}"
 

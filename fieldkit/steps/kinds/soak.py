@@ -1,4 +1,4 @@
-"""Load the radio while other steps run; of the load itself only its stalls are measured."""
+"""Load the radio while other steps run, and measure only the stalls of the load."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -23,15 +23,15 @@ from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, Listeni
 from fieldkit.steps.view import View
 
 LIMIT_S: Final = 900.0
-"""For how long the load may outlast the limits of the steps inside."""
+"""Time limit of the load beyond the limits of the steps inside."""
 
 _FOREVER_S: Final = 86_400
-"""The longest that iperf3 takes."""
+"""Maximum duration that iperf3 accepts."""
 
 _STALLS: Final = stalls.declared("soak", "the load", 69)
 
-# Says "flows" when 10 kB more have left by interface $1, and is the command after it. iperf3 itself says nothing of
-# its packets before a second is over, and old versions nothing at all while their output is a file.
+# Prints "flows" when 10 kB have been sent by interface $1, and executes the command after it. iperf3 itself reports
+# its packets only after a second, and old versions do not report at all while their output is a file.
 _FLOWS: Final = (
     'sent() { awk -v i="$1" \'{ sub(":", " ") } $1 == i { print $10 }\' /proc/net/dev; }; '
     '(from=$(sent "$1"); until [ "$(sent "$1")" -gt $((from + 10000)) ]; do sleep 0.1; done; echo flows >&2) & '
@@ -62,7 +62,7 @@ class SoakStep(LoadOptions, Nest):
         yield from self.inside(scene)
 
     def _load(self, scene: Scene) -> tuple[Planned, Planned]:
-        """Return server and client."""
+        """Return the jobs of server and client."""
         limit_s = LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
         interface = scene.robot(self.sender).profile.radio.interface
         client = self.client(scene, "-t", str(_FOREVER_S))
@@ -75,7 +75,7 @@ class SoakStep(LoadOptions, Nest):
                 role,
                 Job(scene.folder, self.own_name("soak"), argv, limit_s=limit_s, log=self._log(role), ready=ready),
                 program=PROGRAM,
-                # The server leaves when its client does.
+                # The server exits after its client.
                 ends=BY_FIELDKIT | (BY_ITSELF if role == self.receiver else frozenset()),
             )
             for role, (argv, ready) in ends.items()
@@ -92,7 +92,7 @@ class SoakStep(LoadOptions, Nest):
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
         except FieldkitError:
-            # What failed first is the reason; what never started cannot be stopped.
+            # The reason is the first error; a job that was never started cannot be stopped.
             for planned in (client, server):
                 with suppress(FieldkitError):
                     jobs.stop(testbed.shells[planned.role], planned.job)
@@ -113,7 +113,7 @@ class SoakStep(LoadOptions, Nest):
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        """A trial without a load has no columns for it."""
+        """Return the columns of stalls, and of the recoveries from faults inside."""
         return (*_STALLS, *across.declared(self))
 
     @override
@@ -122,14 +122,14 @@ class SoakStep(LoadOptions, Nest):
 
     @property
     def destination(self) -> Role:
-        """See `SendsFlow.destination`."""
+        """Role of the receiving robot."""
         return self.receiver
 
     def deliveries(self, view: View) -> Sequence[Delivery]:
-        """See `SendsFlow.deliveries`."""
-        left, came = (view.capture(role) for role in (self.sender, self.receiver))
+        """Return the deliveries of each stream; see `SendsFlow.deliveries`."""
+        sent, received = (view.capture(role) for role in (self.sender, self.receiver))
         load = self.data_streams(view.scene)
-        return load_streams.read(load, left.packets if left else None, came.packets if came else None)
+        return load_streams.read(load, sent.packets if sent else None, received.packets if received else None)
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:

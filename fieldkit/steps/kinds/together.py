@@ -20,8 +20,8 @@ from fieldkit.steps.scene import Announce, Planned, Scene
 
 T = TypeVar("T")
 
-MOST: Final = 8
-"""OpenSSH lets one connection have 10 commands at a time (MaxSessions); two are kept for those to come."""
+MAX_PARALLEL: Final = 8
+"""OpenSSH permits 10 simultaneous commands per connection (MaxSessions); two are reserved."""
 
 
 class TogetherStep(Nest):
@@ -41,11 +41,12 @@ class TogetherStep(Nest):
     during: Annotated[tuple[StepEntry, ...], Field(min_length=2)]
 
     @schema.model_validator(mode="after")
-    def _has_room(self) -> "TogetherStep":
-        if (most := _at_once(self)) > MOST:
-            raise schema.complaint(f"{most} steps at the same time are more than {MOST}: leave some out", "during")
-        for kind, at in _asking(self):
-            raise schema.complaint(f"{kind} may ask the operator: no other step runs beside it", *at)
+    def _can_run_in_parallel(self) -> "TogetherStep":
+        if (count := _max_parallel(self)) > MAX_PARALLEL:
+            why = f"{count} steps at the same time are more than {MAX_PARALLEL}: leave some out"
+            raise schema.complaint(why, "during")
+        for kind, location in _operator_steps(self):
+            raise schema.complaint(f"{kind} may prompt the operator, so no step may run at the same time", *location)
         return self
 
     @override
@@ -73,20 +74,20 @@ class TogetherStep(Nest):
         self.prepare(scene, testbed)(announce)
 
     def _each(self, calls: list[Callable[[], T]], scene: Scene, testbed: Testbed) -> list[T]:
-        """Make all calls at the same time; where one fails, end what the others wait for."""
+        """Make all calls at the same time; if one fails, stop the jobs for which the others wait."""
 
         def end() -> None:
             scene.halt.call()
-            with suppress(FieldkitError):  # what failed first is what is told
+            with suppress(FieldkitError):  # the first error is reported
                 self.end_inside(scene, testbed)
 
         try:
             return together(lambda call: call(), calls, end_others=end)
         except Exception:
-            end()  # also what a step brought up that did not fail
+            end()  # also stops jobs of steps that did not fail
             raise
         except BaseException:
-            scene.halt.call()  # whoever catches Ctrl-C ends the jobs
+            scene.halt.call()  # the handler of Ctrl-C stops the jobs
             raise
 
     @override
@@ -98,19 +99,19 @@ class TogetherStep(Nest):
         return max(entry.step.expected_s(protocol) for entry in self.during)
 
 
-def _asking(nest: Nest) -> Iterator[tuple[str, schema.Location]]:
-    """Yield the kind of each step inside for which a person is asked, and where it stands."""
+def _operator_steps(nest: Nest) -> Iterator[tuple[str, schema.Location]]:
+    """Yield kind and location of each step inside, at any depth, that may prompt the operator."""
     for index, entry in enumerate(nest.during):
-        at = ("during", index, entry.kind)
+        location = ("during", index, entry.kind)
         if entry.step.asks():
-            yield entry.kind, at
+            yield entry.kind, location
         if isinstance(entry.step, Nest):
-            yield from ((kind, (*at, *inside)) for kind, inside in _asking(entry.step))
+            yield from ((kind, (*location, *inside)) for kind, inside in _operator_steps(entry.step))
 
 
-def _at_once(step: Step) -> int:
-    """Return how many steps run at the same time at most."""
+def _max_parallel(step: Step) -> int:
+    """Return the maximum number of steps that run at the same time."""
     if not isinstance(step, Nest) or not step.during:
         return 1
-    inside = [_at_once(entry.step) for entry in step.during]
-    return sum(inside) if step.parallel else max(inside)
+    counts = [_max_parallel(entry.step) for entry in step.during]
+    return sum(counts) if step.parallel else max(counts)

@@ -1,4 +1,4 @@
-"""Stream samples of a topic from one robot to another over a middleware, and measure what arrives, and when."""
+"""Stream samples of a topic from one robot to another over a middleware; measure loss, delay and discovery."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -41,23 +41,23 @@ if TYPE_CHECKING:
 
 
 MASTER: Final = "rosmaster"
-"""ROS's own."""
+"""Program of the ROS master."""
 
 KEPT_BYTES: Final = 256
-"""A capture must show the head of each sample: it ends 138 bytes behind an Ethernet header over DDS, 154 if DDS names
-the reader, and at about 190 over Zenoh, whose attachment and key expression come first."""
+"""Bytes of a frame that contain the head of each sample. After an Ethernet header it ends at byte 138 for DDS, at 154
+if DDS names the reader, and at about 190 for Zenoh, after attachment and key expression."""
 
 BUFFER_KIB: Final = 32_768
-"""Kernel buffer of a capture around a topic. In immediate mode a frame takes about 400 bytes of it with `KEPT_BYTES`
-kept, so 4 MiB hold 10,000 packets. Fast DDS sent 60,000 per second where it asked again for lost fragments."""
+"""Kernel buffer of a capture around a topic. In immediate mode a frame needs about 400 bytes of it with `KEPT_BYTES`,
+so 4 MiB hold 10,000 packets. Fast DDS sent 60,000 packets per second when it requested lost fragments again."""
 
 _GRACE_S: Final = 5
-_ENDS_S: Final = 10.0
-"""Starting Python and the middleware, and what the publisher waits at its end."""
+_OVERHEAD_S: Final = 10.0
+"""Time for the start of Python and the middleware, and for the publisher's wait at its end."""
 _RECORD_BYTES: Final = 32
-"""What an end writes down of a sample."""
+"""Size of a sample's record in a log."""
 _ENVELOPE_BYTES: Final = 100
-"""About what a middleware and IP add to a sample."""
+"""Approximate size of the headers of middleware and IP per sample."""
 
 
 class TopicsStep(StreamOptions, AlongStep):
@@ -75,62 +75,63 @@ class TopicsStep(StreamOptions, AlongStep):
     flow_kind: ClassVar[str] = "topic"
 
     @override
-    def lasting(self, seconds: float) -> Self:
+    def with_duration(self, seconds: float) -> Self:
         return self.model_copy(update={"duration": min(seconds, LONGEST_S)})
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        if self.serves:
-            yield self._serve(scene, self.serves)
-        yield self._end(scene, self.receiver, "subscribe")
-        yield self._end(scene, self.sender, "publish")
+        if self.server_role:
+            yield self._server(scene, self.server_role)
+        yield self._endpoint(scene, self.receiver, "subscribe")
+        yield self._endpoint(scene, self.sender, "publish")
 
-    def _end(self, scene: Scene, role: Role, verb: str) -> Planned:
+    def _endpoint(self, scene: Scene, role: Role, verb: str) -> Planned:
+        """Return the job of the agent that publishes or subscribes."""
         robot = scene.robot(role)
         publishes = role == self.sender
-        lasts_s = self.patience + self.duration + _ENDS_S
+        duration_s = self.patience + self.duration + _OVERHEAD_S
         job = Job(
             folder=scene.folder,
             name=self.own_name(verb),
             argv=streams.agent_command(
-                robot, verb, self.told(scene, role), self._file(role), environment=self.environment(robot)
+                robot, verb, self.agent_arguments(scene, role), self._file(role), environment=self.environment(robot)
             ),
-            # A subscriber never ends before its publisher.
-            limit_s=lasts_s if publishes else 2 * lasts_s,
+            # The limit of the subscriber must be longer than that of the publisher.
+            limit_s=duration_s if publishes else 2 * duration_s,
             log=self._log(role),
             ready=None if publishes else "log:up,",
         )
         setup, program = streams.setup(robot), robot.profile.tools.python
         return Planned(role, job, program=program, setup=setup, ends=BY_ITSELF if publishes else BY_FIELDKIT)
 
-    def _serve(self, scene: Scene, role: Role) -> Planned:
-        """Return what routes for others, or is ROS's master."""
+    def _server(self, scene: Scene, role: Role) -> Planned:
+        """Return the job of the router or of the ROS master."""
         robot = scene.robot(role)
-        routes = self.way is Discovery.ROUTER
+        is_router = self.discovery_method is Discovery.ROUTER
         setup = streams.setup(robot)
-        if routes:
-            told = streams.compact({"network": self.network(scene, role)})
-            argv, program = streams.agent_command(robot, "route", told), robot.profile.tools.python
+        if is_router:
+            arguments = streams.compact({"network": self.network(scene, role)})
+            argv, program = streams.agent_command(robot, "route", arguments), robot.profile.tools.python
         else:
-            # A master listens where its node is said to be, which setup files often say is the robot itself alone.
-            where = {"ROS_IP": robot.address, "ROS_HOSTNAME": robot.address}
-            command = (MASTER, "--core", "-p", str(self.served_on))
-            argv, program = with_environment(command, setup=setup, environment=where), MASTER
+            # A master listens on the address of its node, which setup files often set to the loopback address.
+            addresses = {"ROS_IP": robot.address, "ROS_HOSTNAME": robot.address}
+            command = (MASTER, "--core", "-p", str(self.listening_port))
+            argv, program = with_environment(command, setup=setup, environment=addresses), MASTER
         job = Job(
             folder=scene.folder,
             name=self.own_name("serve"),
             argv=argv,
-            limit_s=3 * (self.patience + self.duration + _ENDS_S),
+            limit_s=3 * (self.patience + self.duration + _OVERHEAD_S),
             log=self.own_name(f"{role}-serve.log"),
-            ready="log:up," if routes else jobs.bound(Protocol.TCP, self.served_on),
+            ready="log:up," if is_router else jobs.bound(Protocol.TCP, self.listening_port),
         )
         return Planned(role, job, program=program, setup=setup, ends=BY_FIELDKIT)
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        """The agent is there, and all but the publisher is up."""
-        members = in_order(self.members)
-        together(lambda role: agent.install(testbed.shells[role]), members)
+        """Install the agent and start all jobs except the publisher; return the function that publishes."""
+        roles = in_order(self.participants)
+        together(lambda role: agent.install(testbed.shells[role]), roles)
         *before, publish = self.jobs(scene)
         for planned in before:
             jobs.start(testbed.shells[planned.role], planned.job)
@@ -145,20 +146,20 @@ class TopicsStep(StreamOptions, AlongStep):
     ) -> None:
         announce("topics", self.expected_s(scene.protocol))
         with ExitStack() as silent:
-            for role in self.members:
+            for role in self.participants:
                 silent.enter_context(testbed.shells[role].silence(publish.job.limit_s))
             code = jobs.run(testbed.shells[publish.role], publish.job)
         stopped = [
             (planned, jobs.stop(testbed.shells[planned.role], planned.job, grace_s=_GRACE_S))
             for planned in reversed(before)
         ]
-        for planned, left in ((publish, code), *stopped):
-            if left != 0:
-                raise scene.failure(planned, f"{planned.job.name} ended with exit code {left}")
+        for planned, exit_code in ((publish, code), *stopped):
+            if exit_code != 0:
+                raise scene.failure(planned, f"{planned.job.name} ended with exit code {exit_code}")
 
     @override
     def roles(self) -> frozenset[Role]:
-        return self.members
+        return self.participants
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
@@ -166,22 +167,22 @@ class TopicsStep(StreamOptions, AlongStep):
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """Each domain has ports of its own."""
-        if not self.served_on:  # of DDS, whose participants take the next ports that are free
-            return (ListeningPort(self.receiver, min(self.wire.data), self.sender, by="domain", shared=True),)
+        """Return the ports of the domain, which no other domain uses."""
+        if not self.listening_port:  # DDS, whose participants use the next free ports
+            return (ListeningPort(self.receiver, min(self.wire_ports.data), self.sender, by="domain", shared=True),)
         listeners = {(self.receiver, self.sender), (self.sender, self.receiver)}
-        if self.serves:
-            # Clients of a router have none of their own.
+        if self.server_role:
+            # Clients of a router do not listen.
             listeners = listeners if self.over is Over.ROS1 else set()
-            listeners |= {(self.serves, self.sender if self.serves != self.sender else self.receiver)}
-        found = (ListeningPort(role, self.served_on, peer, by="domain") for role, peer in listeners)
-        return tuple(sorted(found, key=lambda one: (one.role, one.peer)))
+            listeners |= {(self.server_role, self.sender if self.server_role != self.sender else self.receiver)}
+        ports = (ListeningPort(role, self.listening_port, peer, by="domain") for role, peer in listeners)
+        return tuple(sorted(ports, key=lambda port: (port.role, port.peer)))
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """The middleware's Python package."""
-        # A master needs none of it.
-        for role in in_order(self.members - ({self.serves} if self.way is Discovery.MASTER else set())):
+        """Yield the check of the middleware's Python package for each robot that needs it; a ROS master does not."""
+        masters = {self.server_role} if self.discovery_method is Discovery.MASTER else set()
+        for role in in_order(self.participants - masters):
             yield self.need(role, scene.robot(role))
 
     @override
@@ -191,7 +192,7 @@ class TopicsStep(StreamOptions, AlongStep):
     @override
     def files(self) -> tuple[str, ...]:
         ends = [name for role in (self.receiver, self.sender) for name in (self._file(role), self._log(role))]
-        return (*ends, *([self.own_name(f"{self.serves}-serve.log")] if self.serves else []))
+        return (*ends, *([self.own_name(f"{self.server_role}-serve.log")] if self.server_role else []))
 
     def _file(self, role: Role) -> str:
         return self.own_name(f"{role}-topic.bin")
@@ -203,11 +204,12 @@ class TopicsStep(StreamOptions, AlongStep):
     def flows(self, scene: Scene) -> Iterator[Flow]:
         frames = 2 * self._samples * fragments(round(self.bytes) + _ENVELOPE_BYTES)
         ends = (self.sender, self.receiver)
-        pairs = [ends, *((end, self.serves) for end in ends if self.serves and end != self.serves)]
+        server = self.server_role
+        pairs = [ends, *((end, server) for end in ends if server and end != server)]
         for source, destination in dict.fromkeys(pairs):
-            for port in sorted(self.wire.data | self.wire.discovery):
-                yield Flow(source, destination, port, frames, group=self.wire.group)
-                frames = 0.0  # all of them have been counted
+            for port in sorted(self.wire_ports.data | self.wire_ports.discovery):
+                yield Flow(source, destination, port, frames, group=self.wire_ports.group)
+                frames = 0.0  # all frames are counted with the first flow
 
     @property
     def _samples(self) -> float:
@@ -219,18 +221,18 @@ class TopicsStep(StreamOptions, AlongStep):
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        """A trial without topics has no columns for them."""
-        from fieldkit.measure.transfers import topic_stalls, topics  # noqa: PLC0415 (only where there are any)
+        """Return the columns of topics, which only trials with this step have."""
+        from fieldkit.measure.transfers import topic_stalls, topics  # noqa: PLC0415 (needed only by this step)
 
         return (*topics.COLUMNS, *topic_stalls.COLUMNS)
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """Both logs are whole, and agree with each other, the attempt and the captures."""
+        """Yield a reason if a log is incomplete, or contradicts the other log, the attempt or the captures."""
         from fieldkit.steps import topic_evidence  # noqa: PLC0415 (as above)
 
-        logs, wrong = topic_evidence.read(self, view, self._logs)
-        yield from wrong
+        logs, errors = topic_evidence.read(self, view, self._logs)
+        yield from errors
         yield from topic_evidence.problems(self, view, logs)
 
     @property
@@ -244,22 +246,22 @@ class TopicsStep(StreamOptions, AlongStep):
 
         logs, _ = topic_evidence.read(self, view, self._logs)
         ends = logs.get(self.sender), logs.get(self.receiver)
-        flow, captured = self._traffic(view), self._captured(view)
-        stalled = topic_stalls.measure(flow, ends, captured, self._expected)
-        measured = topics.measure(flow, *ends, *captured) | stalled
+        flow, packets = self._traffic(view), self._packets(view)
+        stall_values = topic_stalls.measure(flow, ends, packets, self._schedule)
+        measured = topics.measure(flow, *ends, *packets) | stall_values
         measured = measured.without(topics.without_captures(measured, topic_evidence.dropped(self, view)))
         measured = topic_evidence.checked(self, view, logs, measured)
         return measured | topics.withheld_mark(topic_evidence.dropped(self, view))
 
     def deliveries(self, view: View) -> "Sequence[Delivery]":
-        """See `SendsFlow.deliveries`."""
+        """Return the deliveries of the stream; see `SendsFlow.deliveries`."""
         from fieldkit.measure.transfers import topic_stalls  # noqa: PLC0415 (as above)
 
-        return topic_stalls.read(self._traffic(view), self._both_logs(view), self._captured(view), self._expected)
+        return topic_stalls.read(self._traffic(view), self._both_logs(view), self._packets(view), self._schedule)
 
     @property
     def destination(self) -> Role:
-        """See `SendsFlow.destination`."""
+        """Role of the subscriber."""
         return self.receiver
 
     def _traffic(self, view: View) -> "TopicTraffic":
@@ -268,24 +270,25 @@ class TopicsStep(StreamOptions, AlongStep):
         return topics.TopicTraffic(
             sender_address=view.scene.robot(self.sender).address,
             receiver_address=view.scene.robot(self.receiver).address,
-            data_ports=self.wire.data,
-            discovery_ports=self.wire.discovery,
+            data_ports=self.wire_ports.data,
+            discovery_ports=self.wire_ports.discovery,
             deadline_s=self.qos.deadline,
         )
 
     def _both_logs(self, view: View) -> "tuple[TopicLog | None, TopicLog | None]":
-        """Return the whole logs of publisher and subscriber."""
+        """Return the complete logs of publisher and subscriber."""
         from fieldkit.steps import topic_evidence  # noqa: PLC0415 (as above)
 
         logs, _ = topic_evidence.read(self, view, self._logs)
         return logs.get(self.sender), logs.get(self.receiver)
 
-    def _captured(self, view: View) -> "tuple[Packets | None, Packets | None]":
-        left, arrived = (view.capture(role) for role in (self.sender, self.receiver))
-        return left.packets if left else None, arrived.packets if arrived else None
+    def _packets(self, view: View) -> "tuple[Packets | None, Packets | None]":
+        """Return the packets in the captures of sender and receiver."""
+        sent, received = (view.capture(role) for role in (self.sender, self.receiver))
+        return sent.packets if sent else None, received.packets if received else None
 
     @property
-    def _expected(self) -> "FlowSchedule":
+    def _schedule(self) -> "FlowSchedule":
         from fieldkit.measure.transfers.deliveries import FlowSchedule  # noqa: PLC0415 (as above)
 
         # The last sample is sent one interval before the end.

@@ -1,4 +1,4 @@
-"""Record where robots really are while other steps run: odometry, satellites, or a tracker."""
+"""Record the positions of robots while other steps run: odometry, satellite receivers, or a tracking system."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,10 +27,12 @@ from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, 
 from fieldkit.steps.view import View
 
 _PERIODS: Final = 1.5
+"""Recording time after the last step, in periods of the topic."""
 ODOMETRY: Final = "nav_msgs/Odometry"
 
-# Says "recording" when the bag $1 is open and topics have had $2 s to come, and is the command after it: rosbag says
-# so itself only when its output is full. Who waits is no child of that command, which may wait for its own.
+# Prints "recording" $2 s after the bag $1 has been opened, and executes the command after it; rosbag itself prints
+# its messages only when its output buffer is full. The waiting subshell is not a child of the command, because the
+# command may wait for all its children.
 _RECORDS: Final = (
     '( (until [ -e "$1" ] || [ -e "$1.active" ]; do sleep 0.1; done; sleep "$2"; echo recording >&2) & ); '
     'shift 2; exec "$@"'
@@ -38,7 +40,7 @@ _RECORDS: Final = (
 
 
 class Spot(Strict):
-    """A place in which a robot stands: degrees and metres on the earth, or metres in the frame of a tracker.
+    """A fixed position of a robot: degrees and metres on the earth, or metres in the frame of a tracker.
 
     Attributes:
         lat: Degrees north, together with robots that publish `NavSatFix`.
@@ -62,14 +64,14 @@ class Spot(Strict):
     def _is_one_place(self) -> "Spot":
         on_earth, in_frame = (self.lat, self.lon), (self.frame, self.x, self.y)
         if None in (in_frame if self.frame is not None else on_earth) or {*on_earth, *in_frame} - {None} == set():
-            raise schema.complaint("a place has lat and lon, or frame, x and y")
+            raise schema.complaint("a position needs lat and lon, or frame, x and y")
         if self.frame is not None and (*on_earth, self.alt) != (None, None, None):
-            raise schema.complaint("a place has lat and lon, or frame, x and y; not both")
+            raise schema.complaint("a position has lat and lon, or frame, x and y, not both")
         return self
 
     @property
     def account(self) -> Account:
-        """What says that a robot stands there."""
+        """The position as a source of positions."""
         if self.frame is not None:
             return Account(place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}")
         up_m = None if self.alt is None else float(self.alt)
@@ -77,7 +79,7 @@ class Spot(Strict):
 
 
 class TrackedRobot(Strict):
-    """What tells where one robot is.
+    """Source of the position of one robot.
 
     Attributes:
         topic: `nav_msgs/Odometry`, `sensor_msgs/NavSatFix`, or of a tracker `geometry_msgs/PoseStamped`,
@@ -99,9 +101,9 @@ class TrackedRobot(Strict):
     at: Spot | None = None
 
     @schema.model_validator(mode="after")
-    def _is_told_once(self) -> "TrackedRobot":
+    def _has_one_source(self) -> "TrackedRobot":
         if (self.topic is None) is (self.at is None):
-            raise schema.complaint("say which topic tells it, or at which place it stands")
+            raise schema.complaint("a robot needs either topic or at")
         return self
 
 
@@ -133,31 +135,30 @@ class TrackStep(Nest):
         yield from self.inside(scene)
 
     def _recordings(self, scene: Scene) -> list[Planned]:
-        """Return what records each topic until it is stopped."""
+        """Return the jobs that record the topics until they are stopped."""
         limit_s = follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
         return [self._recording(scene, recorder) for recorder in self._recorders(limit_s).values()]
 
     def _recording(self, scene: Scene, recorder: RecordStep) -> Planned:
         (planned,) = recorder.jobs(scene)
-        words = (recorder.bag(scene.robot(planned.role)), str(self._period_s(scene, planned.role)))
+        arguments = (recorder.bag(scene.robot(planned.role)), str(self._period_s(scene, planned.role)))
         job = replace(
             planned.job,
             name=self.own_name("track"),
-            argv=("sh", "-c", _RECORDS, "sh", *words, *planned.job.argv),
+            argv=("sh", "-c", _RECORDS, "sh", *arguments, *planned.job.argv),
             limit_s=recorder.duration,
             ready="log:recording",
         )
         return replace(planned, job=job, ends=BY_FIELDKIT, least_s=0.0)
 
-    def _recorders(self, lasts_s: float) -> Mapping[Role, RecordStep]:
-        """Return the steps that would record for so long, by robot."""
-        made = RecordStep.model_validate
+    def _recorders(self, duration_s: float) -> Mapping[Role, RecordStep]:
+        """Return the equivalent `record` step of each robot with a topic, for a duration."""
         return {
-            role: made(
+            role: RecordStep.model_validate(
                 {
                     "robot": role,
                     "topics": [tracked.topic],
-                    "duration": f"{lasts_s:.9g}s",
+                    "duration": f"{duration_s:.9g}s",
                     "name": f"track_{role}"[:31],
                 }
             )
@@ -167,7 +168,7 @@ class TrackStep(Nest):
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """Whether a recording is whole its bag tells."""
+        """Run the steps inside while the topics are recorded; `check` reads the bags, so exit codes are ignored."""
         announce("record positions", None)
         follow.follow(
             self,
@@ -175,12 +176,12 @@ class TrackStep(Nest):
             testbed,
             announce,
             self._recordings(scene),
-            tell=partial(self._accounts, scene),
-            outlast=lambda recording: self._period_s(scene, recording.role),
+            make_accounts=partial(self._accounts, scene),
+            extra_s=lambda recording: self._period_s(scene, recording.role),
         )
 
     def _period_s(self, scene: Scene, role: Role) -> int:
-        """Return the whole seconds in which a topic says something."""
+        """Return the time in whole seconds in which a topic publishes at least one message."""
         ros = scene.robot(role).profile.ros
         rates_hz = (
             [topic.rate for topic in ros.topics if topic.name == self.robots[role].topic and topic.rate]
@@ -190,14 +191,14 @@ class TrackStep(Nest):
         return math.ceil(_PERIODS / min(rates_hz, default=1.0))
 
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
-        """Return who tells where robots were in an attempt."""
+        """Return the sources of the robots' positions in an attempt."""
         places_m = scene.places_m
-        found = dict(follow.standing(self, scene))
+        sources = dict(follow.stationary_robots(self, scene))
         for role, tracked in self.robots.items():
             if tracked.at is not None:
-                found[role] = tracked.at.account
+                sources[role] = tracked.at.account
             elif tracked.topic is not None:
-                found[role] = Account(
+                sources[role] = Account(
                     file=self._recorders(1.0)[role].bag(scene.robot(role)),
                     topic=tracked.topic,
                     child=tracked.child or "",
@@ -207,18 +208,18 @@ class TrackStep(Nest):
                     heading_rad=None if tracked.facing is None else geometry.heading_rad(role, tracked.facing),
                     began_utc_ns=began_utc_ns,
                 )
-        return Accounts(found, offsets, self.heights)
+        return Accounts(sources, offsets, self.heights)
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """Recorders, and odometry of which nobody says where its robot faces."""
+        """Yield the refusals of the recorders, and a reason for odometry without `facing`."""
         for role, recorder in self._recorders(1.0).items():
             yield from recorder.refusals(scene)
             ros = scene.robot(role).profile.ros
             kinds = {topic.name: topic.type for topic in ros.topics} if ros else {}
             if kinds.get(recorder.topics[0]) == ODOMETRY and self.robots[role].facing is None:
-                what = "its odometry says not where it faces when the step begins"
-                yield Refusal(role, what, "facing: away, towards, left or right, in the step track")
+                what = "its odometry needs its direction at the start of the step"
+                yield Refusal(role, what, "write facing: away, towards, left or right, in the step track")
         yield from super().refusals(scene)
 
     @override
@@ -252,12 +253,12 @@ class TrackStep(Nest):
     @override
     def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
         if any(isinstance(step, TrackStep) for step in earlier):
-            return "one track records a repeat: name all its robots, and put all steps into it"
+            return "a repeat can have only one track: list all robots in it, and put all steps into it"
         return follow.placement_error("track", within)
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """A bag of each topic, in which it says places."""
+        """Yield the reasons why the recorded positions cannot be used."""
         yield from follow.problems(view, list(self._recorders(1.0)))
 
     @override

@@ -54,7 +54,7 @@ BagName = Annotated[
 _LISTEN: Final = "listen"
 _SEND: Final = "send"
 MAX_LATE_SHARE: Final = 0.1
-"""How much of its limit a listener may have waited for its sender where that limit then ends it."""
+"""Maximum share of its limit that a listener may have waited for its sender if it was then stopped at the limit."""
 
 _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
 
@@ -74,7 +74,7 @@ class TransferStep(Step):
         into: The file written by the receiver.
         port: Port that the receiver listens on.
         idle: A UDP listener ends after this time without a datagram; at least `1s`, rounded up to whole seconds.
-        limit: A transfer that takes longer is ended, and what had arrived by then is measured.
+        limit: A transfer that takes longer is stopped, and the data received until then is measured.
     """
 
     columns = COLUMNS
@@ -100,34 +100,34 @@ class TransferStep(Step):
         recorders = [step for step in earlier if self.sender in step.records_on()]
         what = f"the transfer from {self.sender} {f'sends {self.file}' if self.file else 'names no file'}"
         if not recorders:
-            return f"{what}, and no step before it records on {self.sender}"
+            return f"{what}, but no step before it records on {self.sender}"
         if self.file is None and len(recorders) > 1:
-            return f"{what}, and {len(recorders)} are recorded there before it: write file:"
+            return f"{what}, but {len(recorders)} files are recorded there before it: write file:"
         files = {name for step in recorders for name in step.files()}
         if self.file and PurePosixPath(self.file).parts[0] not in files:
-            return f"{what}, and nothing of that name is recorded on {self.sender} before it"
+            return f"{what}, but no recording of that name is made on {self.sender} before it"
         return None
 
     def _sent(self, scene: Scene) -> RecordedFile:
-        """Return the recording that is sent; the first where none has the name, which `refusals` tells."""
-        made = scene.recorded[self.sender]
-        return next((file for file in made if self.file in {file.name, file.called}), made[0])
+        """Return the recording to send; the first one if none has the name, which `refusals` reports."""
+        recordings = scene.recorded[self.sender]
+        return next((file for file in recordings if self.file in {file.name, file.called}), recordings[0])
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         yield from self._netcats(scene)
 
     def _netcats(self, scene: Scene) -> Iterator[Planned]:
-        """Yield listener and sender."""
+        """Yield the jobs of listener and sender."""
         listener, sender = (scene.robot(role).profile.tools.netcat for role in (self.receiver, self.sender))
-        theirs, ours = scene.tools(self.receiver).netcat, scene.tools(self.sender).netcat
+        listener_variant, sender_variant = scene.tools(self.receiver).netcat, scene.tools(self.sender).netcat
         address = scene.robot(self.receiver).address
         yield Planned(
             self.receiver,
             Job(
                 folder=scene.folder,
                 name=self.own_name(_LISTEN),
-                argv=netcat.listen(theirs, listener, scene.protocol, self.port, math.ceil(self.idle)),
+                argv=netcat.listen(listener_variant, listener, scene.protocol, self.port, math.ceil(self.idle)),
                 limit_s=self.limit,
                 log=self._logs[0],
                 stdout=self._into,
@@ -142,7 +142,7 @@ class TransferStep(Step):
             Job(
                 folder=scene.folder,
                 name=self.own_name(_SEND),
-                argv=netcat.send(ours, sender, scene.protocol, address, self.port),
+                argv=netcat.send(sender_variant, sender, scene.protocol, address, self.port),
                 limit_s=self.limit,
                 log=self._logs[1],
                 stdin=self._sent(scene).name,
@@ -154,7 +154,7 @@ class TransferStep(Step):
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        yield from self._refused_file(scene)
+        yield from self._file_refusals(scene)
         if scene.protocol is not Protocol.UDP:
             return
         ends = {role: scene.tools(role).netcat for role in (self.sender, self.receiver)}
@@ -162,24 +162,24 @@ class TransferStep(Step):
             if kind is Netcat.BUSYBOX:
                 yield Refusal(role, "busybox nc has no UDP", _TRADITIONAL)
         version = scene.tools(self.receiver).versions.get(Tool.NETCAT, "")
-        if netcat.cut_short(ends[self.sender], ends[self.receiver], version):
+        if netcat.truncates_datagrams(ends[self.sender], ends[self.receiver], version):
             size = netcat.DATAGRAM_BYTES[ends[self.sender]]
-            what = f"its netcat cuts off the datagrams of {size} bytes that the sender's sends"
+            what = f"its netcat truncates the datagrams of {size} bytes from the sender's netcat"
             yield Refusal(
                 self.receiver, what, "sudo apt-get install netcat-openbsd, and netcat: nc.openbsd in its profile"
             )
 
-    def _refused_file(self, scene: Scene) -> Iterator[Refusal]:
-        """Yield why the file cannot be what is sent."""
-        made = [file.name for file in scene.recorded[self.sender]]
+    def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:
+        """Yield a reason if no recording has the name of the file to send."""
+        recordings = [file.name for file in scene.recorded[self.sender]]
         if self.file is not None and self.file not in {self._sent(scene).name, self._sent(scene).called}:
-            what = f"it is to send {self.file}, and its recorder writes {', '.join(made)}"
-            leave_out = "leave out file: in the transfer, or " if len(made) == 1 else ""
-            yield Refusal(self.sender, what, f"{leave_out}write file: {made[0]}")
+            what = f"it cannot send {self.file}: its recorder writes {', '.join(recordings)}"
+            leave_out = "leave out file: in the transfer, or " if len(recordings) == 1 else ""
+            yield Refusal(self.sender, what, f"{leave_out}write file: {recordings[0]}")
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        """The listener is up."""
+        """Start the listener; return the function that sends the file."""
         listen, _ = self._netcats(scene)
         started_s = time.monotonic()
         listening = jobs.serve(testbed.shells[self.receiver], listen.job)
@@ -190,11 +190,11 @@ class TransferStep(Step):
         self.prepare(scene, testbed)(announce)
 
     def _send(self, scene: Scene, testbed: Testbed, listening: Pending, started_s: float, announce: Announce) -> None:
-        """Send the file to a listener that was started then, by the monotonic clock.
+        """Send the file to a listener that was started at `started_s` of the monotonic clock.
 
-        Between the start of the sender and the end of the listener nothing crosses a control connection: the robots
-        have accepted both commands by then; the receiver reports when its listener has ended, the sender when asked.
-        A connection over the same radio that is lost meanwhile is made again when that is measured, or at the limit.
+        During the transfer no data crosses the control connections: both commands have been accepted before, the
+        receiver reports only the exit of its listener, and the sender is queried afterwards. A control connection
+        over the same radio that is lost meanwhile is restored after the transfer or at the limit.
         """
         oracle = testbed.oracle
         flow = (self.sender, self.receiver, scene.protocol, self.port)
@@ -207,28 +207,28 @@ class TransferStep(Step):
             sending = jobs.begin(testbed.shells[self.sender], send.job)
             waited_s = time.monotonic() - started_s
             if scene.protocol is Protocol.UDP and waited_s >= self.idle:
-                raise self._late(waited_s, f"ends after {self.idle:g} s of silence", scene)
-            # Longer than the robot takes to end a listener at its limit, so that it never outlives the step.
+                raise self._late_start(waited_s, f"the listener exits after {self.idle:g} s of silence", scene)
+            # Longer than the robot needs to stop the listener at its limit, so that it ends before the step.
             code = listening.end(self.limit + 2 * jobs.REPLY_S)
         if scene.protocol is Protocol.TCP and code != 0 and waited_s > MAX_LATE_SHARE * self.limit:
-            raise self._late(waited_s, f"was ended {self.limit:g} s after it began", scene)
-        # A sender outlives its listener only where the transfer broke off; its own limit has then passed too.
+            raise self._late_start(waited_s, f"the listener was stopped after {self.limit:g} s", scene)
+        # A sender runs longer than its listener only if the transfer was interrupted; then its limit has passed, too.
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.here is not None:
             after = oracle.delays(*flow)
             (scene.here / self.own_name(medium.FILE)).write_text(medium.text(before, after), encoding="ascii")
 
-    def _late(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
-        """Return why a listener that was gone before the sender had its time tells nothing of the radio."""
+    def _late_start(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
+        """Return the error of a sender that started so late that its loss is not caused by the radio."""
         return RobotError(
-            f"sending began up to {waited_s:.1f} s after listening, which {listener}",
+            f"sending started up to {waited_s:.1f} s after listening, but {listener}",
             where=scene.robot(self.sender).name,
-            remedy="look at the control link; a larger `idle` or `limit` in the procedure leaves it more time",
+            remedy="check the control link, or increase `idle` or `limit` in the procedure",
         )
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:
-        """Of a `send`, too."""
+        """Return the resource, which a `send` also uses."""
         return ("a transfer",)
 
     @override
@@ -253,8 +253,8 @@ class TransferStep(Step):
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        sent = frames(scene.protocol, self._size_bytes(scene), netcat.DATAGRAM_BYTES[Netcat.TRADITIONAL])
-        yield Flow(self.sender, self.receiver, self.port, sent)
+        frame_count = frames(scene.protocol, self._size_bytes(scene), netcat.DATAGRAM_BYTES[Netcat.TRADITIONAL])
+        yield Flow(self.sender, self.receiver, self.port, frame_count)
 
     @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
@@ -280,9 +280,9 @@ class TransferStep(Step):
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """A file, netcats that nobody ended, and captures that do not contradict the file."""
+        """Yield a reason for a missing file, a netcat that was stopped by a signal, and each contradiction."""
         transfer = self.transfer(view.scene, view.within)
-        endings = [self._ending(view, role, job) for role, job in self._ends]
+        endings = [self._ending(view, role, job) for role, job in self._jobs]
         listened, sent = (ending if ending and ending.cause is Cause.ITSELF else None for ending in endings)
         if not view.evidence.has(self._into):
             yield f"{self._into} is missing"
@@ -290,52 +290,52 @@ class TransferStep(Step):
             yield why
         else:
             finished = listened is not None and listened.code == 0
-            cut = endings[0] is not None and listened is None
-            yield from contradictions.find(view.evidence, transfer, finished=finished, cut=cut)
-        said = [view.evidence.read_or_none(reading.text, log) for log in self._logs]
-        if listened is not None and netcat.listener_cut(listened.code, said[0]):
-            yield f"{self._logs[0]}: netcat was ended by a signal, or could not write {self._into}"
-        if sent is not None and netcat.sender_cut(sent.code, said[1]):
-            yield f"{self._logs[1]}: netcat was ended by a signal"
+            was_stopped = endings[0] is not None and listened is None
+            yield from contradictions.find(view.evidence, transfer, finished=finished, cut=was_stopped)
+        texts = [view.evidence.read_or_none(reading.text, log) for log in self._logs]
+        if listened is not None and netcat.listener_failed(listened.code, texts[0]):
+            yield f"{self._logs[0]}: netcat was terminated by a signal, or could not write {self._into}"
+        if sent is not None and netcat.sender_was_killed(sent.code, texts[1]):
+            yield f"{self._logs[1]}: netcat was terminated by a signal"
 
     @property
-    def _ends(self) -> tuple[tuple[Role, str], tuple[Role, str]]:
+    def _jobs(self) -> tuple[tuple[Role, str], tuple[Role, str]]:
         return (self.receiver, self.own_name(_LISTEN)), (self.sender, self.own_name(_SEND))
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
-        """Return how a robot noted that a netcat ended, None if it did not."""
+        """Return how a netcat ended, as recorded by the robot; None if it was not recorded."""
         after = view.evidence.read_or_none(host.state, host.after(role))
         return (after.endings or {}).get(job) if after else None
 
     @override
     def measure(self, view: View) -> Measured:
-        found = figures.measure(view.evidence, self.transfer(view.scene, view.within), self.own_name(_LISTEN))
-        if self._shares_kernel(view.scene):
-            found = host.shared(found)
+        measured = figures.measure(view.evidence, self.transfer(view.scene, view.within), self.own_name(_LISTEN))
+        if self._shares_udp_counters(view.scene):
+            measured = host.shared(measured)
         if self._shares_port(view):
-            found = found.without(dict.fromkeys(paper.COUNTED, "the paper's filter counts another flow, too"))
-        return found
+            measured = measured.without(dict.fromkeys(paper.COUNTED, "the paper's filter counts another flow, too"))
+        return measured
 
     @property
     def destination(self) -> Role:
-        """See `SendsFlow.destination`."""
+        """Role of the receiving robot."""
         return self.receiver
 
     def deliveries(self, view: View) -> Sequence[Delivery]:
-        """See `SendsFlow.deliveries`."""
+        """Return the deliveries of the transfer; see `SendsFlow.deliveries`."""
         return transfer_stalls.read(view.evidence, self.transfer(view.scene, view.within), self.own_name(_LISTEN))
 
     def _shares_port(self, view: View) -> bool:
-        """Return whether another flow that was captured with it has its port: of other robots, or the other way."""
+        """Return True if another flow in the same capture uses its port, also in the reverse direction."""
         captures = (nest for nest in reversed(view.within) if nest.captures())
         flows = next((list(nest.flows_inside(view.scene)) for nest in captures), [])
         return sum(flow.port == self.port for flow in flows) > 1
 
-    def _shares_kernel(self, scene: Scene) -> bool:
-        """Return whether other steps send UDP to the receiver, too, whose kernel counts all of it together."""
-        to_it = (flow for flow in scene.flows if flow.destination == self.receiver and flow.port is not None)
-        udp = sum((flow.protocol or scene.protocol) is Protocol.UDP for flow in to_it)
-        return udp > (scene.protocol is Protocol.UDP)
+    def _shares_udp_counters(self, scene: Scene) -> bool:
+        """Return True if other steps also send UDP to the receiver, whose kernel has one set of UDP counters."""
+        flows = (flow for flow in scene.flows if flow.destination == self.receiver and flow.port is not None)
+        udp_flows = sum((flow.protocol or scene.protocol) is Protocol.UDP for flow in flows)
+        return udp_flows > (scene.protocol is Protocol.UDP)
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

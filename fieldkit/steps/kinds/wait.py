@@ -1,4 +1,4 @@
-"""Wait for some time, or until the operator says so."""
+"""Wait for a time, or until the operator presses Enter."""
 
 from collections.abc import Iterator
 from typing import Annotated, ClassVar, Self
@@ -30,13 +30,13 @@ class WaitStep(AlongStep):
     until: Annotated[str, Field(pattern=r"^\S[^\n]{0,200}$")] | None = None
 
     @schema.model_validator(mode="after")
-    def _waits_for_one_thing(self) -> "WaitStep":
+    def _has_one_end(self) -> "WaitStep":
         if [self.duration is not None, self.until is not None, self.along].count(True) != 1:
-            raise schema.complaint("a wait has a duration, or until: what the operator is to do, or along: true")
+            raise schema.complaint("a wait needs exactly one of duration, until and along: true")
         return self
 
     @override
-    def lasting(self, seconds: float) -> Self:
+    def with_duration(self, seconds: float) -> Self:
         return self.model_copy(update={"duration": seconds})
 
     @override
@@ -48,21 +48,21 @@ class WaitStep(AlongStep):
         yield f"the operator is asked to {self.until}" if self.until else f"wait {self.duration:g} s"
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """See `Step.run`.
+        """Wait; see `Step.run`.
 
         Raises:
-            ConfigurationError: There is nobody to ask.
-            RobotError: It was not to go on, since a step beside it had failed.
+            ConfigurationError: There is no operator, because the input is not a terminal.
+            RobotError: The wait was interrupted, because a simultaneous step failed.
         """
         announce("wait", self.duration)
         if self.until:
             testbed.operator.ask(self.until)
         elif scene.halt.wait(self.duration or 0.0):
-            raise RobotError("the wait was cut short, since a step beside it had failed")
+            raise RobotError("the wait was interrupted, because a simultaneous step failed")
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:
-        """There may be any number."""
+        """Return no resources: a repeat may have any number of waits."""
         return ()
 
     @override
@@ -71,5 +71,5 @@ class WaitStep(AlongStep):
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        """Nobody knows how long a person takes."""
+        """Return the duration; 0 if the operator ends the wait."""
         return self.duration or 0.0

@@ -111,11 +111,11 @@ def test_preflight_s_question_is_answered_by_a_master_and_by_nobody_else(up: Emu
     scene = Scene(Protocol.TCP, cast, "f")
     (need,) = ros_master.needs(scene, Role.SENDER, explains="rosbag")
     answer = asked(up.shells[Role.SENDER], need)
-    assert ros_master.judged(cast[Role.RELAY], answer)[0] is Verdict.OK, answer
+    assert ros_master.judge(cast[Role.RELAY], answer)[0] is Verdict.OK, answer
     wrong = {role: robot.model_copy(update={"ros_master": "10.42.0.2"}) for role, robot in cast.items()}
     (need,) = ros_master.needs(Scene(Protocol.TCP, wrong, "f"), Role.SENDER, explains="rosbag")
     answer = asked(up.shells[Role.SENDER], need)
-    assert ros_master.judged(cast[Role.RECEIVER], answer)[0] is Verdict.FAIL
+    assert ros_master.judge(cast[Role.RECEIVER], answer)[0] is Verdict.FAIL
     assert "Connection refused" in answer.text
 
 

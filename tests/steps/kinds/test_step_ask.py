@@ -1,4 +1,4 @@
-"""The steps ask and wait: what can be answered, who is asked how often, and what of it is kept."""
+"""The steps ask and wait: valid answers, number of prompts, and stored answers."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,10 +25,10 @@ GRASS = "column: grass, question: how is the grass, choices: [dry, wet]"
 
 
 @dataclass
-class Talkative:
-    """An operator with an answer to everything, who remembers what was asked."""
+class ScriptedOperator:
+    """An operator with one answer to all questions; records the questions."""
 
-    says: str
+    answer: str
     asked: list[str] = field(default_factory=list)
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
@@ -38,7 +38,7 @@ class Talkative:
 
     def enter(self, question: Question) -> str:
         self.asked.append(question.text)
-        answer = question.read(self.says)
+        answer = question.read(self.answer)
         assert answer is not None
         return answer
 
@@ -47,30 +47,30 @@ def ask(text: str) -> AskStep:
     return schema.validate(schema.parse(f"{{{text}}}", source="x.yaml"), AskStep)
 
 
-def silent(name: str, expected_s: float | None) -> None:
-    """Nobody looks."""
+def ignore(name: str, expected_s: float | None) -> None:
+    """Ignore a phase."""
 
 
-def answered(step: AskStep, here: Path, operator: Talkative | None = None) -> View:
+def run_and_view(step: AskStep, here: Path, operator: ScriptedOperator | None = None) -> View:
     here.mkdir(parents=True)
     testbed = IdleTestbed()
     testbed.operator = operator or NOBODY
-    step.run(replace(SCENE, here=here), testbed, silent)
+    step.run(replace(SCENE, here=here), testbed, ignore)
     return View(SCENE, AttemptEvidence(here))
 
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (f"{GRASS}, unit: m", "they take no unit"),
-        (f"{WIND}, choices: [a, b]", "they take no unit"),
-        ("column: a, question: b, least: 2, most: 1", "least is above most"),
-        (f"{WIND}, usual: strong", "usual is 'strong', and what can be answered is a number in m/s from 0 to 40"),
-        (f"{GRASS}, usual: high", "usual is 'high', and what can be answered is 1 dry, 2 wet; - if nobody knows\n"),
+        (f"{GRASS}, unit: m", "they have no unit"),
+        (f"{WIND}, choices: [a, b]", "they have no unit"),
+        ("column: a, question: b, least: 2, most: 1", "least is greater than most"),
+        (f"{WIND}, usual: strong", "usual is 'strong'; permitted answers: a number in m/s from 0 to 40"),
+        (f"{GRASS}, usual: high", "usual is 'high'; permitted answers: 1 dry, 2 wet; - if nobody knows\n"),
         ("column: a, question: b, choices: [a]", "at least 2 items"),
         ("column: A, question: b", "'A' is not a name: small letters"),
         ("column: a, question: b, unit: 2m", "'2m' is not a unit"),
-        ("column: a, question: b, choices: [a, b, a]", "a choice comes twice"),
+        ("column: a, question: b, choices: [a, b, a]", "a choice is listed twice"),
         ("column: a, question: b, choices: [a, '2']", "choices.1: '2' cannot be a choice: write words"),
         ("column: a, question: b, choices: [a, ' b']", "cannot be a choice"),
         ("column: a, question: b, choices: [a, '-']", "cannot be a choice"),
@@ -78,7 +78,7 @@ def answered(step: AskStep, here: Path, operator: Talkative | None = None) -> Vi
         (f"{WIND}, each: day", "'repeat' or 'trial'"),
     ],
 )
-def test_what_nobody_could_answer_is_refused(text: str, complaint: str) -> None:
+def test_invalid_question_is_refused(text: str, complaint: str) -> None:
     with pytest.raises(ConfigurationError, match=complaint):
         ask(text)
 
@@ -101,12 +101,12 @@ def test_what_nobody_could_answer_is_refused(text: str, complaint: str) -> None:
         (GRASS, "we", None),
     ],
 )
-def test_a_line_answers_a_question_or_does_not(text: str, line: str, answer: str | None) -> None:
-    assert ask(text)._asked.read(line) == answer
+def test_reading_of_typed_answers(text: str, line: str, answer: str | None) -> None:
+    assert ask(text)._full_question.read(line) == answer
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False, width=32), st.sampled_from(["", "m/s", "hPa", "e"]))
-def test_every_number_that_is_possible_is_read_again(value: float, unit: str) -> None:
+def test_numbers_are_read_again(value: float, unit: str) -> None:
     question = Question("how much", unit)
     answer = question.read(f"{value!r} {unit}")
     assert answer is not None
@@ -114,9 +114,9 @@ def test_every_number_that_is_possible_is_read_again(value: float, unit: str) ->
     assert question.read(answer) == answer
 
 
-def test_an_answer_becomes_a_column_with_its_unit(tmp_path: Path) -> None:
+def test_number_becomes_a_column_with_its_unit(tmp_path: Path) -> None:
     step = ask(WIND)
-    view = answered(step, tmp_path / "a", Talkative("3.5"))
+    view = run_and_view(step, tmp_path / "a", ScriptedOperator("3.5"))
     (column,) = step.output_columns()
     assert (column.name, column.unit, column.possible) == ("wind", "m/s", (0.0, 40.0))
     assert step.measure(view).values == {"wind": 3.5}
@@ -124,40 +124,40 @@ def test_an_answer_becomes_a_column_with_its_unit(tmp_path: Path) -> None:
     assert not list(step.check(view))
 
 
-def test_a_word_stays_a_word(tmp_path: Path) -> None:
+def test_word_becomes_a_text_column(tmp_path: Path) -> None:
     step = ask(GRASS)
-    assert step.measure(answered(step, tmp_path / "a", Talkative("2"))).values == {"grass": "wet"}
+    assert step.measure(run_and_view(step, tmp_path / "a", ScriptedOperator("2"))).values == {"grass": "wet"}
     assert step.output_columns()[0].unit == "text"
 
 
-def test_who_does_not_know_leaves_the_column_empty_and_the_repeat_valid(tmp_path: Path) -> None:
-    for operator in (Talkative("-"), None):
+def test_unknown_answer_leaves_column_empty_and_repeat_valid(tmp_path: Path) -> None:
+    for operator in (ScriptedOperator("-"), None):
         step = ask(WIND)
-        view = answered(step, tmp_path / str(operator is None), operator)
+        view = run_and_view(step, tmp_path / str(operator is None), operator)
         assert step.measure(view).missing == {"wind": "the operator did not know"}
         assert not list(step.check(view))
 
 
-def test_where_nobody_is_asked_the_usual_answer_stands(tmp_path: Path) -> None:
+def test_usual_answer_is_used_without_operator(tmp_path: Path) -> None:
     step = ask(f"{GRASS}, usual: dry")
-    assert step.measure(answered(step, tmp_path / "a")).values == {"grass": "dry"}
+    assert step.measure(run_and_view(step, tmp_path / "a")).values == {"grass": "dry"}
 
 
 @pytest.mark.parametrize(("each", "times"), [("trial", 1), ("repeat", 3)])
-def test_a_question_is_asked_once_per_trial_or_in_each_repeat(tmp_path: Path, each: str, times: int) -> None:
-    operator, step = Talkative("7"), ask(f"{WIND}, each: {each}")
-    views = [answered(step, tmp_path / "trial" / "repeats" / name, operator) for name in ("b", ".a", "c")]
+def test_question_is_asked_once_per_trial_or_repeat(tmp_path: Path, each: str, times: int) -> None:
+    operator, step = ScriptedOperator("7"), ask(f"{WIND}, each: {each}")
+    views = [run_and_view(step, tmp_path / "trial" / "repeats" / name, operator) for name in ("b", ".a", "c")]
     assert len(operator.asked) == times
     assert [step.measure(view).values for view in views] == [{"wind": 7.0}] * 3
-    answered(step, tmp_path / "other" / "repeats" / "a", operator)
+    run_and_view(step, tmp_path / "other" / "repeats" / "a", operator)
     assert len(operator.asked) == times + 1
 
 
 @pytest.mark.parametrize("text", ["", "\n", "strong\n", "99\n", "3\n4\n"])
-def test_a_file_that_answers_nothing_voids_the_repeat(tmp_path: Path, text: str) -> None:
+def test_invalid_answer_file_makes_repeat_void(tmp_path: Path, text: str) -> None:
     (tmp_path / "answer-wind.txt").write_text(text, encoding="utf-8")
     step, view = ask(WIND), View(SCENE, AttemptEvidence(tmp_path))
-    assert list(step.check(view)) == ["answer-wind.txt does not say what the operator answered"]
+    assert list(step.check(view)) == ["answer-wind.txt has no valid answer of the operator"]
     assert step.measure(view).missing
 
 
@@ -166,15 +166,15 @@ def wait(text: str) -> WaitStep:
 
 
 @pytest.mark.parametrize("text", ["", "duration: 1s, until: open the door", "duration: 0s", "until: ''"])
-def test_a_wait_waits_for_one_thing(text: str) -> None:
+def test_wait_needs_exactly_one_end(text: str) -> None:
     with pytest.raises(ConfigurationError):
         wait(text)
 
 
-def test_a_wait_ends_with_its_time_or_with_the_operator_s_word() -> None:
-    operator, testbed = Talkative(""), IdleTestbed()
+def test_wait_ends_after_its_time_or_by_operator() -> None:
+    operator, testbed = ScriptedOperator(""), IdleTestbed()
     testbed.operator = operator
-    wait("until: open the door").run(SCENE, testbed, silent)
+    wait("until: open the door").run(SCENE, testbed, ignore)
     assert operator.asked == ["open the door"]
     phases: list[tuple[str, float | None]] = []
     wait("duration: 1ms").run(SCENE, testbed, lambda *phase: phases.append(phase))

@@ -1,4 +1,4 @@
-"""The step capture: what comes up side by side, and what is ended when the first step inside cannot begin."""
+"""The step capture: simultaneous start of captures and first step, and clean-up if that step cannot start."""
 
 import threading
 from collections.abc import Callable
@@ -21,22 +21,25 @@ from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.userlands import LocalShell
 
 TEXT = "{during: [{ping: {from: sender, to: receiver}}]}"
-LAST_S = 60.0
+TIMEOUT_S = 60.0
 
 
-def run(home: Path, patch: pytest.MonkeyPatch, prepare: Callable[[], None], meet: threading.Barrier) -> list[str]:
-    """Capture while a step runs that prepares itself so; captures meet it as they start. Return what happened."""
-    happened: list[str] = []
+def run(home: Path, patch: pytest.MonkeyPatch, prepare: Callable[[], None], barrier: threading.Barrier) -> list[str]:
+    """Run a capture around a step with this `prepare` function; return phases, stops and the error in order.
+
+    The barrier makes sure that the starts of the captures and `prepare` run at the same time.
+    """
+    events: list[str] = []
 
     def start(_shell: Shell, _job: Job) -> None:
-        meet.wait(LAST_S)
+        barrier.wait(TIMEOUT_S)
 
     def stop(shell: Shell, _job: Job, **_: object) -> int:
-        happened.append(f"end on {shell.robot}")
+        events.append(f"end on {shell.robot}")
         return 0
 
     def prepared(*_: object) -> Callable[[Announce], None]:
-        meet.wait(LAST_S)
+        barrier.wait(TIMEOUT_S)
         prepare()
         return lambda announce: announce("inside", None)
 
@@ -46,34 +49,30 @@ def run(home: Path, patch: pytest.MonkeyPatch, prepare: Callable[[], None], meet
     step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
     shells = {role: LocalShell(home, robot=role) for role in step.robots}
     try:
-        step.run(Scene(Protocol.TCP, CAST, "f"), IdleTestbed(shells), lambda name, _: happened.append(name))
+        step.run(Scene(Protocol.TCP, CAST, "f"), IdleTestbed(shells), lambda name, _: events.append(name))
     except RobotError as error:
-        happened.append(error.what)
-    return happened
+        events.append(error.what)
+    return events
 
 
-def test_the_first_step_inside_prepares_itself_beside_the_start_of_captures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    happened = run(tmp_path, monkeypatch, lambda: None, threading.Barrier(3))
-    assert happened[:3] == ["start captures", "inside", "drain captures"]
-    assert sorted(happened[3:]) == [f"end on {role}" for role in sorted((Role.SENDER, Role.RECEIVER))]
+def test_first_step_inside_is_prepared_while_captures_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events = run(tmp_path, monkeypatch, lambda: None, threading.Barrier(3))
+    assert events[:3] == ["start captures", "inside", "drain captures"]
+    assert sorted(events[3:]) == [f"end on {role}" for role in sorted((Role.SENDER, Role.RECEIVER))]
 
 
-def test_where_captures_start_by_sudo_what_is_inside_waits_for_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_step_inside_waits_for_captures_with_sudo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """sudo may take longer than a UDP listener waits for its sender."""
-    happened: list[str] = []
+    events: list[str] = []
     preparing = threading.Event()
 
     def start(shell: Shell, _job: Job) -> None:
         assert not preparing.wait(0.1)
-        happened.append(f"capture on {shell.robot}")
+        events.append(f"capture on {shell.robot}")
 
     def prepared(*_: object) -> Callable[[Announce], None]:
         preparing.set()
-        return lambda _: happened.append("inside")
+        return lambda _: events.append("inside")
 
     profile = CAST[Role.SENDER].profile
     tools = profile.tools.model_copy(update={"capture_right": "sudo"})
@@ -84,23 +83,23 @@ def test_where_captures_start_by_sudo_what_is_inside_waits_for_them(
     step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
     shells = {role: LocalShell(tmp_path, robot=role) for role in step.robots}
     step.run(Scene(Protocol.TCP, CAST | {Role.SENDER: slow}, "f"), IdleTestbed(shells), lambda *_: None)
-    assert sorted(happened[:2]) == ["capture on receiver", "capture on sender"]
-    assert happened[2:] == ["inside"]
+    assert sorted(events[:2]) == ["capture on receiver", "capture on sender"]
+    assert events[2:] == ["inside"]
 
 
-def test_captures_are_ended_when_the_first_step_inside_cannot_begin(
+def test_captures_are_stopped_if_first_step_inside_cannot_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail() -> None:
-        raise RobotError("its port is taken", remedy="take another")
+        raise RobotError("its port is taken", remedy="use another")
 
-    happened = run(tmp_path, monkeypatch, fail, threading.Barrier(3))
-    assert (happened[0], happened[-1]) == ("start captures", "its port is taken")
-    assert sorted(happened[1:-1]) == [f"end on {role}" for role in sorted((Role.SENDER, Role.RECEIVER))]
+    events = run(tmp_path, monkeypatch, fail, threading.Barrier(3))
+    assert (events[0], events[-1]) == ("start captures", "its port is taken")
+    assert sorted(events[1:-1]) == [f"end on {role}" for role in sorted((Role.SENDER, Role.RECEIVER))]
 
 
 @pytest.mark.emulated
-def test_what_keeps_a_capture_from_its_start_is_not_hidden_by_its_end(tmp_path: Path) -> None:
+def test_error_of_start_is_not_hidden_by_error_of_stop(tmp_path: Path) -> None:
     plan, shells = los_plan(), {role: LocalShell(tmp_path) for role in (Role.SENDER, Role.RECEIVER)}
     for shell in shells.values():
         jobs.install(shell, Deadline.after(60))

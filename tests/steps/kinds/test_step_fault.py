@@ -1,4 +1,4 @@
-"""The step fault: what a procedure may say, who takes part, and the command lines to the letter."""
+"""The step fault: valid keys, roles, and golden command lines."""
 
 from dataclasses import replace
 
@@ -46,18 +46,18 @@ def fault(text: str) -> FaultStep:
 
 
 def lines(step: FaultStep, scene: Scene = SCENE) -> list[tuple[Role, str]]:
-    return [(one.role, in_shell(one.job)) for one in step.jobs(scene)]
+    return [(planned.role, in_shell(planned.job)) for planned in step.jobs(scene)]
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "message"),
     [
         ("robot: sender, kind: link-down", "a link-down needs for:"),
         ("robot: sender, kind: out-of-range", "an? out-of-range needs for:"),
-        ("robot: sender, kind: reboot, for: 3s", "a reboot takes no for:"),
-        ("robot: sender, kind: kill, process: nc, for: 3s", "a kill takes no for:"),
+        ("robot: sender, kind: reboot, for: 3s", "a reboot does not allow for:"),
+        ("robot: sender, kind: kill, process: nc, for: 3s", "a kill does not allow for:"),
         ("robot: sender, kind: kill", "a kill needs process:"),
-        ("robot: sender, kind: reboot, process: nc", "a reboot takes no process:"),
+        ("robot: sender, kind: reboot, process: nc", "a reboot does not allow process:"),
         ("robot: sender, kind: link-down, for: 3", "has no unit"),
         ("robot: sender, kind: link-down, for: 0s", "greater than 0"),
         ("robot: sender, kind: linkdown, for: 3s", "'link-down'"),
@@ -67,13 +67,13 @@ def lines(step: FaultStep, scene: Scene = SCENE) -> list[tuple[Role, str]]:
         ("robot: sender, kind: reboot, during: [{ping: {from: sender}}]", "'to' is missing"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_a_sentence(text: str, complaint: str) -> None:
-    with pytest.raises(ConfigurationError, match=complaint) as caught:
+def test_invalid_keys_are_refused(text: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         fault(text)
     assert caught.value.where == "x.yaml:1"
 
 
-def test_a_link_is_watched_from_the_other_end_while_the_steps_inside_run() -> None:
+def test_link_is_observed_from_the_other_end() -> None:
     step = fault("robot: sender, kind: link-down, for: 3s, after: 1s, during: [{ping: {from: sender, to: receiver}}]")
     first, inside, last = lines(step)
     assert first == (
@@ -91,7 +91,7 @@ def test_a_link_is_watched_from_the_other_end_while_the_steps_inside_run() -> No
     assert step.roles() == {Role.SENDER, Role.RECEIVER}
 
 
-def test_a_killed_process_is_watched_on_the_robot_itself() -> None:
+def test_killed_process_is_observed_on_the_robot_itself() -> None:
     step = fault("robot: receiver, kind: kill, process: nc.traditional")
     (role, watch), (_, heals) = lines(step)
     assert role is Role.RECEIVER
@@ -101,30 +101,30 @@ def test_a_killed_process_is_watched_on_the_robot_itself() -> None:
     assert step.roles() == {Role.RECEIVER}
 
 
-def test_no_command_of_a_fault_has_more_than_one_line() -> None:
+def test_commands_of_a_fault_have_one_line() -> None:
     for kind in ("kill, process: nc", "reboot"):
         assert not [line for _, line in lines(fault(f"robot: sender, kind: {kind}")) if "\n" in line]
 
 
 @pytest.mark.parametrize(
-    ("tool", "root", "words"),
+    ("tool", "root", "options"),
     [
         (PingTool.IPUTILS_OLD, False, "-n -D -i 0.2"),
         (PingTool.IPUTILS_OLD, True, "-n -D -i 0.1"),
         (PingTool.BUSYBOX, False, "-i 0.1"),
     ],
 )
-def test_each_ping_is_asked_for_what_it_can(tool: PingTool, root: bool, words: str) -> None:
+def test_interval_depends_on_variant_of_ping(tool: PingTool, root: bool, options: str) -> None:
     tools = replace(expected(TURTLEBOT), ping=tool, root=root)
     scene = replace(SCENE, variants={Role.SENDER: tools})
     (role, watch), (_, heals) = lines(fault("robot: relay, kind: reboot"), scene)
     assert role is Role.SENDER
-    assert watch == f"env LC_ALL=C ping {words} 10.42.0.3 2> fault-reboot-ping.txt"
-    answers = 5 if "0.2" in words else 10
+    assert watch == f"env LC_ALL=C ping {options} 10.42.0.3 2> fault-reboot-ping.txt"
+    answers = 5 if "0.2" in options else 10
     assert f"'bytes from' {answers} >" in heals
 
 
-def test_every_walk_goes_into_a_fault() -> None:
+def test_steps_inside_a_fault_are_included() -> None:
     procedure = schema.validate(schema.parse(NESTED, source="x"), Procedure)
     assert procedure.roles() == {Role.SENDER, Role.RECEIVER, Role.RELAY}
     (record,) = steps_of(procedure.with_record(2.0), RecordStep)
@@ -133,7 +133,7 @@ def test_every_walk_goes_into_a_fault() -> None:
     assert procedure.expected_s(Protocol.UDP) > 15.0
 
 
-def test_what_is_inside_a_fault_is_left_out_where_it_is_asked_for() -> None:
+def test_steps_inside_a_fault_can_be_excluded() -> None:
     procedure = schema.validate(schema.parse(NESTED, source="x"), Procedure)
     assert list(steps_of(procedure, RecordStep, undisturbed=True)) == []
     assert len(list(steps_of(procedure, FaultStep, undisturbed=True))) == 1
@@ -146,13 +146,13 @@ def test_two_faults_of_one_kind_are_refused() -> None:
         schema.validate(schema.parse(again, source="x"), Procedure)
 
 
-def test_a_procedure_with_faults_survives_being_written_and_read_again() -> None:
+def test_written_procedure_with_faults_is_read_unchanged() -> None:
     procedure = load_procedure("selfheal")
     text = schema.dump(procedure)
     assert schema.validate(schema.parse(text, source="x"), Procedure) == procedure
 
 
-def test_the_observer_s_robot_is_the_cast_s() -> None:
+def test_observer_uses_address_of_the_cast() -> None:
     robots = {
         role: Robot(name=f"r-{role}", address=f"10.0.0.{n}", profile=TURTLEBOT) for n, role in enumerate(FIXED_ROLES)
     }

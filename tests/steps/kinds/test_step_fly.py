@@ -1,4 +1,4 @@
-"""The step fly: what a procedure may say, and that nothing beyond the limits of a profile is flown."""
+"""The step fly: valid keys, refusal of flights beyond the limits of a profile, and preflight checks."""
 
 import json
 import math
@@ -20,8 +20,8 @@ from tests.helpers.casts import CAST, los_plan
 
 DURING = "during: [{wait: {duration: 1s}}]"
 DRONE = next(role for role, robot in CAST.items() if robot.profile.mavlink is not None)
-FREE = {role: robot.model_copy(update={"flies": True}) for role, robot in CAST.items()}
-SCENE = Scene(Protocol.TCP, FREE, "f")
+PERMITTED = {role: robot.model_copy(update={"flies": True}) for role, robot in CAST.items()}
+SCENE = Scene(Protocol.TCP, PERMITTED, "f")
 LOW = '{"what": "its battery has 10%", "remedy": "charge it", "grave": true}'
 MODE = '{"what": "PX4 does not let itself be armed", "remedy": "see to that", "grave": false}'
 LIMITS = CAST[DRONE].profile.limits
@@ -32,16 +32,16 @@ def step(text: str) -> FlyStep:
 
 
 def refused(text: str) -> list[str]:
-    return [one.what for one in step(text).refusals(Scene(Protocol.TCP, FREE, "f"))]
+    return [refusal.what for refusal in step(text).refusals(Scene(Protocol.TCP, PERMITTED, "f"))]
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "message"),
     [
         ("robot: receiver", "'height' is missing"),
         ("robot: receiver, height: 0m", "greater than 0"),
         ("robot: receiver, height: 2", "has no unit"),
-        ("robot: receiver, height: 2m, path: [{up: 1m, down: 1m}]", "up or down; make two pieces"),
+        ("robot: receiver, height: 2m, path: [{up: 1m, down: 1m}]", "up or down, not both; make two segments"),
         ("robot: receiver, height: 2m, path: [{}]", "towards, left, right, up or down"),
         ("robot: receiver, height: 2m, path: [{down: 2m}]", "leads to the ground"),
         ("robot: receiver, height: 2m, then: hover", "land.*return"),
@@ -49,52 +49,52 @@ def refused(text: str) -> list[str]:
         ("robot: receiver, height: 2m, speed: 0m/s", "greater than 0"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_a_sentence(text: str, complaint: str) -> None:
-    with pytest.raises(ConfigurationError, match=complaint):
+def test_invalid_keys_are_refused(text: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
         step(text)
 
 
-metres = st.floats(0.1, 80).map(lambda one: round(one, 1))
-pieces = st.lists(st.tuples(metres, metres, metres), max_size=4)
+metres = st.floats(0.1, 80).map(lambda value: round(value, 1))
+paths = st.lists(st.tuples(metres, metres, metres), max_size=4)
 
 
-@given(metres, pieces, st.floats(0.1, 6).map(lambda one: round(one, 1)))
-def test_a_way_is_refused_exactly_where_it_leaves_the_limits(
-    height_m: float, way: list[tuple[float, float, float]], speed_m_s: float
+@given(metres, paths, st.floats(0.1, 6).map(lambda value: round(value, 1)))
+def test_flight_is_refused_exactly_if_it_exceeds_a_limit(
+    height_m: float, path: list[tuple[float, float, float]], speed_m_s: float
 ) -> None:
-    legs = ", ".join(f"{{away: {away}m, left: {left}m, up: {up}m}}" for away, left, up in way)
-    said = refused(f"robot: {DRONE}, height: {height_m}m, speed: {speed_m_s}m/s, path: [{legs}]")
-    highest_m = height_m + sum(up for _, _, up in way)
-    farthest_m = math.hypot(sum(one[0] for one in way), sum(one[1] for one in way))
+    legs = ", ".join(f"{{away: {away}m, left: {left}m, up: {up}m}}" for away, left, up in path)
+    reasons = refused(f"robot: {DRONE}, height: {height_m}m, speed: {speed_m_s}m/s, path: [{legs}]")
+    highest_m = height_m + sum(up for _, _, up in path)
+    farthest_m = math.hypot(sum(away for away, _, _ in path), sum(left for _, left, _ in path))
     assert LIMITS.max_height_m is not None
     assert LIMITS.fence_m is not None
-    asked = (highest_m, LIMITS.max_height_m), (farthest_m, LIMITS.fence_m), (speed_m_s, LIMITS.max_speed_m_s)
-    if all(abs(one - most) > 1e-6 for one, most in asked):
-        assert len(said) == sum(one > most for one, most in asked), said
+    pairs = (highest_m, LIMITS.max_height_m), (farthest_m, LIMITS.fence_m), (speed_m_s, LIMITS.max_speed_m_s)
+    if all(abs(value - limit) > 1e-6 for value, limit in pairs):
+        assert len(reasons) == sum(value > limit for value, limit in pairs), reasons
 
 
-def test_who_cannot_fly_is_refused() -> None:
+def test_robot_without_autopilot_is_refused() -> None:
     ground = next(role for role, robot in CAST.items() if robot.profile.mavlink is None)
-    said = refused(f"robot: {ground}, height: 1m")
-    assert said[0] == "its profile has no mavlink: nothing flies it"
-    assert "its profile does not say how high it may fly" in said
+    reasons = refused(f"robot: {ground}, height: 1m")
+    assert reasons[0] == "it cannot fly: its profile has no mavlink"
+    assert "its profile has no limit for the height" in reasons
 
 
-def test_the_log_of_a_longer_flight_is_larger_and_is_on_the_drone_alone() -> None:
+def test_size_of_log_grows_with_flight_and_is_on_drone_only() -> None:
     short, long = (step(f"robot: {DRONE}, height: 2m, path: [{{away: {far}m}}]") for far in (10, 910))
     assert [role for role in CAST if long.bytes_left(SCENE, role)] == [DRONE]
-    # The way back takes 900 s more, and the log has ten lines a second, each of 100 to 250 bytes.
+    # The return takes 900 s more, and the log has ten lines per second, each of 100 to 250 bytes.
     grown_bytes = long.bytes_left(SCENE, DRONE) - short.bytes_left(SCENE, DRONE)
     assert 100 * 9000 < grown_bytes < 250 * 9000
 
 
-def test_a_real_one_needs_leave() -> None:
+def test_real_drone_needs_permission() -> None:
     (refusal,) = step(f"robot: {DRONE}, height: 1m").refusals(Scene(Protocol.TCP, CAST, "f"))
-    assert refusal.what == "it is real, and fieldkit is to fly it"
+    assert refusal.what == "it is a real drone, and flights are not allowed"
     assert "--allow-motion" in refusal.remedy
 
 
-def test_the_shipped_drones_say_their_limits() -> None:
+def test_shipped_drone_profiles_have_limits() -> None:
     for name in ("duckiedrone", "iris"):
         limits = load_profile(name).limits
         assert limits.max_height_m is not None
@@ -119,26 +119,26 @@ def test_the_shipped_drones_say_their_limits() -> None:
         ("[" * 100_000, 0, Verdict.FAIL),
     ],
 )
-def test_what_preflight_makes_of_the_answer(text: str, code: int, verdict: Verdict) -> None:
-    found, detail, remedy = arming_need._judged(Said(text, code))
-    assert found is verdict
+def test_verdict_of_arming_check(text: str, code: int, verdict: Verdict) -> None:
+    actual, detail, remedy = arming_need._judge(Said(text, code))
+    assert actual is verdict
     assert detail
     assert bool(remedy) == (verdict is not Verdict.OK)
     assert not detail.startswith("error")
 
 
 @given(st.text(max_size=200))
-def test_no_answer_ends_preflight(text: str) -> None:
-    assert arming_need._judged(Said(text, 0))[0] in Verdict
+def test_any_output_has_a_verdict(text: str) -> None:
+    assert arming_need._judge(Said(text, 0))[0] in Verdict
 
 
-def test_its_autopilot_is_asked_for_what_it_flies() -> None:
+def test_arming_check_has_limits_of_the_flight() -> None:
     link, need = step(f"robot: {DRONE}, height: 2m, path: [{{away: 3m, left: 4m, up: 1m}}]").needs(SCENE)
     assert link.name == "MAVLink"
     assert json.loads(link.argv[-1])["connection"] == json.loads(need.argv[-1])["connection"]
-    told = json.loads(need.argv[-1])
+    argument = json.loads(need.argv[-1])
     assert need.agent
-    assert told["needs"] == {
+    assert argument["needs"] == {
         "highest_m": 3.0,
         "farthest_m": 5.0,
         "ceiling_m": LIMITS.max_height_m,
@@ -147,7 +147,7 @@ def test_its_autopilot_is_asked_for_what_it_flies() -> None:
     }
 
 
-def test_on_abort_knows_the_roles_of_the_procedure_and_needs_a_drone() -> None:
+def test_on_abort_needs_a_role_of_the_procedure_and_a_drone() -> None:
     text = """\
 name: up
 summary: up
@@ -168,11 +168,11 @@ steps: [{ping: {from: sender, to: receiver}}]
     assert re.search("no mavlink", refusal.what)
 
 
-def test_what_becomes_of_it_where_it_is_stopped_at_once_is_told() -> None:
+def test_abort_notes_describe_the_action() -> None:
     flight = step(f"robot: {DRONE}, height: 2m")
     assert list(flight.abort_notes(SCENE)) == [
-        f"{CAST[DRONE].name} lands, if it is in the air: for up to about 37 s, also when fieldkit has ended"
+        f"{CAST[DRONE].name} lands, if it is in the air: this takes up to about 37 s, also after fieldkit has exited"
     ]
-    returns = Scene(Protocol.TCP, FREE, "f", on_abort={DRONE: OnAbort.RETURN})
-    (said,) = flight.abort_notes(returns)
-    assert "returns by itself" in said
+    returns = Scene(Protocol.TCP, PERMITTED, "f", on_abort={DRONE: OnAbort.RETURN})
+    (note,) = flight.abort_notes(returns)
+    assert "returns automatically" in note

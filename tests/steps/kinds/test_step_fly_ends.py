@@ -1,4 +1,4 @@
-"""A flight that ends before its steps do: by the agent itself, with an emulated autopilot, on this machine."""
+"""Flights that end before their steps, with the real agent and an emulated autopilot on this machine."""
 
 import json
 import math
@@ -40,13 +40,13 @@ pytestmark = pytest.mark.emulated
 FOLDER = jobs.work_folder("trial", "tcp-01-1")
 FLIGHT = "robot: receiver, height: 60cm, path: [{away: 2m}], speed: 3m/s, lease: 3s"
 NOTICED_S = 5.0
-"""On a busy machine; a quiet one needs less than 1 s."""
+"""Maximum time until the loss is noticed on a busy machine; a quiet machine needs less than 1 s."""
 NEAR_M = 0.6
-"""To home; it flew three times as far."""
+"""Maximum distance to the take-off point after the return; the drone had flown three times as far."""
 
 
 class Shell(LocalShell):
-    """A robot whose link may be cut."""
+    """A robot with a link that can be interrupted."""
 
     is_cut = False
 
@@ -68,7 +68,7 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
 def fly(
     shell: Shell, where: int | str, waits: str, begun: Callable[[], object], abort: OnAbort = OnAbort.LAND
 ) -> None:
-    """Fly a drone that is at a UDP port or a connection, and call something when the step inside begins."""
+    """Fly a drone at a UDP port or a connection; call `begun` when a step inside starts."""
     connection = where if isinstance(where, str) else f"udpout:127.0.0.1:{where}"
     assert DUCKIEDRONE.mavlink is not None
     update = {
@@ -93,23 +93,23 @@ def log(shell: Shell) -> str:
     return (shell.home / FOLDER / "fly.log").read_text(encoding="utf-8")
 
 
-def test_who_takes_a_drone_over_ends_the_steps_inside(shell: Shell) -> None:
+def test_takeover_by_a_person_aborts_steps_inside(shell: Shell) -> None:
     with drones.autopilot_at_udp() as (port, autopilot):
         with pytest.raises(RobotError, match="here: its flight ended early: another party flies it") as caught:
             fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LAND))
-        assert "the wait was cut short" in str(caught.value.__cause__)
-        assert "landed" not in log(shell), "it let go of it"
+        assert "the wait was interrupted" in str(caught.value.__cause__)
+        assert "landed" not in log(shell), "the pilot released the drone"
 
 
 def agent_of(shell: Shell, job: str) -> int:
-    """Return the process of the agent that runs a job."""
+    """Return the process id of the agent of a job."""
     leader = int((shell.home / FOLDER / f".jobs/{job}/pid").read_text(encoding="ascii").split()[0])
     names = {pid: Path(f"/proc/{pid}/comm").read_text(encoding="utf-8") for pid in descendants(leader)}
     (pid,) = (pid for pid, name in names.items() if name.startswith("python"))
     return pid
 
 
-def said(shell: Shell, job: str) -> list[tuple[float, str]]:
+def log_lines(shell: Shell, job: str) -> list[tuple[float, str]]:
     """Return the lines of a job's log with their times, in seconds since 1970."""
     lines = (shell.home / FOLDER / f"{job}.log").read_text(encoding="utf-8").splitlines()
     return [(float(line.partition(" ")[0]), line.partition(" ")[2]) for line in lines]
@@ -117,54 +117,54 @@ def said(shell: Shell, job: str) -> list[tuple[float, str]]:
 
 @pytest.mark.quiet
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-@pytest.mark.parametrize(("struck", "watcher"), [("fly", "guard"), ("guard", "fly")])
-def test_pilot_and_guard_see_within_a_second_that_the_other_does_not_run(
-    shell: Shell, struck: str, watcher: str, number: signal.Signals
+@pytest.mark.parametrize(("target", "watcher"), [("fly", "guard"), ("guard", "fly")])
+def test_pilot_and_guard_notice_within_a_second_that_the_other_does_not_run(
+    shell: Shell, target: str, watcher: str, number: signal.Signals
 ) -> None:
     at_s: list[float] = []
 
-    def strike() -> None:
+    def send_signal() -> None:
         at_s.append(time.time())
-        os.kill(agent_of(shell, struck), number)
+        os.kill(agent_of(shell, target), number)
 
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError):
-            fly(shell, port, "60min", strike)
+            fly(shell, port, "60min", send_signal)
         wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
         evidence.end_jobs(shell, FOLDER)
-    (seen_s,) = (seen_s for seen_s, text in said(shell, watcher) if text.startswith("land: the "))
+    (seen_s,) = (seen_s for seen_s, text in log_lines(shell, watcher) if text.startswith("land: the "))
     assert seen_s - at_s[0] < 1.0
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_flight_outlasts_its_link_server(shell: Shell, number: signal.Signals) -> None:
+def test_flight_continues_without_its_link_server(shell: Shell, number: signal.Signals) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         connection, ended = f"udpout:127.0.0.1:{port}", list[int]()
 
-        def strike() -> None:
+        def send_signal() -> None:
             if not ended:
                 ended.extend(servers(connection))
                 os.kill(ended[0], number)
                 wait_until(lambda: bool({*servers(connection)} - {*ended}), Deadline.after(60))
                 assert autopilot.vehicle.armed, "the server was replaced in flight"
 
-        fly(shell, port, "5s", strike)
+        fly(shell, port, "5s", send_signal)
         assert len(ended) == 1
         assert autopilot.vehicle.body.on_ground
         assert not autopilot.vehicle.armed
     wait_for_end(set(ended), within_s=30.0)
-    assert [text for _, text in said(shell, "fly")][-1] == "landed"
+    assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
 
 
 def silent_lines(shell: Shell) -> int:
-    """Return how many lines of the log, ten a second, show on the way that no position came in the last second."""
+    """Return the number of log lines, ten per second, that report no position in the last second of flight."""
     lines = (shell.home / FOLDER / "fly.jsonl").read_text(encoding="ascii").splitlines()
     moments = [moment for moment in map(json.loads, lines) if moment.get("phase") in {"flying", "there"}]
     assert moments
     return sum(moment["rate_hz"] == 0 for moment in moments)
 
 
-def test_a_flight_outlasts_a_restart_of_its_router(shell: Shell) -> None:
+def test_flight_continues_after_restart_of_its_router(shell: Shell) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), MavlinkRouter(port) as router:
         restarts: list[float] = []
 
@@ -177,12 +177,12 @@ def test_a_flight_outlasts_a_restart_of_its_router(shell: Shell) -> None:
         assert autopilot.vehicle.body.on_ground
         assert not autopilot.vehicle.armed
         assert restarts
-        assert router.accepted == 2, "the link server's connection, and the one after the restart"
-    assert silent_lines(shell) >= 3, "positions did not arrive meanwhile"
-    assert [text for _, text in said(shell, "fly")][-1] == "landed"
+        assert router.accepted == 2, "the connection of the link server, and the one after the restart"
+    assert silent_lines(shell) >= 3, "no positions arrived during the interruption"
+    assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
 
 
-def test_a_flight_outlasts_a_serial_device_that_disappears_for_two_seconds(shell: Shell, tmp_path: Path) -> None:
+def test_flight_continues_after_serial_device_was_missing_for_two_seconds(shell: Shell, tmp_path: Path) -> None:
     with drones.autopilot_at_usb(tmp_path / "ttyUSB0") as (usb, autopilot):
         back = threading.Timer(2.0, usb.plug_in)
 
@@ -196,46 +196,44 @@ def test_a_flight_outlasts_a_serial_device_that_disappears_for_two_seconds(shell
         back.join()
         assert autopilot.vehicle.body.on_ground
         assert not autopilot.vehicle.armed
-    assert silent_lines(shell) >= 3, "positions did not arrive meanwhile"
-    assert [text for _, text in said(shell, "fly")][-1] == "landed"
+    assert silent_lines(shell) >= 3, "no positions arrived during the interruption"
+    assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])
-def test_the_guard_lands_a_drone_whose_pilot_does_not_run(
-    shell: Shell, number: signal.Signals, firmware: Firmware
-) -> None:
-    """It ends a suspended pilot first, which could lead the drone again later."""
-    struck: list[tuple[int, float]] = []
+def test_guard_lands_drone_whose_pilot_does_not_run(shell: Shell, number: signal.Signals, firmware: Firmware) -> None:
+    """It kills a suspended pilot first, which could otherwise control the drone again later."""
+    target: list[tuple[int, float]] = []
 
-    def strike() -> None:
+    def send_signal() -> None:
         pid = agent_of(shell, "fly")
         os.kill(pid, number)
-        struck.append((pid, time.time()))
+        target.append((pid, time.time()))
 
     with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot):
         with pytest.raises(RobotError, match="ended with exit code 137"):
-            fly(shell, port, "60min", strike)
+            fly(shell, port, "60min", send_signal)
         wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
         assert autopilot.vehicle.body.on_ground
-        wait_until(lambda: any(text == "landed" for _, text in said(shell, "guard")), Deadline.after(60))
-    ((pid, at_s),) = struck
+        wait_until(lambda: any(text == "landed" for _, text in log_lines(shell, "guard")), Deadline.after(60))
+    ((pid, at_s),) = target
     wait_for_end({pid}, within_s=30.0)
-    (seen_s,) = (seen_s for seen_s, text in said(shell, "guard") if text.startswith("land: the pilot "))
+    (seen_s,) = (seen_s for seen_s, text in log_lines(shell, "guard") if text.startswith("land: the pilot "))
     assert seen_s - at_s < NOTICED_S
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_the_pilot_lands_its_drone_where_the_guard_does_not_run(shell: Shell, number: signal.Signals) -> None:
+def test_pilot_lands_drone_whose_guard_does_not_run(shell: Shell, number: signal.Signals) -> None:
     guards: list[int] = []
 
-    def strike() -> None:
+    def send_signal() -> None:
         guards.append(agent_of(shell, "guard"))
         os.kill(guards[0], number)
 
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError, match="its flight ended early: the guard "):
-            fly(shell, port, "60min", strike)
+            fly(shell, port, "60min", send_signal)
         wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
         wait_until(lambda: "landed" in log(shell), Deadline.after(60))
         if number == signal.SIGSTOP:
@@ -243,8 +241,8 @@ def test_the_pilot_lands_its_drone_where_the_guard_does_not_run(shell: Shell, nu
     evidence.end_jobs(shell, FOLDER)
 
 
-def test_neither_pilot_nor_guard_touches_a_drone_that_a_person_has_taken_over(shell: Shell) -> None:
-    """The pilot of an ArduCopter takes LOITER by remote control; the job is ended then, as by Ctrl-C."""
+def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) -> None:
+    """A person switches an ArduCopter to LOITER by remote control; then the job is stopped, as by Ctrl-C."""
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError, match=r"another party flies it \(mode LOITER") as caught:
             fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LOITER))
@@ -257,20 +255,20 @@ def test_neither_pilot_nor_guard_touches_a_drone_that_a_person_has_taken_over(sh
         assert not autopilot.vehicle.body.on_ground
 
 
-def test_a_guard_leaves_a_drone_that_a_person_took_over_from_a_suspended_pilot(shell: Shell) -> None:
-    def strike() -> None:
+def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(shell: Shell) -> None:
+    def send_signal() -> None:
         os.kill(agent_of(shell, "fly"), signal.SIGSTOP)
         autopilot.vehicle.change_mode(Mode.LOITER)
 
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError, match="ended with exit code 137"):
-            fly(shell, port, "60min", strike)
+            fly(shell, port, "60min", send_signal)
         wait_until(lambda: jobs.left(shell, Deadline.after(30)) == (), Deadline.after(60))
         assert autopilot.vehicle.mode is Mode.LOITER
         assert not autopilot.vehicle.body.on_ground
 
 
-def test_an_arducopter_returns_whose_laptop_is_not_heard_for_longer_than_its_lease(shell: Shell) -> None:
+def test_arducopter_returns_after_its_lease_expired(shell: Shell) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         for name, centimetres in (("RTL_ALT", 100.0), ("WPNAV_RADIUS", 10.0)):
             autopilot._parameters.set(name, centimetres)
@@ -283,14 +281,14 @@ def test_an_arducopter_returns_whose_laptop_is_not_heard_for_longer_than_its_lea
         with pytest.raises(LinkError, match="out of range"):
             fly(shell, port, "1ms", cut, OnAbort.RETURN)
         wait_until(lambda: not vehicle.armed, Deadline.after(60))
-        assert math.hypot(*vehicle.body.position_m[:2]) < NEAR_M, "where it rose"
+        assert math.hypot(*vehicle.body.position_m[:2]) < NEAR_M, "at the take-off point"
         shell.is_cut = False
         wait_until(lambda: "landed" in log(shell), Deadline.after(60))
         assert "return: the order was not renewed in time" in log(shell)
 
 
-def test_who_ends_all_jobs_leaves_a_pilot_the_time_that_it_needs(shell: Shell) -> None:
-    """Its autopilot lands, as it was told, for longer than others may take to end."""
+def test_stop_of_all_jobs_lets_the_pilot_land(shell: Shell) -> None:
+    """The landing takes longer than the grace period of other jobs."""
     with drones.autopilot_at_udp() as (port, autopilot):
         autopilot._parameters.set("MPC_LAND_SPEED", 0.1)
         with suppress(RobotError):

@@ -1,4 +1,4 @@
-"""The step mavlink: what a procedure may say, what is recorded where, and what an attempt then keeps."""
+"""The step mavlink: valid keys, jobs of the recorder, and positions and checks from its files."""
 
 import json
 import math
@@ -36,8 +36,8 @@ DRONE = CAST[Role.RECEIVER].model_copy(
 SCENE = replace(Scene(Protocol.UDP, {**CAST, Role.RECEIVER: DRONE}, "f"), placement=PLACED)
 START_NS = START_US * 1000
 NOTHING: dict[str, object] = {}
-BEGAN_S = 0.1005
-"""When the steps inside began: with the second message of each kind."""
+START_S = 0.1005
+"""Start of the steps inside, at the second message of each kind."""
 
 
 def mavlink(more: str = "", during: str = PING) -> MavlinkStep:
@@ -46,37 +46,37 @@ def mavlink(more: str = "", during: str = PING) -> MavlinkStep:
 
 
 @pytest.mark.parametrize(
-    ("more", "complaint"),
+    ("more", "message"),
     [
-        ("rates: {ATITUDE: 5Hz}", "no rate can be asked for 'ATITUDE'; there are SYS_STATUS"),
+        ("rates: {ATITUDE: 5Hz}", "no rate can be requested for 'ATITUDE'; possible: SYS_STATUS"),
         ("rates: {ATTITUDE: 5}", "has no unit"),
         ("rates: {ATTITUDE: 0Hz}", "greater than 0"),
-        ("positions: local", "say where it faces"),
-        ("positions: global, facing: away", "say where it faces"),
+        ("positions: local", "facing is required with positions: local"),
+        ("positions: global, facing: away", "facing is required with positions: local"),
         ("system: 256", "less than or equal to 255"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_a_sentence(more: str, complaint: str) -> None:
-    with pytest.raises(ConfigurationError, match=complaint):
+def test_invalid_keys_are_refused(more: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
         mavlink(more)
 
 
-def test_a_robot_without_an_autopilot_is_refused() -> None:
+def test_robot_without_autopilot_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="has no mavlink"):
         list(mavlink().jobs(replace(SCENE, cast=CAST)))
 
 
-def told(step: MavlinkStep, scene: Scene = SCENE) -> tuple[Role, dict[str, object]]:
+def role_and_argument(step: MavlinkStep, scene: Scene = SCENE) -> tuple[Role, dict[str, object]]:
     recording, _ = step.jobs(scene)
     return recording.role, json.loads(recording.job.argv[-2])
 
 
-def test_the_drone_records_itself_and_another_robot_over_the_radio() -> None:
-    own = {"connection": "udpout:127.0.0.1:14550", "intervals_us": {}, "system": 0}
-    assert told(mavlink()) == (Role.RECEIVER, own)
-    far = {"connection": f"udpout:{DRONE.address}:14550", "intervals_us": {"30": 50_000}, "system": 7}
+def test_recorder_on_the_drone_and_on_another_robot() -> None:
+    local = {"connection": "udpout:127.0.0.1:14550", "intervals_us": {}, "system": 0}
+    assert role_and_argument(mavlink()) == (Role.RECEIVER, local)
+    remote = {"connection": f"udpout:{DRONE.address}:14550", "intervals_us": {"30": 50_000}, "system": 7}
     step = mavlink("at: sender, system: 7, rates: {ATTITUDE: 20Hz}")
-    assert told(step) == (Role.SENDER, far)
+    assert role_and_argument(step) == (Role.SENDER, remote)
     (flow,) = step.flows(SCENE)
     assert flow == Flow(Role.RECEIVER, Role.SENDER, 14550, flow.frames, Protocol.UDP, served=True)
     assert not list(mavlink().flows(SCENE))
@@ -84,116 +84,116 @@ def test_the_drone_records_itself_and_another_robot_over_the_radio() -> None:
     assert step.bytes_left(SCENE, Role.RECEIVER) == 0
 
 
-def test_a_profile_says_how_a_robot_reaches_its_own_autopilot() -> None:
+def test_local_recorder_uses_connection_of_profile() -> None:
     profile = DRONE.profile.model_copy(update={"mavlink": Mavlink(port=14550, connection="/dev/ttyAMA0:921600")})
     scene = replace(SCENE, cast={**CAST, Role.RECEIVER: DRONE.model_copy(update={"profile": profile})})
-    assert told(mavlink(), scene)[1]["connection"] == "/dev/ttyAMA0:921600"
-    assert told(mavlink("at: sender"), scene)[1]["connection"] == f"udpout:{DRONE.address}:14550"
+    assert role_and_argument(mavlink(), scene)[1]["connection"] == "/dev/ttyAMA0:921600"
+    assert role_and_argument(mavlink("at: sender"), scene)[1]["connection"] == f"udpout:{DRONE.address}:14550"
 
 
 @pytest.mark.parametrize("connection", ["udp:h:1", "tcp:h", "/etc/passwd:1", "udpout:a b:1", "tcp:$(x):1"])
-def test_a_connection_of_another_kind_is_refused(connection: str) -> None:
+def test_invalid_connection_is_refused(connection: str) -> None:
     with pytest.raises(ConfigurationError, match="connection"):
         schema.validate(schema.parse(f"{{port: 1, connection: '{connection}'}}", source="x.yaml"), Mavlink)
 
 
-def test_who_tells_where_robots_are_stands_where_they_begin() -> None:
+def test_step_with_positions_must_not_be_inside_a_move() -> None:
     head = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps: "
     step = f"{{mavlink: {{robot: receiver, positions: local, facing: away, during: [{PING}]}}}}"
     moved = f"[move: {{robot: receiver, path: [away: 1m], speed: 1m/s, during: [{step}]}}]"
     with pytest.raises(ConfigurationError, match="put the move into the mavlink"):
         schema.validate(schema.parse(head + moved, source="x.yaml"), Procedure)
-    told_of_none = moved.replace("positions: local, facing: away, ", "")
-    assert schema.validate(schema.parse(head + told_of_none, source="x.yaml"), Procedure)
+    without_positions = moved.replace("positions: local, facing: away, ", "")
+    assert schema.validate(schema.parse(head + without_positions, source="x.yaml"), Procedure)
 
 
 def attempt(
-    tmp_path: Path, step: MavlinkStep, log: bytes, clock: Offset | None = None, said: dict[str, object] = NOTHING
+    tmp_path: Path, step: MavlinkStep, log: bytes, clock: Offset | None = None, counters: dict[str, object] = NOTHING
 ) -> View:
-    """Return an attempt whose log this is, 10 messages a second from `START_US` on."""
-    began = step._accounts(SCENE, START_NS + round(1e9 * BEGAN_S), {Role.SENDER: clock} if clock else {})
+    """Return an attempt with this log, which has 10 messages per second from `START_US` on."""
+    began = step._accounts(SCENE, START_NS + round(1e9 * START_S), {Role.SENDER: clock} if clock else {})
     (tmp_path / accounts.FILE).write_text(accounts.text(began), encoding="utf-8")
     (tmp_path / "mavlink.tlog").write_bytes(log)
-    whole = {"frames": 203, "left_out": 0, "ended_us": START_US + 10_000_000, "refused": {}} | said
-    (tmp_path / "mavlink.json").write_text(json.dumps(whole), encoding="utf-8")
+    all_counters = {"frames": 203, "left_out": 0, "ended_us": START_US + 10_000_000, "refused": {}} | counters
+    (tmp_path / "mavlink.json").write_text(json.dumps(all_counters), encoding="utf-8")
     return View(SCENE, AttemptEvidence(tmp_path))
 
 
 def apart(view: View, from_s: float, to_s: float) -> Apart:
     source, destination = where.of_two(view.evidence, (Role.SENDER, Role.RECEIVER))
-    began_ns = START_NS + round(1e9 * BEGAN_S)
+    began_ns = START_NS + round(1e9 * START_S)
     return trajectories.apart(source, destination, began_ns + round(from_s * 1e9), began_ns + round(to_s * 1e9))
 
 
 LOCAL = "positions: local, facing: left"
 
 
-def test_its_own_frame_is_turned_into_that_of_the_placement(tmp_path: Path) -> None:
-    """It looks north and to the left, and flies ahead: at 10 m, then along a line that is square to the link."""
+def test_local_frame_is_rotated_into_frame_of_placement(tmp_path: Path) -> None:
+    """The drone faces north, which is to the left of the link, and flies ahead from a distance of 10 m."""
     view = attempt(tmp_path, mavlink(LOCAL), flight(10, 1.0))
     assert not list(mavlink(LOCAL).check(view))
-    found = apart(view, 1, 9)
-    assert found.distance_start_m == pytest.approx(math.hypot(10, 1), abs=1e-3)
-    assert found.distance_max_m == pytest.approx(math.hypot(10, 9), abs=1e-3)
+    distances = apart(view, 1, 9)
+    assert distances.distance_start_m == pytest.approx(math.hypot(10, 1), abs=1e-3)
+    assert distances.distance_max_m == pytest.approx(math.hypot(10, 9), abs=1e-3)
     measured = mavlink(LOCAL).measure(view)
     assert measured.values["positions_from"] == "sender as placed, receiver LOCAL_POSITION_NED"
     assert measured.values["mavlink_north_end_m"] == 10
 
 
-def test_times_are_by_the_clock_of_who_recorded(tmp_path: Path) -> None:
+def test_times_use_clock_of_the_recorder(tmp_path: Path) -> None:
     step = mavlink(f"at: sender, {LOCAL}")
     view = attempt(tmp_path, step, flight(10, 1.0), Offset(0.5, 0.001))
     assert where.samples_of(view.evidence, Role.RECEIVER).times_ns[0] == START_NS + 500_000 - 500_000_000
 
 
-def test_what_the_radio_held_back_was_true_when_the_autopilot_says(tmp_path: Path) -> None:
-    held_back = b"".join(
-        struct.pack(">Q", one.at_us + (2_000_000 if one.at_us > START_US + 5_000_000 else 0)) + one.data
-        for one in tlog_reader.frames(flight(10, 1.0))
+def test_delayed_messages_count_at_time_in_header(tmp_path: Path) -> None:
+    delayed = b"".join(
+        struct.pack(">Q", frame.at_us + (2_000_000 if frame.at_us > START_US + 5_000_000 else 0)) + frame.data
+        for frame in tlog_reader.frames(flight(10, 1.0))
     )
-    told = attempt(tmp_path, mavlink(LOCAL), held_back)
-    assert apart(told, 1, 8).distance_max_m == pytest.approx(math.hypot(10, 8), abs=1e-3)
-    received = attempt(tmp_path, mavlink(f"{LOCAL}, times: received"), held_back)
+    by_header = attempt(tmp_path, mavlink(LOCAL), delayed)
+    assert apart(by_header, 1, 8).distance_max_m == pytest.approx(math.hypot(10, 8), abs=1e-3)
+    received = attempt(tmp_path, mavlink(f"{LOCAL}, times: received"), delayed)
     assert apart(received, 1, 8).distance_max_m == pytest.approx(math.hypot(10, 6), abs=1e-3)
 
 
-def test_degrees_stand_beside_a_place_on_the_earth(tmp_path: Path) -> None:
+def test_global_positions_with_fixed_position_on_the_earth(tmp_path: Path) -> None:
     sender, step = Sender(), mavlink("positions: global, heights: true")
     frames = [(0, sender.frame(beat()))]
     for at_ms in range(0, 10_001, 100):
-        north = round(1e7 * at_ms / 1e3 / 110_574.3)  # a metre a second: of a degree, at the equator
+        north = round(1e7 * at_ms / 1e3 / 110_574.3)  # 1 m/s northwards, in degrees at the equator
         place = d.MAVLink_global_position_int_message(at_ms, north, 0, 30_000, 3_000, 100, 0, 0, 0)
         frames.append((at_ms * 1_000, sender.frame(place)))
-    view = attempt(tmp_path, step, stamped(frames), said={"frames": 102})
+    view = attempt(tmp_path, step, stamped(frames), counters={"frames": 102})
     assert not list(step.check(view))
-    told = Account(place=(0.0, 0.0, 0.0), frame=WGS84)
-    robots = {**accounts.read(tmp_path / accounts.FILE).robots, Role.SENDER: told}
+    fixed = Account(place=(0.0, 0.0, 0.0), frame=WGS84)
+    robots = {**accounts.read(tmp_path / accounts.FILE).robots, Role.SENDER: fixed}
     (tmp_path / accounts.FILE).write_text(accounts.text(Accounts(robots, heights=True)), encoding="utf-8")
-    found = apart(View(SCENE, AttemptEvidence(tmp_path)), 2 - BEGAN_S, 8 - BEGAN_S)
-    assert found.distance_start_m == pytest.approx(math.hypot(30, 2), abs=0.02)
-    assert found.distance_max_m == pytest.approx(math.hypot(30, 8), abs=0.02)
+    distances = apart(View(SCENE, AttemptEvidence(tmp_path)), 2 - START_S, 8 - START_S)
+    assert distances.distance_start_m == pytest.approx(math.hypot(30, 2), abs=0.02)
+    assert distances.distance_max_m == pytest.approx(math.hypot(30, 8), abs=0.02)
 
 
 @pytest.mark.parametrize(
-    ("log", "said", "problem"),
+    ("log", "counters", "problem"),
     [
         (flight(10)[:-3], {}, "is cut off"),
         (flight(10), {"frames": 9}, "mavlink.tlog has 203 frames, its recorder wrote 9"),
-        (flight(10), {"left_out": 4}, "4 frames more came"),
-        (flight(10), {"refused": {"1": 2}}, "does not send SYS_STATUS as asked"),
-        (flight(10), {}, "no SYS_STATUS, which was asked for"),
+        (flight(10), {"left_out": 4}, "lacks 4 received frames"),
+        (flight(10), {"refused": {"1": 2}}, "refused the request for SYS_STATUS"),
+        (flight(10), {}, "no SYS_STATUS, which was requested"),
         (b"", {"frames": 0}, "no heartbeat of an autopilot"),
     ],
 )
-def test_a_log_that_is_not_whole_voids_the_repeat(
-    log: bytes, said: dict[str, object], problem: str, tmp_path: Path
+def test_incomplete_log_makes_repeat_void(
+    log: bytes, counters: dict[str, object], problem: str, tmp_path: Path
 ) -> None:
     step = mavlink(f"{LOCAL}, rates: {{SYS_STATUS: 1Hz}}")
-    problems = list(step.check(attempt(tmp_path, step, log, said=said)))
-    assert any(problem in one for one in problems), problems
+    problems = list(step.check(attempt(tmp_path, step, log, counters=counters)))
+    assert any(problem in text for text in problems), problems
 
 
-def test_what_a_step_inside_told_of_others_stays() -> None:
+def test_sources_of_steps_inside_are_kept() -> None:
     placed, topic, file = Account(place=(0.0, 0.0, 0.0)), Account(file="a.bag", topic="/odom"), Account(file="b.tlog")
     inner = Accounts({Role.SENDER: topic, Role.RECEIVER: placed})
     outer = Accounts({Role.SENDER: placed, Role.RECEIVER: file}, {Role.SENDER: Offset(1, 0.1)}, heights=True)

@@ -1,4 +1,4 @@
-"""The step move: what a procedure may say, what the lab is asked, and what is refused before a robot moves."""
+"""The step move: valid keys, the move passed to the testbed, and refusals before a robot moves."""
 
 import math
 from collections.abc import Iterator
@@ -51,7 +51,7 @@ def move(text: str) -> MoveStep:
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "message"),
     [
         (f"robot: sender, speed: 1m/s, {PING}", "'path' is missing"),
         (f"robot: sender, path: [], speed: 1m/s, {PING}", "at least 1 item"),
@@ -69,30 +69,30 @@ def move(text: str) -> MoveStep:
         (f"robot: Laptop, path: [{{away: 1m}}], speed: 1m/s, {PING}", "a role is named by small letters"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_a_sentence(text: str, complaint: str) -> None:
-    with pytest.raises(ConfigurationError, match=complaint) as caught:
+def test_invalid_keys_are_refused(text: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         move(text)
     assert caught.value.where == "x.yaml:1"
 
 
-def test_a_move_inside_a_fault_is_refused_with_its_line() -> None:
+def test_move_inside_fault_is_refused_with_line() -> None:
     with pytest.raises(ConfigurationError, match="put the fault into the move") as caught:
         schema.validate(schema.parse(INSIDE, source="x.yaml"), Procedure)
     assert caught.value.where == "x.yaml:12"
 
 
-def test_the_lab_is_asked_for_metres_and_seconds() -> None:
+def test_motion_is_in_metres_and_seconds() -> None:
     step = move(f"robot: receiver, path: [{{towards: 2km}}, {{away: 3m, right: 4m}}], speed: 3.6km/h, {PING}")
     assert step.motion == model.Move(Role.RECEIVER, (Leg(-2000.0), Leg(3.0, -4.0)), 1.0)
     assert geometry.length_m(step.motion) == pytest.approx(2005.0)
     assert geometry.in_words(step.motion) == "2000 m towards, then 3 m away and 4 m right, at 1 m/s"
     assert step.roles() == {Role.SENDER, Role.RECEIVER}
-    assert [in_shell(one.job) for one in step.jobs(SCENE)] == [
-        in_shell(one.job) for one in step.during[0].step.jobs(SCENE)
+    assert [in_shell(planned.job) for planned in step.jobs(SCENE)] == [
+        in_shell(planned.job) for planned in step.during[0].step.jobs(SCENE)
     ]
 
 
-def test_ways_lead_from_the_place_of_each_role() -> None:
+def test_direction_of_path_depends_on_role() -> None:
     legs = (Leg(away_m=3.0), Leg(left_m=2.0))
     assert geometry.way_m(model.Move(Role.SENDER, legs, 1.0)) == ((0.0, 0.0), (-3.0, 0.0), (-3.0, -2.0))
     assert geometry.way_m(model.Move(Role.RECEIVER, legs, 1.0)) == ((0.0, 0.0), (3.0, 0.0), (3.0, 2.0))
@@ -101,102 +101,104 @@ def test_ways_lead_from_the_place_of_each_role() -> None:
     assert geometry.other_end(Role.SENDER, Topology.MASTERLESS) is Role.RECEIVER
 
 
-def test_a_robot_is_not_asked_for_more_than_its_top_speed() -> None:
+def test_move_above_top_speed_is_refused() -> None:
     (refusal,) = move(f"robot: sender, path: [{{away: 1m}}], speed: 0.3m/s, {PING}").refusals(SCENE)
     assert refusal.role is Role.SENDER
-    assert refusal.what == "its top speed is 0.22 m/s, and it is to move at 0.3 m/s"
+    assert refusal.what == "its top speed is 0.22 m/s, but the move needs 0.3 m/s"
     assert not list(move(f"robot: relay, path: [{{away: 1m}}], speed: 3m/s, {PING}").refusals(SCENE))
 
 
-def test_steps_run_while_the_robot_moves_and_their_error_ends_it() -> None:
-    happened: list[object] = []
+def test_steps_run_during_motion_and_their_error_ends_it() -> None:
+    events: list[object] = []
 
     class Robots:
         @contextmanager
-        def moving(self, wanted: model.Move) -> Iterator[None]:
-            happened.append(wanted)
+        def moving(self, motion: model.Move) -> Iterator[None]:
+            events.append(motion)
             try:
                 yield
             finally:
-                happened.append("back")
+                events.append("back")
 
         @property
-        def shells(self) -> Any:  # noqa: ANN401 (none is there)
-            happened.append("inside")
-            raise RobotError("it broke", remedy="mend it")
+        def shells(self) -> Any:  # noqa: ANN401 (there are no shells)
+            events.append("inside")
+            raise RobotError("it broke", remedy="repair it")
 
     step = move(f"robot: sender, path: [{{away: 1m}}], speed: 0.1m/s, {PING}")
     with pytest.raises(RobotError, match="it broke"):
-        step.run(SCENE, cast("Testbed", Robots()), lambda name, expected_s: happened.append(name))
-    assert happened == ["move turtlebot-1", step.motion, "ping", "inside", "back"]
+        step.run(SCENE, cast("Testbed", Robots()), lambda name, expected_s: events.append(name))
+    assert events == ["move turtlebot-1", step.motion, "ping", "inside", "back"]
 
 
-def test_the_dry_run_shows_what_no_command_does(capsys: pytest.CaptureFixture[str]) -> None:
+def test_dry_run_shows_moves_and_faults(capsys: pytest.CaptureFixture[str]) -> None:
     shipped = load_procedure("driveaway")
     print_commands(los_plan().model_copy(update={"procedure": shipped.resolved(CAST)}))
-    said = capsys.readouterr().out.splitlines()
-    assert "# while steps run: turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.1 s" in said
-    assert not any("refused" in line for line in said)
+    output = capsys.readouterr().out.splitlines()
+    assert "# while steps run: turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.1 s" in output
+    assert not any("refused" in line for line in output)
     healing = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
     print_commands(healing)
-    said = capsys.readouterr().out.splitlines()
-    assert "# while steps run: link-down of turtlebot-1 for 2 s, after 1 s" in said
+    output = capsys.readouterr().out.splitlines()
+    assert "# while steps run: link-down of turtlebot-1 for 2 s, after 1 s" in output
 
 
-def fitted(text: str, cast: Cast = CAST) -> MoveStep:
+def resolved_move(text: str, cast: Cast = CAST) -> MoveStep:
     return move(text).resolved(cast)
 
 
-def test_a_robot_within_its_limits_goes_as_fast_and_as_far_as_it_may() -> None:
+def test_move_within_limits_is_reduced_to_speed_and_fence() -> None:
     path = "path: [{away: 60m}], speed: 2m/s"
-    slow = fitted(f"robot: receiver, {path}, within_limits: true, {PING}")
+    slow = resolved_move(f"robot: receiver, {path}, within_limits: true, {PING}")
     assert slow.motion == model.Move(Role.RECEIVER, (Leg(29.5),), 0.22)
-    assert slow.lasts_s == pytest.approx(29.5 / 0.22, abs=1e-3)
+    assert slow.straight_s == pytest.approx(29.5 / 0.22, abs=1e-3)
     assert not list(slow.refusals(SCENE))
-    drone = fitted(f"robot: relay, {path}, within_limits: true, {PING}")
-    assert drone.motion == model.Move(Role.RELAY, (Leg(60.0),), 2.0), "it may"
-    assert not slow.within_limits, "what is planned says what is driven"
-    refused = fitted(f"robot: receiver, {path}, {PING}")
+    drone = resolved_move(f"robot: relay, {path}, within_limits: true, {PING}")
+    assert drone.motion == model.Move(Role.RELAY, (Leg(60.0),), 2.0), "within the limits of the drone"
+    assert not slow.within_limits, "the plan has the actual motion"
+    refused = resolved_move(f"robot: receiver, {path}, {PING}")
     assert refused.motion.speed_m_s == 2.0
-    assert [one.what for one in refused.refusals(SCENE)] == ["its top speed is 0.22 m/s, and it is to move at 2 m/s"]
+    assert [refusal.what for refusal in refused.refusals(SCENE)] == [
+        "its top speed is 0.22 m/s, but the move needs 2 m/s"
+    ]
 
 
 @pytest.mark.parametrize(
-    ("profile", "said", "pings"),
+    ("profile", "note", "pings"),
     [
         (
             "turtlebot3_burger",
-            "turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.4 s, and back, by itself",
+            "turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.4 s, and back, automatically",
             672,
         ),
-        ("husky", "turtlebot-2 moves 60 m away, at 1 m/s, for up to 62.6 s, and back, by itself", 313),
+        ("husky", "turtlebot-2 moves 60 m away, at 1 m/s, for up to 62.6 s, and back, automatically", 313),
         ("duckiedrone", "turtlebot-2 moves 60 m away, at 2 m/s, for up to 30 s", 150),
     ],
 )
-def test_the_one_that_ships_runs_with_what_a_lab_has(
-    profile: str, said: str, pings: int, capsys: pytest.CaptureFixture[str]
+def test_shipped_procedure_with_shipped_profiles(
+    profile: str, note: str, pings: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    own = load_profile(profile)
-    update = {"profile": own, "drives": own.drive is not None}
+    loaded = load_profile(profile)
+    update = {"profile": loaded, "drives": loaded.drive is not None}
     cast = {role: robot.model_copy(update=update) for role, robot in CAST.items()}
     request = TrialRequest(load_procedure("driveaway"), parse_distance("5m"))
     plan = make_plan(request, backend="field", cast=cast, now=datetime(2026, 11, 20, tzinfo=UTC))
     print_commands(plan)
     out = capsys.readouterr().out
-    assert said in out
+    assert note in out
     assert f"-c {pings} -i 0.2" in out
     assert "refused" not in out
-    assert bool(plan.columns) == (own.drive is not None), "columns of driving"
+    assert bool(plan.columns) == (loaded.drive is not None), "columns of the drive"
 
 
-def test_who_names_no_speed_goes_at_the_top_speed() -> None:
+def test_top_speed_is_the_default() -> None:
     step = move(f"robot: receiver, path: [{{away: 1m}}], {PING}")
     assert step.resolved(CAST).motion.speed_m_s == 0.22
-    with pytest.raises(ValueError, match="not fitted"):
+    with pytest.raises(ValueError, match="has no speed"):
         _ = step.motion
 
 
-def test_what_is_made_less_is_said() -> None:
+def test_adjustments_describe_the_reduction() -> None:
     text = f"robot: receiver, path: [{{away: 40m}}], within_limits: true, {PING}"
     assert list(move(text).adjustments(CAST)) == [
         "turtlebot-2 moves 29.5 m away, at 0.22 m/s; 40 m away, at 0.22 m/s is beyond its limits"
@@ -205,7 +207,7 @@ def test_what_is_made_less_is_said() -> None:
     assert not list(move(text.replace("within_limits: true, ", "")).adjustments(CAST))
 
 
-def test_a_plan_reads_back_what_it_says() -> None:
+def test_written_plan_is_read_unchanged() -> None:
     plan = los_plan().model_copy(update={"procedure": load_procedure("driveaway").resolved(CAST)})
     again = schema.validate(schema.parse(schema.dump(plan.procedure), source="trial.yaml"), Procedure)
     assert again == plan.procedure
@@ -218,41 +220,41 @@ legs = st.lists(st.builds(Leg, lengths, lengths).filter(lambda leg: leg != Leg()
 
 
 @given(legs, st.floats(0.5, 40))
-def test_a_way_ends_where_it_meets_its_fence(way: list[Leg], fence_m: float) -> None:
-    kept = geometry.within(way, fence_m)
-    assert geometry.farthest_m(kept) <= fence_m + 1e-6
-    if geometry.farthest_m(way) <= fence_m:
-        assert list(kept) == way
+def test_path_is_shortened_at_the_fence(path: list[Leg], fence_m: float) -> None:
+    shortened = geometry.within(path, fence_m)
+    assert geometry.farthest_m(shortened) <= fence_m + 1e-6
+    if geometry.farthest_m(path) <= fence_m:
+        assert list(shortened) == path
         return
-    whole = len(kept) - 1
-    assert list(kept[:whole]) == way[:whole]
-    end = math.hypot(sum(leg.away_m for leg in kept), sum(leg.left_m for leg in kept))
+    complete = len(shortened) - 1
+    assert list(shortened[:complete]) == path[:complete]
+    end = math.hypot(sum(leg.away_m for leg in shortened), sum(leg.left_m for leg in shortened))
     assert end == pytest.approx(fence_m, abs=1e-6)
-    cut, leg = kept[whole], way[whole]
+    cut, leg = shortened[complete], path[complete]
     assert cut.away_m * leg.left_m == pytest.approx(cut.left_m * leg.away_m, abs=1e-6), "the same direction"
     assert math.hypot(cut.away_m, cut.left_m) <= math.hypot(leg.away_m, leg.left_m) + 1e-6
 
 
 @given(legs, st.floats(0.5, 40))
-def test_a_way_that_was_cut_is_a_procedure_s_own(way: list[Leg], fence_m: float) -> None:
-    pieces = [PathLeg.of(leg) for leg in geometry.within(way, fence_m)]
-    for piece, leg in zip(pieces, way, strict=False):
-        if piece is not None:
-            again = schema.validate(schema.parse(schema.dump(piece), source="x.yaml"), PathLeg)
-            assert again == piece
+def test_shortened_path_is_valid_in_a_procedure(path: list[Leg], fence_m: float) -> None:
+    segments = [PathLeg.of(leg) for leg in geometry.within(path, fence_m)]
+    for segment, leg in zip(segments, path, strict=False):
+        if segment is not None:
+            again = schema.validate(schema.parse(schema.dump(segment), source="x.yaml"), PathLeg)
+            assert again == segment
             assert abs(again.leg.away_m) <= abs(leg.away_m) + 1e-9
             assert again.leg.away_m * leg.away_m >= 0
             assert again.leg.left_m * leg.left_m >= 0
 
 
-def test_a_robot_that_drives_has_columns_of_it_and_its_way_back_takes_time() -> None:
+def test_driving_robot_has_columns_and_time_for_the_return() -> None:
     text = f"robot: receiver, path: [{{away: 2m}}], speed: 0.2m/s, {PING}"
     drives = {role: robot.model_copy(update={"drives": True}) for role, robot in CAST.items()}
-    by_itself, moved = fitted(text, drives), fitted(text)
-    assert {column.name for column in by_itself.output_columns()} >= {
+    driving, moved = resolved_move(text, drives), resolved_move(text)
+    assert {column.name for column in driving.output_columns()} >= {
         "drive_out_m",
         "drive_back_off_m",
         "drive_ended",
     }
     assert not moved.output_columns()
-    assert by_itself.expected_s(Protocol.UDP) == moved.expected_s(Protocol.UDP) + 10.0
+    assert driving.expected_s(Protocol.UDP) == moved.expected_s(Protocol.UDP) + 10.0

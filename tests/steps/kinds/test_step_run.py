@@ -1,4 +1,4 @@
-"""A step `run`: what the robot is told, what of it is refused, what its output is worth."""
+"""The step run: command lines, refusals, and values from the output."""
 
 import signal
 from dataclasses import replace
@@ -43,7 +43,7 @@ def run_step(text: str) -> RunStep:
     return schema.validate(schema.parse(text, source="run.yaml"), RunStep)
 
 
-def test_words_are_those_of_a_shell_and_addresses_are_filled_in() -> None:
+def test_command_is_split_into_words_with_addresses() -> None:
     (planned,) = run_step(BATTERY).jobs(SCENE)
     assert planned.role == Role.RECEIVER
     assert planned.program == "vendorctl"
@@ -55,14 +55,12 @@ def test_words_are_those_of_a_shell_and_addresses_are_filled_in() -> None:
     assert run_step(BATTERY).roles() == {Role.RECEIVER, Role.SENDER}
 
 
-def test_a_shell_has_no_say_in_words() -> None:
+def test_words_are_not_interpreted_by_a_shell() -> None:
     (planned,) = run_step("{robot: sender, argv: [echo, '$HOME; rm *', '{print}', '|']}").jobs(SCENE)
     assert planned.job.argv[-4:] == ("echo", "$HOME; rm *", "{print}", "|")
 
 
-def test_distance_repeat_and_the_copied_program_are_filled_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_variables_are_filled_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "probe").write_text("x", encoding="utf-8")
     (tmp_path / "probe").chmod(0o755)
     monkeypatch.chdir(tmp_path)
@@ -72,7 +70,7 @@ def test_distance_repeat_and_the_copied_program_are_filled_in(
     placement = Placement(Scenario.LOS, Topology.MASTERLESS, Distance(9.144, "30ft"))
     (planned,) = step.jobs(replace(SCENE, placement=placement, repeat=7))
     assert planned.job.argv == (".put/a.run/probe", "--at=30ft", "7", "10.42.0.1")
-    assert planned.program == "sh", "preflight cannot find what is not copied yet"
+    assert planned.program == "sh", "preflight cannot find a program that is not copied yet"
     assert planned.put is not None
     assert (planned.put.role, planned.put.at, planned.put.program) == (Role.SENDER, ".put/a.run/probe", step.put)
     assert step.files() == ("a.run.txt", "a.sender-run.log"), "the copy is not fetched"
@@ -83,46 +81,48 @@ def test_distance_repeat_and_the_copied_program_are_filled_in(
     [
         ("robot: sender\ncommand: a {distanse}", 2, "no variable {distanse}; did you mean '{distance}'"),
         ("robot: sender\nargv:\n- a\n- '{repeats}'", 4, "no variable {repeats}; did you mean '{repeat}'"),
-        ("robot: sender\ncommand: 'a-{repeat} b'", 2, "the program cannot depend on a variable"),
-        ("robot: sender\ncommand: 'sh {put}'", 2, "there is no put:"),
-        ("robot: sender\ncommand: sh\nput: LICENSE", 3, "nothing runs LICENSE: write {put} in the command"),
+        ("robot: sender\ncommand: 'a-{repeat} b'", 2, "the name of the program must not depend on a variable"),
+        ("robot: sender\ncommand: 'sh {put}'", 2, "the step has no put:"),
+        (
+            "robot: sender\ncommand: sh\nput: LICENSE",
+            3,
+            "the command does not run LICENSE: write {put} in the command",
+        ),
         ("robot: sender\ncommand: '{put}'\nput: LICENSE", 3, "LICENSE is not executable: chmod"),
         ("robot: sender\ncommand: '{put}'\nput: no-such", 3, "there is no file 'no-such'"),
-        ("robot: sender", 1, "one of them"),
-        ("robot: sender\ncommand: a\nargv: [a]", 1, "one of them"),
+        ("robot: sender", 1, "needs either command: or argv:"),
+        ("robot: sender\ncommand: a\nargv: [a]", 1, "needs either command: or argv:"),
         ("robot: sender\ncommand: echo 'a", 2, "cannot be split into words"),
-        ("robot: sender\nargv: ['', a]", 2, "the program, is empty"),
-        ("robot: sender\ncommand: ls | wc", 2, "no shell sees this command, and | is a shell's"),
+        ("robot: sender\nargv: ['', a]", 2, "the program, which is the first word, is empty"),
+        ("robot: sender\ncommand: ls | wc", 2, "| is a shell operator, but no shell runs this command"),
         ("robot: sender\ncommand: a {address.Receiver}", 1, "small letters"),
-        ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V}", 4, "one of them"),
-        ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V, json: 'a['}", 4, "no path into JSON"),
+        ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V}", 4, "needs either json: or regex:"),
+        ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V, json: 'a['}", 4, "is not a valid JMESPath"),
         ("robot: sender\ncommand: a\ncolumns:\n- name: x\n  unit: V\n  regex: 'a'", 6, "0 groups"),
         (
             "robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V, json: a}\n- {name: x, unit: V, json: b}",
             5,
-            "a column x is there already",
+            "there is already a column x",
         ),
         ("robot: sender\ncommand: a\nexpect:\n  values:\n    y: {min: 1}", 5, "there is no column y"),
         ("robot: sender\ncommand: a\nexpect: {code: []}", 3, "at least 1"),
     ],
 )
-def test_what_cannot_be_run_or_read_is_refused_at_its_line(
-    text: str, line: int, why: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_invalid_keys_are_refused_with_line(text: str, line: int, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     with pytest.raises(ConfigurationError, match=why) as caught:
         run_step(text)
     assert caught.value.where == f"run.yaml:{line}"
 
 
-def test_its_columns_are_those_that_the_procedure_declares() -> None:
+def test_columns_are_those_of_the_procedure() -> None:
     volts, mode = run_step(BATTERY).output_columns()
     assert (volts.name, volts.unit, volts.meaning) == ("volts", "V", "Of the battery.")
     assert (mode.unit, mode.type) == ("text", str)
-    assert RunStep.columns == (), "no other trial has them"
+    assert RunStep.columns == (), "other trials do not have them"
 
 
-def judged(folder: Path, output: str | None, *, after: str = "") -> tuple[dict[str, Any], list[str]]:
+def values_and_problems(folder: Path, output: str | None, *, after: str = "") -> tuple[dict[str, Any], list[str]]:
     if output is not None:
         (folder / "battery.json").write_text(output, encoding="utf-8")
     (folder / "receiver-after.txt").write_text(after, encoding="utf-8")
@@ -130,13 +130,13 @@ def judged(folder: Path, output: str | None, *, after: str = "") -> tuple[dict[s
     return dict(step.measure(view).values), list(step.check(view))
 
 
-def test_values_are_read_and_told(tmp_path: Path) -> None:
-    values, problems = judged(tmp_path, '{"cells": [{"V": 3.75}], "mode": "auto"}')
+def test_values_and_summary(tmp_path: Path) -> None:
+    values, problems = values_and_problems(tmp_path, '{"cells": [{"V": 3.75}], "mode": "auto"}')
     assert (values, problems) == ({"volts": 3.75, "mode": "auto"}, [])
     assert list(run_step(BATTERY).summary(values)) == ["battery 3.75 V", "mode auto"]
 
 
-def test_what_is_true_or_false_is_said_as_it_stands_in_the_table() -> None:
+def test_summary_of_bool_is_as_in_the_table() -> None:
     step = run_step("{robot: sender, command: a, columns: [{name: up, unit: bool, json: up}]}")
     assert list(step.summary({"up": False})) == ["up false"]
 
@@ -153,26 +153,24 @@ def test_what_is_true_or_false_is_said_as_it_stands_in_the_table() -> None:
         (" " * printed.MOST_BYTES, "battery.json: the program printed more than 1 MiB"),
     ],
 )
-def test_a_value_that_is_missing_or_out_of_bounds_voids_the_repeat(
-    tmp_path: Path, output: str | None, problem: str
-) -> None:
-    (found,) = judged(tmp_path, output)[1]
-    assert found.startswith(problem)
+def test_missing_or_out_of_bounds_value_makes_repeat_void(tmp_path: Path, output: str | None, problem: str) -> None:
+    (reason,) = values_and_problems(tmp_path, output)[1]
+    assert reason.startswith(problem)
 
 
-def test_what_is_optional_may_be_missing(tmp_path: Path) -> None:
-    values, problems = judged(tmp_path, '{"cells": [{"V": 3.75}]}')
+def test_optional_value_may_be_missing(tmp_path: Path) -> None:
+    values, problems = values_and_problems(tmp_path, '{"cells": [{"V": 3.75}]}')
     assert (values, problems) == ({"volts": 3.75}, [])
 
 
-@pytest.mark.parametrize(("code", "well"), [(0, True), (3, True), (1, False)])
-def test_the_exit_code_is_judged_again_by_what_the_robot_noted(tmp_path: Path, code: int, well: bool) -> None:
+@pytest.mark.parametrize(("code", "is_valid"), [(0, True), (3, True), (1, False)])
+def test_recorded_exit_code_is_checked(tmp_path: Path, code: int, is_valid: bool) -> None:
     after = f"==> jobs <==\nrun itself {code} 100 2.00\n"
-    problems = judged(tmp_path, '{"cells": [{"V": 3.75}]}', after=after)[1]
-    assert problems == ([] if well else [f"turtlebot-2: vendorctl ended with exit code {code}"])
+    problems = values_and_problems(tmp_path, '{"cells": [{"V": 3.75}]}', after=after)[1]
+    assert problems == ([] if is_valid else [f"turtlebot-2: vendorctl ended with exit code {code}"])
 
 
-def test_an_exit_code_that_nobody_expects_fails_the_attempt(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_unexpected_exit_code_fails_the_attempt(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     testbed = IdleTestbed({Role.RECEIVER: LocalShell(tmp_path)})
     monkeypatch.setattr(jobs, "run", lambda shell, job: 1)
     with pytest.raises(RobotError, match="turtlebot-2: vendorctl ended with exit code 1"):
@@ -181,7 +179,7 @@ def test_an_exit_code_that_nobody_expects_fails_the_attempt(monkeypatch: pytest.
     run_step(BATTERY).run(SCENE, testbed, lambda name, expected_s: None)
 
 
-def ran(home: Path, userland: str, script: str) -> Completed:
+def run_script(home: Path, userland: str, script: str) -> Completed:
     (planned,) = RunStep.model_validate({"robot": "sender", "argv": ["sh", "-c", script]}).jobs(SCENE)
     robot = LocalShell(home, path_of(userland, home / "bin"))
     return robot.run(jobs.limited_argv(planned.job), deadline=Deadline.after(60.0), check=False)
@@ -196,21 +194,21 @@ def ran(home: Path, userland: str, script: str) -> Completed:
         ("printf 'no line end'", 0, b"no line end", b""),
     ],
 )
-def test_outputs_and_exit_code_are_the_program_s(
+def test_output_and_exit_code_of_the_program(
     tmp_path: Path, userland: str, script: str, code: int, *, out: bytes, err: bytes
 ) -> None:
-    done = ran(tmp_path, userland, script)
-    assert (done.exit_code, done.stdout, done.stderr) == (code, out, err)
+    result = run_script(tmp_path, userland, script)
+    assert (result.exit_code, result.stdout, result.stderr) == (code, out, err)
 
 
 @pytest.mark.parametrize("userland", USERLANDS)
-def test_a_program_that_prints_without_end_is_ended(tmp_path: Path, userland: str) -> None:
-    done = ran(tmp_path, userland, "yes")
-    assert (done.exit_code, len(done.stdout)) == (128 + signal.SIGPIPE, printed.MOST_BYTES)
-    done = ran(tmp_path / "bin", userland, "yes >&2")
-    assert (done.exit_code, len(done.stderr)) == (128 + signal.SIGPIPE, printed.MOST_BYTES)
+def test_program_with_endless_output_is_stopped(tmp_path: Path, userland: str) -> None:
+    result = run_script(tmp_path, userland, "yes")
+    assert (result.exit_code, len(result.stdout)) == (128 + signal.SIGPIPE, printed.MOST_BYTES)
+    result = run_script(tmp_path / "bin", userland, "yes >&2")
+    assert (result.exit_code, len(result.stderr)) == (128 + signal.SIGPIPE, printed.MOST_BYTES)
 
 
 @pytest.mark.parametrize("userland", USERLANDS)
-def test_a_program_that_is_killed_says_so_by_its_code(tmp_path: Path, userland: str) -> None:
-    assert ran(tmp_path, userland, "kill -KILL $$").exit_code == 128 + signal.SIGKILL
+def test_exit_code_of_killed_program(tmp_path: Path, userland: str) -> None:
+    assert run_script(tmp_path, userland, "kill -KILL $$").exit_code == 128 + signal.SIGKILL

@@ -1,4 +1,4 @@
-"""Steps at the same time, on robots that this machine plays: all begin, the first that fails ends the others."""
+"""Simultaneous steps on robots of this machine: all start, and the first failure stops the others."""
 
 import threading
 from _thread import interrupt_main
@@ -14,7 +14,7 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Step, StepEntry
-from fieldkit.steps.kinds.together import MOST, TogetherStep
+from fieldkit.steps.kinds.together import MAX_PARALLEL, TogetherStep
 from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Planned, RecordedFile, Scene
@@ -30,13 +30,13 @@ WAIT = {"wait": {"duration": "60min"}}
 RECORD = "  - record: {robot: sender, topics: [/scan], duration: 1s}\n"
 
 
-class Says(Step):
-    """A step that runs a command of a shell."""
+class CommandStep(Step):
+    """A step that runs a shell command."""
 
-    says: str
+    command: str
 
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        argv = ("sh", "-c", self.says)
+        argv = ("sh", "-c", self.command)
         yield Planned(
             Role.SENDER, Job(scene.folder, self.own_name("says"), argv, limit_s=60, log=self.files()[0]), "sh"
         )
@@ -60,8 +60,8 @@ class Says(Step):
         return (self.own_name("says.log"),)
 
 
-class Quiet(Nest):
-    """Runs steps one after the other."""
+class SequenceStep(Nest):
+    """Runs steps in order."""
 
     during: tuple[StepEntry, ...]
 
@@ -86,7 +86,7 @@ class Quiet(Nest):
 
 
 def together(**commands: str) -> TogetherStep:
-    entries = (StepEntry("says", Says(name=name, says=says)) for name, says in commands.items())
+    entries = (StepEntry("says", CommandStep(name=name, command=command)) for name, command in commands.items())
     return TogetherStep(during=tuple(entries))
 
 
@@ -123,9 +123,9 @@ def running(robots: IdleTestbed) -> Sequence[str]:
 
 @pytest.mark.emulated
 def test_steps_run_at_the_same_time(robots: IdleTestbed) -> None:
-    """Each waits for what the other two write."""
-    meet = "touch {0}; until [ -e a ] && [ -e b ] && [ -e c ]; do sleep 0.01; done"
-    announced = run(together(**{name: meet.format(name) for name in "abc"}), robots)
+    """Each step waits for the files of the other two."""
+    wait_for_all = "touch {0}; until [ -e a ] && [ -e b ] && [ -e c ]; do sleep 0.01; done"
+    announced = run(together(**{name: wait_for_all.format(name) for name in "abc"}), robots)
     assert sorted(announced) == ["a", "b", "c"]
     assert not running(robots)
 
@@ -143,22 +143,22 @@ def test_transfers_cross_at_the_same_time(robots: IdleTestbed) -> None:
 
 
 @pytest.mark.emulated
-def test_the_first_that_fails_ends_the_others_and_is_what_is_told(robots: IdleTestbed) -> None:
-    begun = "touch {0}; sleep 50; touch {0}.done"
+def test_first_failure_stops_the_others_and_is_reported(robots: IdleTestbed) -> None:
+    started = "touch {0}; sleep 50; touch {0}.done"
     fails = "until [ -e a ] && [ -e b ]; do sleep 0.01; done; exit 7"
     with pytest.raises(RobotError, match="c ended with 7"):
-        run(together(a=begun.format("a"), b=begun.format("b"), c=fails), robots)
+        run(together(a=started.format("a"), b=started.format("b"), c=fails), robots)
     assert not running(robots)
     assert not list(folder(robots).glob("*.done"))
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("inside", [WAIT, {"together": {"during": [WAIT, WAIT]}}])
-def test_the_first_that_fails_cuts_a_wait_short_and_nothing_follows_it(robots: IdleTestbed, inside: object) -> None:
-    """An hour would pass otherwise."""
+def test_first_failure_interrupts_a_wait_and_the_steps_after_it(robots: IdleTestbed, inside: object) -> None:
+    """Without the interruption the wait would last an hour."""
     steps = [
-        StepEntry("quiet", Quiet.model_validate({"during": [inside, WAIT]})),
-        StepEntry("says", Says(name="c", says="exit 7")),
+        StepEntry("quiet", SequenceStep.model_validate({"during": [inside, WAIT]})),
+        StepEntry("says", CommandStep(name="c", command="exit 7")),
     ]
     threads_before = threading.active_count()
     with pytest.raises(RobotError, match="c ended with 7"):
@@ -167,25 +167,25 @@ def test_the_first_that_fails_cuts_a_wait_short_and_nothing_follows_it(robots: I
 
 
 @pytest.mark.emulated
-def test_what_a_step_brought_up_ends_where_another_cannot_be(robots: IdleTestbed) -> None:
-    """The listener of a transfer is up, and nothing follows."""
+def test_started_listener_is_stopped_if_another_step_is_not_ready(robots: IdleTestbed) -> None:
+    """The listener of a transfer is running when the other step fails."""
     receiver = robots.shells[Role.RECEIVER]
 
-    class Unready(Says):
+    class Unready(CommandStep):
         def prepare(self, scene: Scene, testbed: IdleTestbed) -> Callable[[Announce], None]:  # type: ignore[override]
             wait_until(lambda: bool(jobs.left(receiver, Deadline.after(30))), Deadline.after(30))
             raise RobotError("it is not ready")
 
     ends = {"from": "sender", "to": "receiver", "port": free_port()}
-    entries = (StepEntry("transfer", TransferStep.model_validate(ends)), StepEntry("says", Unready(says="")))
+    entries = (StepEntry("transfer", TransferStep.model_validate(ends)), StepEntry("says", Unready(command="")))
     with pytest.raises(RobotError, match="it is not ready"):
         run(TogetherStep(during=entries), robots, "a.bag")
     assert not jobs.left(receiver, Deadline.after(30))
 
 
 @pytest.mark.emulated
-def test_who_runs_steps_at_the_same_time_is_interrupted_at_once(robots: IdleTestbed) -> None:
-    """Ctrl-C waits for no step: whoever catches it ends the jobs."""
+def test_interrupt_does_not_wait_for_steps(robots: IdleTestbed) -> None:
+    """Ctrl-C does not wait for the steps; the caller stops the jobs."""
 
     def interrupt() -> None:
         wait_until(lambda: len(running(robots)) == 2, Deadline.after(30))
@@ -201,16 +201,16 @@ def test_who_runs_steps_at_the_same_time_is_interrupted_at_once(robots: IdleTest
 
 
 @pytest.mark.emulated
-def test_an_interrupt_ends_a_wait_that_another_thread_is_in(robots: IdleTestbed) -> None:
-    begun = threading.Event()
+def test_interrupt_ends_waits_of_other_threads(robots: IdleTestbed) -> None:
+    started = threading.Event()
 
     def interrupt() -> None:
-        begun.wait()
+        started.wait()
         interrupt_main()
 
     def announce(name: str, expected_s: float | None) -> None:
         if name == "wait":
-            begun.set()
+            started.set()
 
     waits = TogetherStep.model_validate({"during": [WAIT, WAIT]})
     threads_before = threading.active_count()
@@ -220,7 +220,7 @@ def test_an_interrupt_ends_a_wait_that_another_thread_is_in(robots: IdleTestbed)
     wait_until(lambda: threading.active_count() == threads_before, Deadline.after(30))
 
 
-def test_it_takes_as_long_as_the_longest_and_says_what_it_does() -> None:
+def test_expected_duration_and_dry_run_note() -> None:
     step = together(a="", long="", longest="")
     assert step.expected_s(Protocol.TCP) == len("longest")
     assert list(step.dry_run_notes(Scene(Protocol.TCP, CAST, FOLDER))) == [
@@ -237,7 +237,7 @@ SAME_PORT = """\
         - transfer: {FLOW, name: b}
 """
 IN_ONE_CAPTURE = SAME_PORT.replace("together", "capture")
-ASKED = """\
+FAULT_INSIDE = """\
   - together:
       during:
         - ping: {FLOW}
@@ -320,7 +320,7 @@ SWEEP = """\
         SOAKED.replace("iperf3: {FLOW, port: PORT}", "iperf3: {from: receiver, to: sender, port: 5202}"),
     ],
 )
-def test_loads_that_can_be_told_apart_are_taken(steps: str) -> None:
+def test_distinguishable_loads_are_accepted(steps: str) -> None:
     assert load(steps)
 
 
@@ -342,23 +342,27 @@ def load(steps: str) -> Procedure:
         (FROM_TWO, "port 5201 comes twice at the same time", 4),
         (SAME_WAY, "port 5201 comes twice in one capture, from sender to receiver", 4),
         (BESIDE_A_TRANSFER, "port 5201 comes twice in one capture", 4),
-        (ASKED, "fault may ask the operator: no other step runs beside it", 4),
+        (FAULT_INSIDE, "fault may prompt the operator, so no step may run at the same time", 4),
         (
-            ASKED.replace("fault: {robot: sender, kind: reboot}", "wait: {until: say so}"),
-            "wait may ask the operator",
+            FAULT_INSIDE.replace("fault: {robot: sender, kind: reboot}", "wait: {until: say so}"),
+            "wait may prompt the operator",
             4,
         ),
         (
-            ASKED.replace("fault: {robot: sender, kind: reboot}", "ask: {column: a, question: b}"),
-            "ask may ask the operator",
+            FAULT_INSIDE.replace("fault: {robot: sender, kind: reboot}", "ask: {column: a, question: b}"),
+            "ask may prompt the operator",
             4,
         ),
-        (MOVE_INSIDE, "move may ask the operator: no other step runs beside it", 6),
-        (RECORDED_BESIDE, "sends a, and nothing of that name is recorded on sender before it", 4),
-        (SWEEP.replace("VALUES", "[1, 2, 3, 4, 5, 6, 7, 8, 9]"), f"9 steps at the same time are more than {MOST}", 4),
+        (MOVE_INSIDE, "move may prompt the operator, so no step may run at the same time", 6),
+        (RECORDED_BESIDE, "sends a, but no recording of that name is made on sender before it", 4),
+        (
+            SWEEP.replace("VALUES", "[1, 2, 3, 4, 5, 6, 7, 8, 9]"),
+            f"9 steps at the same time are more than {MAX_PARALLEL}",
+            4,
+        ),
     ],
 )
-def test_what_cannot_run_at_the_same_time_is_refused_with_its_line(steps: str, what: str, line: int) -> None:
+def test_steps_that_cannot_run_simultaneously_are_refused_with_line(steps: str, what: str, line: int) -> None:
     with pytest.raises(ConfigurationError) as caught:
         load(steps)
     assert what in caught.value.what
@@ -370,16 +374,16 @@ def test_what_cannot_run_at_the_same_time_is_refused_with_its_line(steps: str, w
     [
         SAME_PORT.replace("name: b", "name: b, port: 99"),
         IN_ONE_CAPTURE.replace("name: b", "name: b, port: 99"),
-        # One after the other, each in a capture of its own.
+        # In sequence, each in a separate capture.
         "  - for: {each: {a: [x, y]}, during: [capture: {name: '{a}', during: [transfer: {FLOW, name: '{a}'}]}]}",
         SWEEP.replace("VALUES", "[1, 2, 3]"),
     ],
 )
-def test_what_can_be_told_apart_is_taken(steps: str) -> None:
+def test_distinguishable_transfers_are_accepted(steps: str) -> None:
     assert load(steps)
 
 
-def test_what_is_recorded_beside_a_transfer_is_none_that_it_can_send() -> None:
+def test_transfer_cannot_send_a_simultaneous_recording() -> None:
     beside = "  - together: {during: [record: {robot: relay, topics: [/a], duration: 1s, name: a}, STEP]}"
     with pytest.raises(ConfigurationError, match="no step before it records on relay"):
         load(beside.replace("STEP", "transfer: {from: relay, to: sender}"))

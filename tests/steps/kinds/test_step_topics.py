@@ -1,4 +1,4 @@
-"""A step `topics`: what it is in YAML, what robots are told, and trials over radios that lose packets."""
+"""The step topics: valid keys, arguments of the agents, and trials over radios that lose packets."""
 
 import csv
 import json
@@ -34,54 +34,54 @@ def topics(keys: str = "over: dds") -> TopicsStep:
 
 
 @pytest.mark.parametrize(
-    ("keys", "complaint"),
+    ("keys", "message"),
     [
         ("over: dds, discovery: router", "dds has multicast and peers, not router"),
         ("over: ros1, discovery: multicast", "ros1 has master, not multicast"),
         ("over: ros2, discovery: router", "ros2 has environment and multicast and peers, not router"),
-        ("over: ros2, settings: {'General/x': '1'}", "variables of the environment, not 'General/x'"),
-        ("over: ros2, settings: {ROS_DOMAIN_ID: '1'}", "ROS_DOMAIN_ID is said by domain"),
-        ("over: dds, transport: udp", "only Zenoh can be carried by another transport"),
+        ("over: ros2, settings: {'General/x': '1'}", "environment variables, not 'General/x'"),
+        ("over: ros2, settings: {ROS_DOMAIN_ID: '1'}", "ROS_DOMAIN_ID is set by the key domain"),
+        ("over: dds, transport: udp", "only zenoh has a choice of transport"),
         ("over: ros1, qos: {reliability: best_effort}", "ROS 1 sends by TCP"),
         ("over: ros1, qos: {profile: sensor_data}", "ROS 1 sends by TCP"),
-        ("rate: 1Hz, duration: 500ms", "over before its second sample"),
+        ("rate: 1Hz, duration: 500ms", "ends before its second sample"),
         ("bytes: 23B", "greater than or equal to 24"),
         ("domain: 102", "less than or equal to 101"),
         ("qos: {profile: sensor}", "ROS 2 has no profile 'sensor'; there are default, sensor_data"),
         ("settings: {'Discovery/<x>': '1'}", "match pattern"),
-        ("settings: tunde", "settings is default, tuned, or"),
+        ("settings: tunde", "settings must be default, tuned, or"),
         ("topic: /a//b", "is not the name of a topic"),
     ],
 )
-def test_what_cannot_be_is_refused_with_its_line(keys: str, complaint: str) -> None:
-    with pytest.raises(ConfigurationError, match=complaint) as failed:
+def test_invalid_keys_are_refused_with_line(keys: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as failed:
         topics(keys)
     assert failed.value.where.startswith("x.yaml:1") or "x.yaml:1" in str(failed.value)
 
 
-def test_nobody_sends_to_himself() -> None:
+def test_equal_sender_and_receiver_are_refused() -> None:
     with pytest.raises(ConfigurationError, match="cannot send to itself"):
         schema.validate(schema.parse("{from: sender, to: sender}", source="x.yaml"), TopicsStep)
 
 
-def test_what_robots_are_told() -> None:
+def test_arguments_of_subscriber_and_publisher() -> None:
     subscribe, publish = topics("name: a, bytes: 500B, rate: 20Hz, qos: {profile: sensor_data}").jobs(SCENE)
     head = ("bash", "-c", '. /opt/ros/noetic/setup.bash && exec "$@"', "bash", "python3", agent.path_from_job())
-    for one, verb, role in ((subscribe, "subscribe", Role.RECEIVER), (publish, "publish", Role.SENDER)):
-        assert (one.role, one.program, one.job.name) == (role, "python3", f"a.{verb}")
-        assert one.job.argv[:6] == head
-        assert one.job.argv[6] == verb
-        assert one.job.argv[8] == f"a.{role}-topic.bin"
-        told = json.loads(one.job.argv[7])
-        network, topic = Network(**told["network"]), Topic.from_json(told["topic"])
+    for planned, verb, role in ((subscribe, "subscribe", Role.RECEIVER), (publish, "publish", Role.SENDER)):
+        assert (planned.role, planned.program, planned.job.name) == (role, "python3", f"a.{verb}")
+        assert planned.job.argv[:6] == head
+        assert planned.job.argv[6] == verb
+        assert planned.job.argv[8] == f"a.{role}-topic.bin"
+        argument = json.loads(planned.job.argv[7])
+        network, topic = Network(**argument["network"]), Topic.from_json(argument["topic"])
         assert (network.address, network.node) == (CAST[role].address, f"fieldkit_{role}")
         assert (topic.dds_topic, topic.quality.reliability) == ("rt/fieldkit/stream", "best_effort")
-        assert Stream(**told["stream"]) == Stream("dds", 500, 20.0, 10.0, 20.0)
+        assert Stream(**argument["stream"]) == Stream("dds", 500, 20.0, 10.0, 20.0)
     assert subscribe.job.ready == "log:up,"
     assert publish.job.limit_s < subscribe.job.limit_s
 
 
-def test_who_serves_comes_first() -> None:
+def test_router_or_master_starts_first() -> None:
     serve, *_ = topics("over: zenoh, discovery: router").jobs(SCENE)
     assert (serve.role, serve.job.argv[6]) == (Role.RELAY, "route")
     master, subscribe, _ = topics("over: ros1").jobs(SCENE)
@@ -91,60 +91,64 @@ def test_who_serves_comes_first() -> None:
     assert json.loads(subscribe.job.argv[7])["network"]["server"] == relay
 
 
-def test_a_capture_takes_what_goes_to_everybody_too() -> None:
+def test_capture_filter_includes_multicast() -> None:
     text = "{robots: [sender], during: [topics: {from: sender, to: receiver, over: zenoh}]}"
     capture, *_ = schema.validate(schema.parse(text, source="x"), CaptureStep).jobs(SCENE)
-    one, other = (CAST[role].address for role in (Role.SENDER, Role.RECEIVER))
+    sender, receiver = (CAST[role].address for role in (Role.SENDER, Role.RECEIVER))
     assert capture.job.argv[-1] == (
-        f"((host {one} and host {other}) or (src host {other} and dst host 224.0.0.224) or "
-        f"(src host {one} and dst host 224.0.0.224)) and "
+        f"((host {sender} and host {receiver}) or (src host {receiver} and dst host 224.0.0.224) or "
+        f"(src host {sender} and dst host 224.0.0.224)) and "
         f"(port 7446 or port {ports.zenoh_listener(42)} or icmp or ip[6:2] & 0x1fff != 0)"
     )
 
 
-def test_ports_of_dds_are_those_of_rtps() -> None:
-    """RTPS 2.5, table 9.8: of domain 1, and of participants 0 and 1 there."""
-    found = ports.dds(1, multicast=True)
-    assert {7650, 7660, 7662} <= found.discovery
-    assert {7651, 7661, 7663} <= found.data
+def test_ports_of_dds_follow_rtps() -> None:
+    """RTPS 2.5, table 9.8, for participants 0 and 1 of domain 1."""
+    dds_ports = ports.dds(1, multicast=True)
+    assert {7650, 7660, 7662} <= dds_ports.discovery
+    assert {7651, 7661, 7663} <= dds_ports.data
     assert max(ports.dds(ports.MOST_DOMAIN, multicast=True).data) < 32_768
 
 
-def test_the_laptop_and_the_agent_agree() -> None:
+def test_constants_of_laptop_and_agent_are_equal() -> None:
     assert streams.LEAST_BYTES == LEAST_BYTES
     assert set(ports.ros1_node(0)) == set(ros1.PORTS)
 
 
-def test_every_domain_has_ports_of_its_own() -> None:
-    """Of Zenoh and ROS 1, beside each other's and those of Zenoh and ROS themselves."""
-    every = [7446, 7447, 11311]
+def test_ports_of_domains_are_disjoint() -> None:
+    """The ports of Zenoh and ROS 1 in each domain differ from each other and from the default ports."""
+    all_ports = [7446, 7447, 11311]
     for domain in range(ports.MOST_DOMAIN + 1):
-        every += [*ports.zenoh(domain, multicast=False).data, *ports.ros1(domain).data, *ports.ros1(domain).discovery]
-    assert len(set(every)) == len(every)
-    assert max(every) < 32_768
+        all_ports += [
+            *ports.zenoh(domain, multicast=False).data,
+            *ports.ros1(domain).data,
+            *ports.ros1(domain).discovery,
+        ]
+    assert len(set(all_ports)) == len(all_ports)
+    assert max(all_ports) < 32_768
 
 
 def settings(keys: str) -> dict[str, str]:
     *_, publish = topics(keys).jobs(SCENE)
-    told: dict[str, str] = json.loads(publish.job.argv[7])["network"]["settings"]
-    return told
+    values: dict[str, str] = json.loads(publish.job.argv[7])["network"]["settings"]
+    return values
 
 
 @pytest.mark.parametrize("keys", ["over: dds", "over: zenoh", "over: zenoh, transport: udp", "over: ros1"])
-def test_tuned_settings_are_told_beside_what_the_middleware_needs(keys: str) -> None:
+def test_tuned_settings_are_added_to_required_ones(keys: str) -> None:
     plain, tuned = settings(keys), settings(f"{keys}, settings: tuned")
     assert settings(f"{keys}, settings: default") == plain
     assert plain.items() <= tuned.items()
     assert plain != tuned
 
 
-def test_one_datagram_of_what_is_tuned_is_one_packet() -> None:
-    """With the headers of IP and UDP it fits into 1,500 bytes, and a fragment of DDS with its own into a datagram."""
-    most = 1500 - 20 - 8
+def test_tuned_datagram_fits_into_one_packet() -> None:
+    """A datagram with the headers of IP and UDP fits into 1,500 bytes, and a DDS fragment with its header into it."""
+    max_bytes = 1500 - 20 - 8
     dds = {name: int(value.removesuffix(" B")) for name, value in settings("over: dds, settings: tuned").items()}
-    assert dds["General/FragmentSize"] < dds["General/MaxMessageSize"] <= most
+    assert dds["General/FragmentSize"] < dds["General/MaxMessageSize"] <= max_bytes
     udp = settings("over: zenoh, transport: udp, settings: tuned")
-    assert int(udp["transport/link/tx/batch_size"]) <= most
+    assert int(udp["transport/link/tx/batch_size"]) <= max_bytes
 
 
 def ros2(keys: str) -> tuple[str, ...]:
@@ -152,11 +156,11 @@ def ros2(keys: str) -> tuple[str, ...]:
     return publish.job.argv
 
 
-def test_ros_2_runs_with_the_robots_own_environment_and_the_settings() -> None:
+def test_ros_2_runs_with_environment_of_robot_and_settings() -> None:
     sender = CAST[Role.SENDER]
     assert sender.profile.ros is not None
-    own = sender.profile.ros.model_copy(update={"environment": {"RMW_IMPLEMENTATION": "rmw_a", "A": "b c"}})
-    robot = sender.model_copy(update={"profile": sender.profile.model_copy(update={"ros": own})})
+    ros = sender.profile.ros.model_copy(update={"environment": {"RMW_IMPLEMENTATION": "rmw_a", "A": "b c"}})
+    robot = sender.model_copy(update={"profile": sender.profile.model_copy(update={"ros": ros})})
     scene = Scene(Protocol.UDP, {**CAST, Role.SENDER: robot}, ".fieldkit/t/a")
     step = topics("over: ros2, discovery: peers, settings: {RMW_IMPLEMENTATION: rmw_b}")
     need, _ = step.needs(scene)
@@ -178,20 +182,20 @@ def together(*several: str, within: str = "together") -> str:
 
 
 @pytest.mark.parametrize("over", ["zenoh", "zenoh, discovery: router", "ros1"])
-def test_two_streams_at_once_want_a_domain_each(over: str) -> None:
-    """They would listen on the same ports of the receiver, the router or the master."""
+def test_simultaneous_streams_need_different_domains(over: str) -> None:
+    """In one domain they would listen on the same ports of the receiver, the router or the master."""
     keys = f"from: sender, to: receiver, over: {over}", f"from: relay, to: receiver, over: {over}, topic: /b"
     with pytest.raises(ConfigurationError, match=r"comes twice at the same time on .*; give one another domain"):
         schema.validate(schema.parse(together(*keys), source="x.yaml"), Procedure)
     schema.validate(schema.parse(together(keys[0], f"{keys[1]}, domain: 7"), source="x.yaml"), Procedure)
 
 
-def test_two_streams_of_dds_share_a_domain_but_no_capture_of_one_pair() -> None:
-    one = "from: sender, to: receiver"
-    schema.validate(schema.parse(together(one, "from: relay, to: receiver"), source="x.yaml"), Procedure)
-    schema.validate(schema.parse(together(one, f"{one}, domain: 7"), source="x.yaml"), Procedure)
+def test_streams_of_dds_may_share_a_domain_but_not_a_pair_in_a_capture() -> None:
+    keys = "from: sender, to: receiver"
+    schema.validate(schema.parse(together(keys, "from: relay, to: receiver"), source="x.yaml"), Procedure)
+    schema.validate(schema.parse(together(keys, f"{keys}, domain: 7"), source="x.yaml"), Procedure)
     with pytest.raises(ConfigurationError, match=r"comes twice in one capture.*; give one another domain"):
-        schema.validate(schema.parse(together(one, f"{one}, topic: /b"), source="x.yaml"), Procedure)
+        schema.validate(schema.parse(together(keys, f"{keys}, topic: /b"), source="x.yaml"), Procedure)
 
 
 @pytest.mark.parametrize(
@@ -203,13 +207,13 @@ def test_two_streams_of_dds_share_a_domain_but_no_capture_of_one_pair() -> None:
         ("ros2", "setup files"),
     ],
 )
-def test_a_middleware_that_is_missing_is_told_with_its_remedy(over: str, remedy: str) -> None:
+def test_missing_middleware_fails_with_remedy(over: str, remedy: str) -> None:
     step = topics(f"over: {over}")
     needs = list(step.needs(SCENE))
     assert [need.role for need in needs] == [Role.SENDER, Role.RECEIVER]
-    verdict, detail, said = needs[0].judge(Said("Traceback\nModuleNotFoundError: No module named 'x'", 1))
+    verdict, detail, remedy_text = needs[0].judge(Said("Traceback\nModuleNotFoundError: No module named 'x'", 1))
     assert (verdict, detail) == (Verdict.FAIL, "ModuleNotFoundError: No module named 'x'")
-    assert remedy in said
+    assert remedy in remedy_text
     assert needs[0].judge(Said("", 0))[0] is Verdict.OK
 
 
@@ -260,73 +264,73 @@ def trial_of(folder: Path, monkeypatch: pytest.MonkeyPatch, procedure: str, site
     (folder / "fieldkit.yaml").write_text(site, encoding="utf-8")
     monkeypatch.chdir(folder)
     assert main(["trial", "lossy", "5m", "--yes"]) == 0
-    (found,) = (folder / "trials").iterdir()
-    return found
+    (trial_folder,) = (folder / "trials").iterdir()
+    return trial_folder
 
 
 def row(folder: Path) -> dict[str, str]:
-    (found,) = csv.DictReader((folder / "trial.csv").open(encoding="utf-8"))
-    return found
+    (values,) = csv.DictReader((folder / "trial.csv").open(encoding="utf-8"))
+    return values
 
 
 @pytest.mark.emulated
-def test_losses_are_those_of_the_radio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Best effort with one frame per sample: what the subscriber missed is what never came over the radio."""
+def test_losses_equal_those_of_the_radio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With best effort and one frame per sample, the missed samples are the packets lost on the radio."""
     size = 600
     keys = f"rate: 200Hz, bytes: {size}B, duration: 2s, patience: 60s, qos: {{profile: sensor_data, depth: 1000}}"
     folder = trial(tmp_path, monkeypatch, keys, loss="20%")
-    found = row(folder)
+    row_values = row(folder)
     counts = []
     for role in ("sender", "receiver"):
         packets = pcap.read(folder / "repeats" / "udp-01" / f"{role}.pcap").packets
         from_sender = np.isin(packets.dport, list(ports.dds(42, multicast=True).data)) & (packets.udp_bytes > size)
         counts.append(int(from_sender.sum()))
-    left, came = counts
-    assert (int(found["topic_sent"]), int(found["topic_received"])) == (left, came)
-    assert left > came
-    # A subscription may come to know the publisher later than it is known; then it takes no sample of before.
-    assert float(found["topic_loss"]) == pytest.approx(0.2, abs=0.15)
+    sent, received = counts
+    assert (int(row_values["topic_sent"]), int(row_values["topic_received"])) == (sent, received)
+    assert sent > received
+    # A subscriber may discover the publisher later than the reverse; then it accepts no earlier samples.
+    assert float(row_values["topic_loss"]) == pytest.approx(0.2, abs=0.15)
 
 
 @pytest.mark.emulated
-def test_nobody_who_is_found_makes_a_valid_repeat_without_samples(
+def test_repeat_without_discovery_is_valid_and_has_no_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = row(trial(tmp_path, monkeypatch, "duration: 1s, patience: 1s", loss="100%"))
-    assert (found["status"], found["topic_discovered"], found["topic_sent"]) == ("valid", "false", "0")
-    assert found["topic_loss"] == ""
-    assert int(found["topic_discovery_packets"]) > 0
+    row_values = row(trial(tmp_path, monkeypatch, "duration: 1s, patience: 1s", loss="100%"))
+    assert (row_values["status"], row_values["topic_discovered"], row_values["topic_sent"]) == ("valid", "false", "0")
+    assert row_values["topic_loss"] == ""
+    assert int(row_values["topic_discovery_packets"]) > 0
 
 
 @pytest.mark.emulated
-def test_topics_by_masters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_topics_with_router_and_master(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     zenoh = "        - topics: {name: z, from: sender, to: receiver, over: zenoh, discovery: router, duration: 1s}\n"
     ros1 = "over: ros1, rate: 50Hz, duration: 1s"
-    found = row(trial(tmp_path, monkeypatch, ros1, loss="0%", topology="master", more=zenoh))
+    row_values = row(trial(tmp_path, monkeypatch, ros1, loss="0%", topology="master", more=zenoh))
     for name in ("", "z."):
-        assert found[f"{name}topic_sent"] == found[f"{name}topic_received"] != "0"
-        assert int(found[f"{name}topic_data_packets"]) > int(found[f"{name}topic_sent"])
+        assert row_values[f"{name}topic_sent"] == row_values[f"{name}topic_received"] != "0"
+        assert int(row_values[f"{name}topic_data_packets"]) > int(row_values[f"{name}topic_sent"])
 
 
 @pytest.mark.emulated
-def test_several_robots_publish_to_one_at_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over Zenoh and ROS 1 each stream has its listeners on the receiver, in a domain of its own."""
-    every = [
+def test_several_robots_publish_simultaneously_to_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over Zenoh and ROS 1 each stream has its listeners on the receiver, in a separate domain."""
+    stream_keys = [
         f"{{name: {over}{number}, from: {role}, to: receiver, over: {over}, domain: {number}, server: receiver, "
         "rate: 20Hz, duration: 1s, patience: 60s}"
         for over in ("zenoh", "ros1")
         for number, role in enumerate(("sender", "relay"), start=1)
     ]
-    text = "".join(f"        - topics: {one}\n" for one in every)
+    text = "".join(f"        - topics: {keys}\n" for keys in stream_keys)
     more = f"  - together:\n      during:\n{text}"
-    found = row(trial(tmp_path, monkeypatch, "duration: 1s", loss="0%", topology="master", more=more))
+    row_values = row(trial(tmp_path, monkeypatch, "duration: 1s", loss="0%", topology="master", more=more))
     for name in ("zenoh1.", "zenoh2.", "ros11.", "ros12."):
-        assert found[f"{name}topic_sent"] == found[f"{name}topic_received"] != "0"
+        assert row_values[f"{name}topic_sent"] == row_values[f"{name}topic_received"] != "0"
 
 
 @pytest.mark.emulated
-def test_robots_with_a_real_ros_2_speak_by_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over Fast DDS: as its environment says, by multicast, and at the same time by peers."""
+def test_robots_with_real_ros_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over Fast DDS: one stream with discovery of the environment (multicast), and one by peers."""
     profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     python = f"  ping: ping\n  python: {ROOT / '.ros2' / 'bin' / 'python'}"
     (tmp_path / "robots").mkdir()
@@ -337,19 +341,19 @@ def test_robots_with_a_real_ros_2_speak_by_it(tmp_path: Path, monkeypatch: pytes
     several = together(keys, f"{keys}, domain: 7, discovery: peers").replace("name: x", "name: lossy")
     site = SITE.replace("profile: turtlebot3_burger", "profile: real").replace("LOSS", "0%")
     folder = trial_of(tmp_path, monkeypatch, several, site)
-    found = row(folder)
-    assert found["status"] == "valid"
+    row_values = row(folder)
+    assert row_values["status"] == "valid"
     packets = pcap.read(folder / "repeats" / "udp-01" / "sender.pcap").packets
-    for name, domain, asks_all in (("s0", 42, True), ("s1", 7, False)):
-        assert found[f"{name}.topic_sent"] == found[f"{name}.topic_received"] != "0"
-        sent = int(found[f"{name}.topic_sent"])
-        # Each sample once, in a packet; beside them heartbeats, and who belongs to which node.
-        assert sent <= int(found[f"{name}.topic_data_packets"]) < 200
-        assert sent * 1_000 <= int(found[f"{name}.topic_data_bytes"]) < 2 * 20 * 1_000
-        assert int(found[f"{name}.topic_discovery_packets"]) > 0
-        assert 0 < float(found[f"{name}.topic_discovery_s"]) < 60
-        assert found[f"{name}.topic_packet_loss"] == "0"
-        to_all = packets.are_to("239.255.0.1") & np.isin(
+    for name, domain, uses_multicast in (("s0", 42, True), ("s1", 7, False)):
+        assert row_values[f"{name}.topic_sent"] == row_values[f"{name}.topic_received"] != "0"
+        sent = int(row_values[f"{name}.topic_sent"])
+        # One packet per sample, and some for heartbeats and the participants of each node.
+        assert sent <= int(row_values[f"{name}.topic_data_packets"]) < 200
+        assert sent * 1_000 <= int(row_values[f"{name}.topic_data_bytes"]) < 2 * 20 * 1_000
+        assert int(row_values[f"{name}.topic_discovery_packets"]) > 0
+        assert 0 < float(row_values[f"{name}.topic_discovery_s"]) < 60
+        assert row_values[f"{name}.topic_packet_loss"] == "0"
+        multicast = packets.are_to("239.255.0.1") & np.isin(
             packets.dport, list(ports.dds(domain, multicast=True).discovery)
         )
-        assert to_all.any() == asks_all
+        assert multicast.any() == uses_multicast

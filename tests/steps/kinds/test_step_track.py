@@ -1,4 +1,4 @@
-"""The step track: what a procedure may say, what each robot records, and what an attempt then keeps."""
+"""The step track: valid keys, recordings of each robot, and stored sources of positions."""
 
 import math
 from dataclasses import replace
@@ -29,46 +29,46 @@ def track(robots: str, during: str = PING) -> TrackStep:
 
 
 @pytest.mark.parametrize(
-    ("robots", "complaint"),
+    ("robots", "message"),
     [
         ("{}", "at least 1 item"),
-        ("{sender: {}}", "which topic tells it, or at which place"),
-        ("{sender: {topic: /odom, at: {lat: 1, lon: 2}}}", "which topic tells it, or at which place"),
+        ("{sender: {}}", "a robot needs either topic or at"),
+        ("{sender: {topic: /odom, at: {lat: 1, lon: 2}}}", "a robot needs either topic or at"),
         ("{sender: {topic: odom}}", "'odom' is not the name of a topic"),
         ("{sender: {topic: /odom, facing: north}}", "away.*towards"),
         ("{sender: {topic: /odom, gap: 3}}", "has no unit"),
         ("{sender: {topic: /odom, gap: 0s}}", "greater than 0"),
-        ("{sender: {at: {}}}", "a place has lat and lon, or frame, x and y"),
-        ("{sender: {at: {lat: 1}}}", "a place has lat and lon, or frame, x and y"),
+        ("{sender: {at: {}}}", "a position needs lat and lon, or frame, x and y"),
+        ("{sender: {at: {lat: 1}}}", "a position needs lat and lon, or frame, x and y"),
         ("{sender: {at: {lat: 91, lon: 0}}}", "less than or equal to 90"),
-        ("{sender: {at: {x: 1, y: 2}}}", "a place has lat and lon, or frame, x and y"),
-        ("{sender: {at: {frame: map, x: 1}}}", "a place has lat and lon, or frame, x and y"),
+        ("{sender: {at: {x: 1, y: 2}}}", "a position needs lat and lon, or frame, x and y"),
+        ("{sender: {at: {frame: map, x: 1}}}", "a position needs lat and lon, or frame, x and y"),
         ("{sender: {at: {frame: map, x: 1, y: 2, lat: 1, lon: 2}}}", "not both"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_a_sentence(robots: str, complaint: str) -> None:
-    with pytest.raises(ConfigurationError, match=complaint):
+def test_invalid_keys_are_refused(robots: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
         track(robots)
 
 
 @pytest.mark.parametrize(
-    ("steps", "complaint"),
+    ("steps", "message"),
     [
-        ("[{TRACK}, {TRACK}]", "one track records a repeat"),
+        ("[{TRACK}, {TRACK}]", "a repeat can have only one track"),
         ("[{{move: {{robot: sender, path: [away: 1m], speed: 1m/s, during: [{TRACK}]}}}}]", "put the move into"),
         ("[{{fault: {{robot: sender, kind: reboot, during: [{TRACK}]}}}}]", "put them into the track"),
         ("[{{together: {{during: [{TRACK}, {WAIT}]}}}}]", "put them into the track"),
     ],
 )
-def test_where_it_cannot_stand_is_refused(steps: str, complaint: str) -> None:
+def test_invalid_position_in_procedure_is_refused(steps: str, message: str) -> None:
     inside = f"{{track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}}}"
     text = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps: "
-    whole = text + steps.format(TRACK=inside, WAIT="{wait: {duration: 1s}}")
-    with pytest.raises(ConfigurationError, match=complaint):
-        schema.validate(schema.parse(whole, source="x.yaml"), Procedure)
+    procedure = text + steps.format(TRACK=inside, WAIT="{wait: {duration: 1s}}")
+    with pytest.raises(ConfigurationError, match=message):
+        schema.validate(schema.parse(procedure, source="x.yaml"), Procedure)
 
 
-def test_each_robot_records_by_its_own_recorder_until_it_is_stopped() -> None:
+def test_each_robot_records_with_its_recorder_until_stopped() -> None:
     step = track("{sender: {topic: /odom, facing: away}, receiver: {at: {lat: 48.1, lon: 11.5}}}")
     recording, _ = step.jobs(SCENE)
     assert (recording.role, recording.program) == (Role.SENDER, "rosbag")
@@ -83,16 +83,16 @@ def test_each_robot_records_by_its_own_recorder_until_it_is_stopped() -> None:
     assert {"positions.json", "track_sender.bag"} <= set(step.files())
 
 
-def test_odometry_wants_to_know_where_its_robot_faces() -> None:
+def test_odometry_needs_facing() -> None:
     (refused,) = track("{sender: {topic: /odom}}").refusals(SCENE)
     assert "facing: away, towards, left or right" in refused.remedy
     assert not list(track("{sender: {topic: /odom, facing: left}}").refusals(SCENE))
 
 
-def kept(step: TrackStep) -> dict[Role, Account]:
-    told = step._accounts(SCENE, 7, {Role.SENDER: Offset(0.5, 0.1)})
-    assert told.clocks == {Role.SENDER: Offset(0.5, 0.1)}
-    return dict(told.robots)
+def sources_of(step: TrackStep) -> dict[Role, Account]:
+    stored = step._accounts(SCENE, 7, {Role.SENDER: Offset(0.5, 0.1)})
+    assert stored.clocks == {Role.SENDER: Offset(0.5, 0.1)}
+    return dict(stored.robots)
 
 
 @pytest.mark.parametrize(
@@ -105,26 +105,26 @@ def kept(step: TrackStep) -> dict[Role, Account]:
         (Role.SENDER, "right", math.pi / 2),
     ],
 )
-def test_an_attempt_keeps_from_where_odometry_counts(role: Role, facing: str, heading_rad: float) -> None:
-    told = kept(track(f"{{{role}: {{topic: /odom, facing: {facing}, gap: 1s, times: received}}}}"))
+def test_stored_source_has_start_and_heading(role: Role, facing: str, heading_rad: float) -> None:
+    sources = sources_of(track(f"{{{role}: {{topic: /odom, facing: {facing}, gap: 1s, times: received}}}}"))
     place_m = {Role.SENDER: (0.0, 0.0, 0.0), Role.RECEIVER: (10.0, 0.0, 0.0)}
     (other,) = {Role.SENDER, Role.RECEIVER} - {role}
-    assert told[other] == Account(place=place_m[other])
-    known = told[role].heading_rad
-    assert known == pytest.approx(heading_rad)
-    assert told[role] == Account(
+    assert sources[other] == Account(place=place_m[other])
+    stored_rad = sources[role].heading_rad
+    assert stored_rad == pytest.approx(heading_rad)
+    assert sources[role] == Account(
         file=f"track_{role}.bag",
         topic="/odom",
         stamps="received",
         gap_s=1.0,
         start=place_m[role],
-        heading_rad=known,
+        heading_rad=stored_rad,
         began_utc_ns=7,
     )
 
 
-def test_who_moves_and_is_not_tracked_is_nowhere_and_who_has_a_place_stands_there() -> None:
-    told = kept(track("{receiver: {at: {lat: 48.1, lon: 11}}}", MOVE))
-    assert told == {Role.RECEIVER: Account(place=(48.1, 11.0, None), frame=WGS84)}
-    there = track("{receiver: {at: {frame: map, x: 1, y: 2.5}}}")
-    assert kept(there)[Role.RECEIVER] == Account(place=(1.0, 2.5, 0.0), frame="frame map")
+def test_moving_robot_without_source_has_no_position_and_fixed_one_is_stored() -> None:
+    sources = sources_of(track("{receiver: {at: {lat: 48.1, lon: 11}}}", MOVE))
+    assert sources == {Role.RECEIVER: Account(place=(48.1, 11.0, None), frame=WGS84)}
+    fixed = track("{receiver: {at: {frame: map, x: 1, y: 2.5}}}")
+    assert sources_of(fixed)[Role.RECEIVER] == Account(place=(1.0, 2.5, 0.0), frame="frame map")

@@ -1,4 +1,4 @@
-"""A transfer between two robots that this machine plays, over loopback."""
+"""A transfer between two robots of this machine over loopback."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,13 +26,15 @@ FOLDER = jobs.work_folder("trial", "udp-01-1")
 
 @dataclass(frozen=True)
 class Medium:
-    known: Iterator[DelayParts]
+    """An oracle that returns these delays in order."""
+
+    parts: Iterator[DelayParts]
 
     port: int
 
     def delays(self, source: Role, destination: Role, protocol: Protocol, port: int) -> DelayParts:
         assert (source, destination, protocol, port) == (Role.SENDER, Role.RECEIVER, Protocol.TCP, self.port)
-        return next(self.known)
+        return next(self.parts)
 
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
         raise AssertionError(since_utc_ns)
@@ -48,15 +50,17 @@ class Medium:
 
 
 class Robots(IdleTestbed):
+    """A testbed with an oracle, if delays are given."""
+
     oracle: Medium | None
 
-    def __init__(self, shells: Mapping[Role, Shell], known: Sequence[DelayParts], port: int) -> None:
+    def __init__(self, shells: Mapping[Role, Shell], delays: Sequence[DelayParts], port: int) -> None:
         super().__init__(shells)
-        self.oracle = Medium(iter(known), port) if known else None
+        self.oracle = Medium(iter(delays), port) if delays else None
 
 
 class LateShell(LocalShell):
-    """A robot that takes a command only when a job of the other one has ended."""
+    """A robot that accepts a command only after a job of the other robot has exited."""
 
     until: Path
 
@@ -70,7 +74,7 @@ def transfer(
     protocol: Protocol,
     sender: LocalShell,
     receiver: LocalShell,
-    known: Sequence[DelayParts] = (),
+    delays: Sequence[DelayParts] = (),
     *,
     idle: str = "5s",
     limit: str = "120s",
@@ -87,7 +91,7 @@ def transfer(
     )
     bag = RecordedFile(Role.SENDER, "scan.bag", 20_000)
     scene = Scene(protocol, cast, FOLDER, {Role.SENDER: (bag,)}, here=sender.home.parent)
-    robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, known, port)
+    robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, delays, port)
     try:
         step.run(scene, robots, lambda name, expected_s: None)
     finally:
@@ -96,11 +100,11 @@ def transfer(
 
 
 @pytest.mark.parametrize("protocol", Protocol)
-def test_the_file_arrives(tmp_path: Path, protocol: Protocol) -> None:
+def test_file_arrives(tmp_path: Path, protocol: Protocol) -> None:
     receiver = LocalShell(tmp_path / "receiver")
     transfer(protocol, LocalShell(tmp_path / "sender"), receiver)
     assert (receiver.home / FOLDER / "recv.bag").read_bytes() == b"x" * 20_000
-    assert not (tmp_path / "medium.txt").exists(), "nobody knows the delays"
+    assert not (tmp_path / "medium.txt").exists(), "no oracle knows the delays"
 
 
 def _parts(n: int) -> DelayParts:
@@ -108,20 +112,20 @@ def _parts(n: int) -> DelayParts:
 
 
 @pytest.mark.parametrize("packets", [0, 215])
-def test_what_the_lab_knows_of_the_delays_meanwhile_is_kept(tmp_path: Path, packets: int) -> None:
-    known = _parts(1000), _parts(1000 + packets)
-    transfer(Protocol.TCP, LocalShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver"), known)
+def test_delays_of_the_oracle_are_stored(tmp_path: Path, packets: int) -> None:
+    delays = _parts(1000), _parts(1000 + packets)
+    transfer(Protocol.TCP, LocalShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver"), delays)
     assert medium.read(tmp_path / "medium.txt") == _parts(packets)
 
 
 @pytest.mark.parametrize(
-    ("protocol", "words"),
-    [(Protocol.UDP, "ends after 1 s of silence"), (Protocol.TCP, "was ended 2 s after it began")],
+    ("protocol", "reason"),
+    [(Protocol.UDP, "the listener exits after 1 s of silence"), (Protocol.TCP, "the listener was stopped after 2 s")],
 )
-def test_a_sender_that_begins_after_the_listener_is_gone_is_no_measurement(
-    tmp_path: Path, protocol: Protocol, words: str
+def test_sender_that_starts_after_end_of_listener_is_an_error(
+    tmp_path: Path, protocol: Protocol, reason: str
 ) -> None:
     sender, receiver = LateShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver")
     sender.until = receiver.home / FOLDER / ".jobs" / "listen" / "exit"
-    with pytest.raises(RobotError, match=rf"after listening, which {words}"):
+    with pytest.raises(RobotError, match=rf"after listening, but {reason}"):
         transfer(protocol, sender, receiver, idle="1s", limit="2s")

@@ -328,7 +328,7 @@ def test_a_robot_without_ros_is_asked_for_no_recorder_and_no_topic() -> None:
 def test_a_robot_without_ros_that_is_to_record_is_refused() -> None:
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
-    with pytest.raises(ConfigurationError, match="is to record, and its profile turtlebot3_burger has no ros"):
+    with pytest.raises(ConfigurationError, match="cannot record: its profile turtlebot3_burger has no ros"):
         plan.scenes()
 
 
