@@ -142,9 +142,6 @@ class Coordinator:
             return self.situation.now_ns
         return self._agents.next_wake_ns()
 
-    def _next_wake_ns(self) -> int | None:
-        return self.situation.now_ns if self._agents.mail or self._held else self._agents.next_wake_ns()
-
     def _next_event_ns(self) -> int | None:
         try:
             return self._network.next_event_ns()
@@ -287,7 +284,7 @@ class Coordinator:
     def _enter(
         self, sent: Sequence[Sent], begin_ns: int, assumed: Mapping[str, State]
     ) -> tuple[Sequence[Fate], Sequence[Packet]]:
-        """Record the packets that enter in a window: those sent in it or, if sends are deferred, in the one before."""
+        """Record packets that enter in a window: those sent in it or, if sends are deferred, in the one before."""
         if self.policy.defers_sends:
             sent, self._deferred = self._deferred, sent
         elif self._deferred:
