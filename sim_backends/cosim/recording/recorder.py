@@ -1,4 +1,4 @@
-"""The recorder: an observer that writes a run into a folder, in parts that remain readable if the process is killed."""
+"""The recorder: an observer that writes a run into a folder, in parts that survive a kill of the process."""
 
 import errno
 import os
