@@ -65,7 +65,7 @@ def jackknife(value: float, without: Floats) -> IntervalEstimate:
 
 
 def repeats_needed(difference: float, deviation: float) -> int | None:
-    """Return the number of pairs of repeats that detect a difference in four of five studies; None if the difference is 0.
+    """Return the number of pairs of repeats that detect a difference in four of five studies; None if it is zero.
 
     It is ((z_0.975 + z_0.8) s / d)^2 + z_0.975^2 / 2; the second term compensates that the deviation is an estimate
     (Guenther 1981, Am. Stat. 35:243). Small numbers may be one too low.
