@@ -106,7 +106,6 @@ def simulate_all(
             if result.is_interrupted:  # with a single worker, the run itself catches Ctrl-C
                 interrupted = True
                 break
-                break
     except KeyboardInterrupt:
         interrupted = True
     return [results[number] for number in sorted(results)], interrupted
