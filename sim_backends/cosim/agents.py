@@ -30,7 +30,7 @@ _MAX_WAKES_AT_ONE_TIME: Final = 1000
 
 
 class Agents:
-    """Advances bodies and programs together: a program reads its own body's state at the current time, at any window.
+    """Advances bodies and programs together. A program reads the state of its body at the current time in any window.
 
     Args:
         physics: Moves the bodies.

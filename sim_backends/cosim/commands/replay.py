@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     show_results(arguments.format, title(recording), scenario, [result])
     if recording.manifest.ending is not RunEnding.WHOLE:
         why = f": {recording.manifest.why}" if recording.manifest.why else ""
-        show_note(f"the run did not come to its end ({recording.manifest.ending}){why}")
+        show_note(f"the run did not complete ({recording.manifest.ending}){why}")
     if arguments.mcap is not None:
         _write_mcap(arguments.mcap, recording)
     return 0

@@ -110,7 +110,7 @@ class ErrorBounded:
         return end_ns
 
     def reckoning_step_ns(self, situation: Situation) -> int:
-        """Return the physics step, or a shorter one if the motion in a step would take too much of the bound."""
+        """Return the physics step, or a shorter one if the motion in a step would use too much of the bound."""
         pairs = self._pairs(situation)
         with np.errstate(divide="ignore"):
             longest_s = float(np.min(_STEP_SHARE * pairs.bounds_m / pairs.assumed_m_s, initial=math.inf))

@@ -65,7 +65,10 @@ _PACKET: Final = _object(
             "description": "Whether it arrived; absent if that was not known at the end.",
         },
         "reason": {"type": "string", "description": "Why it never arrived; absent otherwise."},
-        "delay_s": {"type": "number", "description": "Time from sending by its program to its counted arrival."},
+        "delay_s": {
+            "type": "number",
+            "description": "Time from its sending to its arrival as its receiver counts it.",
+        },
         "added_s": {
             "type": "number",
             "description": "Part of the delay that the sync policy added.",

@@ -1,4 +1,4 @@
-"""The tables of a recording: each is a folder of Parquet files, of which each is complete.
+"""The tables of a recording: each is a folder of Parquet files, and each file is readable without the others.
 
 The only module of `sim_backends` that imports pyarrow.
 """

@@ -66,13 +66,13 @@ def _lines(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
 
 
 def _robots(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
-    known = robots()
+    robot_names = robots()
     for name, plan in scenario.agents.items():
-        if plan.robot not in known:
+        if plan.robot not in robot_names:
             yield ScenarioProblem(
                 ("agents", name, "robot"),
                 f"there is no robot {plan.robot!r}",
-                nearest(plan.robot, known, f"robots: {', '.join(known)}"),
+                nearest(plan.robot, robot_names, f"robots: {', '.join(robot_names)}"),
             )
 
 
@@ -112,7 +112,7 @@ def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
     try:
         Bodies(bodies(scenario, world), world)
     except ConfigurationError as error:
-        agent = error.what.partition(" ")[0]  # the message begins with the agent that overlaps something at its start
+        agent = error.what.partition(" ")[0]  # the message begins with the name of the agent
         yield ScenarioProblem(("agents", agent), error.what, error.remedy)
 
 

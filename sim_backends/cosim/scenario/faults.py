@@ -121,7 +121,7 @@ class JammerFault(_TimedFault):
 
 
 class ClockSkewFault(_TimedFault):
-    """The clock of an agent is wrong, by which its programs wake and stamp; at the end of the fault it is set right.
+    """The clock of an agent, which its programs use to wake and stamp, is wrong; at the fault's end it is set right.
 
     Attributes:
         kind: `clock-skew`.

@@ -171,7 +171,7 @@ class FileTraffic(_Traffic):
     Attributes:
         kind: `file`.
         size_bytes: Size of the file.
-        piece_bytes: Size of each write to the transport: netcat writes 8192 bytes.
+        piece_bytes: Size of each write to the transport: netcat uses 8192 bytes.
     """
 
     kind: Literal["file"]

@@ -24,7 +24,7 @@ class Printed:
     Attributes:
         text: Its digits, in the printed unit.
         per_si: Factor from SI units to the printed unit: 100 for %, 1000 for ms.
-        step: Precision of numbers of its kind; empty for that of its own last digit.
+        step: Precision of numbers of its kind; if empty, that of its last digit.
     """
 
     text: str

@@ -131,7 +131,7 @@ def local_errors(
 
 
 def low_discrepancy_times_ns(begin_ns: int, end_ns: int, count: int, step_ns: int) -> list[int]:
-    """Return evenly distributed times at whole steps whose phase within any period is practically random.
+    """Return evenly distributed times at whole steps, whose phases within any period are practically random.
 
     They are multiples of the golden ratio modulo 1, the sequence of lowest discrepancy in one dimension.
     """

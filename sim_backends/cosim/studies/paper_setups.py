@@ -24,7 +24,7 @@ RADIOS: Final[Mapping[str, Changes]] = MappingProxyType(
 """Radios of the mesh: the one in its file, and fixed links as in EMANE's model RF Pipe."""
 
 _DURATION: Final = "20s"
-"""9 s longer than until the last packet of a bag; packets that are still under way then count as lost."""
+"""The run ends 9 s after the last packet of a bag; packets that are still under way then count as lost."""
 
 
 def masterless(line: Sight, distance_m: float, changes: Changes, *, flying: bool = False) -> Setup:

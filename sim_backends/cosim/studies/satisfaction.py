@@ -5,8 +5,8 @@ window is changed by algorithm 1, and the same round is run again, until a resul
 window of a round is the result of the rule in the previous round.
 
 A synchronization method does not change the losses of the radio. So each round is compared with the exact reference
-of the same scenario and seed, whose loss does not depend on a window: the loop selects an error, and every round adds
-cost.
+of the same scenario and seed, whose loss does not depend on a window. The loop only changes the error of the result,
+and every round adds to its cost.
 """
 
 from collections.abc import Callable, Sequence
