@@ -19,14 +19,14 @@ MEMINFO: Final = Path("/proc/meminfo")
 
 
 def needed_bytes(scenario: CosimScenario) -> int:
-    """Return about the largest memory that a run needs for its record and its radio, with any policy."""
+    """Return the approximate maximum memory that a run needs for its record and its radio, with any policy."""
     packets = sum(traffic.packets(scenario.duration) for traffic in scenario.traffic)
     windows = scenario.duration / scenario.physics.step + packets * EVENTS_PER_PACKET
     return round(packets * PACKET_BYTES + windows * WINDOW_BYTES) + radio_bytes(scenario)
 
 
 def radio_bytes(scenario: CosimScenario) -> int:
-    """Return about the largest memory of the radio, which is proportional to the number of pairs of agents."""
+    """Return the approximate maximum memory of the radio, which is proportional to the number of pairs of agents."""
     return 0 if scenario.radio.fixed else math.comb(len(scenario.agents), 2) * PAIR_BYTES
 
 

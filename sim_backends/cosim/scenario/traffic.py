@@ -94,7 +94,7 @@ class _Traffic(Strict, ABC):
 
     @abstractmethod
     def packets(self, duration_s: float) -> float:
-        """Return about the largest number of packets that it sends in a scenario of a duration."""
+        """Return the approximate maximum number of packets that it sends in a scenario of a duration."""
 
 
 class StreamTraffic(_Traffic):
