@@ -1,7 +1,7 @@
 """Co-simulation: robots that move and a network that carries their packets, at one simulated time.
 
-What a script needs stands here: `from sim_backends.cosim import load_scenario, build`. It is imported when
-it is asked for, so that a federate may import its neighbours without everything else.
+Scripts need two functions: `from sim_backends.cosim import load_scenario, build`. They are imported on first use, so
+that a federate can import a module of this package without importing all others.
 """
 
 from importlib import import_module
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Simulation", "build", "load_scenario"]
 
-_WHERE: Final = {
+_MODULES: Final = {
     "Simulation": "sim_backends.cosim.scenario.build",
     "build": "sim_backends.cosim.scenario.build",
     "load_scenario": "sim_backends.cosim.scenario.loading",
 }
 
 
-def __getattr__(name: str) -> Any:  # noqa: ANN401 (whatever the module has by that name)
-    if name not in _WHERE:
+def __getattr__(name: str) -> Any:  # noqa: ANN401 (the type depends on the name)
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__} has no attribute {name!r}")
-    return getattr(import_module(_WHERE[name]), name)
+    return getattr(import_module(_MODULES[name]), name)

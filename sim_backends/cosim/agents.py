@@ -1,10 +1,10 @@
-"""The agents of a co-simulation: bodies that the physics moves, and programs on them."""
+"""The agents of a co-simulation: the bodies that the physics moves, and the programs that run on them."""
 
 import heapq
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from sim_backends.cosim.federate_errors import FederateError, failed, seconds
+from sim_backends.cosim.federate_errors import FederateError, federate_error, seconds_text
 from sim_backends.cosim.federates import PhysicsFederate, Program, next_send_ns
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
@@ -14,10 +14,10 @@ class Sent(NamedTuple):
     """A datagram that a program sent.
 
     Attributes:
-        at_ns: When.
-        source: On which agent it runs.
-        datagram: What it sent.
-        states: Where the agents were then, at the physics' last own step.
+        at_ns: Time of sending.
+        source: Name of the sending agent.
+        datagram: The datagram.
+        states: States of all agents at the last physics step before `at_ns`.
     """
 
     at_ns: int
@@ -26,40 +26,40 @@ class Sent(NamedTuple):
     states: Mapping[str, State]
 
 
-_MOST_AT_ONCE: Final = 1000
+_MAX_WAKES_AT_ONE_TIME: Final = 1000
 
 
 class Agents:
-    """Lets bodies and programs go on together: a program senses its own body at its own time, whatever the window.
+    """Advances bodies and programs together. A program reads the state of its body at the current time in any window.
 
     Args:
         physics: Moves the bodies.
-        programs: What runs on each agent; an agent may have none.
+        programs: The program of each agent; an agent may have none.
 
     Raises:
         FederateError: A program failed.
 
     Attributes:
-        physics: As given.
-        programs: As given, by name.
-        new: Agents that the physics moves since `with_new` was called last, and did not before.
+        physics: The physics.
+        programs: The programs by agent name, sorted.
+        new_agents: Agents that the physics has added since the last call of `with_new_agents`.
     """
 
     def __init__(self, physics: PhysicsFederate, programs: Mapping[str, Program]) -> None:
         self.physics = physics
         self.programs = dict(sorted(programs.items()))
-        self.new: frozenset[str] = frozenset()
+        self.new_agents: frozenset[str] = frozenset()
         self._names = frozenset(programs)
         self._at_ns = 0
-        self._mail: dict[str, list[Received]] = {}
+        self._received: dict[str, list[Received]] = {}
         self._commands: dict[str, Any] = {}
-        self._wakes_ns: dict[str, int] = {}
-        self._planned: list[tuple[int, str]] = []
+        self._wake_times_ns: dict[str, int] = {}
+        self._queue: list[tuple[int, str]] = []
         self._next_ns: int | None = None
-        self._plan(self.programs)
+        self._schedule(self.programs)
 
     def states(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states at the last own step of the physics that is not after `now_ns`.
+        """Return the states of all agents at the last physics step that is not after `now_ns`.
 
         Raises:
             FederateError: The physics failed, did not answer in time, or has lost an agent.
@@ -70,128 +70,131 @@ class Agents:
         try:
             states = self.physics.advance(now_ns, commands)
         except Exception as error:
-            asked = f"advance from {seconds(self._at_ns)} to {seconds(now_ns)}"
-            raise failed(error, "physics", asked) from error
+            request = f"advance from {seconds_text(self._at_ns)} to {seconds_text(now_ns)}"
+            raise federate_error(error, "physics", request) from error
         try:
             if states.keys() != self._names:
-                self._meet(states, now_ns)
+                self._update_names(states, now_ns)
         except AttributeError:
             raise FederateError(
-                f"physics, asked to advance to {seconds(now_ns)}, returned {states!r}, which is no mapping of states"
+                f"physics, asked to advance to {seconds_text(now_ns)}, returned {states!r}, which is not a "
+                "mapping of states"
             ) from None
         self._at_ns = now_ns
         return states
 
-    def _meet(self, states: Mapping[str, State], now_ns: int) -> None:
-        """Note whom the physics moves, who may become more but not fewer."""
+    def _update_names(self, states: Mapping[str, State], now_ns: int) -> None:
+        """Update the names of the agents; agents may appear during a run, but must not disappear."""
         if lost := self._names - states.keys():
             names = ", ".join(sorted(lost))
-            raise FederateError(f"physics, asked to advance to {seconds(now_ns)}, has no state of {names}")
-        self.new |= states.keys() - self._names
+            raise FederateError(f"physics, asked to advance to {seconds_text(now_ns)}, has no state of {names}")
+        self.new_agents |= states.keys() - self._names
         self._names = frozenset(states)
 
-    def with_new(self, begin: Mapping[str, State], states: Mapping[str, State]) -> Mapping[str, State]:
-        """Return the states at a window's begin; with those at its end of agents that appeared in it, if any did."""
-        if not self.new:
+    def with_new_agents(self, begin: Mapping[str, State], end: Mapping[str, State]) -> Mapping[str, State]:
+        """Return the states at the beginning of a window; agents that appeared in it have their state at its end."""
+        if not self.new_agents:
             return begin
-        new, self.new = self.new, frozenset()
-        return {**{name: states[name] for name in new}, **begin}
+        new_agents, self.new_agents = self.new_agents, frozenset()
+        return {**{name: end[name] for name in new_agents}, **begin}
 
     def next_wake_ns(self) -> int | None:
-        """Return when a program wakes next by itself, None for never."""
+        """Return the next time at which a program's timer wakes it, or None if no timer is set."""
         return self._next_ns
 
     def next_send_ns(self) -> int | None:
-        """Return before when surely no program sends anything by itself, None for never.
+        """Return a time before which no program sends because of a timer, or None if none will.
 
         Raises:
             FederateError: A program failed, or did not answer in time.
         """
-        found: int | None = None
+        earliest_ns: int | None = None
         for name, program in self.programs.items():
             try:
                 at_ns = next_send_ns(program)
             except Exception as error:
-                asked = f"say when it sends next after {seconds(self._at_ns)}"
-                raise failed(error, f"the program of {name}", asked) from error
-            if at_ns is not None and (found is None or at_ns < found):
-                found = at_ns
-        return found
+                request = f"return its next send time after {seconds_text(self._at_ns)}"
+                raise federate_error(error, f"the program of {name}", request) from error
+            if at_ns is not None and (earliest_ns is None or at_ns < earliest_ns):
+                earliest_ns = at_ns
+        return earliest_ns
 
-    def _plan(self, names: Iterable[str]) -> None:
-        """Ask programs when they wake next, which changes by nothing but waking; note when the first of all does."""
+    def _schedule(self, names: Iterable[str]) -> None:
+        """Read the next wake times of programs, which change only when a program wakes, and update the queue."""
         for name in names:
             try:
                 wake_ns = self.programs[name].next_wake_ns()
             except Exception as error:
-                asked = f"say when it wakes next after {seconds(self._at_ns)}"
-                raise failed(error, f"the program of {name}", asked) from error
+                request = f"return its next wake time after {seconds_text(self._at_ns)}"
+                raise federate_error(error, f"the program of {name}", request) from error
             if wake_ns is None:
-                self._wakes_ns.pop(name, None)
-            elif wake_ns != self._wakes_ns.get(name):
-                self._wakes_ns[name] = wake_ns
-                heapq.heappush(self._planned, (wake_ns, name))
-        # What programs have planned otherwise since stays in the heap until it comes up.
-        planned = self._planned
-        while planned and self._wakes_ns.get(planned[0][1]) != planned[0][0]:
-            heapq.heappop(planned)
-        self._next_ns = planned[0][0] if planned else None
+                self._wake_times_ns.pop(name, None)
+            elif wake_ns != self._wake_times_ns.get(name):
+                self._wake_times_ns[name] = wake_ns
+                heapq.heappush(self._queue, (wake_ns, name))
+        # Entries that a program has replaced stay in the heap until they are at its top.
+        queue = self._queue
+        while queue and self._wake_times_ns.get(queue[0][1]) != queue[0][0]:
+            heapq.heappop(queue)
+        self._next_ns = queue[0][0] if queue else None
 
-    def hand_over(self, receiver: str, received: Received) -> None:
-        """Let the program of an agent get a datagram when it is let go on next."""
+    def deliver(self, receiver: str, received: Received) -> None:
+        """Keep a datagram for the program of an agent, which gets it when `advance` is called next."""
         if receiver in self.programs:
-            self._mail.setdefault(receiver, []).append(received)
+            self._received.setdefault(receiver, []).append(received)
 
     @property
-    def mail(self) -> bool:
-        """Whether a program has a datagram that it was not woken for."""
-        return bool(self._mail)
+    def has_undelivered(self) -> bool:
+        """True if a program has a datagram for which it was not woken yet."""
+        return bool(self._received)
 
     def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[Sent], Mapping[str, State]]:
-        """Let programs act up to `last_ns`, those with mail first, now; then let bodies move on to `end_ns`.
+        """Wake programs that have received datagrams, then those due up to `last_ns`; then move bodies to `end_ns`.
 
         Returns:
-            What programs sent, and the states at `end_ns`, as `states` gives them.
+            The datagrams that programs sent, and the states at `end_ns` (see `states`).
 
         Raises:
-            FederateError: Physics or a program failed or did not answer in time, or wakes without end at one time.
+            FederateError: Physics or a program failed or did not answer in time, or a program wakes endlessly at one
+                time.
         """
         sent: list[Sent] = []
-        if self._mail:
-            mail, self._mail = self._mail, {}
-            sent += self._wake(now_ns, mail)
-        woke_ns, turns = -1, 0
+        if self._received:
+            received, self._received = self._received, {}
+            sent += self._wake(now_ns, received)
+        woke_ns, repeats = -1, 0
         while (wake_ns := self._next_ns) is not None and wake_ns <= last_ns:
-            names = self._due(wake_ns)
-            turns = turns + 1 if wake_ns <= woke_ns else 0
-            if turns > _MOST_AT_ONCE:
+            names = self._pop_due(wake_ns)
+            repeats = repeats + 1 if wake_ns <= woke_ns else 0
+            if repeats > _MAX_WAKES_AT_ONE_TIME:
                 raise FederateError(
-                    f"the program of {' and '.join(names)} woke {turns} times at {seconds(wake_ns)}, and goes on"
+                    f"the program of {' and '.join(names)} woke {repeats} times at {seconds_text(wake_ns)}, and "
+                    "continues"
                 )
             woke_ns = wake_ns
             sent += self._wake(wake_ns, dict.fromkeys(names, ()))
         return sent, self.states(end_ns)
 
-    def _due(self, wake_ns: int) -> list[str]:
-        """Take out of the plan, and return, who wakes at a time."""
+    def _pop_due(self, wake_ns: int) -> list[str]:
+        """Remove the agents whose programs wake at a time from the queue, and return their names."""
         names = []
-        while self._planned and self._planned[0][0] == wake_ns:
-            _, name = heapq.heappop(self._planned)
-            if self._wakes_ns.get(name) == wake_ns:
-                del self._wakes_ns[name]
+        while self._queue and self._queue[0][0] == wake_ns:
+            _, name = heapq.heappop(self._queue)
+            if self._wake_times_ns.get(name) == wake_ns:
+                del self._wake_times_ns[name]
                 names.append(name)
         return names
 
-    def _wake(self, now_ns: int, mail: Mapping[str, Sequence[Received]]) -> list[Sent]:
+    def _wake(self, now_ns: int, received: Mapping[str, Sequence[Received]]) -> list[Sent]:
         states = self.states(now_ns)
         sent: list[Sent] = []
-        for name in sorted(mail):
+        for name in sorted(received):
             try:
-                action = self.programs[name].wake(now_ns, states[name], mail[name])
+                action = self.programs[name].wake(now_ns, states[name], received[name])
             except Exception as error:
-                raise failed(error, f"the program of {name}", f"act at {seconds(now_ns)}") from error
+                raise federate_error(error, f"the program of {name}", f"act at {seconds_text(now_ns)}") from error
             sent += [Sent(now_ns, name, datagram, states) for datagram in action.datagrams]
             if action.command is not None:
                 self._commands[name] = action.command
-        self._plan(mail)
+        self._schedule(received)
         return sent

@@ -1,4 +1,4 @@
-"""What became of the packets of a run, as arrays: a column each, named as in the recorded Parquet file."""
+"""The packets of a run as arrays: one array per column, named as in the recorded Parquet file."""
 
 from collections.abc import Callable
 from typing import Any, Final
@@ -10,7 +10,7 @@ from sim_backends.cosim.programs.pings import REPLY
 from sim_backends.cosim.run import Fate, Run
 
 NEVER: Final = -1
-"""Stands for a time that there is not."""
+"""Value of a time that does not exist, for example the arrival time of a lost packet."""
 
 _INTEGERS: Final[dict[str, Callable[[Fate], int | None]]] = {
     "number": lambda fate: fate.packet.identity[1],
@@ -33,30 +33,31 @@ _TEXTS: Final[dict[str, Callable[[Fate], str]]] = {
 def columns(run: Run) -> dict[str, NDArray[Any]]:
     """Return one array per column, one row per packet in the order in which the network got them.
 
-    `flow`, `source`, `destination`, `protocol` and `reason` (why it never arrived; empty if it did, or is under way)
-    are texts. `number`, `size_bytes` and, in nanoseconds of simulated time, `sent_ns`, `enters_ns`, `arrived_ns`,
-    `counted_ns` and `late_ns`, are 64-bit integers, `NEVER` where there is none.
+    `flow`, `source`, `destination`, `protocol` and `reason` are texts; `reason` says why the packet never arrived,
+    and is empty if it arrived or is under way. `number`, `size_bytes` and the times `sent_ns`, `enters_ns`,
+    `arrived_ns`, `counted_ns` and `late_ns`, in nanoseconds of simulated time, are 64-bit integers; a missing time is
+    `NEVER`.
     """
     fates = list(run.fates.values())
-    texts = {name: np.array([text(fate) for fate in fates], dtype=np.str_) for name, text in _TEXTS.items()}
-    numbers = {
-        name: np.array([NEVER if (value := number(fate)) is None else value for fate in fates], dtype=np.int64)
-        for name, number in _INTEGERS.items()
+    texts = {name: np.array([value_of(fate) for fate in fates], dtype=np.str_) for name, value_of in _TEXTS.items()}
+    integers = {
+        name: np.array([NEVER if (value := value_of(fate)) is None else value for fate in fates], dtype=np.int64)
+        for name, value_of in _INTEGERS.items()
     }
-    return texts | numbers
+    return texts | integers
 
 
 def round_trips_s(run: Run, flow: str) -> NDArray[np.float64]:
-    """Return the round-trip time of each request of a ping in order, nan for those without an answer.
+    """Return the round-trip time of each request of a ping in order; nan for requests without a reply.
 
     Args:
         run: The run.
-        flow: The flow of the requests; that of their answers is `FLOW/reply`.
+        flow: Name of the flow of requests; their replies are the flow `FLOW/reply`.
     """
     requests = {number: fate.packet.sent_ns for (name, number), fate in run.fates.items() if name == flow}
     trips_s = np.full(len(requests), np.nan)
     for row, (number, sent_ns) in enumerate(sorted(requests.items())):
-        answer = run.fates.get((flow + REPLY, number))
-        if answer is not None and answer.counted_ns is not None:
-            trips_s[row] = (answer.counted_ns - sent_ns) / 1e9
+        reply = run.fates.get((flow + REPLY, number))
+        if reply is not None and reply.counted_ns is not None:
+            trips_s[row] = (reply.counted_ns - sent_ns) / 1e9
     return trips_s

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.cosim.geometry import displaced_m
+from sim_backends.cosim.geometry import position_error_m
 from sim_backends.cosim.run import Run
 from sim_backends.radio.random_streams import PacketIdentity
 
@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Spread:
-    """A distribution in three numbers; nan where there is nothing.
+    """A distribution as three numbers; all are nan for an empty sample.
 
     Attributes:
         mean: Its mean.
@@ -31,22 +31,22 @@ class Spread:
 
 @dataclass(frozen=True)
 class Errors:
-    """How wrong a run is, and what it cost. Where no packet tells, values are nan.
+    """The errors and the cost of a run. Values that no packet determines are nan.
 
     Attributes:
-        packets: Packets whose fate is known in both runs.
-        delivery_error_s: Magnitude of the difference of delivery times, over packets that arrived in both.
-        position_error_m: By how much the network was wrong, when a packet was sent, about where two of the agents
-            that transmit, forward or interfere were to each other in the same run, the largest; of the continuous
-            trajectories, so that states which are held for a step h count with v h / 2.
-        path_error_m: How far off agents are, over time; above 0 only where their programs steer by what they receive.
-        fate_disagreement: Share of packets that arrived in one run and not in the other.
-        first_disagreement: The packet that was sent first of these; None for none.
-        first_disagreement_s: When it was sent; nan for none.
-        causality_violations: Arrivals that their receiver had passed already.
-        late_s: By how much, over all arrivals.
-        delay_added_s: Mean of what the policy added to a delay: before the network got a packet, and after it
-            had delivered it.
+        packets: Number of packets whose fate is decided in both runs.
+        delivery_error_s: Absolute difference of delivery times, over packets that arrived in both runs.
+        position_error_m: Largest error, at the time when a packet was sent, of the relative position that the network
+            assumed for two of the agents that transmit, forward or interfere in this run. The true positions are
+            those of the continuous trajectories: states that are held for a step h have an error of v h / 2.
+        path_error_m: Distance of agents from their positions in the reference, over time; above 0 only if programs
+            steer by received data.
+        fate_disagreement: Share of packets that arrived in one run only.
+        first_disagreement: The packet of these that was sent first, or None.
+        first_disagreement_s: Time when it was sent, or nan.
+        causality_violations: Number of arrivals at a time that the receiver had already passed.
+        late_s: How far the receiver had passed the time of arrival, over all arrivals.
+        delay_added_s: Mean delay that the policy added, before a packet entered the network and after its delivery.
         exchanges_per_s: Windows per simulated second.
         wall_s: Wall time by part.
         real_time_factor: Simulated time over wall time.
@@ -67,35 +67,36 @@ class Errors:
     real_time_factor: float
 
 
-def errors(reference: Run, run: Run, apart_m: Floats | None = None) -> Errors:
-    """Return how a run differs from the exact reference.
+def errors(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Errors:
+    """Return the errors of a run relative to the exact reference.
 
     Args:
-        reference: Of an exact policy.
-        run: Of the same scenario and seed, as far as the reference goes.
-        apart_m: How far each agent is off, at equal times of both runs, any shape; None where nobody looked.
+        reference: The run by an exact policy.
+        run: A run of the same scenario and seed, of the same duration.
+        path_errors_m: Distance of each agent from its position in the reference, at equal times, any shape; None if
+            positions were not sampled.
     """
     both = [(fate, run.fates[identity]) for identity, fate in reference.fates.items() if identity in run.fates]
-    known = [(one, other) for one, other in both if one.is_known and other.is_known]
-    differing = [one.packet for one, other in known if bool(one.reason) != bool(other.reason)]
-    arrived = [
-        (one.counted_ns, other.counted_ns)
-        for one, other in known
-        if one.counted_ns is not None and other.counted_ns is not None
+    decided = [(expected, actual) for expected, actual in both if expected.is_decided and actual.is_decided]
+    differing = [expected.packet for expected, actual in decided if bool(expected.reason) != bool(actual.reason)]
+    counted_ns = [
+        (expected.counted_ns, actual.counted_ns)
+        for expected, actual in decided
+        if expected.counted_ns is not None and actual.counted_ns is not None
     ]
     late_ns = [fate.late_ns for fate in run.fates.values() if fate.arrived_ns is not None]
     simulated_s = run.windows_ns[-1] / 1e9 if run.windows_ns else math.nan
     first = min(differing, key=lambda packet: packet.sent_ns, default=None)
     return Errors(
-        packets=len(known),
-        delivery_error_s=_spread([abs(one - other) / 1e9 for one, other in arrived]),
-        position_error_m=_spread([displaced_m(fate) for fate in run.fates.values()]),
-        path_error_m=_spread([] if apart_m is None else apart_m.ravel()),
-        fate_disagreement=len(differing) / len(known) if known else math.nan,
+        packets=len(decided),
+        delivery_error_s=_spread([abs(expected_ns - actual_ns) / 1e9 for expected_ns, actual_ns in counted_ns]),
+        position_error_m=_spread([position_error_m(fate) for fate in run.fates.values()]),
+        path_error_m=_spread([] if path_errors_m is None else path_errors_m.ravel()),
+        fate_disagreement=len(differing) / len(decided) if decided else math.nan,
         first_disagreement=None if first is None else first.identity,
         first_disagreement_s=math.nan if first is None else first.sent_ns / 1e9,
-        causality_violations=sum(one > 0 for one in late_ns),
-        late_s=_spread([one / 1e9 for one in late_ns]),
+        causality_violations=sum(time_ns > 0 for time_ns in late_ns),
+        late_s=_spread([time_ns / 1e9 for time_ns in late_ns]),
         delay_added_s=delay_added_s(run),
         exchanges_per_s=len(run.windows_ns) / simulated_s,
         wall_s=dict(run.wall_s),
@@ -104,45 +105,47 @@ def errors(reference: Run, run: Run, apart_m: Floats | None = None) -> Errors:
 
 
 def mean_errors(several: Sequence[Errors]) -> Errors:
-    """Return the errors of several runs, for example of all seeds, in one.
+    """Return the errors of several runs, for example of all seeds, as one.
 
-    Numbers are means over the runs in which they are known, but of maxima the largest, and of first disagreements the
-    earliest.
+    Numbers are means over the runs that have them. A maximum is the largest of all runs, and the first disagreement
+    is the earliest of all runs.
 
     Args:
-        several: The errors of each, at least one.
+        several: The errors of each run, at least one.
     """
-    first = min(several, key=lambda one: (math.isnan(one.first_disagreement_s), one.first_disagreement_s))
+    first = min(several, key=lambda errors: (math.isnan(errors.first_disagreement_s), errors.first_disagreement_s))
 
     def mean(value: Callable[[Errors], float]) -> float:
-        values = [number for one in several if not math.isnan(number := value(one))]
+        values = [number for errors in several if not math.isnan(number := value(errors))]
         return math.fsum(values) / len(values) if values else math.nan
 
-    def spread(of: str) -> Spread:
-        largest = [number for one in several if not math.isnan(number := getattr(one, of).largest)]
+    def spread(name: str) -> Spread:
+        largest = [number for errors in several if not math.isnan(number := getattr(errors, name).largest)]
         return Spread(
-            mean(lambda one: getattr(one, of).mean),
-            mean(lambda one: getattr(one, of).p95),
+            mean(lambda errors: getattr(errors, name).mean),
+            mean(lambda errors: getattr(errors, name).p95),
             max(largest, default=math.nan),
         )
 
-    spreads = {one.name: spread(one.name) for one in fields(Errors) if one.type is Spread}
+    spreads = {field.name: spread(field.name) for field in fields(Errors) if field.type is Spread}
     return Errors(
-        packets=sum(one.packets for one in several),
+        packets=sum(errors.packets for errors in several),
         **spreads,
-        fate_disagreement=mean(lambda one: one.fate_disagreement),
+        fate_disagreement=mean(lambda errors: errors.fate_disagreement),
         first_disagreement=first.first_disagreement,
         first_disagreement_s=first.first_disagreement_s,
-        causality_violations=mean(lambda one: one.causality_violations),
-        delay_added_s=mean(lambda one: one.delay_added_s),
-        exchanges_per_s=mean(lambda one: one.exchanges_per_s),
-        wall_s={part: math.fsum(one.wall_s[part] for one in several) / len(several) for part in several[0].wall_s},
-        real_time_factor=mean(lambda one: one.real_time_factor),
+        causality_violations=mean(lambda errors: errors.causality_violations),
+        delay_added_s=mean(lambda errors: errors.delay_added_s),
+        exchanges_per_s=mean(lambda errors: errors.exchanges_per_s),
+        wall_s={
+            part: math.fsum(errors.wall_s[part] for errors in several) / len(several) for part in several[0].wall_s
+        },
+        real_time_factor=mean(lambda errors: errors.real_time_factor),
     )
 
 
 def delay_added_s(run: Run) -> float:
-    """Return what the policy added to a delay, before the network got a packet and behind it, mean; nan for none."""
+    """Return the mean delay that the policy added before and after the network; nan if no packet arrived."""
     added_ns = [
         fate.packet.enters_ns - fate.packet.sent_ns + fate.counted_ns - fate.arrived_ns
         for fate in run.fates.values()
@@ -152,9 +155,9 @@ def delay_added_s(run: Run) -> float:
 
 
 def lost_share(run: Run) -> float:
-    """Return the share of packets lost, of those whose fate is known; nan for none."""
-    known = [bool(fate.reason) for fate in run.fates.values() if fate.is_known]
-    return sum(known) / len(known) if known else math.nan
+    """Return the share of packets lost, of those whose fate is decided; nan if there are none."""
+    lost = [bool(fate.reason) for fate in run.fates.values() if fate.is_decided]
+    return sum(lost) / len(lost) if lost else math.nan
 
 
 def _spread(values: Sequence[float] | Floats) -> Spread:

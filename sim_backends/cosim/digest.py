@@ -1,4 +1,4 @@
-"""The hash over the events of a run: two runs with the same digest are the same run, packet by packet."""
+"""The hash over the events of a run: runs with equal digests are equal, packet by packet."""
 
 import hashlib
 import struct
@@ -12,35 +12,35 @@ _EVENT: Final = struct.Struct("<cQQ")
 _PACKET: Final = struct.Struct("<QqqQQ")
 
 _HASHED_BYTES: Final = 1 << 15
-"""At once: a call for every window would take longer than its hashing."""
+"""Events are hashed in blocks of this size, because hashing each window separately would take longer."""
 
 
 class EventDigest:
-    """Hashes windows one after the other: what entered the network, what arrived, what was dropped, and the end.
+    """Hashes windows in order: packets that entered the network, arrivals, drops, and the end of each window.
 
-    A window is hashed when it is over, so that a run that ends within one has the digest of those before. States
-    are left out: the last bit of a position may differ between two mathematical libraries, times may not.
+    A window is hashed when it is over, so a run that stops within a window has the digest of the windows before.
+    States are not hashed: the last bit of a position may differ between two mathematical libraries, times may not.
 
     Attributes:
-        quiet_ns: The ends of windows since the last with packets, which are hashed together; who has another window
-            without packets may append its end.
+        quiet_ends_ns: Ends of the windows since the last window with packets. They are hashed together; for a window
+            without packets, a caller may append its end here.
     """
 
     def __init__(self) -> None:
-        self.quiet_ns: list[int] = []
+        self.quiet_ends_ns: list[int] = []
         self._hash = hashlib.blake2b(digest_size=16)
         self._events = bytearray()
         self._windows = 0
 
-    def window(self, end_ns: int, entered: Iterable[Fate], ended: Iterable[Fate]) -> None:
+    def add_window(self, end_ns: int, entered: Iterable[Fate], ended: Iterable[Fate]) -> None:
         """Hash a window.
 
         Args:
-            end_ns: When it ended.
-            entered: The fates of packets that the network got, in order.
-            ended: Those that were decided in it, in order.
+            end_ns: Its end.
+            entered: The fates of packets that entered the network, in order.
+            ended: The fates that were decided in the window, in order.
         """
-        self._take_in()
+        self._add_quiet_windows()
         events = self._events
         for fate in entered:
             packet = fate.packet
@@ -53,14 +53,14 @@ class EventDigest:
                 events += fate.reason.encode()
             else:
                 events += _EVENT.pack(b"a", fate.packet.packet_id, fate.arrived_ns)
-        self.quiet_ns.append(end_ns)
+        self.quiet_ends_ns.append(end_ns)
         if len(events) > _HASHED_BYTES:
             self._hash.update(events)
             events.clear()
 
-    def _take_in(self) -> None:
-        """Let the ends of quiet windows stand among the events."""
-        ends_ns = self.quiet_ns
+    def _add_quiet_windows(self) -> None:
+        """Append the ends of the quiet windows to the events."""
+        ends_ns = self.quiet_ends_ns
         numbers = range(self._windows, self._windows + len(ends_ns))
         self._events += b"".join(map(_EVENT.pack, repeat(b"w"), numbers, ends_ns))
         self._windows += len(ends_ns)
@@ -68,13 +68,13 @@ class EventDigest:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "EventDigest":
         other = EventDigest()
-        other.quiet_ns = self.quiet_ns.copy()
+        other.quiet_ends_ns = self.quiet_ends_ns.copy()
         other._hash, other._events, other._windows = self._hash.copy(), self._events.copy(), self._windows
         return other
 
     def hexdigest(self) -> str:
         """Return the hash over all windows so far, in hexadecimal."""
-        self._take_in()
-        found = self._hash.copy()
-        found.update(self._events)
-        return found.hexdigest()
+        self._add_quiet_windows()
+        complete = self._hash.copy()
+        complete.update(self._events)
+        return complete.hexdigest()

@@ -1,6 +1,6 @@
-"""Protocols of what a co-simulation brings together: physics, network, and the programs of the agents.
+"""Protocols of the parts of a co-simulation: physics, network, and the programs of the agents.
 
-Time is an integer number of nanoseconds since the beginning. A federate is asked with times that never go back.
+Time is an integer number of nanoseconds since the start of the run. The times of successive calls never decrease.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,30 +16,30 @@ class PhysicsFederate(Protocol):
     """Moves the agents.
 
     Attributes:
-        step_ns: Its own step; its states are those at whole steps.
-        limits_m_s2: The most that each agent's velocity changes per second, in m/s^2. Asked for once; its values may
-            change as the physics goes on.
+        step_ns: Its step; its states are those at whole steps.
+        limits_m_s2: Largest change of each agent's velocity per second, in m/s^2. The mapping is read once; its
+            values may change during the run.
     """
 
     step_ns: int
     limits_m_s2: Mapping[str, float]
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        """Return the state of each agent at its last own step that is not after `to_ns`.
+        """Return the state of each agent at the last step that is not after `to_ns`.
 
         Args:
-            to_ns: Until when.
-            commands: What each agent's program asks of its body from now on, which is the time that was asked for
-                last; an agent without one goes on as it was told before.
+            to_ns: Time to advance to.
+            commands: Command of each agent's program to its body. It applies from the time of the previous call on;
+                an agent without a command keeps its last one.
         """
         ...
 
 
 def check_physics(physics: object) -> None:
-    """Refuse what is no physics federate, before anything is asked of it.
+    """Check that an object is a physics federate, before it is used.
 
     Raises:
-        ConfigurationError: It lacks something; says what.
+        ConfigurationError: It lacks an attribute or method; the message names it.
     """
     step_ns = getattr(physics, "step_ns", None)
     lacks = ""
@@ -57,15 +57,15 @@ def check_physics(physics: object) -> None:
 
 
 def check_states(states: Mapping[str, object]) -> None:
-    """Refuse what a physics gives at time 0 if it is no mapping of states.
+    """Check the states that a physics returns for time 0.
 
     Raises:
-        ConfigurationError: There is something else in it; says what.
+        ConfigurationError: A value is not a `State`; the message names it.
     """
     for name, state in states.items():
         if not isinstance(state, State):
             raise ConfigurationError(
-                f"the physics gave {state!r} for {name}, which is no State",
+                f"the physics gave {state!r} for {name}, which is not a State",
                 remedy="see what a physics class needs: fieldkit docs cosim-api",
             )
 
@@ -73,27 +73,28 @@ def check_states(states: Mapping[str, object]) -> None:
 class NetworkFederate(Protocol):
     """Carries packets.
 
-    One in which agents forward or interfere names them by an attribute `transmitters`, and the places of what
-    interferes without being an agent by `fixed_emitters_m`: `error_bounded` and the errors of places include them.
+    If agents forward or interfere, an attribute `transmitters` has their names; if objects that are not agents
+    interfere, an attribute `fixed_emitters_m` has their positions. `error_bounded` and the position errors include
+    them.
     """
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
     ) -> tuple[list[Arrival], list[Drop]]:
-        """Let everything happen up to `to_ns`; return what arrived and what never will, in order of time.
+        """Simulate up to `to_ns`, and return the arrivals and drops in order of time.
 
-        One that can let agents move on by dead reckoning says so by an attribute `extrapolates` that is True; then
-        states may be `DeadReckoned`, and it takes those of their own time for everything that happens.
+        A network that supports dead reckoning has an attribute `extrapolates` that is True. Then `states` may be
+        `DeadReckoned`, and the network evaluates them at the time of each event.
 
         Args:
-            to_ns: Until when.
-            packets: What enters the network until then, in order of `enters_ns`.
-            states: Where the agents are and how they move, as far as the network knows, from now on.
+            to_ns: Time to advance to.
+            packets: Packets that enter the network up to then, in order of `enters_ns`.
+            states: Positions and velocities of the agents that the network assumes from now on.
         """
         ...
 
     def next_event_ns(self) -> int | None:
-        """Return when something happens next in it, None when nothing is under way."""
+        """Return the time of its next event, or None if nothing is scheduled."""
         ...
 
 
@@ -102,8 +103,8 @@ class Action:
     """What a program does when it wakes.
 
     Attributes:
-        datagrams: What it sends.
-        command: What it asks of its agent's body; None for what it asked before.
+        datagrams: Datagrams that it sends.
+        command: Command to its agent's body, or None to keep the previous one.
     """
 
     datagrams: Sequence[Datagram] = ()
@@ -111,26 +112,26 @@ class Action:
 
 
 class Program(Protocol):
-    """Software of one agent: it senses its own state, hears what the network delivers, sends, and steers."""
+    """Software of one agent: it reads the agent's state, receives datagrams, sends, and steers."""
 
     def next_wake_ns(self) -> int | None:
-        """Return when it wakes next by itself; None when only a datagram wakes it. It changes by waking alone."""
+        """Return when its timer wakes it next, or None if only a datagram does; waking alone changes this time."""
         ...
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-        """Return what it does now.
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Return the action at this time.
 
         Args:
-            now_ns: Now.
-            own: The state of its agent, at the body's last own step.
-            received: What arrived since it woke last.
+            now_ns: The current time.
+            own_state: State of its agent at the last step of the physics.
+            received: Datagrams that have arrived since it woke last.
         """
         ...
 
 
 def next_send_ns(program: Program) -> int | None:
-    """Return before when a program surely sends nothing by itself; None where it never will, but for mail.
+    """Return a time before which a program sends nothing unless it receives a datagram, or None if it never will.
 
-    A program may say it by a method of this name, or else sends whenever it wakes.
+    A program may have a method `next_send_ns`; otherwise it is assumed to send whenever it wakes.
     """
     return getattr(program, "next_send_ns", program.next_wake_ns)()

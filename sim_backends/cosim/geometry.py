@@ -1,7 +1,7 @@
-"""Whose places the network uses, and how wrong it is about them.
+"""The agents whose positions the network uses, and the errors of these positions.
 
-A packet's fate depends on the places of its sender and its receiver, of a relay that forwards it, of a jammer, and of
-every other agent that transmits on the channel. What counts is where two of them are to each other.
+The fate of a packet depends on the positions of its sender, its receiver, a relay that forwards it, a jammer, and
+every other agent that transmits on the channel. Only their relative positions matter.
 """
 
 import math
@@ -13,49 +13,53 @@ from sim_backends.cosim.run import Fate
 from sim_backends.world.motion import STILL, State
 
 
-def transmitting(network: object) -> tuple[str, ...]:
-    """Return the agents that a network lets forward or interfere, beside those that send and receive.
+def transmitters(network: object) -> tuple[str, ...]:
+    """Return the agents that forward or interfere in a network, in addition to those that send and receive.
 
-    A network names them by an attribute `transmitters`, which may be missing.
+    They are the value of the network's optional attribute `transmitters`.
     """
     names: Iterable[str] = getattr(network, "transmitters", ())
     return tuple(sorted(names))
 
 
 def fixed_emitters_m(network: object) -> tuple[Vector, ...]:
-    """Return the places of what interferes and is no agent, by an attribute of this name; it may be missing."""
+    """Return the positions of sources of interference that are not agents: the network's optional attribute."""
     return tuple(getattr(network, "fixed_emitters_m", ()))
 
 
-def displaced_m(fate: Fate) -> float:
-    """Return how wrong the network was about the places that count for a packet when it was sent, in metres.
+def position_error_m(fate: Fate) -> float:
+    """Return the largest error, in metres, of the relative positions that the network assumed for a packet.
 
-    It is the largest error of the vector from one of the agents to another one: of sender and receiver at least.
+    The positions are those of at least sender and receiver, at the time of sending.
     """
-    return _widest_m(_offsets_m(fate.known, fate.true)) if fate.displaced_m is None else fate.displaced_m
+    if fate.position_error_m is not None:
+        return fate.position_error_m
+    return _max_distance_m(_offsets_m(fate.assumed, fate.true))
 
 
-def largest_m(known: Mapping[str, State], true: Sequence[State], names: Collection[str], *, anchored: bool) -> float:
-    """Return by how much the network is wrong about where two agents are to each other, the largest.
+def max_position_error_m(
+    assumed: Mapping[str, State], true: Sequence[State], names: Collection[str], *, has_fixed_emitters: bool
+) -> float:
+    """Return the largest error of the network's relative position of two agents.
 
     Args:
-        known: Where the network takes the agents to be.
-        true: Where those of `names` are, in their order.
-        names: The agents whose places count.
-        anchored: Whether something that never moves counts, too.
+        assumed: States of the agents that the network assumes.
+        true: True states of the agents in `names`, in the same order.
+        names: The agents to include.
+        has_fixed_emitters: True to include a point that never moves, too.
     """
-    offsets_m = _offsets_m([known[name] for name in names], true)
-    return _widest_m([*offsets_m, STILL] if anchored else offsets_m)
+    offsets_m = _offsets_m([assumed[name] for name in names], true)
+    return _max_distance_m([*offsets_m, STILL] if has_fixed_emitters else offsets_m)
 
 
-def _offsets_m(known: Iterable[State], true: Iterable[State]) -> list[Vector]:
-    """Return how far each is from where it is taken to be."""
+def _offsets_m(assumed: Iterable[State], true: Iterable[State]) -> list[Vector]:
+    """Return the error vector of each assumed position."""
     offsets_m = []
-    for taken, state in zip(known, true, strict=True):
-        (e, n, u), (true_e, true_n, true_u) = taken.position_m, state.position_m
+    for assumed_state, true_state in zip(assumed, true, strict=True):
+        (e, n, u), (true_e, true_n, true_u) = assumed_state.position_m, true_state.position_m
         offsets_m.append((e - true_e, n - true_n, u - true_u))
     return offsets_m
 
 
-def _widest_m(offsets_m: Sequence[Vector]) -> float:
-    return max((math.dist(one, other) for one, other in combinations(offsets_m, 2)), default=0.0)
+def _max_distance_m(offsets_m: Sequence[Vector]) -> float:
+    return max((math.dist(first, second) for first, second in combinations(offsets_m, 2)), default=0.0)

@@ -1,4 +1,4 @@
-"""SIGINT during a run: it ends the run between two windows, never while one is being recorded."""
+"""SIGINT during a run: it stops the run between two windows, never while a window is being recorded."""
 
 import signal
 import threading
@@ -13,10 +13,10 @@ from sim_backends.cosim.coordinator import Coordinator
 def between_windows(coordinator: Coordinator) -> Iterator[None]:
     """Let SIGINT raise `KeyboardInterrupt` as soon as no window is being hashed and recorded.
 
-    Nothing changes outside the main thread, or where SIGINT is handled otherwise.
+    Outside the main thread, or if SIGINT has another handler, nothing changes.
 
     Args:
-        coordinator: Of the run.
+        coordinator: The coordinator of the run.
     """
     in_main_thread = threading.current_thread() is threading.main_thread()
     if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
@@ -24,12 +24,12 @@ def between_windows(coordinator: Coordinator) -> Iterator[None]:
         return
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        if coordinator.commits:
+        if coordinator.is_committing:
             coordinator.is_interrupted = True
         else:
             signal.default_int_handler(number, frame)
 
-    coordinator.commits = coordinator.is_interrupted = False
+    coordinator.is_committing = coordinator.is_interrupted = False
     signal.signal(signal.SIGINT, interrupt)
     try:
         yield

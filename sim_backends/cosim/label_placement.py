@@ -1,4 +1,4 @@
-"""Places for labels beside their points, so that none covers another: greedy, and the same each time."""
+"""Placement of labels next to their points without overlap: greedy and deterministic."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -6,25 +6,25 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 Point = tuple[float, float]
-"""In points of the figure, from its lower left corner."""
+"""Position in typographic points (1/72 inch), from the lower left corner of the figure."""
 
-_AWAY = 1.3
-"""Steps by which a label goes further away until there is room, as a factor."""
-_MOST_STEPS = 12
-_TOUCHED = 10.0
-"""What it costs to cover anything at all, in heights of the label that it could be farther away instead."""
+_DISTANCE_FACTOR = 1.3
+"""Factor by which the distance of a label from its point grows until it does not cover anything."""
+_MAX_STEPS = 12
+_OVERLAP_COST = 10.0
+"""Cost of any overlap, as a distance from the point in heights of the label."""
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class LabelBox:
-    """A rectangle in points of the figure.
+    """A rectangle, in typographic points.
 
     Attributes:
         left: Its left side.
         bottom: Its lower side.
-        width: How wide it is.
-        height: How high.
+        width: Its width.
+        height: Its height.
     """
 
     left: float
@@ -34,15 +34,15 @@ class LabelBox:
 
     def overlap(self, other: "LabelBox") -> float:
         """Return the area that both cover."""
-        wide = min(self.left + self.width, other.left + other.width) - max(self.left, other.left)
-        high = min(self.bottom + self.height, other.bottom + other.height) - max(self.bottom, other.bottom)
-        return max(wide, 0.0) * max(high, 0.0)
+        width = min(self.left + self.width, other.left + other.width) - max(self.left, other.left)
+        height = min(self.bottom + self.height, other.bottom + other.height) - max(self.bottom, other.bottom)
+        return max(width, 0.0) * max(height, 0.0)
 
     def gap(self, point: Point) -> float:
-        """Return how far a point is from it, 0 inside."""
-        wide = max(self.left - point[0], 0.0, point[0] - self.left - self.width)
-        high = max(self.bottom - point[1], 0.0, point[1] - self.bottom - self.height)
-        return math.hypot(wide, high)
+        """Return the distance of a point from the rectangle, 0 inside."""
+        across = max(self.left - point[0], 0.0, point[0] - self.left - self.width)
+        up = max(self.bottom - point[1], 0.0, point[1] - self.bottom - self.height)
+        return math.hypot(across, up)
 
     @property
     def area(self) -> float:
@@ -50,52 +50,57 @@ class LabelBox:
         return self.width * self.height
 
 
-def placed(
-    at: Sequence[Sequence[Point]], sizes: Sequence[tuple[float, float]], room: LabelBox, taken: Sequence[LabelBox]
+def place_labels(
+    anchors: Sequence[Sequence[Point]],
+    sizes: Sequence[tuple[float, float]],
+    bounds: LabelBox,
+    obstacles: Sequence[LabelBox],
 ) -> list[tuple[Point, LabelBox]]:
-    """Return a box for each label and the point that it is beside, over as little of anything else as can be.
+    """Return, for each label, the point that it belongs to and a box that overlaps as little as possible.
 
     Args:
-        at: Points of what each label names, any of which it may be beside.
+        anchors: For each label, the points of its curve; the label may be next to any of them.
         sizes: Width and height of each label.
-        room: Where labels may be.
-        taken: What they must not cover: the points themselves, and lines.
+        bounds: The area in which labels may be.
+        obstacles: Boxes that labels must not cover: the points themselves, and lines.
     """
-    found: list[tuple[Point, LabelBox]] = []
-    for points, size in zip(at, sizes, strict=True):
-        covered = [*taken, *(box for _, box in found)]
-        candidates = ((point, box) for point in points for box in _around(point, size))
-        found.append(min(candidates, key=lambda one: _cost(one[1], one[0], room, covered)))
-    return found
+    placed: list[tuple[Point, LabelBox]] = []
+    for points, size in zip(anchors, sizes, strict=True):
+        covered = [*obstacles, *(box for _, box in placed)]
+        candidates = ((point, box) for point in points for box in _boxes_around(point, size))
+        placed.append(min(candidates, key=lambda candidate: _cost(candidate[1], candidate[0], bounds, covered)))
+    return placed
 
 
-def stacked(at: Sequence[Point], sizes: Sequence[tuple[float, float]], left: float, room: LabelBox) -> list[LabelBox]:
-    """Return a box for each label, one above the other in the order of their points, as near in height as can be.
+def stack_labels(
+    anchors: Sequence[Point], sizes: Sequence[tuple[float, float]], left: float, bounds: LabelBox
+) -> list[LabelBox]:
+    """Return a box for each label, stacked in the order of their points, as close to the points' heights as possible.
 
     Args:
-        at: Where the points are that labels belong to.
+        anchors: The point of each label.
         sizes: Width and height of each label.
-        left: Where all labels begin.
-        room: Where labels may be.
+        left: Left side of all labels.
+        bounds: The area in which labels may be.
     """
-    order = sorted(range(len(at)), key=lambda index: at[index][1])
+    order = sorted(range(len(anchors)), key=lambda index: anchors[index][1])
     bottoms: dict[int, float] = {}
-    free = room.bottom
+    free = bounds.bottom
     for index in order:
-        bottoms[index] = max(at[index][1] - sizes[index][1] / 2, free)
+        bottoms[index] = max(anchors[index][1] - sizes[index][1] / 2, free)
         free = bottoms[index] + sizes[index][1]
-    above = room.bottom + room.height
-    for index in reversed(order):  # those that were pushed out of the room go back into it
-        bottoms[index] = min(bottoms[index], above - sizes[index][1])
-        above = bottoms[index]
-    return [LabelBox(left, bottoms[index], *sizes[index]) for index in range(len(at))]
+    top = bounds.bottom + bounds.height
+    for index in reversed(order):  # move labels above the upper bound down again
+        bottoms[index] = min(bottoms[index], top - sizes[index][1])
+        top = bottoms[index]
+    return [LabelBox(left, bottoms[index], *sizes[index]) for index in range(len(anchors))]
 
 
-def _around(point: Point, size: tuple[float, float]) -> Iterator[LabelBox]:
+def _boxes_around(point: Point, size: tuple[float, float]) -> Iterator[LabelBox]:
     x, y = point
     width, height = size
     away = height * 0.6
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         for left, bottom in (
             (x + away, y - height / 2),
             (x - away - width, y - height / 2),
@@ -107,29 +112,29 @@ def _around(point: Point, size: tuple[float, float]) -> Iterator[LabelBox]:
             (x - away * 0.7 - width, y - away * 0.7 - height),
         ):
             yield LabelBox(left, bottom, width, height)
-        away *= _AWAY
+        away *= _DISTANCE_FACTOR
 
 
-def _cost(box: LabelBox, point: Point, room: LabelBox, taken: Sequence[LabelBox]) -> float:
-    """Return how bad a place is: what it covers weighs most, then what is outside of the room, then the way to it."""
-    covered = sum(box.overlap(other) for other in taken) / box.area
-    outside = 1 - box.overlap(room) / box.area
-    touched = (covered > 0) + (outside > _ROUNDING)
-    return _TOUCHED * touched + 30 * (covered + 3 * outside) + box.gap(point) / box.height
+def _cost(box: LabelBox, point: Point, bounds: LabelBox, obstacles: Sequence[LabelBox]) -> float:
+    """Return the cost of a box: overlap weighs most, then the part outside the bounds, then the distance."""
+    covered = sum(box.overlap(other) for other in obstacles) / box.area
+    outside = 1 - box.overlap(bounds) / box.area
+    overlaps = (covered > 0) + (outside > _ROUNDING)
+    return _OVERLAP_COST * overlaps + 30 * (covered + 3 * outside) + box.gap(point) / box.height
 
 
-def along_all(curves: Sequence[Sequence[Point]], half: float) -> Iterator[LabelBox]:
-    """Yield what labels must not cover: markers that are `half` as wide from their middle, and lines between them."""
+def curve_boxes(curves: Sequence[Sequence[Point]], half_width: float) -> Iterator[LabelBox]:
+    """Yield boxes that cover curves: squares of `2 half_width` around their markers, and along the lines between."""
     for points in curves:
-        for x, y in _along(points, half):
-            yield LabelBox(x - half, y - half, 2 * half, 2 * half)
+        for x, y in _interpolated(points, half_width):
+            yield LabelBox(x - half_width, y - half_width, 2 * half_width, 2 * half_width)
 
 
-def _along(points: Sequence[Point], step: float) -> Iterator[Point]:
-    """Yield the points of a line, and others between them, a step apart."""
+def _interpolated(points: Sequence[Point], step: float) -> Iterator[Point]:
+    """Yield the points of a polyline, and intermediate points at most a step apart."""
     yield points[0]
-    for one, other in pairwise(points):
-        pieces = max(math.ceil(math.dist(one, other) / step), 1)
+    for start, end in pairwise(points):
+        pieces = max(math.ceil(math.dist(start, end) / step), 1)
         for piece in range(1, pieces + 1):
             share = piece / pieces
-            yield one[0] + (other[0] - one[0]) * share, one[1] + (other[1] - one[1]) * share
+            yield start[0] + (end[0] - start[0]) * share, start[1] + (end[1] - start[1]) * share

@@ -1,4 +1,4 @@
-"""Protocol of who watches a run: called once per window with what happened in it."""
+"""Protocol of the observer of a run, which is called once per window."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -9,17 +9,18 @@ from sim_backends.world.motion import State
 
 
 class Window(NamedTuple):
-    """What happened in a window.
+    """The events of a window.
 
     Attributes:
-        begin_ns: When it began.
-        end_ns: When it ended.
-        decided_by: What decided its length, for example a pair of agents; empty where the policy does not say.
-        entered: Fates of the packets that the network got in it, in order; most are not known yet, and the same
-            object comes again in `ended` when it is.
-        ended: Fates that became known in it, in order.
-        states: Where the agents are at its end.
-        known: Where the network took them to be throughout, or at its begin if it let them move on (`DeadReckoned`).
+        begin_ns: Its beginning.
+        end_ns: Its end.
+        decided_by: What determined its length, for example a pair of agents; empty if the policy does not report it.
+        entered: Fates of the packets that entered the network in it, in order. Most are not decided yet; the same
+            objects are in `ended` of a later window.
+        ended: Fates that were decided in it, in order.
+        states: States of the agents at its end.
+        assumed: States that the network assumed throughout it, or at its beginning if it extrapolates
+            (`DeadReckoned`).
         wall_s: Wall time that it took, by part, as in `Run`.
     """
 
@@ -29,26 +30,26 @@ class Window(NamedTuple):
     entered: Sequence[Fate]
     ended: Sequence[Fate]
     states: Mapping[str, State]
-    known: Mapping[str, State]
+    assumed: Mapping[str, State]
     wall_s: Mapping[str, float]
 
 
 class WindowObserver(Protocol):
-    """Watches a run; it must change nothing in what it is shown, and its own time counts in no part of wall time."""
+    """Observes a run. It must not change its arguments; the recorded wall time does not include its time."""
 
     def begin(self, states: Mapping[str, State]) -> None:
-        """Take note of where the agents are at time 0, before the first window."""
+        """Receive the states of the agents at time 0, before the first window."""
         ...
 
     def window(self, window: Window) -> None:
-        """Take note of a window, right after it ended."""
+        """Receive a window, right after it has ended."""
         ...
 
 
 @runtime_checkable
 class IpObserver(Protocol):
-    """An observer that takes IP packets, too."""
+    """An observer that also receives IP packets."""
 
     def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
-        """Take note of an IP packet, or a fragment of one, that an agent sent or that arrived at it."""
+        """Receive an IP packet, or a fragment of one, that an agent sent or that arrived at it."""
         ...

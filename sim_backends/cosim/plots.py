@@ -1,6 +1,6 @@
-"""Figures of co-simulations, fit for a paper; the only module of `sim_backends` that imports matplotlib.
+"""Figures of co-simulations for publications; the only module of `sim_backends` that imports matplotlib.
 
-They look as those of trials do (`fieldkit.report.theme`), and are the same bytes whenever and wherever.
+They have the style of the figures of trials (`fieldkit.report.theme`), and are identical bytes on every machine.
 """
 
 import io
@@ -22,27 +22,27 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from fieldkit.core.text import harmless
 from fieldkit.report.theme import CYCLE, LIGHT, METADATA, SETTINGS, Colour, Format, Marker
 from sim_backends.cosim.from_above import ObstacleOutline, last_heading
-from sim_backends.cosim.label_placement import LabelBox, Point, along_all, placed, stacked
+from sim_backends.cosim.label_placement import LabelBox, Point, curve_boxes, place_labels, stack_labels
 
-_POINTS: Final = 8.0
-"""Size of letters, as IEEE asks for."""
+_FONT_POINTS: Final = 8.0
+"""Font size that IEEE requires."""
 _BOTH_COLUMNS_INCHES: Final = 7.16
 _PANEL_INCHES: Final = 2.9
-_LABEL: Final = 7.0
-"""And of those beside curves."""
+_LABEL_POINTS: Final = 7.0
+"""Font size of the labels of curves."""
 _RUN_INCHES: Final = 3.2
-_BESIDE: Final = 1.45
-"""How much longer than a run its axis of time is, for labels."""
-_MARKER: Final = 5.0
-_PER_INCH: Final = 72.0
+_TIME_AXIS_FACTOR: Final = 1.45
+"""Length of the time axis over the duration of the run, to leave space for labels."""
+_MARKER_POINTS: Final = 5.0
+_POINTS_PER_INCH: Final = 72.0
 _ZERO_SHARE: Final = 0.16
-"""How far below the axis the line of zeros is, as a share of its decades."""
-_FAR: Final = 5.0
-"""From how many points on between them a label has a line to its point."""
-_BACKED: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.3}
-_DARKER: Final = 0.75
-_LETTER: Final = 0.58
-"""Mean width of a letter of DejaVu Sans, in its size."""
+"""Distance of the line for zeros below the axis, as a share of the axis' decades."""
+_LEADER_POINTS: Final = 5.0
+"""Distance from which on a leader line connects a label with its point."""
+_BACKGROUND: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.3}
+_DARKENING: Final = 0.75
+_LETTER_WIDTH: Final = 0.58
+"""Mean width of a letter of DejaVu Sans, relative to the font size."""
 
 _STYLES: Final[Mapping[str, tuple[Colour, Marker]]] = {
     "event_driven": ("ink", "o"),
@@ -54,18 +54,18 @@ _STYLES: Final[Mapping[str, tuple[Colour, Marker]]] = {
     "velocity_aware": ("red", "v"),
     "error_bounded": ("orange", "P"),
 }
-"""Colour and shape of each sync policy, the same in all figures; others take those of `CYCLE`."""
+"""Colour and marker of each sync policy, the same in all figures; other curves have those of `CYCLE`."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A series of points that is named where it is drawn.
+    """A labelled series of points.
 
     Attributes:
-        name: Its name, by which its colour and shape are chosen where it is a sync policy's.
+        name: Its name; the name of a sync policy determines its colour and marker.
         x: Above 0, at least one.
         y: At least 0, one for each x.
-        label: What stands beside it; the name where it is empty.
+        label: Text next to it; if empty, its name.
     """
 
     name: str
@@ -76,31 +76,31 @@ class Curve:
 
 @dataclass(frozen=True)
 class LogPanel:
-    """Curves on two logarithmic axes; values of 0 stand on a line of their own below.
+    """Curves on two logarithmic axes; values of 0 are on a separate line below.
 
     Attributes:
-        title: Above it.
-        x_label: What x is, with its unit.
-        y_label: What y is, with its unit.
-        curves: What is drawn.
-        aside: Whether labels stand one above the other at the right, with room for the longest.
-        over_time: Whether x is a time, from 0 on: its axis is not logarithmic, and there are no markers.
+        title: Title above the panel.
+        x_label: Quantity and unit of x.
+        y_label: Quantity and unit of y.
+        curves: The curves.
+        labels_at_right: True to stack the labels at the right; the axis then leaves space for the longest.
+        over_time: True if x is a time from 0 on: its axis is then linear, and there are no markers.
     """
 
     title: str
     x_label: str
     y_label: str
     curves: Sequence[Curve]
-    aside: bool = False
+    labels_at_right: bool = False
     over_time: bool = False
 
 
 def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
-    """Return panels side by side, two in a row, in the width of both columns of a paper.
+    """Return a figure of panels side by side, two per row, as wide as both columns of a paper.
 
     Args:
         panels: At least one.
-        form: Of the file.
+        form: File format.
     """
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
@@ -110,27 +110,27 @@ def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
         for number, panel in enumerate(panels, start=1):
             axes = figure.add_subplot(rows, columns, number)
             drawn.append((axes, panel, _draw_log(axes, panel)))
-        figure.draw_without_rendering()  # only then are the axes where they will be
+        figure.draw_without_rendering()  # the positions of the axes are known only after that
         figure.set_layout_engine("none")
         for axes, panel, curves in drawn:
             _label(
                 axes,
                 [curve.label or curve.name for curve in panel.curves],
                 curves,
-                aside=panel.aside or panel.over_time,
+                at_right=panel.labels_at_right or panel.over_time,
             )
         return _saved(figure, form)
 
 
 @dataclass(frozen=True)
 class FlowTrace:
-    """A flow over time.
+    """The packets of a flow over time.
 
     Attributes:
         name: Its name.
-        sent_s: When its packets were sent.
-        delay_s: How long the network had each; nan for one that never arrived.
-        distance_m: How far sender and receiver were apart.
+        sent_s: Times of sending.
+        delay_s: Time that each packet spent in the network; nan for packets that never arrived.
+        distance_m: Distance of sender and receiver at each time of sending.
     """
 
     name: str
@@ -141,30 +141,30 @@ class FlowTrace:
 
 def run_figure(
     title: str,
-    ways_m: Mapping[str, Sequence[tuple[float, float]]],
+    paths_m: Mapping[str, Sequence[tuple[float, float]]],
     flows: Sequence[FlowTrace],
     form: Format,
     outlines: Sequence[ObstacleOutline] = (),
 ) -> bytes:
-    """Return a run in the width of both columns of a paper: the ways from above, and delay and distance over time.
+    """Return a figure of a run, as wide as both columns of a paper: paths from above, delay and distance over time.
 
     Args:
-        title: Above it.
-        ways_m: Metres east and north of each agent over time, at least one each.
+        title: Title above the figure.
+        paths_m: Positions of each agent over time, metres east and north, at least one each.
         flows: Its flows.
-        form: Of the file.
-        outlines: What stands around them.
+        form: File format.
+        outlines: Obstacles around the agents.
     """
     with _drawing():
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _RUN_INCHES), layout="constrained")
         grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.25))
-        above = figure.add_subplot(grid[:, 0])
-        above.set_title(harmless(title))
-        _draw_ways(above, ways_m)
+        map_axes = figure.add_subplot(grid[:, 0])
+        map_axes.set_title(harmless(title))
+        _draw_paths(map_axes, paths_m)
         for outline in outlines:
-            # An artist of no data, so that what is far away does not change what is shown.
+            # Added as an artist without data, so that distant obstacles do not change the limits of the axes.
             shade, alpha = LIGHT["muted"], 0.2 if outline.is_light else 0.6
-            above.add_artist(Polygon(outline.corners_m, facecolor=shade, alpha=alpha, linewidth=0, zorder=1))
+            map_axes.add_artist(Polygon(outline.corners_m, facecolor=shade, alpha=alpha, linewidth=0, zorder=1))
         delay, distance = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
         _draw_delays(delay, flows)
         distance.set(xlabel="sent at (s)", ylabel="distance (m)")
@@ -174,24 +174,24 @@ def run_figure(
         distance.set_ylim(bottom=0)
         end_s = max((max(flow.sent_s) for flow in flows), default=1.0)
         for axes in (delay, distance):
-            _time_axis(axes, end_s)
+            _set_time_axis(axes, end_s)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
-        _label(distance, [flow.name for flow in flows], curves, aside=True)
-        lines = above.get_lines()
-        _label(above, list(ways_m), lines[len(ways_m) :], around=lines[: len(ways_m)])
+        _label(distance, [flow.name for flow in flows], curves, at_right=True)
+        lines = map_axes.get_lines()
+        _label(map_axes, list(paths_m), lines[len(paths_m) :], other_lines=lines[: len(paths_m)])
         return _saved(figure, form)
 
 
-def _time_axis(axes: Axes, end_s: float) -> None:
-    """Let x be times from 0 to an end, with room for labels behind it."""
-    axes.set_xlim(0, end_s * _BESIDE)
+def _set_time_axis(axes: Axes, end_s: float) -> None:
+    """Set the x axis to times from 0 to an end, and leave space for labels behind it."""
+    axes.set_xlim(0, end_s * _TIME_AXIS_FACTOR)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
     axes.set_xticks([tick for tick in axes.get_xticks() if 0 <= tick <= end_s * 1.02])
 
 
 def _draw_delays(axes: Axes, flows: Sequence[FlowTrace]) -> None:
-    """Draw the delay of each packet, and at the top those that never arrived, a row for each flow."""
+    """Draw the delay of each packet; packets that never arrived are marked at the top, in one row per flow."""
     axes.set(ylabel="delay (ms)", yscale="log")
     for number, flow in enumerate(flows):
         delay_ms = 1e3 * np.asarray(flow.delay_s, np.float64)
@@ -199,20 +199,22 @@ def _draw_delays(axes: Axes, flows: Sequence[FlowTrace]) -> None:
         lost_s = np.asarray(flow.sent_s, np.float64)[np.isnan(delay_ms)]
         height = 1.0 + 0.06 * (len(flows) - number)
         style: dict[str, Any] = {"color": _colour(number), "markersize": 4, "clip_on": False}
-        if len(lost_s):  # matplotlib would make room for an empty one, at the corner of the figure
+        if len(lost_s):  # for an empty series, matplotlib would leave space at the corner of the figure
             axes.plot(lost_s, [height] * len(lost_s), "|", transform=axes.get_xaxis_transform(), **style)
     axes.yaxis.set_major_formatter(FuncFormatter(_plain))
     axes.yaxis.set_minor_formatter(NullFormatter())
     if any(math.isnan(delay_s) for flow in flows for delay_s in flow.delay_s):
-        axes.text(1.0, 1.03, "| lost", transform=axes.transAxes, ha="right", fontsize=_LABEL, color=LIGHT["muted"])
+        axes.text(
+            1.0, 1.03, "| lost", transform=axes.transAxes, ha="right", fontsize=_LABEL_POINTS, color=LIGHT["muted"]
+        )
 
 
 def interval_figure(panels: Mapping[str, Mapping[str, tuple[float, float, float]]], form: Format) -> bytes:
-    """Return panels side by side of values with their intervals, a row for each name, and a line at 0.
+    """Return a figure of values with their intervals: a panel per quantity, a row per name, and a line at 0.
 
     Args:
-        panels: By what each is of, with its unit: value, lower and upper end by name.
-        form: Of the file.
+        panels: For each quantity with its unit: value, lower and upper end of the interval, by name.
+        form: File format.
     """
     with _drawing():
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_INCHES), layout="constrained")
@@ -224,7 +226,7 @@ def interval_figure(panels: Mapping[str, Mapping[str, tuple[float, float, float]
             for row, (name, (value, low, high)) in enumerate(values.items()):
                 colour, marker = _style(name, row)
                 axes.hlines(row, low, high, color=LIGHT[colour], zorder=3)
-                axes.plot(value, row, marker=marker, color=LIGHT[colour], markersize=_MARKER, zorder=3)
+                axes.plot(value, row, marker=marker, color=LIGHT[colour], markersize=_MARKER_POINTS, zorder=3)
             axes.set_yticks(range(len(values)), list(values))
             axes.tick_params(axis="y", labelleft=first is None)
             axes.xaxis.set_major_locator(MaxNLocator(nbins=4))
@@ -234,16 +236,16 @@ def interval_figure(panels: Mapping[str, Mapping[str, tuple[float, float, float]
         return _saved(figure, form)
 
 
-def _draw_ways(axes: Axes, ways_m: Mapping[str, Sequence[tuple[float, float]]]) -> None:
-    """Draw the way of each agent from above, with a mark where it begins."""
+def _draw_paths(axes: Axes, paths_m: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    """Draw the path of each agent from above, with a marker at its start and an arrow at its end."""
     axes.set(aspect="equal", xlabel="east (m)", ylabel="north (m)")
-    # In ink: colours are for flows.
-    for way_m in ways_m.values():
-        axes.plot(*zip(*way_m, strict=True), color=LIGHT["muted"], zorder=3)
-    for number, way_m in enumerate(ways_m.values()):
+    # Paths are black, because colours distinguish flows.
+    for path_m in paths_m.values():
+        axes.plot(*zip(*path_m, strict=True), color=LIGHT["muted"], zorder=3)
+    for number, path_m in enumerate(paths_m.values()):
         marker = CYCLE[number % len(CYCLE)][1]
-        axes.plot(*way_m[0], marker=marker, color=LIGHT["ink"], markersize=_MARKER, zorder=3)
-        if (heading := last_heading(way_m)) is not None:
+        axes.plot(*path_m[0], marker=marker, color=LIGHT["ink"], markersize=_MARKER_POINTS, zorder=3)
+        if (heading := last_heading(path_m)) is not None:
             arrow = {"arrowstyle": "-|>", "color": LIGHT["ink"], "linewidth": 0.6, "shrinkA": 0, "shrinkB": 0}
             axes.annotate("", heading[1], heading[0], arrowprops=arrow, zorder=3)
     axes.margins(0.15)
@@ -251,22 +253,22 @@ def _draw_ways(axes: Axes, ways_m: Mapping[str, Sequence[tuple[float, float]]]) 
 
 
 def _draw_log(axes: Axes, panel: LogPanel) -> list[Line2D]:
-    """Draw the curves; return them."""
+    """Draw the curves, and return their lines."""
     axes.set_xscale("linear" if panel.over_time else "log")
     axes.set_yscale("log")
     axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
     axes.set_title(panel.title)
-    above = [value for curve in panel.curves for value in curve.y if value > 0]
-    low, high = (min(above), max(above)) if above else (0.1, 1.0)
+    positive = [value for curve in panel.curves for value in curve.y if value > 0]
+    low, high = (min(positive), max(positive)) if positive else (0.1, 1.0)
     low, high = 10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(high * 1.001))
     has_zero = any(value == 0 for curve in panel.curves for value in curve.y)
     zero = low / 10 ** (_ZERO_SHARE * max(math.log10(high / low), 1))
     drawn: list[Line2D] = []
     for number, curve in enumerate(panel.curves):
         colour, marker = _style(curve.name, number)
-        marked = "" if panel.over_time else marker
-        look: dict[str, Any] = {"color": LIGHT[colour], "marker": marked, "markersize": _MARKER}
-        drawn += axes.plot(curve.x, [max(y, zero) for y in curve.y], clip_on=False, zorder=3, **look)
+        shown_marker = "" if panel.over_time else marker
+        style: dict[str, Any] = {"color": LIGHT[colour], "marker": shown_marker, "markersize": _MARKER_POINTS}
+        drawn += axes.plot(curve.x, [max(y, zero) for y in curve.y], clip_on=False, zorder=3, **style)
     _ticks(axes, panel, zero if has_zero else None, low, high)
     return drawn
 
@@ -275,9 +277,9 @@ def _ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: fl
     xs = [value for curve in panel.curves for value in curve.x if value > 0]
     first, last = min(xs, default=0.5), max(xs, default=1.0)
     if panel.over_time:
-        _time_axis(axes, last)
+        _set_time_axis(axes, last)
     else:
-        axes.set_xlim(first / 2, last * 2 * (last / first if panel.aside else 1))
+        axes.set_xlim(first / 2, last * 2 * (last / first if panel.labels_at_right else 1))
         axes.set_xticks([tick for tick in axes.get_xticks() if first / 2 <= tick <= last * 2])
     axes.set_ylim(zero / (low / zero) ** 0.7 if zero is not None else low, high)
     for axis in (axes.xaxis, axes.yaxis):
@@ -292,51 +294,56 @@ def _ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: fl
 
 
 def _label(
-    axes: Axes, labels: Sequence[str], drawn: Sequence[Line2D], *, aside: bool = False, around: Sequence[Line2D] = ()
+    axes: Axes,
+    labels: Sequence[str],
+    drawn: Sequence[Line2D],
+    *,
+    at_right: bool = False,
+    other_lines: Sequence[Line2D] = (),
 ) -> None:
-    """Write the label of each line beside it, once for lines that lie one on the other.
+    """Write the label of each line next to it; lines that coincide share one label.
 
     Args:
-        axes: On which they are drawn, and where it will be.
+        axes: The axes of the lines, at their final position.
         labels: One per line.
         drawn: The lines.
-        aside: Whether labels stand one above the other at the right.
-        around: Further lines that they must not cover.
+        at_right: True to stack the labels at the right.
+        other_lines: Further lines that labels must not cover.
     """
     groups: dict[tuple[Point, ...], list[int]] = {}
     for index, line in enumerate(drawn):
         groups.setdefault(_points(axes, line), []).append(index)
     texts = [harmless("\n".join(labels[index] for index in group)) for group in groups.values()]
-    sizes = [_size(text) for text in texts]
-    scale = _PER_INCH / axes.figure.dpi
+    sizes = [_text_size(text) for text in texts]
+    scale = _POINTS_PER_INCH / axes.figure.dpi
     window = axes.get_window_extent()
-    room = LabelBox(window.x0 * scale, window.y0 * scale, window.width * scale, window.height * scale)
-    if aside:
+    bounds = LabelBox(window.x0 * scale, window.y0 * scale, window.width * scale, window.height * scale)
+    if at_right:
         last = [points[-1] for points in groups]
-        left = room.left + room.width - max((width for width, _ in sizes), default=0.0)
-        places = list(zip(last, stacked(last, sizes, left, room), strict=True))
+        left = bounds.left + bounds.width - max((width for width, _ in sizes), default=0.0)
+        places = list(zip(last, stack_labels(last, sizes, left, bounds), strict=True))
     else:
-        covered = [*groups, *(_points(axes, line) for line in around)]
-        places = placed(list(groups), sizes, room, list(along_all(covered, _MARKER / 2 + 1)))
+        covered = [*groups, *(_points(axes, line) for line in other_lines)]
+        places = place_labels(list(groups), sizes, bounds, list(curve_boxes(covered, _MARKER_POINTS / 2 + 1)))
     for (point, box), text, group in zip(places, texts, groups.values(), strict=True):
-        _annotate(axes, text, point, box, str(drawn[group[0]].get_color()), at_left=aside)
+        _annotate(axes, text, point, box, str(drawn[group[0]].get_color()), at_left=at_right)
 
 
 def _points(axes: Axes, line: Line2D) -> tuple[Point, ...]:
-    """Return the points of a line on the figure, whole ones of 1/72 inch, each once in a row."""
+    """Return the points of a line in the figure, rounded to whole points (1/72 inch), without repetitions."""
     data = np.asarray(line.get_xydata(), np.float64)
-    xy = np.rint(axes.transData.transform(data) * _PER_INCH / axes.figure.dpi)
+    xy = np.rint(axes.transData.transform(data) * _POINTS_PER_INCH / axes.figure.dpi)
     return tuple(point for point, _ in groupby((float(x), float(y)) for x, y in xy))
 
 
-def _size(text: str) -> tuple[float, float]:
-    """Return the width and height of a label, in points."""
+def _text_size(text: str) -> tuple[float, float]:
+    """Return the width and height of a label, in points (1/72 inch)."""
     lines = text.split("\n")
-    return _LETTER * _LABEL * max(map(len, lines)), 1.25 * _LABEL * len(lines)
+    return _LETTER_WIDTH * _LABEL_POINTS * max(map(len, lines)), 1.25 * _LABEL_POINTS * len(lines)
 
 
 def _annotate(axes: Axes, text: str, point: Point, box: LabelBox, colour: str, *, at_left: bool) -> None:
-    line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": _MARKER / 2}
+    line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": _MARKER_POINTS / 2}
     end = {"relpos": (0.0, 0.5)} if at_left else {}
     axes.annotate(
         text,
@@ -344,14 +351,14 @@ def _annotate(axes: Axes, text: str, point: Point, box: LabelBox, colour: str, *
         (box.left, box.bottom + box.height / 2),
         xycoords="figure points",
         textcoords="figure points",
-        fontsize=_LABEL,
+        fontsize=_LABEL_POINTS,
         color=_darker(colour),
         ha="left",
         va="center",
         annotation_clip=False,
         zorder=4,
-        bbox=_BACKED,
-        arrowprops={**line, **end} if box.gap(point) > _FAR else None,
+        bbox=_BACKGROUND,
+        arrowprops={**line, **end} if box.gap(point) > _LEADER_POINTS else None,
     )
 
 
@@ -360,7 +367,7 @@ def _colour(number: int) -> str:
 
 
 def _plain(value: float, _: object = None) -> str:
-    """Return a tick's number without an exponent."""
+    """Return the label of a tick: the number without an exponent."""
     return f"{value:,.7g}"
 
 
@@ -369,17 +376,17 @@ def _style(name: str, number: int) -> tuple[Colour, Marker]:
 
 
 def _darker(colour: str) -> str:
-    """Return a colour in which letters can be read on white."""
-    red, green, blue = (int(int(colour[at : at + 2], 16) * _DARKER) for at in (1, 3, 5))
+    """Return a darker colour, in which text is readable on white."""
+    red, green, blue = (int(int(colour[at : at + 2], 16) * _DARKENING) for at in (1, 3, 5))
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 
 @contextmanager
 def _drawing() -> Iterator[None]:
-    sizes = dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), _POINTS)
+    sizes = dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), _FONT_POINTS)
     settings: dict[Any, Any] = {**SETTINGS, **sizes}
     with mpl.rc_context():
-        # What a user's matplotlibrc says must not change a byte.
+        # The user's matplotlibrc must not change the figure.
         mpl.rcdefaults()
         mpl.rcParams.update(settings)
         yield

@@ -1,4 +1,4 @@
-"""What a run says when it is over: what became of every packet, the windows, and what they cost."""
+"""The record of a run: the fate of every packet, the windows, and the wall time."""
 
 from dataclasses import dataclass, field
 
@@ -9,49 +9,49 @@ from sim_backends.world.motion import State
 
 @dataclass(slots=True)
 class Fate:
-    """What became of a packet.
+    """The fate of a packet: arrived, dropped, or not decided yet.
 
     Attributes:
-        packet: The packet, with when it was sent and when the network got it.
-        known: Where the network took source and destination to be when it got the packet.
-        true: Where they were when it was sent: at the physics' last own step, moved on at their velocity of then, so
-            that it is right to a h^2 / 2 at an acceleration a and a step h.
-        arrived_ns: When it arrived by the network's clock; None if it did not.
-        counted_ns: When it arrived by the policy: its window's end, or `arrived_ns`.
-        late_ns: By how much its receiver had passed that time already.
-        reason: Why it never arrived; empty if it did, or is under way.
-        displaced_m: By how much the network was wrong about the distance vector of two of the agents whose places
-            count for it, the largest; None if these are source and destination alone (`geometry.displaced_m`).
+        packet: The packet, with the times when it was sent and when it entered the network.
+        assumed: States of source and destination that the network assumed when the packet entered.
+        true: True states of source and destination at the time of sending: those at the last physics step,
+            extrapolated at their velocity. At an acceleration a and a step h the error is at most a h^2 / 2.
+        arrived_ns: Time when the network delivered it, or None.
+        counted_ns: Time when its receiver got it, which depends on the policy: the window's end, or `arrived_ns`.
+        late_ns: How far the receiver had passed `counted_ns` already.
+        reason: Why it never arrived; empty if it arrived or is under way.
+        position_error_m: Largest error of the relative position that the network assumed for two of the agents that
+            matter for the packet; None if these are source and destination only (`geometry.position_error_m`).
     """
 
     packet: Packet
-    known: tuple[State, State]
+    assumed: tuple[State, State]
     true: tuple[State, State]
     arrived_ns: int | None = None
     counted_ns: int | None = None
     late_ns: int = 0
     reason: str = ""
-    displaced_m: float | None = field(default=None, compare=False)
+    position_error_m: float | None = field(default=None, compare=False)
 
     @property
-    def is_known(self) -> bool:
-        """Whether it arrived, or never will."""
+    def is_decided(self) -> bool:
+        """True if it arrived, or never will."""
         return self.arrived_ns is not None or bool(self.reason)
 
 
 def no_wall_s() -> dict[str, float]:
-    """Return the parts into which wall time is split, each still at 0."""
+    """Return the parts of the wall time, each 0."""
     return {"agents": 0.0, "network": 0.0, "exchange": 0.0, "wait": 0.0}
 
 
 @dataclass
 class Run:
-    """What a run recorded.
+    """The record of a run.
 
     Attributes:
-        fates: Of every packet, by flow and number.
+        fates: The fate of every packet, by flow and number.
         windows_ns: The ends of all windows.
-        wall_s: Wall time by part: agents, network, exchange, and wait, in which a federate itself only waited.
+        wall_s: Wall time by part: agents, network, exchange, and wait, which is the time that federates only waited.
         digest: Hash over every packet, arrival, drop and window, in order (`EventDigest`).
     """
 

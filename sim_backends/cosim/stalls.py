@@ -1,4 +1,4 @@
-"""Fault `stalled-federate`: a party that answers late, in wall time, once, at a simulated time."""
+"""Fault `stalled-federate`: a federate that answers one request late, in wall time."""
 
 import time
 from collections.abc import Callable
@@ -12,14 +12,14 @@ from sim_backends.cosim.wall_time import Waits
 DEADLINE_S: Final = 30.0
 """Default deadline of an answer, in seconds of wall time."""
 
-Party = TypeVar("Party", bound=PhysicsFederate | NetworkFederate | Program)
+Federate = TypeVar("Federate", bound=PhysicsFederate | NetworkFederate | Program)
 
 
 class Stall:
     """Delays one answer.
 
     Args:
-        at_ns: Simulated time from which on it waits: the first question about this time or a later one waits.
+        at_ns: Simulated time of the stall: the first request for this time or a later one is delayed.
         wall_s: Duration, in seconds of wall time.
         limit_s: Deadline of an answer, in seconds of wall time; None for no deadline.
 
@@ -31,59 +31,59 @@ class Stall:
         self._at_ns = at_ns
         self._wall_s = wall_s
         self._limit_s = limit_s
-        self._over = False
+        self._is_over = False
         self.waited_s = 0.0
 
     def wait(self, now_ns: int) -> None:
-        """Wait if this is the first question about `at_ns` or later.
+        """Wait if this is the first request for `at_ns` or later.
 
         Raises:
             AnswerTimeoutError: The wait is longer than the deadline, and the deadline has passed.
         """
-        if self._over or now_ns < self._at_ns:
+        if self._is_over or now_ns < self._at_ns:
             return
-        self._over = True
+        self._is_over = True
         if self._limit_s is not None and self._wall_s > self._limit_s:
             self._sleep(self._limit_s)
             raise AnswerTimeoutError(self._limit_s)
         self._sleep(self._wall_s)
 
     def _sleep(self, wall_s: float) -> None:
-        begun_s = time.perf_counter()
+        started_s = time.perf_counter()
         time.sleep(wall_s)
-        self.waited_s += time.perf_counter() - begun_s
+        self.waited_s += time.perf_counter() - started_s
 
 
-_QUESTIONS: Final = ("advance", "wake")
-"""What federates and programs are asked at a simulated time, which comes first."""
+_REQUESTS: Final = ("advance", "wake")
+"""Methods of federates and programs whose first argument is a simulated time."""
 
 
 class _Stalled:
-    def __init__(self, party: object, stall: Stall) -> None:
-        self._party = party
+    def __init__(self, federate: object, stall: Stall) -> None:
+        self._federate = federate
         self._stall = stall
 
     @property
     def waited_s(self) -> float:
-        """See `wall_time.Waits`; what it stalls may wait, too."""
-        return self._stall.waited_s + (self._party.waited_s if isinstance(self._party, Waits) else 0.0)
+        """The waiting time of the stall and of the federate itself (`wall_time.Waits`)."""
+        return self._stall.waited_s + (self._federate.waited_s if isinstance(self._federate, Waits) else 0.0)
 
-    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 (whatever the party has)
-        if name.startswith("_"):  # a copy that is being made has no party yet
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 (depends on the federate)
+        if name.startswith("_"):  # an unfinished copy has no federate yet
             raise AttributeError(name)
-        found = getattr(self._party, name)
-        return partial(self._ask, found) if name in _QUESTIONS else found
+        attribute = getattr(self._federate, name)
+        return partial(self._delayed, attribute) if name in _REQUESTS else attribute
 
-    def _ask(self, question: Callable[..., Any], now_ns: int, *rest: object) -> Any:  # noqa: ANN401 (as above)
+    def _delayed(self, request: Callable[..., Any], now_ns: int, *rest: object) -> Any:  # noqa: ANN401 (as above)
         self._stall.wait(now_ns)
-        return question(now_ns, *rest)
+        return request(now_ns, *rest)
 
 
-def stalled(party: Party, stall: Stall) -> Party:
-    """Return a federate, or a program, that stalls.
+def stalled(federate: Federate, stall: Stall) -> Federate:
+    """Return a federate or program with a delayed answer.
 
     Args:
-        party: What it is otherwise.
-        stall: When, and for how long.
+        federate: The federate or program.
+        stall: When it stalls, and for how long.
     """
-    return cast("Party", _Stalled(party, stall))
+    return cast("Federate", _Stalled(federate, stall))

@@ -7,7 +7,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 @runtime_checkable
 class Waits(Protocol):
-    """A federate or program that waits in wall time: for another process, a machine, or a fault.
+    """A federate or program that waits in wall time: for another process, a device, or a fault.
 
     It raises `AnswerTimeoutError` if it waits for longer than its deadline.
 
@@ -21,7 +21,7 @@ class Waits(Protocol):
 class WallTime:
     """Stopwatch that adds each lap to one part of the wall time.
 
-    The time in which a federate of the part only waited is added to `wait` instead.
+    Time that a federate of the part only waited is added to `wait` instead.
 
     Args:
         total_s: Receives the sums, in seconds by part, whenever `window` is called.
@@ -41,7 +41,7 @@ class WallTime:
         self._lap_s = time.perf_counter()
 
     def start(self) -> None:
-        """Begin a lap; the time since the last lap counts for no part."""
+        """Begin a lap; the time since the last lap belongs to no part."""
         self._lap_s = time.perf_counter()
 
     def lap(self, part: Literal["agents", "network", "exchange"]) -> None:

@@ -165,12 +165,12 @@ def test_replay_and_plot_tell_what_is_no_recording(lab: Path) -> None:
         (("run", "pass.yaml", "--seed", "-1"), "'-1' is not a whole number from 0", "--help"),
         (("run", "pass.yaml", "--seeds", "0"), "must be at least 1", "--help"),
         (("run", "pass.yaml", "--seed", "1", "--seeds", "2"), "not allowed with", "--help"),
-        (("run", "pass.yaml", "--set", "duration"), "--set: 'duration' does not say", "--set policy.window=5ms"),
+        (("run", "pass.yaml", "--set", "duration"), "--set: 'duration' is not KEY=VALUE", "--set policy.window=5ms"),
         (("run", "pass.yaml", "--set", "lasts=1s"), "unknown key lasts", "duration"),
         (("run", "pass.yaml", "--window", "5"), "has no unit", "5s or 5ms"),
         (("run", "pass.yaml", "--duration", "0s"), "greater than 0", ""),
         (("run", "pass.yaml", "--window", "0s"), "greater than 0", ""),
-        (("run", "pass.yaml", "--out", "taken"), "taken: something is in this folder", "choose another --out"),
+        (("run", "pass.yaml", "--out", "taken"), "taken: this folder is not empty", "choose another --out"),
         (("run", "pass.yaml", "--out", "pass.yaml"), "cannot be written: File exists", "choose another --out"),
         (("run", "pass.yaml", "--out", "/proc/sim"), "cannot be written: ", "choose another --out"),
         (("rnu",), "COMMAND cannot be 'rnu'", "did you mean 'run'?"),
@@ -219,7 +219,7 @@ def test_ctrl_c_ends_many_seeds_and_keeps_those_that_had_ended(lab: Path) -> Non
     assert printed
     # One may have ended after the last that was told.
     assert set(printed) <= set(ended)
-    assert f"interrupted: {len(printed)} of 10000 seeds had ended" in done.err
+    assert f"interrupted: {len(printed)} of 10000 seeds had finished" in done.err
     aggregated = fieldkit(lab, "aggregate", "sim", "--format", "csv")
     assert aggregated.code == 0, aggregated.err
 

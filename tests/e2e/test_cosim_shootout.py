@@ -63,17 +63,17 @@ def test_the_table_says_what_its_columns_mean_in_100_columns(lab: Path) -> None:
         assert f"{head.partition(' (')[0]}: " in " ".join(done.out.split()), "what it means"
 
 
-def test_a_window_that_shares_a_beat_with_traffic_is_named_with_one_that_does_not(lab: Path) -> None:
+def test_a_window_that_is_commensurate_with_traffic_is_reported_with_a_better_one(lab: Path) -> None:
     """The stream of 50 Hz is sent every two windows of 10 ms; the window that is proposed gives no note."""
     options = ("--duration", "400ms", "--policy", "scheduled")
     done = cosim(lab, "shootout", "pass.yaml", *options, "--window", "10ms")
     assert done.code == 0, done.err
     told = " ".join(done.err.split())
-    assert "the window of 10 ms shares a beat with" in told
+    assert "the window of 10 ms is commensurate with" in told
     assert "(every 20 ms: 1 phase)" in told
-    proposed = re.search(r"take --window (\d+ms), or --seeds 20", told)
+    proposed = re.search(r"use --window (\d+ms), or --seeds 20", told)
     assert proposed, told
-    assert "shares a beat" not in cosim(lab, "shootout", "pass.yaml", *options, "--window", proposed[1]).err
+    assert "commensurate" not in cosim(lab, "shootout", "pass.yaml", *options, "--window", proposed[1]).err
 
 
 def test_the_figure_names_every_policy_and_is_the_same_twice(lab: Path) -> None:
@@ -122,7 +122,7 @@ def test_followers_are_told_with_how_far_they_leave_the_references_way(lab: Path
     )
     assert exact != late
     drawn = (lab / "c.svg").read_text(encoding="utf-8")
-    assert "Off the reference's way, 70 ms" in drawn.replace("&#x27;", "'")
+    assert "Off the reference's path, 70 ms" in drawn.replace("&#x27;", "'")
 
 
 def test_a_run_tells_of_followers_what_its_recording_tells(lab: Path) -> None:
@@ -165,7 +165,7 @@ def test_what_a_bound_costs_is_told_beside_the_fixed_windows_that_keep_it(lab: P
     factor = sum(int(row["all_exchanges"]) for row in (one, other)) / sum(
         int(row["exchanges"]) for row in (one, other)
     )
-    assert f"{factor:.3g} times as many; the longest that would have done" in told
+    assert f"{factor:.3g} times as many; the longest windows of the single runs need" in told
     refused = cosim(lab, "shootout", "pass.yaml", "--bound", "--set", "policy.bound_db=1")
     assert (refused.code, "bound_db is about path loss" in refused.err) == (2, True)
     refused = cosim(lab, "shootout", "pass.yaml", "--bound", "--figure", "b.svg")

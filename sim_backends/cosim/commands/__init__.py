@@ -1,1 +1,1 @@
-"""The commands `fieldkit cosim ...`, as any package can add some (docs/add-a-command.md)."""
+"""The commands `fieldkit cosim ...`; any package can add commands in this way (docs/add-a-command.md)."""

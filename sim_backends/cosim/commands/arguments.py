@@ -1,4 +1,4 @@
-"""What `fieldkit cosim` and its commands take. Nothing here imports what a command runs."""
+"""The arguments of `fieldkit cosim` and its commands; modules that only a running command needs are not imported."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -7,14 +7,16 @@ from typing import Any, Final
 from fieldkit.cli.parser import Commands, Parser
 from fieldkit.cli.shared_arguments import natural, repeats
 
-_HERE: Final = "sim_backends.cosim.commands"
+_PACKAGE: Final = "sim_backends.cosim.commands"
 _FORMATS: Final = ("table", "csv", "json", "markdown")
 _TABLES: Final = ("1", "2", "3", "emane", "claims")
 
 
 def add(parser: Parser) -> None:
     """Declare the commands of `fieldkit cosim`."""
-    parser.description = "Simulate robots that move and talk, and measure what each synchronization method costs."
+    parser.description = (
+        "Simulate robots that move and communicate, and measure what each synchronization method costs."
+    )
     parser.epilog = "example: fieldkit cosim run baylands --policy sliding_window"
     commands = parser.add_commands(title="commands", metavar="COMMAND")
     _run(commands)
@@ -31,7 +33,7 @@ def _run(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "run",
         help="run a scenario",
-        description="Run a scenario with one sync policy, and tell of each flow of packets what became of it.",
+        description="Run a scenario with one sync policy, and report the packets of each flow.",
         epilog="example: fieldkit cosim run baylands --seeds 20 --out runs/baylands",
     )
     _add_scenario(parser)
@@ -42,54 +44,54 @@ def _run(commands: Commands) -> None:
         "--out",
         type=Path,
         metavar="FOLDER",
-        help="keep the recordings, a capture per robot and trial.csv there; it is made (default: none)",
+        help="write the recordings, a capture per robot and trial.csv to this new folder (default: none)",
     )
     parser.add_argument(
         "--deadline",
         metavar="TIME",
-        help="longest wait of physics or network for an answer, in wall time (default 30s)",
+        help="longest wait for an answer of physics or network, in wall time (default 30s)",
     )
     _add_format(parser)
-    parser.set_defaults(run=f"{_HERE}.run:run")
+    parser.set_defaults(run=f"{_PACKAGE}.run:run")
 
 
 def _shootout(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "shootout",
-        help="measure how wrong each sync policy is, and what it costs",
-        description="Run a scenario with every sync policy; tell how wrong each is beside the exact reference of the "
-        "same seed, and what it costs.",
+        help="measure the error and the cost of each sync policy",
+        description="Run a scenario with every sync policy; report the error of each relative to the exact reference "
+        "with the same seed, and its cost.",
         epilog="example: fieldkit cosim shootout baylands --window 1ms,10ms,100ms --figure shootout.svg",
     )
     _add_scenario(parser)
     _add_policy(parser, "may be given more than once (default: all)", action="append", default=[])
     _add_window(parser, "windows to compare", dest="windows", metavar="TIME,...")
     _add_seeds(parser)
-    told = parser.add_mutually_exclusive_group()
-    told.add_argument("--bias", action="store_true", help="what differs from the reference in the mean over seeds")
-    told.add_argument(
+    modes = parser.add_mutually_exclusive_group()
+    modes.add_argument("--bias", action="store_true", help="mean difference from the reference over seeds")
+    modes.add_argument(
         "--orders",
         action="store_true",
-        help="errors of single windows, begun in the reference's own state, and their order in the window",
+        help="errors of single windows that begin in the reference's own state, and their order in the window",
     )
-    told.add_argument(
+    modes.add_argument(
         "--bound",
         action="store_true",
-        help="exchanges that the scenario's policy.bound costs: by error_bounded, and by fixed windows that keep it",
+        help="exchanges that the scenario's policy.bound costs with error_bounded, and with fixed windows",
     )
     parser.add_argument(
         "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
     )
     _add_format(parser)
-    parser.set_defaults(run=f"{_HERE}.shootout:run")
+    parser.set_defaults(run=f"{_PACKAGE}.shootout:run")
 
 
 def _paper(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "table",
         help="regenerate a table of the paper",
-        description="Run what a table of the paper was made from, and print each of its numbers beside ours with its "
-        "interval, and whether they agree.",
+        description="Run the simulations of a table of the paper, and print each of its numbers next to ours with "
+        "its interval, and whether they agree.",
         epilog="example: fieldkit cosim table 1 --format markdown",
     )
     parser.add_choice("which", _TABLES, metavar="TABLE", help="1, 2 or 3 of its simulation, emane, or claims")
@@ -100,20 +102,21 @@ def _paper(commands: Commands) -> None:
     )
     _add_changes(parser)
     _add_format(parser)
-    parser.set_defaults(run=f"{_HERE}.table:run")
+    parser.set_defaults(run=f"{_PACKAGE}.table:run")
 
 
 def _satisfy(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "satisfy",
-        help="run the paper's satisfaction loop, and tell what it changes",
-        description="Run a scenario again and again, as the paper does, each time with the window that its rule made "
-        "of the last one, until the loss is accepted; tell how wrong each round is beside the exact reference.",
+        help="run the paper's satisfaction loop, and report its effect",
+        description="Run a scenario repeatedly, as the paper does, each time with the window that its rule "
+        "computed in the previous round, until the loss is accepted; report the error of each round relative to the "
+        "exact reference.",
         epilog="example: fieldkit cosim satisfy baylands --set agents.husky-2.along=60m --threshold 10%",
     )
     _add_scenario(parser)
     parser.add_argument(
-        "--threshold", required=True, metavar="SHARE", help="loss that is accepted, of all packets: 10%%"
+        "--threshold", required=True, metavar="SHARE", help="accepted loss, as a share of all packets: 10%%"
     )
     parser.add_choice(
         "--policy",
@@ -122,37 +125,40 @@ def _satisfy(commands: Commands) -> None:
         help="the rule: as the paper prints it (default), or made safe",
     )
     _add_window(parser, "w of the first round")
-    parser.add_argument("--rounds", type=repeats, default=20, metavar="N", help="most rounds (default 20)")
+    parser.add_argument(
+        "--rounds", type=repeats, default=20, metavar="N", help="largest number of rounds (default 20)"
+    )
     _add_seed(parser, "the scenario's first")
     _add_format(parser)
-    parser.set_defaults(run=f"{_HERE}.satisfy:run")
+    parser.set_defaults(run=f"{_PACKAGE}.satisfy:run")
 
 
 def _plot(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "plot",
         help="draw a recording, or the table of a shootout",
-        description="Draw a recording: the ways of its agents from above, and delay, loss and distance over time. Or "
-        "draw the table of a shootout in CSV: errors against cost.",
+        description="Draw a recording: the paths of its agents from above, and delay, loss and distance over time. "
+        "Or draw the table of a shootout in CSV: errors against cost.",
         epilog="example: fieldkit cosim plot runs/baylands --out baylands.pdf",
     )
     _add_recording(parser)
     parser.add_argument(
         "-o", "--out", type=Path, default=Path("run.svg"), metavar="FILE", help="SVG, PDF or PNG (default run.svg)"
     )
-    parser.set_defaults(run=f"{_HERE}.plot:run")
+    parser.set_defaults(run=f"{_PACKAGE}.plot:run")
 
 
 def _replay(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "replay",
         help="print the numbers of a recording",
-        description="Print of a recording what its run printed, and tell one that was changed or cut.",
+        description="Print the numbers that the run of a recording printed; refuse a recording that was changed or "
+        "truncated.",
     )
     _add_recording(parser)
-    parser.add_argument("--mcap", type=Path, metavar="FILE", help="write it for Foxglove, too")
+    parser.add_argument("--mcap", type=Path, metavar="FILE", help="also write it as MCAP, for Foxglove")
     _add_format(parser)
-    parser.set_defaults(run=f"{_HERE}.replay:run")
+    parser.set_defaults(run=f"{_PACKAGE}.replay:run")
 
 
 def _list(commands: Commands) -> None:
@@ -160,27 +166,27 @@ def _list(commands: Commands) -> None:
         "list", help="list scenarios and sync policies", description="List every scenario and sync policy."
     )
     _add_format(parser)
-    parser.set_defaults(run=f"{_HERE}.listing:list_all")
+    parser.set_defaults(run=f"{_PACKAGE}.listing:list_all")
 
 
 def _schema(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "schema",
         help="print the JSON schema of scenario files",
-        description="Print the JSON schema of scenario files, by which editors complete and check them.",
+        description="Print the JSON schema of scenario files, with which editors complete and check them.",
     )
-    parser.set_defaults(run=f"{_HERE}.listing:print_schema")
+    parser.set_defaults(run=f"{_PACKAGE}.listing:print_schema")
 
 
 def _add_scenario(parser: Parser) -> None:
-    """Add the scenario, and what of it is changed; `settings.scenario` reads both."""
+    """Add the scenario and the options that change it; `settings.scenario` reads both."""
     scenario = parser.add_argument(
         "scenario",
         metavar="SCENARIO",
         help="name of a scenario, see `fieldkit cosim list`, or a file ending in .yaml",
     )
-    _completed(scenario, _scenario_names)
-    parser.add_argument("--duration", metavar="TIME", help="how long it lasts, for example 30s")
+    _set_completer(scenario, _scenario_names)
+    parser.add_argument("--duration", metavar="TIME", help="duration of the simulation, for example 30s")
     _add_changes(parser)
 
 
@@ -190,7 +196,7 @@ def _add_changes(parser: Parser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="another value of its file, agents.husky-2.along=40m; may be given more than once",
+        help="change a value of its file, for example agents.husky-2.along=40m; may be given more than once",
     )
 
 
@@ -201,7 +207,7 @@ def _add_recording(parser: Parser) -> None:
 
 
 def _add_policy(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (argparse's own)
-    _completed(parser.add_argument("--policy", metavar="NAME", help=meaning, **options), _policy_names)
+    _set_completer(parser.add_argument("--policy", metavar="NAME", help=meaning, **options), _policy_names)
 
 
 def _add_window(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (argparse's own)
@@ -209,7 +215,7 @@ def _add_window(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: 
 
 
 def _add_seed(parser: Any, default: str) -> None:  # noqa: ANN401 (a parser or a group of one)
-    parser.add_argument("--seed", type=natural, metavar="N", help=f"seed of everything random (default: {default})")
+    parser.add_argument("--seed", type=natural, metavar="N", help=f"seed of all random draws (default: {default})")
 
 
 def _add_seeds(parser: Parser) -> None:
@@ -219,11 +225,11 @@ def _add_seeds(parser: Parser) -> None:
 
 
 def _add_format(parser: Parser) -> None:
-    parser.add_choice("--format", _FORMATS, default="table", help="how it is printed (default table)")
+    parser.add_choice("--format", _FORMATS, default="table", help="output format (default table)")
 
 
-def _completed(action: Any, names: Callable[[], Iterable[str]]) -> None:  # noqa: ANN401 (argparse's own is generic)
-    """Let the Tab key complete an argument by names that are looked for only then."""
+def _set_completer(action: Any, names: Callable[[], Iterable[str]]) -> None:  # noqa: ANN401 (argparse's is generic)
+    """Complete an argument with names that are determined when the Tab key is pressed."""
     action.completer = lambda **_: list(names())
 
 

@@ -9,7 +9,7 @@ from typing import Final
 from fieldkit.cli.display import show_note, working
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.clock import teller
+from sim_backends.cosim.commands.clock import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
@@ -17,17 +17,17 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.bias import Bias, biases
 from sim_backends.cosim.studies.outcomes import outcomes
 
-MEASURES: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
+LABELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
     {"loss": ("packets lost (%)", 100.0), "delay_s": ("delay (ms)", 1e3), "apart_m": ("agents apart (m)", 1.0)}
 )
-"""Of each measure what people call it, and the factor from SI units."""
+"""For each measure: its label, and the factor from SI units to the label's unit."""
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the scenario by each policy with each seed, and print what differs in the mean.
+    """Run the scenario with each policy and each seed, and print the mean differences.
 
     Raises:
-        ConfigurationError: There is one seed alone.
+        ConfigurationError: There is only one seed.
     """
     scenario = settings.scenario(arguments)
     policies = settings.policies(arguments)
@@ -37,19 +37,22 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.windows:
         scenario = settings.with_window(scenario, settings.windows_s(arguments, scenario)[0])
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
-    build(scenario)  # what cannot be run is told before anything runs
-    settings.note_shared_beats(scenario, policies, [scenario.policy.window], len(seeds))
+    build(scenario)  # raises before any run if the scenario is invalid
+    settings.note_commensurate_events(scenario, policies, [scenario.policy.window], len(seeds))
     with working() as sink:
         runs = len({*policies, EventDriven.name}) * len(seeds)
-        found = outcomes(partial(_make, scenario), policies, seeds, progress=partial(teller(sink), "bias", runs))
-    told = {name: one for name, one in biases(found).items() if name in policies}
-    _sheet(f"{scenario.name}, {scenario.topology}, {len(seeds)} seeds", told, arguments.format).show(arguments.format)
-    for name, failure in found.failures.items():
+        all_outcomes = outcomes(
+            partial(_make, scenario), policies, seeds, progress=partial(progress_reporter(sink), "bias", runs)
+        )
+    by_policy = {name: measures for name, measures in biases(all_outcomes).items() if name in policies}
+    title = f"{scenario.name}, {scenario.topology}, {len(seeds)} seeds"
+    _sheet(title, by_policy, arguments.format).show(arguments.format)
+    for name, failure in all_outcomes.failures.items():
         show_note(f"{name}: {failure}")
     if draw is not None:
-        from sim_backends.cosim.commands import figures  # noqa: PLC0415 (matplotlib takes half a second)
+        from sim_backends.cosim.commands import figures  # noqa: PLC0415 (importing matplotlib takes half a second)
 
-        draw(figures.bias_of_policies(told))
+        draw(figures.bias_of_policies(by_policy))
     return 0
 
 
@@ -57,14 +60,14 @@ def _make(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
     return build(scenario, policy=policy, seed=seed)
 
 
-def _sheet(title: str, found: Mapping[str, Mapping[str, Bias]], form: str) -> Sheet:
+def _sheet(title: str, by_policy: Mapping[str, Mapping[str, Bias]], form: str) -> Sheet:
     rows: list[Sequence[Value]] = []
-    for name, (words, factor) in MEASURES.items():
-        scale, said = (factor, words) if form in {"table", "markdown"} else (1.0, name)
-        for policy, measures in found.items():
-            one = measures[name]
-            values = one.mean.value, one.bias.value, one.bias.low, one.bias.high
-            rows.append((policy, said, *(value * scale for value in values), one.seeds_needed))
+    for name, (label, factor) in LABELS.items():
+        scale, shown = (factor, label) if form in {"table", "markdown"} else (1.0, name)
+        for policy, measures in by_policy.items():
+            bias = measures[name]
+            values = bias.mean.value, bias.bias.value, bias.bias.low, bias.bias.high
+            rows.append((policy, shown, *(value * scale for value in values), bias.seeds_needed))
     columns = (
         SheetColumn("policy", "policy", ""),
         SheetColumn("measure", "of", ""),
@@ -72,6 +75,6 @@ def _sheet(title: str, found: Mapping[str, Mapping[str, Bias]], form: str) -> Sh
         SheetColumn("bias", "bias", f"mean of the differences from {EventDriven.name} with the same seed"),
         SheetColumn("bias_low", "low", "lower end of its 95 % interval"),
         SheetColumn("bias_high", "high", "upper end"),
-        SheetColumn("seeds_needed", "seeds", "that it takes to see this bias in four of five studies"),
+        SheetColumn("seeds_needed", "seeds", "number needed to detect this bias in four of five studies"),
     )
     return Sheet(columns, rows, [SheetPart(f"{title}: in distribution", [column.name for column in columns])])

@@ -1,4 +1,4 @@
-"""How far runs are, and how much time is left."""
+"""Progress of runs, and the estimated time left."""
 
 import time
 from collections.abc import Callable
@@ -6,20 +6,21 @@ from collections.abc import Callable
 from fieldkit.core.events import Progress, Sink
 
 
-def teller(sink: Sink, unit: str = "runs") -> Callable[[str, float, float], None]:
-    """Return what tells a sink what is done, of how much in all, and how much of it.
+def progress_reporter(sink: Sink, unit: str = "runs") -> Callable[[str, float, float], None]:
+    """Return a function that reports progress to a sink; its arguments are the activity, the total and the part done.
 
-    Time left is told from the first call on for the same work.
+    The time left is estimated from the time since the first call for the same activity.
 
     Args:
-        sink: Who is told.
-        unit: What is counted.
+        sink: Receives the events.
+        unit: Unit of total and part.
     """
-    begun_s: dict[str, float] = {}
+    started_s: dict[str, float] = {}
 
-    def tell(what: str, total: float, done: float) -> None:
+    def report(activity: str, total: float, done: float) -> None:
         now_s = time.monotonic()
-        spent_s = now_s - begun_s.setdefault(what, now_s)
-        sink(Progress(what, done, total, unit, spent_s * (total / done - 1) if done and spent_s else None))
+        spent_s = now_s - started_s.setdefault(activity, now_s)
+        left_s = spent_s * (total / done - 1) if done and spent_s else None
+        sink(Progress(activity, done, total, unit, left_s))
 
-    return tell
+    return report

@@ -1,4 +1,4 @@
-"""The folder in which runs are kept: recordings, and beside each a trial.csv that fieldkit reads as a trial's."""
+"""The folder of runs: recordings, each with a trial.csv that fieldkit reads like that of a trial."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,16 +18,16 @@ class RunFolder:
     """The folder of the runs of one scenario with one sync policy: a recording, or one per seed.
 
     Args:
-        path: The folder; it is made, and may be there if it is empty.
-        scenario: What is run.
-        policy: The sync policy in words.
-        seeds: The seeds with which it is run.
+        path: The folder, which must be empty or not exist; it is created.
+        scenario: The scenario.
+        policy: The sync policy, as text.
+        seeds: The seeds of the runs.
 
     Attributes:
-        path: As given.
+        path: The folder.
 
     Raises:
-        ConfigurationError: There is something of this name, or it cannot be made.
+        ConfigurationError: The folder is not empty, or cannot be created.
     """
 
     def __init__(self, path: Path, scenario: CosimScenario, policy: str, seeds: Sequence[int]) -> None:
@@ -39,7 +39,7 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
             if next(path.iterdir(), None) is not None:
                 raise ConfigurationError(
-                    "something is in this folder, which is not overwritten",
+                    "this folder is not empty, and is not overwritten",
                     where=str(path),
                     remedy="choose another --out",
                 )
@@ -49,20 +49,20 @@ class RunFolder:
                 f"cannot be written: {error.strerror}", where=str(path), remedy="choose another --out"
             ) from error
 
-    def of(self, seed: int) -> Path:
-        """Return the folder of the recording of the run with a seed."""
+    def recording(self, seed: int) -> Path:
+        """Return the folder of the recording with a seed."""
         digits = len(str(max(self._seeds)))
         return self.path if len(self._seeds) == 1 else self.path / f"seed-{seed:0{digits}}"
 
-    def keep(self, result: SeedResult) -> None:
-        """Write the rows of a run that has ended beside its recording.
+    def write_rows(self, result: SeedResult) -> None:
+        """Write the rows of a run that has ended into the folder of its recording.
 
         Raises:
             ConfigurationError: They cannot be written.
         """
         number = self._seeds.index(result.seed) + 1
         table = trial_rows.table(self.path.resolve().name, self._scenario, self._policy, number, result)
-        path = self.of(result.seed) / TRIAL_CSV
+        path = self.recording(result.seed) / TRIAL_CSV
         try:
             files.write(path, table.encode())
         except OSError as error:

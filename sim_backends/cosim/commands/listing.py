@@ -17,13 +17,13 @@ _POLICY: Final = (SheetColumn("policy", "policy", ""), SheetColumn("summary", "w
 
 
 def list_all(arguments: argparse.Namespace) -> int:
-    """Print each scenario and each sync policy in a line."""
+    """Print each scenario and each sync policy in one line."""
     scenarios = []
     for name, path in scenario_files().items():
         try:
             scenarios.append((name, load_scenario(path).summary))
         except FieldkitError as error:
-            show_note(f"{error.located}: it is left out")
+            show_note(f"{error.located}: this scenario is omitted")
     policies = [(name, _summary(kind)) for name, kind in POLICIES.items()]
     if arguments.format == "table":
         table([column.head for column in _SCENARIO], scenarios)

@@ -17,67 +17,67 @@ from sim_backends.cosim.plots import FlowTrace, run_figure
 from sim_backends.cosim.recording.replay import Recording
 from sim_backends.world.world import load_world
 
-_TABLE: Final = "write one with fieldkit cosim shootout SCENARIO --format csv > shootout.csv"
+_REMEDY: Final = "write one with fieldkit cosim shootout SCENARIO --format csv > shootout.csv"
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw it."""
+    """Draw a recording, or the table of a shootout."""
     draw = settings.figure(arguments.out, "--out")
     if arguments.recording.suffix == ".csv":
         draw(figures.error_against_cost(_points(arguments.recording)))
         return 0
     recording = recording_at(arguments.recording)
-    around = _around(recording)
-    draw(lambda form: run_figure(title(recording), _ways_m(recording), _traces(recording), form, around))
+    obstacles = _obstacles(recording)
+    draw(lambda form: run_figure(title(recording), _paths_m(recording), _traces(recording), form, obstacles))
     return 0
 
 
 def _points(path: Path) -> list[CostPoint]:
-    """Return the points of a table of `fieldkit cosim shootout --format csv`; rows without numbers have none.
+    """Return the points of a table of `fieldkit cosim shootout --format csv`; rows without numbers are ignored.
 
     Raises:
-        EvidenceError: It is none, or has no row with numbers.
+        EvidenceError: The file is not such a table, or has no row with numbers.
     """
-    names = [one.name for one in fields(CostPoint)][1:]
+    names = [field.name for field in fields(CostPoint)][1:]
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            found = [
+            points = [
                 CostPoint(row["policy"], *(float(row[name] or math.nan) for name in names))
                 for row in csv.DictReader(file)
             ]
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise EvidenceError(
-            f"this is no table of a shootout: {type(error).__name__}: {error}", where=str(path), remedy=_TABLE
+            f"this is not the table of a shootout: {type(error).__name__}: {error}", where=str(path), remedy=_REMEDY
         ) from error
-    found = [point for point in found if point.exchanges_per_s > 0]
-    if not found:
-        raise EvidenceError("no policy has numbers in this table", where=str(path), remedy=_TABLE)
-    return found
+    points = [point for point in points if point.exchanges_per_s > 0]
+    if not points:
+        raise EvidenceError("no policy has numbers in this table", where=str(path), remedy=_REMEDY)
+    return points
 
 
-def _around(recording: Recording) -> list[ObstacleOutline]:
-    """Return what stands in the world of a run; nothing, with a note, where that world is not here any more."""
+def _obstacles(recording: Recording) -> list[ObstacleOutline]:
+    """Return the outlines of the obstacles in the world of a run; none, with a note, if that world does not exist."""
     name = scenario_of(recording).world
     try:
         return list(outlines(load_world(name)))
     except ConfigurationError as error:
-        show_note(f"without its obstacles: {error.located}")
+        show_note(f"drawn without obstacles: {error.located}")
         return []
 
 
-def _ways_m(recording: Recording) -> dict[str, list[tuple[float, float]]]:
-    ways_m: dict[str, list[tuple[float, float]]] = {}
+def _paths_m(recording: Recording) -> dict[str, list[tuple[float, float]]]:
+    paths_m: dict[str, list[tuple[float, float]]] = {}
     for _, agent, state in recording.states:
-        ways_m.setdefault(agent, []).append(state.position_m[:2])
-    return ways_m
+        paths_m.setdefault(agent, []).append(state.position_m[:2])
+    return paths_m
 
 
 def _traces(recording: Recording) -> list[FlowTrace]:
     flows: dict[str, list[tuple[float, float, float]]] = {}
     for fate in recording.run.fates.values():
-        if fate.is_known:
+        if fate.is_decided:
             arrived_ns = fate.arrived_ns
             delay_s = math.nan if arrived_ns is None else (arrived_ns - fate.packet.enters_ns) / 1e9
-            apart_m = math.dist(fate.true[0].position_m, fate.true[1].position_m)
-            flows.setdefault(fate.packet.identity[0], []).append((fate.packet.sent_ns / 1e9, delay_s, apart_m))
+            distance_m = math.dist(fate.true[0].position_m, fate.true[1].position_m)
+            flows.setdefault(fate.packet.identity[0], []).append((fate.packet.sent_ns / 1e9, delay_s, distance_m))
     return [FlowTrace(name, *zip(*sorted(flows[name]), strict=True)) for name in sorted(flows)]

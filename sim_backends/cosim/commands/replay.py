@@ -1,4 +1,4 @@
-"""`fieldkit cosim replay RECORDING`: the numbers of a run again, from what was recorded."""
+"""`fieldkit cosim replay RECORDING`: prints the numbers of a run again, from its recording."""
 
 import argparse
 import io
@@ -16,21 +16,21 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what `cosim run` printed."""
+    """Print the output of the recorded run."""
     recording = recording_at(arguments.recording)
     scenario = scenario_of(recording)
     result = seed_result(scenario, recording.manifest.about.seed, recording.run, recording.states)
     show_results(arguments.format, title(recording), scenario, [result])
     if recording.manifest.ending is not RunEnding.WHOLE:
         why = f": {recording.manifest.why}" if recording.manifest.why else ""
-        show_note(f"the run did not come to its end ({recording.manifest.ending}){why}")
+        show_note(f"the run did not complete ({recording.manifest.ending}){why}")
     if arguments.mcap is not None:
         _write_mcap(arguments.mcap, recording)
     return 0
 
 
 def _write_mcap(path: Path, recording: Recording) -> None:
-    from sim_backends.cosim.recording.mcap import write_mcap  # noqa: PLC0415 (others need no mcap)
+    from sim_backends.cosim.recording.mcap import write_mcap  # noqa: PLC0415 (only --mcap needs the library mcap)
 
     content = io.BytesIO()
     write_mcap(content, recording)
@@ -47,7 +47,7 @@ def recording_at(folder: Path) -> Recording:
     """Return the recording in a folder.
 
     Raises:
-        EvidenceError: There is none, or it is damaged.
+        EvidenceError: It does not exist, or is damaged.
     """
     several = sorted(path.parent for path in folder.glob("seed-*/run.json"))
     if several and not (folder / "run.json").exists():
@@ -60,10 +60,10 @@ def recording_at(folder: Path) -> Recording:
 
 
 def scenario_of(recording: Recording) -> CosimScenario:
-    """Return what was run.
+    """Return the scenario of a recording.
 
     Raises:
-        EvidenceError: This fieldkit does not read that scenario.
+        EvidenceError: This version of fieldkit cannot read the scenario.
     """
     manifest = recording.manifest
     try:
@@ -74,10 +74,10 @@ def scenario_of(recording: Recording) -> CosimScenario:
 
 
 def title(recording: Recording) -> str:
-    """Return in words what was run.
+    """Return a title of the recorded run: scenario, policy and seed.
 
     Raises:
-        EvidenceError: This fieldkit does not read its scenario.
+        EvidenceError: This version of fieldkit cannot read the scenario.
     """
     about = recording.manifest.about
     name = scenario_of(recording).name

@@ -1,4 +1,4 @@
-"""What came of a run, in numbers that a table needs."""
+"""The result of a run, as the numbers of tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ from sim_backends.world.motion import State
 
 @dataclass(frozen=True)
 class SeedResult:
-    """What came of a run.
+    """The result of a run.
 
     Attributes:
         seed: Its seed.
-        flows: What became of its flows.
+        flows: The results of its flows.
         simulated_s: Simulated time.
-        windows: How many windows it had.
+        windows: Number of windows.
         wall_s: Wall time by part.
-        digest: Hash over all that happened.
-        starts_m: Where each agent stood at time 0, metres east, north, up.
-        recoveries: How flows came back after faults.
-        formation: How well followers kept their place.
-        stopped: Why it did not come to its end; empty where it did.
-        error: What it did not come to its end by; None where it did, or was interrupted.
+        digest: Hash over all events.
+        starts_m: Position of each agent at time 0, metres east, north, up.
+        recoveries: Recoveries of flows after faults.
+        formation: How well followers kept their positions.
+        stopped: Why it ended early; empty if it is complete.
+        error: The error that ended it early; None if it is complete or was interrupted.
     """
 
     seed: int
@@ -46,7 +46,7 @@ class SeedResult:
 
     @property
     def is_interrupted(self) -> bool:
-        """Whether Ctrl-C ended it."""
+        """True if Ctrl-C ended it."""
         return bool(self.stopped) and self.error is None
 
 
@@ -57,14 +57,14 @@ def seed_result(
     states: Sequence[tuple[int, str, State]],
     ended_by: FieldkitError | KeyboardInterrupt | None = None,
 ) -> SeedResult:
-    """Return what came of a run.
+    """Return the result of a run.
 
     Args:
-        scenario: What was run.
+        scenario: The scenario.
         seed: Its seed.
-        run: What was recorded.
-        states: Where agents were, as `Recording.states`, at time 0 at least.
-        ended_by: What ended it early.
+        run: The record.
+        states: States of agents, as `Recording.states`, at least for time 0.
+        ended_by: The exception that ended it early, or None.
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
     error = ended_by if isinstance(ended_by, FieldkitError) else None

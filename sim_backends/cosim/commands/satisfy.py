@@ -1,4 +1,4 @@
-"""`fieldkit cosim satisfy SCENARIO`: the paper's satisfaction loop, and what it changes: error and cost, not loss."""
+"""`fieldkit cosim satisfy SCENARIO`: the paper's satisfaction loop, which changes error and cost, not the loss."""
 
 import argparse
 from functools import partial
@@ -9,7 +9,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.printing import say
 from fieldkit.core.units import format_count, parse_quantity
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.clock import teller
+from sim_backends.cosim.commands.clock import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.run import Run
@@ -18,97 +18,96 @@ from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.satisfaction import Satisfaction, satisfy
 
-MISSED: Final = 1
-"""Exit code where no round was satisfactory."""
+NOT_SATISFIED: Final = 1
+"""Exit code if no round was satisfactory."""
 
 _COLUMNS: Final = (
     SheetColumn("round", "round", ""),
-    SheetColumn("window_s", "w (ms)", "window that it began with", 1e3),
-    SheetColumn("median_window_s", "made (ms)", "median of the windows that the rule made of it", 1e3),
-    SheetColumn("loss", "lost (%)", "of packets whose fate is known", 100),
+    SheetColumn("window_s", "w (ms)", "initial window", 1e3),
+    SheetColumn("median_window_s", "made (ms)", "median of the windows that the rule computed from it", 1e3),
+    SheetColumn("loss", "lost (%)", "share of packets whose fate is decided", 100),
     SheetColumn("fate_disagreement", "fate (%)", "lost here or in the reference, but not in both", 100),
     SheetColumn("delivery_error_mean_s", "time (ms)", "delivery time less the reference's, magnitude, mean", 1e3),
-    SheetColumn("position_error_mean_m", "place (mm)", "how wrong the network was about two agents, mean", 1e3),
-    SheetColumn("exchanges", "exchanges", "what it cost"),
+    SheetColumn("position_error_mean_m", "place (mm)", "error of the network's relative positions, mean", 1e3),
+    SheetColumn("exchanges", "exchanges", "cost of the round"),
 )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run rounds until one is satisfactory, and print each beside the exact reference.
+    """Run rounds until one is satisfactory, and print each relative to the exact reference.
 
     Raises:
-        ConfigurationError: The threshold is no share.
+        ConfigurationError: The threshold is above 100 %.
     """
     scenario = settings.scenario(arguments)
     threshold = parse_quantity(arguments.threshold, {"%": 0.01}, "threshold")
     if threshold > 1:
         raise ConfigurationError(
-            f"--threshold: nothing loses {arguments.threshold} of its packets", remedy="--threshold 10%"
+            f"--threshold: {arguments.threshold} is more than all packets", remedy="write for example --threshold 10%"
         )
     seed = scenario.seeds[0] if arguments.seed is None else arguments.seed
-    build(scenario)  # what cannot be run is told before anything runs
-    settings.note_shared_beats(scenario, [arguments.policy], [scenario.policy.window], 1)
+    build(scenario)  # raises before any run if the scenario is invalid
+    settings.note_commensurate_events(scenario, [arguments.policy], [scenario.policy.window], 1)
     with working() as sink:
-        told = partial(teller(sink), "satisfy", arguments.rounds + 1)
-        runs = _Runs(scenario, seed, told)
-        found = satisfy(
-            runs,
+        report = partial(progress_reporter(sink), "satisfy", arguments.rounds + 1)
+        satisfaction = satisfy(
+            _CountedRuns(scenario, seed, report),
             lambda window_s: make_policy(
                 arguments.policy, window_s=window_s, longest_s=max(window_s, scenario.policy.longest)
             ),
             threshold=threshold,
             window_s=scenario.policy.window,
-            most_rounds=arguments.rounds,
+            max_rounds=arguments.rounds,
         )
     title = f"{scenario.name}, {scenario.topology}, {arguments.policy}, seed {seed}: the satisfaction loop"
-    _sheet(title, found).show(arguments.format)
+    _sheet(title, satisfaction).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        say(_words(found, threshold))
-    if not found.satisfied:
-        show_note(f"no round was satisfactory: {found.reason}")
-    return 0 if found.satisfied else MISSED
+        say(_summary(satisfaction, threshold))
+    if not satisfaction.satisfied:
+        show_note(f"no round was satisfactory: {satisfaction.reason}")
+    return 0 if satisfaction.satisfied else NOT_SATISFIED
 
 
-class _Runs:
-    """Runs a scenario by a policy, always the same, and tells how many runs there were."""
+class _CountedRuns:
+    """Runs the same scenario and seed with a policy, and reports the number of runs."""
 
-    def __init__(self, scenario: CosimScenario, seed: int, told: partial[None]) -> None:
+    def __init__(self, scenario: CosimScenario, seed: int, report: partial[None]) -> None:
         self._scenario = scenario
         self._seed = seed
-        self._told = told
+        self._report = report
         self._done = 0
 
     def __call__(self, policy: SyncPolicy) -> Run:
-        self._told(self._done)
+        self._report(self._done)
         self._done += 1
         return build(self._scenario, policy=policy, seed=self._seed, measures_all=True).run()
 
 
-def _sheet(title: str, found: Satisfaction) -> Sheet:
+def _sheet(title: str, satisfaction: Satisfaction) -> Sheet:
     rows = [
         (
             index,
-            one.window_s,
-            one.median_window_s,
-            one.loss,
-            one.errors.fate_disagreement,
-            one.errors.delivery_error_s.mean,
-            one.errors.position_error_m.mean,
-            one.exchanges,
+            round_.window_s,
+            round_.median_window_s,
+            round_.loss,
+            round_.errors.fate_disagreement,
+            round_.errors.delivery_error_s.mean,
+            round_.errors.position_error_m.mean,
+            round_.exchanges,
         )
-        for index, one in enumerate(found.rounds, start=1)
+        for index, round_ in enumerate(satisfaction.rounds, start=1)
     ]
     return Sheet(_COLUMNS, rows, [SheetPart(title, [column.name for column in _COLUMNS])])
 
 
-def _words(found: Satisfaction, threshold: float) -> str:
-    reference = f"the exact reference loses {number(100 * found.reference_loss)} % in {found.reference_exchanges:,}"
-    lines = [f"{reference} exchanges, whatever the window"]
-    if found.rounds:
-        last = found.rounds[-1]
-        outcome = "accepted" if found.satisfied else "not accepted"
+def _summary(satisfaction: Satisfaction, threshold: float) -> str:
+    reference = f"the exact reference loses {number(100 * satisfaction.reference_loss)} %"
+    lines = [f"{reference} in {satisfaction.reference_exchanges:,} exchanges, independently of the window"]
+    if satisfaction.rounds:
+        last = satisfaction.rounds[-1]
+        outcome = "accepted" if satisfaction.satisfied else "not accepted"
         lines.append(
             f"{outcome} at {number(100 * threshold)} %: {number(100 * last.loss)} % after "
-            f"{format_count(len(found.rounds), 'round')} and {found.exchanges:,} exchanges"
+            f"{format_count(len(satisfaction.rounds), 'round')} and {satisfaction.exchanges:,} exchanges"
         )
     return "\n".join(lines)

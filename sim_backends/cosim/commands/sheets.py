@@ -1,4 +1,4 @@
-"""Tables for people and programs: columns with a unit and a meaning, printed in four forms."""
+"""Tables for people and programs: columns with a unit and a meaning, printed in four formats."""
 
 import math
 import re
@@ -15,10 +15,10 @@ from fieldkit.core.printing import say
 from fieldkit.core.text import json_text
 
 Value = str | int | float | None
-"""A cell; nan and None are missing."""
+"""A cell; nan and None are missing values."""
 
-_WIDEST: Final = 98
-"""Columns of a line of explanations, also in a wider terminal."""
+_MAX_WIDTH: Final = 98
+"""Largest line length of legends, also in a wider terminal."""
 
 _MISSING: Final = "-"
 _NUMBER: Final = re.compile(r"-|-?[0-9][0-9.,]*(e[+-]?[0-9]+)?")
@@ -29,11 +29,11 @@ class SheetColumn:
     """A column.
 
     Attributes:
-        name: For programs, with the unit in it; values are in SI units.
-        head: For people, with the unit in which they read it.
-        meaning: What it says, in a few words; empty where the head does.
-        factor: What a value is multiplied by for people.
-        digits: How many digits of a number count for people.
+        name: Its name in CSV and JSON, with its SI unit.
+        head: Its heading in tables for people, with the unit shown there.
+        meaning: Explanation of the heading; empty if the heading is sufficient.
+        factor: Factor from the SI unit to the shown unit.
+        digits: Number of significant digits that are shown.
     """
 
     name: str
@@ -43,7 +43,7 @@ class SheetColumn:
     digits: int = 3
 
     def shown(self, value: Value) -> str:
-        """Return a value for people."""
+        """Return the text of a value in a table for people."""
         if value is None or isinstance(value, str):
             return value or _MISSING
         scaled = value * self.factor
@@ -54,10 +54,10 @@ class SheetColumn:
 
 @dataclass(frozen=True)
 class SheetPart:
-    """Some columns of a table, which people get as a table of their own.
+    """Some columns of a table, which are printed as a separate table for people.
 
     Attributes:
-        title: Above it.
+        title: Its title.
         columns: Names of its columns.
     """
 
@@ -71,28 +71,28 @@ class Sheet:
 
     Attributes:
         columns: Its columns.
-        rows: A value per column each.
-        parts: What people get of it.
+        rows: Its rows, each with a value per column.
+        parts: The tables for people.
     """
 
     columns: Sequence[SheetColumn]
     rows: Sequence[Sequence[Value]]
     parts: Sequence[SheetPart]
 
-    def of_part(self, part: SheetPart) -> tuple[list[str], list[list[str]]]:
-        """Return the heads and the cells of a part."""
+    def part_cells(self, part: SheetPart) -> tuple[list[str], list[list[str]]]:
+        """Return the headings and the cells of a part."""
         chosen = [index for index, column in enumerate(self.columns) if column.name in part.columns]
         heads = [self.columns[index].head for index in chosen]
         return heads, [[self.columns[index].shown(row[index]) for index in chosen] for row in self.rows]
 
-    def legend(self, part: SheetPart, told: Collection[str] = ()) -> dict[str, str]:
-        """Return what the heads of a part mean, without those that were told already."""
-        columns = [one for one in self.columns if one.name in part.columns and one.meaning]
-        found = {one.head.partition(" (")[0]: one.meaning for one in columns}
-        return {head: meaning for head, meaning in found.items() if head not in told}
+    def legend(self, part: SheetPart, explained: Collection[str] = ()) -> dict[str, str]:
+        """Return the meanings of the headings of a part, without those that are already explained."""
+        columns = [column for column in self.columns if column.name in part.columns and column.meaning]
+        meanings = {column.head.partition(" (")[0]: column.meaning for column in columns}
+        return {head: meaning for head, meaning in meanings.items() if head not in explained}
 
     def records(self) -> list[dict[str, Value]]:
-        """Return its rows for programs, None for what is missing."""
+        """Return the rows as dictionaries, with None for missing values."""
         names = [column.name for column in self.columns]
         return [
             dict(zip(names, (None if _is_missing(value) else value for value in row), strict=True))
@@ -100,60 +100,60 @@ class Sheet:
         ]
 
     def show(self, form: str) -> None:
-        """Print it in one of `FORMS`."""
+        """Print the table in one of `FORMS`."""
         FORMS[form](self)
 
 
 def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
-    """Print several tables in one of `FORMS`: JSON has them by their names, CSV the first of them only.
+    """Print several tables in one of `FORMS`: JSON has all by their names, CSV the first one only.
 
     Args:
-        sheets: The tables by name, the first being what is asked for above all.
-        form: The form.
+        sheets: The tables by name, the main one first.
+        form: The format.
     """
     if form == "json":
-        found = {name: sheet.records() for name, sheet in sheets.items()}
-        say(json_text(found, indent=2, allow_nan=False))
+        records = {name: sheet.records() for name, sheet in sheets.items()}
+        say(json_text(records, indent=2, allow_nan=False))
         return
     for sheet in list(sheets.values())[: 1 if form == "csv" else None]:
         sheet.show(form)
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Return a number with that many digits that count and no exponent, where that is short."""
+    """Return a number with that many significant digits, without an exponent unless it would be long."""
     if value == 0 or 1e-4 <= abs(value) < 1e3:
         return f"{value:.{digits}g}"
     return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"
 
 
 def filled(text: str) -> str:
-    """Return explanations in lines that fit into the terminal."""
-    return textwrap.fill(text, min(shutil.get_terminal_size().columns - 1, _WIDEST))
+    """Return a text wrapped to the width of the terminal."""
+    return textwrap.fill(text, min(shutil.get_terminal_size().columns - 1, _MAX_WIDTH))
 
 
 def _table(sheet: Sheet) -> None:
-    told: set[str] = set()
+    explained: set[str] = set()
     for part in sheet.parts:
-        heads, rows = sheet.of_part(part)
+        heads, rows = sheet.part_cells(part)
         right = [index for index in range(len(heads)) if all(_NUMBER.fullmatch(row[index]) for row in rows)]
         table(heads, rows, title=part.title, right=right)
-        legend = sheet.legend(part, told)
-        told |= legend.keys()
+        legend = sheet.legend(part, explained)
+        explained |= legend.keys()
         if legend:
-            say(filled(_in_words(legend)))
+            say(filled(_legend_text(legend)))
         say()
 
 
 def _markdown(sheet: Sheet) -> None:
     for part in sheet.parts:
-        heads, rows = sheet.of_part(part)
+        heads, rows = sheet.part_cells(part)
         for line in (heads, ["---"] * len(heads), *rows):
             say(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |")
         legend = sheet.legend(part)
-        say("\n" + ". ".join((part.title, *([_in_words(legend)] if legend else []))) + ".\n")
+        say("\n" + ". ".join((part.title, *([_legend_text(legend)] if legend else []))) + ".\n")
 
 
-def _in_words(legend: Mapping[str, str]) -> str:
+def _legend_text(legend: Mapping[str, str]) -> str:
     return "; ".join(f"{head}: {meaning}" for head, meaning in legend.items())
 
 

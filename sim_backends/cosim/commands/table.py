@@ -1,4 +1,4 @@
-"""`fieldkit cosim table TABLE`: the paper's numbers beside ours, and whether they agree."""
+"""`fieldkit cosim table TABLE`: the paper's numbers next to ours, and whether they agree."""
 
 import argparse
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from fieldkit.cli.display import working
 from fieldkit.core.printing import say
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.clock import teller
+from sim_backends.cosim.commands.clock import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, filled
 from sim_backends.cosim.studies.agreement import Agreement
 from sim_backends.cosim.studies.flow_samples import flow_samples
@@ -30,17 +30,17 @@ _LABELS: Final = {
     "radio": SheetColumn("radio", "radio", ""),
     "when": SheetColumn("when", "when", ""),
 }
-_REASON: Final = SheetColumn("loss_reason", "mostly", "why most of what did not arrive did not")
+_REASON: Final = SheetColumn("loss_reason", "mostly", "most frequent reason why packets did not arrive")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run a table of the paper, or its claims, with all seeds, and print its numbers beside ours."""
+    """Run a table of the paper, or its claims, with all seeds, and print its numbers next to ours."""
     which, changes = arguments.which, settings.changes(arguments)
     seeds = range(1, arguments.seeds + 1) if arguments.seed is None else (arguments.seed,)
     table = None if which == "claims" else paper_table(which, changes)
     setups = claim_setups(changes) if table is None else table.setups
     with working() as sink:
-        progress = partial(teller(sink), f"table {which}", len(setups) * len(seeds))
+        progress = partial(progress_reporter(sink), f"table {which}", len(setups) * len(seeds))
         progress(0)
         samples = flow_samples(setups, seeds, progress=progress)
     title = f"{_TITLES[which]}, {format_count(len(seeds), 'seed')}"
@@ -58,22 +58,22 @@ def paper_sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet
     """Return a table of the paper.
 
     Args:
-        title: Above it.
+        title: Its title.
         rows: Its rows.
-        is_ping: Whether delays are round trips, in milliseconds for people.
+        is_ping: True if delays are round trips, which are shown in milliseconds.
     """
     labels = [_LABELS[name] for name in rows[0].labels]
     delay, loss = _columns("delay", 1e3 if is_ping else 1.0), _columns("loss", 100)
     columns = [*labels, *delay, *loss, _REASON]
-    found = [(*row.labels.values(), *_values(row.delay), *_values(row.loss), row.reason) for row in rows]
-    # What is the same in all rows is left to the title.
-    shown = [one.name for one in labels if len({row.labels[one.name] for row in rows}) > 1]
-    what = "mean round trip (ms)" if is_ping else "sum of delays (s)"
+    values = [(*row.labels.values(), *_values(row.delay), *_values(row.loss), row.reason) for row in rows]
+    # Labels that are equal in all rows are omitted, because the title has them.
+    shown = [label.name for label in labels if len({row.labels[label.name] for row in rows}) > 1]
+    delay_name = "mean round trip (ms)" if is_ping else "sum of delays (s)"
     return Sheet(
         columns,
-        found,
+        values,
         [
-            SheetPart(f"{title}: {what}", [*shown, *(column.name for column in delay)]),
+            SheetPart(f"{title}: {delay_name}", [*shown, *(column.name for column in delay)]),
             SheetPart(
                 "packets that did not arrive (%)",
                 [*shown, *(column.name for column in loss if column.head != "seeds"), _REASON.name],
@@ -83,18 +83,20 @@ def paper_sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet
 
 
 def _columns(name: str, factor: float) -> list[SheetColumn]:
-    """Return the columns of a cell, of seconds or shares, and by what they are multiplied for people."""
+    """Return the columns of a cell of seconds or shares; `factor` is the one from SI to the shown unit."""
     suffix = "" if name == "loss" else "_s"
     return [
         SheetColumn(f"{name}_paper{suffix}", "paper", "as printed", factor, digits=6),
         SheetColumn(f"{name}{suffix}", "ours", "mean over seeds", factor),
-        SheetColumn(f"{name}_low{suffix}", "from", "begin of its 95 % interval", factor),
-        SheetColumn(f"{name}_high{suffix}", "to", "its end", factor),
-        SheetColumn(f"{name}_seeds", "seeds", "with how many anything arrived" if name == "delay" else ""),
+        SheetColumn(f"{name}_low{suffix}", "from", "lower end of its 95 % interval", factor),
+        SheetColumn(f"{name}_high{suffix}", "to", "upper end", factor),
+        SheetColumn(
+            f"{name}_seeds", "seeds", "number of seeds with which packets arrived" if name == "delay" else ""
+        ),
         SheetColumn(
             f"{name}_agreement",
             "verdict",
-            "whether the printed value, as it was rounded, lies in the interval, or is our mean",
+            "whether the printed value, with its precision, is within the interval, or equals our mean",
         ),
         SheetColumn(f"{name}_off{suffix}", "off", "ours less the paper's", factor),
     ]
@@ -106,7 +108,7 @@ def _values(cell: PaperCell) -> tuple[Value, ...]:
 
 
 def summary(rows: Sequence[PaperRow]) -> str:
-    """Return in words how many cells of a table agree."""
+    """Return a sentence on how many cells of a table agree."""
     cells = [cell for row in rows for cell in (row.delay, row.loss)]
     agree = [cell for cell in cells if cell.agreement is Agreement.AGREES]
     by_mean = sum(cell.agrees_by_mean for cell in agree)
@@ -116,36 +118,36 @@ def summary(rows: Sequence[PaperRow]) -> str:
     )
 
 
-def claim_sheet(title: str, found: Sequence[Claim]) -> Sheet:
-    """Return the paper's claims.
+def claim_sheet(title: str, claims: Sequence[Claim]) -> Sheet:
+    """Return the table of the paper's claims.
 
     Args:
-        title: Above it.
-        found: What came of them.
+        title: Its title.
+        claims: The claims with their results.
     """
     columns = (
         SheetColumn("than", "against", ""),
         SheetColumn("lines", "rows", "with line of sight, without, or all"),
         SheetColumn("quantity", "of", ""),
-        SheetColumn("paper", "paper", "in its words", 100, digits=6),
-        SheetColumn("tables", "tables", "by its tables 1 and 3", 100),
+        SheetColumn("paper", "paper", "as it states", 100, digits=6),
+        SheetColumn("tables", "tables", "from its tables 1 and 3", 100),
         SheetColumn("ours", "ours", "relative change of the delay of a packet, or change of loss in points", 100),
-        SheetColumn("low", "from", "begin of its 95 % interval", 100),
-        SheetColumn("high", "to", "its end", 100),
-        SheetColumn("row_count", "n", "rows that it comes from"),
-        SheetColumn("agreement", "verdict", "whether the paper's words lie in the interval"),
+        SheetColumn("low", "from", "lower end of its 95 % interval", 100),
+        SheetColumn("high", "to", "upper end", 100),
+        SheetColumn("row_count", "n", "number of rows that it is based on"),
+        SheetColumn("agreement", "verdict", "whether the paper's statement is within the interval"),
     )
     rows = [
         (
-            one.than,
-            one.lines,
-            one.quantity,
-            None if one.claimed is None else one.claimed.value,
-            one.tabled,
-            *(one.ours.value, one.ours.low, one.ours.high),
-            one.rows,
-            str(one.agreement or ""),
+            claim.than,
+            claim.lines,
+            claim.quantity,
+            None if claim.claimed is None else claim.claimed.value,
+            claim.tabled,
+            *(claim.ours.value, claim.ours.low, claim.ours.high),
+            claim.rows,
+            str(claim.agreement or ""),
         )
-        for one in found
+        for claim in claims
     ]
     return Sheet(columns, rows, [SheetPart(title, [column.name for column in columns])])

@@ -1,7 +1,7 @@
-"""Flows as rows of trial.csv, so that aggregate, compare, report and export read simulations beside trials.
+"""Flows as rows of trial.csv, so that aggregate, compare, report and export read simulations like trials.
 
-A flow under one seed is a result. What a simulation cannot know as a trial does has no column here: sizes of files,
-clocks, captures. Delays are the network's own; what the sync policy added to them is in none of them.
+Each flow with each seed is a repeat. Columns that apply to trials only are missing: sizes of files, clocks, captures.
+Delays are those of the network, without the delay that the sync policy added.
 """
 
 import hashlib
@@ -18,19 +18,19 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 
 BACKEND: Final = "cosim"
 
-_OF_NO_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration"})
-"""Keys of a scenario that leave it the same procedure: what is compared, and how often and how long it is run."""
+_NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration"})
+"""Keys of a scenario that do not change the procedure: what is compared, the number of runs, and their duration."""
 
 
 def table(trial: str, scenario: CosimScenario, policy: str, number: int, result: SeedResult) -> str:
     """Return a trial.csv with a row for each flow of a run.
 
     Args:
-        trial: Name of the folder in which all runs are.
-        scenario: What was run.
-        policy: The sync policy in words.
+        trial: Name of the folder of all runs.
+        scenario: The scenario.
+        policy: The sync policy, as text.
         number: Number of the run, from 1.
-        result: What came of it.
+        result: The result of the run.
     """
     rows = [
         _identity(trial, scenario, policy, result, flow)
@@ -46,8 +46,8 @@ def _identity(
     trial: str, scenario: CosimScenario, policy: str, result: SeedResult, flow: FlowResult
 ) -> dict[str, Value]:
     distance_m = _distance_m(flow, scenario, result.starts_m)
-    written = scenario.model_dump(mode="json", by_alias=True)
-    procedure = {key: value for key, value in written.items() if key not in _OF_NO_PROCEDURE}
+    dumped = scenario.model_dump(mode="json", by_alias=True)
+    procedure = {key: value for key, value in dumped.items() if key not in _NOT_PROCEDURE}
     return {
         "schema_version": SCHEMA_VERSION,
         "trial": f"{trial}/{flow.name}",
@@ -65,7 +65,7 @@ def _identity(
         "sender": flow.source,
         "receiver": flow.destination,
         "relay": scenario.relay or "",
-        "profiles_sha256": _digest(written["agents"]),
+        "profiles_sha256": _digest(dumped["agents"]),
         "procedure_sha256": _digest(procedure),
     }
 
@@ -77,7 +77,7 @@ def _measured(flow: FlowResult) -> dict[str, Value]:
         datagrams = {"datagrams_sent": flow.sent, "datagrams_received": flow.arrived, "datagram_loss": flow.loss}
     return (
         datagrams
-        | _pinged(flow)
+        | _ping_columns(flow)
         | {
             "byte_loss": 1 - flow.arrived_bytes / flow.sent_bytes if flow.sent_bytes else math.nan,
             "transfer_s": flow.first_to_last_s,
@@ -102,8 +102,8 @@ def _measured(flow: FlowResult) -> dict[str, Value]:
     )
 
 
-def _pinged(flow: FlowResult) -> dict[str, Value]:
-    """Return the columns of a ping, whose request and answer carry 8 bytes of header, here UDP's, as ICMP's."""
+def _ping_columns(flow: FlowResult) -> dict[str, Value]:
+    """Return the columns of a ping; payload sizes are comparable, as UDP and ICMP have headers of 8 bytes."""
     trips = flow.round_trips
     if trips is None:
         return {}
@@ -126,11 +126,11 @@ def _is_missing(value: Value) -> bool:
 
 
 def _distance_m(flow: FlowResult, scenario: CosimScenario, starts_m: Mapping[str, Vector]) -> float:
-    """Return the distance of a flow at time 0, to the millimetre: with a relay the one to it, as trials have it."""
-    relayed = scenario.topology is Topology.MASTER and scenario.relay is not None
-    other = scenario.relay if relayed and scenario.relay else flow.destination
+    """Return the distance of a flow at time 0, to the millimetre; with a relay, the distance to it, as in trials."""
+    is_relayed = scenario.topology is Topology.MASTER and scenario.relay is not None
+    other = scenario.relay if is_relayed and scenario.relay else flow.destination
     return round(math.dist(starts_m[flow.source], starts_m[other]), 3)
 
 
-def _digest(written: object) -> str:
-    return hashlib.sha256(json.dumps(written, sort_keys=True).encode()).hexdigest()[:16]
+def _digest(value: object) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,1 +1,1 @@
-"""Sync policies: until when physics and network go on without each other, and what they then know."""
+"""Synchronization policies: how long physics and network run independently, and which states the network assumes."""

@@ -1,4 +1,4 @@
-"""Protocol of a sync policy, and what it is told and answers."""
+"""Protocol of a sync policy, and its input."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -15,21 +15,21 @@ Pair = tuple[str, str]
 
 @dataclass(slots=True)
 class Situation:
-    """What a policy decides by. It is alive: a co-simulation has one, which goes on with it.
+    """The input of a policy. A co-simulation has one object, which it updates as it advances.
 
     Attributes:
-        now_ns: Both simulators have reached this time.
-        states: Of the agents, now.
-        pairs: Who may send to whom.
-        next_wake_ns: Asks when a program wakes next by itself; None for never.
-        next_event_ns: Asks when something happens next in the network; None for never.
-        physics_step_ns: Own step of the physics.
-        limits_m_s2: The most that each agent's velocity changes per second.
-        next_send_ns: Before when surely no program sends anything; told to policies that look ahead.
-        known: Where the network takes the agents to be now, and how to go on; told to policies that look ahead, and
-            None for where they are, standing.
-        others: Agents that forward or interfere, or sent without being in `pairs`.
-        fixed_m: Places of what interferes without being an agent.
+        now_ns: Time that both simulators have reached.
+        states: States of the agents now.
+        pairs: Sender and receiver of each possible transmission.
+        next_wake_ns: Returns the next time at which a program's timer wakes it, or None.
+        next_event_ns: Returns the time of the next event in the network, or None.
+        physics_step_ns: The step of the physics.
+        limits_m_s2: Largest change of each agent's velocity per second.
+        next_send_ns: Time before which no program sends, or None; only set for policies that look ahead.
+        assumed: States of the agents that the network assumes now, and from which it extrapolates; only set for
+            policies that look ahead. None means: at their positions, not moving.
+        other_agents: Agents that forward or interfere, or have sent without being in `pairs`.
+        fixed_emitters_m: Positions of sources of interference that are not agents.
     """
 
     now_ns: int
@@ -40,47 +40,47 @@ class Situation:
     physics_step_ns: int
     limits_m_s2: Mapping[str, float]
     next_send_ns: int | None = None
-    known: Mapping[str, State] | None = None
-    others: tuple[str, ...] = ()
-    fixed_m: tuple[Vector, ...] = ()
+    assumed: Mapping[str, State] | None = None
+    other_agents: tuple[str, ...] = ()
+    fixed_emitters_m: tuple[Vector, ...] = ()
 
     @property
     def next_ns(self) -> int | None:
-        """When anything happens next, None for never."""
-        known = [at_ns for at_ns in (self.next_wake_ns(), self.next_event_ns()) if at_ns is not None]
-        return max(min(known), self.now_ns) if known else None
+        """The time of the next event of programs or network, or None."""
+        times_ns = [at_ns for at_ns in (self.next_wake_ns(), self.next_event_ns()) if at_ns is not None]
+        return max(min(times_ns), self.now_ns) if times_ns else None
 
     @property
     def next_use_ns(self) -> int | None:
-        """When the network may next have to know where anybody is, None for never."""
-        known = [at_ns for at_ns in (self.next_send_ns, self.next_event_ns()) if at_ns is not None]
-        return max(min(known), self.now_ns) if known else None
+        """The earliest time at which the network may need the position of an agent, or None."""
+        times_ns = [at_ns for at_ns in (self.next_send_ns, self.next_event_ns()) if at_ns is not None]
+        return max(min(times_ns), self.now_ns) if times_ns else None
 
 
 class SyncPolicy(Protocol):
-    """Decides how long each window is, and what crosses its borders how.
+    """Determines the length of each window, and how data crosses its borders.
 
-    One that can say what decided the last window has a text `decided_by`, which is asked for where a run is recorded.
-    One that has `goes_on` is a `LookingAhead`.
+    A policy may have a text `decided_by` that describes what determined the last window; recordings contain it. A
+    policy with a method `extended_end_ns` is a `LookingAhead`.
 
     Attributes:
-        name: As scenarios and tables have it.
-        exact: Whether no event lies within a window but at its end, so that nothing is known late.
-        holds_sends: Whether a packet enters the network only when the window ends in which it was sent.
-        knows_end: Whether the network knows, for a whole window, where agents are at its end, which then belongs to
-            it; else at its beginning.
-        holds_arrivals: Whether an arrival counts from the end of its window; else from its own time, which the
-            receiver has passed already.
+        name: Its name in scenarios and tables.
+        exact: True if every event is at the end of a window, so that no information is used late.
+        defers_sends: True if a packet enters the network at the end of the window in which it was sent.
+        uses_end_states: True if the network uses the states at the end of a window for the whole window; its end then
+            belongs to it. Otherwise it uses the states at its beginning.
+        defers_arrivals: True if an arrival counts from the end of its window; otherwise it has its own time, which
+            its receiver has passed already.
     """
 
     name: str
     exact: bool
-    holds_sends: bool
-    knows_end: bool
-    holds_arrivals: bool
+    defers_sends: bool
+    uses_end_states: bool
+    defers_arrivals: bool
 
     def next_window(self, situation: Situation) -> int | None:
-        """Return when the next window ends, called once for each; None where nothing will ever happen.
+        """Return the end of the next window, or None if there are no more events. It is called once per window.
 
         Raises:
             PolicyError: The policy has no window for this situation.
@@ -90,46 +90,47 @@ class SyncPolicy(Protocol):
 
 @runtime_checkable
 class LookingAhead(SyncPolicy, Protocol):
-    """A policy that lets physics and programs go ahead of the network, and sees how far they may.
+    """A policy that advances physics and programs ahead of the network, and determines how far.
 
-    It holds arrivals: as they count from the window's end, nothing before it depends on what the network does.
+    It defers arrivals: because they count from the end of the window, nothing before it depends on the network.
     """
 
-    def moves_on_every_ns(self, situation: Situation) -> int:
-        """Return in which steps the network lets agents move on in the window that begins now.
+    def reckoning_step_ns(self, situation: Situation) -> int:
+        """Return the step of the network's dead reckoning in the window that begins now.
 
         Args:
-            situation: How things are now; `known` tells the velocities at which agents will move on.
+            situation: The present situation; `assumed` has the velocities that the network will extrapolate.
         """
         ...
 
-    def goes_on(self, situation: Situation) -> int:
-        """Return until when a window goes on that physics and programs have come to `situation.now_ns` in.
+    def extended_end_ns(self, situation: Situation) -> int:
+        """Return a later end of a window in which physics and programs have reached `situation.now_ns`.
 
         Args:
-            situation: How things are now, but for the network, which is at the window's begin: what it will do next
-                is told as it was then, and who sent anything in the window may ask for places at once.
+            situation: The present situation, except for the network, which is still at the beginning of the window:
+                its next event is the one that it had then. A program that has sent in the window may require
+                positions immediately.
 
         Returns:
-            When to look again; now, to let the window end here.
+            Time of the next call; `situation.now_ns` if the window must end now.
         """
         ...
 
 
 class PolicyError(ConfigurationError):
-    """A policy has no window: says when, for whom, and why."""
+    """A policy has no window; the message has the time, the pair and the reason."""
 
 
 def window_ns(policy: str, window_s: float) -> float:
-    """Return the length of a window in nanoseconds, which need not be whole.
+    """Return the length of a window in nanoseconds, which need not be a whole number.
 
     Raises:
-        PolicyError: It is no positive time.
+        PolicyError: It is not a positive time.
     """
     if not 0 < window_s < math.inf:
         raise PolicyError(
-            f"a window of {window_s:g} s is no positive time",
+            f"a window of {window_s:g} s is not a positive time",
             where=policy,
-            remedy="give it some milliseconds, for example 0.01 s",
+            remedy="use some milliseconds, for example 0.01 s",
         )
     return window_s * 1e9

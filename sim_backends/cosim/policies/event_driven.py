@@ -1,4 +1,4 @@
-"""`event_driven` (CPS-Sim): the physics is made to stand at the exact time of every event of the network."""
+"""`event_driven` (CPS-Sim): the physics stops at the exact time of every network event."""
 
 from sim_backends.cosim.policies.base import Situation
 
@@ -8,10 +8,10 @@ class EventDriven:
 
     name = "event_driven"
     exact = True
-    holds_sends = False
-    knows_end = True
-    holds_arrivals = False
+    defers_sends = False
+    uses_end_states = True
+    defers_arrivals = False
 
     def next_window(self, situation: Situation) -> int | None:
-        """See `SyncPolicy.next_window`."""
+        """Return the time of the next event, or None if there are no more events."""
         return situation.next_ns

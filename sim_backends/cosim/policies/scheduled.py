@@ -1,16 +1,16 @@
-"""`scheduled` (FlyNetSim): one common sampling period; what the faster simulator produced waits for the next sample.
+"""`scheduled` (FlyNetSim): one common sampling period; output of the faster simulator waits for the next sample.
 
-The network simulator is the faster one. It gets packets as they are sent, with the states of the last sample; what it
-delivers waits in a buffer for the next.
+The network simulator is the faster one. Packets enter it when they are sent, with the states of the last sample; its
+deliveries wait in a buffer for the next sample.
 """
 
 from sim_backends.cosim.policies.fixed import FixedWindow
 
 
 class Scheduled(FixedWindow):
-    """Packets go into the network at once, and out of it at samples."""
+    """Packets enter the network immediately, and leave it at samples."""
 
     name = "scheduled"
-    holds_sends = False
-    knows_end = False
-    holds_arrivals = True
+    defers_sends = False
+    uses_end_states = False
+    defers_arrivals = True

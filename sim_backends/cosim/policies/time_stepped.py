@@ -1,16 +1,16 @@
-"""`time_stepped` (PiccSim, RoboNetSim): both simulators halt at fixed thresholds, and share data only there.
+"""`time_stepped` (PiccSim, RoboNetSim): both simulators stop at fixed thresholds, and exchange data only there.
 
-Both go through a window side by side. What is sent in it enters the network at its end, what arrives in it counts
-from there, and the network knows where the agents were at its beginning.
+Both simulate a window in parallel. Packets sent in it enter the network at its end, arrivals in it count from its
+end, and the network uses the states at its beginning.
 """
 
 from sim_backends.cosim.policies.fixed import FixedWindow
 
 
 class TimeStepped(FixedWindow):
-    """Data is shared at thresholds only."""
+    """Data is exchanged at thresholds only."""
 
     name = "time_stepped"
-    holds_sends = True
-    knows_end = False
-    holds_arrivals = True
+    defers_sends = True
+    uses_end_states = False
+    defers_arrivals = True

@@ -4,16 +4,16 @@ from sim_backends.cosim.policies.base import Situation
 
 
 class VariableStepped:
-    """A window lasts until the physics' next step, or the next event, whichever is first."""
+    """A window lasts until the next step of the physics or the next event, whichever is first."""
 
     name = "variable_stepped"
     exact = True
-    holds_sends = False
-    knows_end = True
-    holds_arrivals = False
+    defers_sends = False
+    uses_end_states = True
+    defers_arrivals = False
 
     def next_window(self, situation: Situation) -> int:
-        """See `SyncPolicy.next_window`."""
+        """Return the time of the next step or event."""
         step_ns = situation.physics_step_ns
         next_step_ns = (situation.now_ns // step_ns + 1) * step_ns
         next_ns = situation.next_ns

@@ -1,4 +1,4 @@
-"""`velocity_aware`: the paper's rule made safe, with the magnitude of the relative velocity and within bounds."""
+"""`velocity_aware`: the paper's rule made safe, with the magnitude of the relative velocity and with limits."""
 
 import math
 from collections.abc import Sequence
@@ -13,17 +13,17 @@ class VelocityAware:
 
     Args:
         window_s: w, in seconds.
-        longest_s: What no window exceeds.
+        longest_s: Longest window, in seconds.
 
     Raises:
-        PolicyError: One of them is no positive time.
+        PolicyError: One of them is not a positive time.
     """
 
     name = "velocity_aware"
     exact = False
-    holds_sends = False
-    knows_end = True
-    holds_arrivals = False
+    defers_sends = False
+    uses_end_states = True
+    defers_arrivals = False
 
     def __init__(self, window_s: float = 0.001, longest_s: float = 0.1) -> None:
         self._window_ns = window_ns(self.name, window_s)
@@ -32,7 +32,7 @@ class VelocityAware:
         self._pair: Sequence[str] = ()
 
     def next_window(self, situation: Situation) -> int:
-        """See `SyncPolicy.next_window`."""
+        """Return the end of the next window."""
         states = situation.states
         slowest_m_s, self._pair = min(
             (
@@ -46,5 +46,5 @@ class VelocityAware:
 
     @property
     def decided_by(self) -> str:
-        """The pair with the lowest relative velocity in the last window; see `SyncPolicy`."""
+        """The pair with the lowest relative velocity in the last window."""
         return " and ".join(self._pair)

@@ -1,1 +1,1 @@
-"""Programs that agents of a scenario run."""
+"""The programs that run on the agents of a scenario."""

@@ -1,20 +1,20 @@
-"""Programs that follow others by what the network delivers of them, and by nothing else.
+"""Programs that follow other agents, using only the states that the network delivers.
 
-A state that was received is as old as it took to come, and as its time stamp tells: it is extrapolated to now at its
-velocity. So every delay, and every error in the time of a delivery, becomes an error of position: after a time d a
-leader that changes its velocity by a per second is a d^2 / 2 off from where it is believed to be. Who hears nothing
-for longer than a time-out stops.
+A received state is as old as its transmission took, which its time stamp shows; it is extrapolated to the present at
+its velocity. So every delay, and every error of a delivery time, becomes a position error: after a time d, a leader
+that changes its velocity by a per second is a d^2 / 2 away from its extrapolated position. A follower that receives
+nothing for longer than a timeout stops.
 
 `FollowAtHeadway` keeps a constant time headway h, so a distance r + h v. With the error e = gap - r - h v it
-accelerates by ((v_leader - v) + k e) / h, so that e shrinks by exp(-k t) (Ioannou and Chien, "Autonomous intelligent
-cruise control", IEEE Trans. Veh. Technol. 42, 1993). With a leader that is heard with the delay d and
-extrapolated, from leader to follower
+accelerates by ((v_leader - v) + k e) / h, so that e decays by exp(-k t) (Ioannou and Chien, "Autonomous intelligent
+cruise control", IEEE Trans. Veh. Technol. 42, 1993). For a leader whose states arrive with the delay d and are
+extrapolated, the transfer function from leader to follower is
 
     Gamma(s) = exp(-d s) (s + k (1 + d s)) / ((h s + 1) (s + k)).
 
 A row of such vehicles is string stable if |Gamma(jw)| <= 1 for all w (Ploeg, van de Wouw and Nijmeijer, "Lp string
-stability of cascaded systems", IEEE Trans. Control Syst. Technol. 22, 2014): here, as |Gamma|^2 - 1 has the
-sign of (1 + k d)^2 - 1 - (h k)^2 - (h w)^2, if d <= (sqrt(1 + (h k)^2) - 1) / k.
+stability of cascaded systems", IEEE Trans. Control Syst. Technol. 22, 2014). Since |Gamma|^2 - 1 has the sign of
+(1 + k d)^2 - 1 - (h k)^2 - (h w)^2, it is here if d <= (sqrt(1 + (h k)^2) - 1) / k.
 """
 
 import math
@@ -24,7 +24,7 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.programs.beats import PERIOD_NS, Beat, NeverSends
+from sim_backends.cosim.programs.beats import PERIOD_NS, NeverSends, PeriodicTimer
 from sim_backends.cosim.programs.way_points import drive_towards
 from sim_backends.network.packets import Received
 from sim_backends.physics.body import Twist, Velocity
@@ -32,40 +32,44 @@ from sim_backends.world.dead_reckoning import moved_on
 from sim_backends.world.motion import State
 
 TIMEOUT_NS: Final = 1_000_000_000
-"""After how long without a state a follower stops, if it is not told otherwise."""
+"""Default time without a state after which a follower stops."""
 
 
 class LatestStates:
-    """What was heard last of others.
+    """The latest states received from other agents.
 
     Args:
-        names: The others.
-        timeout_ns: For how long a state is believed, from when it arrived.
+        names: The other agents.
+        timeout_ns: How long a state is valid after its arrival.
+
+    Raises:
+        ConfigurationError: There are no other agents, or the timeout is not above 0.
     """
 
     def __init__(self, names: Sequence[str], timeout_ns: int) -> None:
         if not names or timeout_ns <= 0:
             raise ConfigurationError(
-                f"nobody to follow, or a time-out of {timeout_ns} ns", remedy="name a leader, and a time-out above 0"
+                f"there is no agent to follow, or the timeout of {timeout_ns} ns is not above 0",
+                remedy="name a leader, and a timeout above 0",
             )
         self._names = tuple(names)
         self._timeout_ns = timeout_ns
-        self._last: dict[str, Received] = {}
+        self._latest: dict[str, Received] = {}
 
-    def hear(self, received: Sequence[Received]) -> None:
-        """Keep the newest state of each, by its time stamp."""
-        for one in received:
-            known = self._last.get(one.source)
-            if isinstance(one.payload, State) and (known is None or one.sent_ns >= known.sent_ns):
-                self._last[one.source] = one
+    def update(self, received: Sequence[Received]) -> None:
+        """Keep the state of each agent that has the latest time stamp."""
+        for datagram in received:
+            latest = self._latest.get(datagram.source)
+            if isinstance(datagram.payload, State) and (latest is None or datagram.sent_ns >= latest.sent_ns):
+                self._latest[datagram.source] = datagram
 
-    def now(self, now_ns: int) -> list[State]:
-        """Return where those are now that are believed, as far as one knows who hears them."""
-        heard = (self._last[name] for name in self._names if name in self._last)
+    def at(self, now_ns: int) -> list[State]:
+        """Return the extrapolated states of the agents whose latest state is still valid."""
+        latest = (self._latest[name] for name in self._names if name in self._latest)
         return [
-            moved_on(one.payload, (now_ns - one.sent_ns) / 1e9)
-            for one in heard
-            if now_ns - one.arrived_ns <= self._timeout_ns
+            moved_on(datagram.payload, (now_ns - datagram.sent_ns) / 1e9)
+            for datagram in latest
+            if now_ns - datagram.arrived_ns <= self._timeout_ns
         ]
 
 
@@ -73,17 +77,17 @@ class FollowAtHeadway(NeverSends):
     """Drives behind a leader at a constant time headway.
 
     Args:
-        leader: Whom it follows; its states have to come over the network.
-        headway_s: Time by which it is behind.
-        standstill_m: How far behind it stands, from antenna to antenna.
-        gain_per_s: By what an error of the distance shrinks.
-        top_speed_m_s: The most that it drives.
-        period_ns: From one command to the next.
-        timeout_ns: After how long without a state it stops.
-        begin_ns: When it is steered first.
+        leader: Name of the leader, whose states must arrive over the network.
+        headway_s: Time headway.
+        standstill_m: Distance at standstill, from antenna to antenna.
+        gain_per_s: Rate at which an error of the distance decays.
+        top_speed_m_s: Top speed.
+        period_ns: Time between commands.
+        timeout_ns: Time without a state after which it stops.
+        begin_ns: Time of the first command.
 
     Raises:
-        ConfigurationError: A number of these is not above 0.
+        ConfigurationError: One of these numbers is not above 0.
     """
 
     def __init__(
@@ -100,57 +104,57 @@ class FollowAtHeadway(NeverSends):
     ) -> None:
         if min(headway_s, standstill_m, gain_per_s, top_speed_m_s, period_ns) <= 0:
             raise ConfigurationError(
-                f"nobody follows {leader} {headway_s:g} s and {standstill_m:g} m behind at up to "
-                f"{top_speed_m_s:g} m/s, with a gain of {gain_per_s:g}/s and every {period_ns} ns",
-                remedy="all of these have to be above 0",
+                f"cannot follow {leader} {headway_s:g} s and {standstill_m:g} m behind at up to "
+                f"{top_speed_m_s:g} m/s, with a gain of {gain_per_s:g}/s, steered every {period_ns} ns",
+                remedy="set all of these to values above 0",
             )
-        self._heard = LatestStates([leader], timeout_ns)
+        self._leader = LatestStates([leader], timeout_ns)
         self._headway_s = headway_s
         self._standstill_m = standstill_m
         self._gain_per_s = gain_per_s
         self._top_speed_m_s = top_speed_m_s
         self._period_s = period_ns / 1e9
-        self._beat = Beat(period_ns, begin_ns)
+        self._timer = PeriodicTimer(period_ns, begin_ns)
 
     def next_wake_ns(self) -> int:
-        """See `Program.next_wake_ns`."""
-        return self._beat.next_ns
+        """Return the time of the next command."""
+        return self._timer.next_ns
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-        """See `Program.wake`."""
-        self._heard.hear(received)
-        if not self._beat.is_due(now_ns):
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Keep received states; if a command is due, steer, or stop if there is no valid state."""
+        self._leader.update(received)
+        if not self._timer.fire_if_due(now_ns):
             return Action()
-        leaders = self._heard.now(now_ns)
-        return Action(command=self._steer(own, leaders[0]) if leaders else Twist())
+        leaders = self._leader.at(now_ns)
+        return Action(command=self._command(own_state, leaders[0]) if leaders else Twist())
 
-    def _steer(self, own: State, leader: State) -> Twist:
-        e, n = (there - here for here, there in zip(own.position_m[:2], leader.position_m[:2], strict=True))
+    def _command(self, own_state: State, leader: State) -> Twist:
+        e, n = (there - here for here, there in zip(own_state.position_m[:2], leader.position_m[:2], strict=True))
         gap_m = math.hypot(e, n)
         if not gap_m:
             return Twist()
-        ahead_m_s = (leader.velocity_m_s[0] * e + leader.velocity_m_s[1] * n) / gap_m
-        speed_m_s = math.hypot(*own.velocity_m_s[:2])
+        leader_m_s = (leader.velocity_m_s[0] * e + leader.velocity_m_s[1] * n) / gap_m
+        speed_m_s = math.hypot(*own_state.velocity_m_s[:2])
         error_m = gap_m - self._standstill_m - self._headway_s * speed_m_s
-        wanted_m_s2 = (ahead_m_s - speed_m_s + self._gain_per_s * error_m) / self._headway_s
-        wanted_m_s = speed_m_s + wanted_m_s2 * self._period_s
-        return drive_towards(own, leader.position_m[:2], min(max(wanted_m_s, 0.0), self._top_speed_m_s))
+        acceleration_m_s2 = (leader_m_s - speed_m_s + self._gain_per_s * error_m) / self._headway_s
+        target_m_s = speed_m_s + acceleration_m_s2 * self._period_s
+        return drive_towards(own_state, leader.position_m[:2], min(max(target_m_s, 0.0), self._top_speed_m_s))
 
 
 class HoldStation(NeverSends):
-    """Flies over the middle of others, at their mean velocity and what brings it there.
+    """Flies above the centre of other agents, at their mean velocity plus a correction towards that point.
 
     Args:
-        leaders: The others; their states have to come over the network.
-        above_m: How far over them.
-        top_speed_m_s: The most by which it goes after them.
-        gain_per_s: Speed for each metre that it is off.
-        period_ns: From one command to the next.
-        timeout_ns: After how long without a state one is left out; without any it hovers.
-        begin_ns: When it is steered first.
+        leaders: The other agents, whose states must arrive over the network.
+        above_m: Height above them.
+        top_speed_m_s: Largest correction of the velocity.
+        gain_per_s: Speed per metre of distance from that point.
+        period_ns: Time between commands.
+        timeout_ns: Time without a state after which a leader is ignored; without any leader it hovers.
+        begin_ns: Time of the first command.
 
     Raises:
-        ConfigurationError: There is nobody, or a number of these is not above 0.
+        ConfigurationError: There are no leaders, or one of these numbers is not above 0.
     """
 
     def __init__(
@@ -166,34 +170,34 @@ class HoldStation(NeverSends):
     ) -> None:
         if min(above_m, top_speed_m_s, gain_per_s, period_ns) <= 0:
             raise ConfigurationError(
-                f"nobody flies {above_m:g} m over others at up to {top_speed_m_s:g} m/s with a gain of "
+                f"cannot fly {above_m:g} m above others at up to {top_speed_m_s:g} m/s with a gain of "
                 f"{gain_per_s:g}/s, steered every {period_ns} ns",
-                remedy="all of these have to be above 0",
+                remedy="set all of these to values above 0",
             )
-        self._heard = LatestStates(leaders, timeout_ns)
+        self._leaders = LatestStates(leaders, timeout_ns)
         self._above_m = above_m
         self._top_speed_m_s = top_speed_m_s
         self._gain_per_s = gain_per_s
-        self._beat = Beat(period_ns, begin_ns)
+        self._timer = PeriodicTimer(period_ns, begin_ns)
 
     def next_wake_ns(self) -> int:
-        """See `Program.next_wake_ns`."""
-        return self._beat.next_ns
+        """Return the time of the next command."""
+        return self._timer.next_ns
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-        """See `Program.wake`."""
-        self._heard.hear(received)
-        if not self._beat.is_due(now_ns):
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Keep received states; if a command is due, steer, or hover if there is no valid state."""
+        self._leaders.update(received)
+        if not self._timer.fire_if_due(now_ns):
             return Action()
-        leaders = self._heard.now(now_ns)
-        return Action(command=self._steer(own, leaders) if leaders else Velocity())
+        leaders = self._leaders.at(now_ns)
+        return Action(command=self._command(own_state, leaders) if leaders else Velocity())
 
-    def _steer(self, own: State, leaders: Sequence[State]) -> Velocity:
+    def _command(self, own_state: State, leaders: Sequence[State]) -> Velocity:
         e, n, u = _mean([leader.position_m for leader in leaders])
-        off_m = [there - here for here, there in zip(own.position_m, (e, n, u + self._above_m), strict=True)]
-        after = min(self._gain_per_s, self._top_speed_m_s / (math.hypot(*off_m) or math.inf))
+        off_m = [there - here for here, there in zip(own_state.position_m, (e, n, u + self._above_m), strict=True)]
+        gain_per_s = min(self._gain_per_s, self._top_speed_m_s / (math.hypot(*off_m) or math.inf))
         v_e, v_n, v_u = _mean([leader.velocity_m_s for leader in leaders])
-        return Velocity((v_e + after * off_m[0], v_n + after * off_m[1], v_u + after * off_m[2]))
+        return Velocity((v_e + gain_per_s * off_m[0], v_n + gain_per_s * off_m[1], v_u + gain_per_s * off_m[2]))
 
 
 def _mean(vectors: Sequence[Vector]) -> Vector:

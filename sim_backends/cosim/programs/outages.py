@@ -1,4 +1,4 @@
-"""Programs on a computer that is off for a while."""
+"""Programs on a computer that is switched off for a time."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,15 +9,15 @@ from sim_backends.world.motion import State
 
 
 class Outage:
-    """A program that is off for a while: it hears and sends nothing, and its body is told to stop.
+    """A program that is off for a time: it receives and sends nothing, and its body gets a command to stop.
 
-    When it is on again it goes on as if it had only not heard and not been heard.
+    When it is on again, it continues as if all its packets in that time had been lost.
 
     Args:
         program: The program.
-        begin_ns: From when on it is off.
-        end_ns: When it is on again; None for never.
-        stop: Command that stops the body; None where there is none to be told.
+        begin_ns: Time when it goes off.
+        end_ns: Time when it is on again; None for never.
+        stop: Command that stops the body; None if there is no body to stop.
     """
 
     def __init__(self, program: Program, begin_ns: int, end_ns: int | None, stop: Any = None) -> None:  # noqa: ANN401
@@ -25,24 +25,24 @@ class Outage:
         self._begin_ns = begin_ns
         self._end_ns = end_ns
         self._stop = stop
-        self._stopped = False
+        self._is_stopped = False
 
     def next_wake_ns(self) -> int | None:
-        """See `Program.next_wake_ns`."""
+        """Return the program's next time; before the body has been stopped, at the latest the beginning."""
         wake_ns = self._program.next_wake_ns()
-        return wake_ns if self._stopped else min(self._begin_ns, self._begin_ns if wake_ns is None else wake_ns)
+        return wake_ns if self._is_stopped else min(self._begin_ns, self._begin_ns if wake_ns is None else wake_ns)
 
     def next_send_ns(self) -> int | None:
-        """See `federates.next_send_ns`."""
+        """Return the program's next time of sending."""
         return next_send_ns(self._program)
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-        """See `Program.wake`."""
-        off = self._begin_ns <= now_ns and (self._end_ns is None or now_ns < self._end_ns)
-        if not off:
-            return self._program.wake(now_ns, own, received)
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Wake the program; during the outage, discard its action, and stop the body once."""
+        is_off = self._begin_ns <= now_ns and (self._end_ns is None or now_ns < self._end_ns)
+        if not is_off:
+            return self._program.wake(now_ns, own_state, received)
         wake_ns = self._program.next_wake_ns()
         if wake_ns is not None and wake_ns <= now_ns:
-            self._program.wake(now_ns, own, ())
-        command, self._stopped = None if self._stopped else self._stop, True
+            self._program.wake(now_ns, own_state, ())
+        command, self._is_stopped = None if self._is_stopped else self._stop, True
         return Action(command=command)

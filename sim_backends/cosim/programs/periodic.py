@@ -11,13 +11,13 @@ class Periodic:
     """Publishes its agent's state at a fixed rate.
 
     Args:
-        flow: Name of the stream.
-        destination: Who gets it.
-        period_ns: From one packet to the next.
-        size_bytes: Of each packet.
-        first_ns: When the first is sent.
-        stop_ns: From when on nothing is sent; None for never.
-        protocol: Name of the transport that carries it.
+        flow: Name of the flow.
+        destination: Name of the receiving agent.
+        period_ns: Time between packets.
+        size_bytes: Size of each packet.
+        first_ns: Time of the first packet.
+        stop_ns: Time from which on nothing is sent; None for never.
+        protocol: Name of the transport.
     """
 
     def __init__(
@@ -41,16 +41,16 @@ class Periodic:
         self._number = 0
 
     def next_wake_ns(self) -> int | None:
-        """See `Program.next_wake_ns`."""
+        """Return the time of the next packet, or None after `stop_ns`."""
         return None if self._stop_ns is not None and self._next_ns >= self._stop_ns else self._next_ns
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
-        """See `Program.wake`."""
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+        """Send a packet if it is due."""
         wake_ns = self.next_wake_ns()
         if wake_ns is None or now_ns < wake_ns:
             return Action()
-        datagram = Datagram(self._destination, self._size_bytes, self._flow, self._number, own, self._protocol)
+        datagram = Datagram(self._destination, self._size_bytes, self._flow, self._number, own_state, self._protocol)
         self._number += 1
-        # Where a clock was set ahead, what was missed stays so.
+        # After a clock was set ahead, missed packets are skipped.
         self._next_ns += self._period_ns * ((now_ns - wake_ns) // self._period_ns + 1)
         return Action((datagram,))

@@ -1,4 +1,4 @@
-"""Programs that ask, and programs that answer."""
+"""Programs that send ping requests, and programs that reply to them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 
 REPLY = "/reply"
-"""What is added to a flow's name for that of its answers."""
+"""Suffix of the name of the flow of replies."""
 
 
 @dataclass(frozen=True, slots=True)
 class PingRequest:
-    """What a request says.
+    """The payload of a request.
 
     Attributes:
         flow: Its flow.
-        number: Which it is of it.
-        size_bytes: How large it is, and its answer has to be.
-        protocol: What carries both.
+        number: Its number in the flow.
+        size_bytes: Size of the request and of its reply.
+        protocol: Transport of both.
     """
 
     flow: str
@@ -29,15 +29,15 @@ class PingRequest:
 
 
 class EchoRequester:
-    """Asks at a constant rate.
+    """Sends requests at a constant rate.
 
     Args:
         flow: Name of the flow.
-        destination: Whom it asks.
-        count: How many requests.
-        interval_ns: From one to the next.
-        size_bytes: Of each.
-        first_ns: When the first is sent.
+        destination: Name of the agent that replies.
+        count: Number of requests.
+        interval_ns: Time between requests.
+        size_bytes: Size of each request.
+        first_ns: Time of the first request.
         protocol: Name of the transport.
     """
 
@@ -62,11 +62,11 @@ class EchoRequester:
         self._sent = 0
 
     def next_wake_ns(self) -> int | None:
-        """See `Program.next_wake_ns`."""
+        """Return the time of the next request, or None after the last."""
         return self._next_ns if self._sent < self._count else None
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
-        """See `Program.wake`."""
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+        """Send a request if it is due."""
         wake_ns = self.next_wake_ns()
         if wake_ns is None or now_ns < wake_ns:
             return Action()
@@ -78,18 +78,20 @@ class EchoRequester:
         )
 
 
-class PingAnswers:
-    """Answers every request at once."""
+class EchoResponder:
+    """Replies to every request immediately."""
 
     def next_wake_ns(self) -> None:
-        """See `Program.next_wake_ns`."""
+        """Return None: it wakes only when a request arrives."""
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (see Program)
-        """See `Program.wake`."""
-        requests = [(one.source, one.payload) for one in received if isinstance(one.payload, PingRequest)]
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+        """Send a reply to each received request."""
+        requests = [
+            (datagram.source, datagram.payload) for datagram in received if isinstance(datagram.payload, PingRequest)
+        ]
         return Action(
             [
-                Datagram(source, one.size_bytes, one.flow + REPLY, one.number, None, one.protocol)
-                for source, one in requests
+                Datagram(source, request.size_bytes, request.flow + REPLY, request.number, None, request.protocol)
+                for source, request in requests
             ]
         )

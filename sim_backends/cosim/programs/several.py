@@ -1,4 +1,4 @@
-"""Programs that run side by side on one agent."""
+"""Several programs of one agent as one program."""
 
 from collections.abc import Sequence
 
@@ -8,26 +8,32 @@ from sim_backends.world.motion import State
 
 
 class Several:
-    """Programs of one agent as one: each wakes when it wants to, and all get what arrives.
+    """Combines programs of one agent: each wakes at its own times, and all receive all datagrams.
 
     Args:
-        programs: The programs; where several steer at once, the last one counts.
+        programs: The programs; if several steer at the same time, the command of the last one applies.
     """
 
     def __init__(self, programs: Sequence[Program]) -> None:
         self._programs = tuple(programs)
 
     def next_wake_ns(self) -> int | None:
-        """See `Program.next_wake_ns`."""
-        return min((at_ns for one in self._programs if (at_ns := one.next_wake_ns()) is not None), default=None)
+        """Return the earliest time of any program."""
+        times_ns = (program.next_wake_ns() for program in self._programs)
+        return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
 
     def next_send_ns(self) -> int | None:
-        """See `federates.next_send_ns`."""
-        return min((at_ns for one in self._programs if (at_ns := next_send_ns(one)) is not None), default=None)
+        """Return the earliest time before which no program sends."""
+        times_ns = (next_send_ns(program) for program in self._programs)
+        return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-        """See `Program.wake`."""
-        actions = [one.wake(now_ns, own, received) for one in self._programs if received or _is_due(one, now_ns)]
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Wake the programs that are due, or all if a datagram has arrived."""
+        actions = [
+            program.wake(now_ns, own_state, received)
+            for program in self._programs
+            if received or _is_due(program, now_ns)
+        ]
         commands = [action.command for action in actions if action.command is not None]
         datagrams = tuple(datagram for action in actions for datagram in action.datagrams)
         return Action(datagrams, commands[-1] if commands else None)

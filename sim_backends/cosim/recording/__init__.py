@@ -1,1 +1,1 @@
-"""Recordings of runs: written while a run goes on, readable whenever it ended, and replayed to the same numbers."""
+"""Recordings of runs: written during a run, readable after any end of it, and replayed to the same numbers."""

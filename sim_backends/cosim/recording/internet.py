@@ -1,8 +1,8 @@
-"""IP packets of the simulated network as bytes: headers as they would have been on the wire, all of data zeros.
+"""Encodes the IP packets of the simulated network as bytes: headers as on the wire, data as zeros.
 
-IPv4 of RFC 791, UDP of RFC 768, TCP of RFC 9293 with the options of RFC 7323 (timestamps, window scale) and RFC 2018
-(SACK). Addresses and ports are of our own choice, since the simulated network has names; all the rest is what it
-decided. Sequence numbers begin at 0, timestamps count milliseconds of simulated time.
+IPv4 as in RFC 791, UDP as in RFC 768, TCP as in RFC 9293 with the options of RFC 7323 (timestamps, window scale) and
+RFC 2018 (SACK). Addresses and ports are assigned here, since the simulated network has names; everything else comes
+from the simulation. Sequence numbers begin at 0, timestamps count milliseconds of simulated time.
 """
 
 import struct
@@ -17,16 +17,16 @@ from sim_backends.network.wire import IpPacket
 
 _TCP, _UDP = 6, 17
 _FIRST_HOST: Final = int(IPv4Address("10.0.0.1"))
-_EVERYONE: Final = IPv4Address("239.255.0.1").packed
-"""To which a packet for everyone goes: the group of the discovery of DDS (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
+_MULTICAST: Final = IPv4Address("239.255.0.1").packed
+"""Destination of packets for all hosts: the multicast group of DDS discovery (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
 _TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
-"""Of DDS: for the first participant of a host, and for all (DDSI-RTPS 2.5, 9.6.1.1)."""
+"""Ports of DDS: of the first participant of a host, and of discovery (DDSI-RTPS 2.5, 9.6.1.1)."""
 _FIRST_PORT: Final = 40_000
-"""Of the first flow at its destination; each further one has the next."""
-_EPHEMERAL: Final = 50_000
-"""Likewise at its source: among the ports that nobody is assigned (RFC 6335, 6), of which tcpdump claims 49152."""
+"""Destination port of the first flow; each further flow has the next."""
+_FIRST_EPHEMERAL_PORT: Final = 50_000
+"""Source port of the first flow: a dynamic port (RFC 6335, section 6), of which tcpdump decodes 49152 specially."""
 _PORTS: Final = 9_000
-"""After so many, ports are used again."""
+"""Number of ports after which they are reused."""
 
 _IP: Final = struct.Struct(">BBHHHBBH4s4s")
 _UDP_HEADER: Final = struct.Struct(">HHHH")
@@ -34,12 +34,12 @@ _TCP_HEADER: Final = struct.Struct(">HHIIBBHHH")
 _SYN, _PUSH, _ACK = 0x02, 0x08, 0x10
 _MORE_FRAGMENTS: Final = 0x2000
 _WINDOW_SCALE: Final = 7
-"""What Linux takes for a receive buffer of 6 MiB."""
+"""Linux's value for a receive buffer of 6 MiB."""
 _MSS: Final = 1460
 
 
-class InternetBytes:
-    """Turns fragments into the bytes of IP packets.
+class IpEncoder:
+    """Encodes fragments as the bytes of IP packets.
 
     Args:
         names: The hosts; the first is 10.0.0.1, each further one has the next address.
@@ -47,21 +47,21 @@ class InternetBytes:
 
     def __init__(self, names: Sequence[str]) -> None:
         self.addresses = {name: IPv4Address(_FIRST_HOST + number) for number, name in enumerate(names)}
-        self._packed: dict[str | None, bytes] = {name: one.packed for name, one in self.addresses.items()}
-        self._packed[None] = _EVERYONE
+        self._packed: dict[str | None, bytes] = {name: address.packed for name, address in self.addresses.items()}
+        self._packed[None] = _MULTICAST
         self._flows: dict[object, int] = {}
 
-    def of(self, fragment: Fragment, most_bytes: int) -> bytes:
+    def encode(self, fragment: Fragment, max_bytes: int) -> bytes:
         """Return the first bytes of an IP packet, or of a fragment of one.
 
         Args:
             fragment: The fragment.
-            most_bytes: How many at most.
+            max_bytes: Largest number of bytes.
         """
         packet = fragment.packet
-        protocol, head = self._transport(packet)
+        protocol, transport_header = self._transport(packet)
         begin = fragment.offset_bytes
-        carried = head[begin : begin + fragment.size_bytes - HEADER_BYTES]
+        carried = transport_header[begin : begin + fragment.size_bytes - HEADER_BYTES]
         more = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
         words = (
             0x45,
@@ -74,42 +74,42 @@ class InternetBytes:
         )
         ends = self._packed[packet.source], self._packed[packet.destination]
         header = _IP.pack(*words, _checksum(_IP.pack(*words, 0, *ends)), *ends)
-        data_bytes = min(fragment.size_bytes, most_bytes) - HEADER_BYTES - len(carried)
-        return (header + carried + bytes(max(data_bytes, 0)))[:most_bytes]
+        data_bytes = min(fragment.size_bytes, max_bytes) - HEADER_BYTES - len(carried)
+        return (header + carried + bytes(max(data_bytes, 0)))[:max_bytes]
 
     def _transport(self, packet: IpPacket) -> tuple[int, bytes]:
-        """Return the number of the transport protocol, and its header."""
+        """Return the number of the transport protocol, and the transport header."""
         length = packet.size_bytes - HEADER_BYTES
         if isinstance(packet.body, tuple):
             name, segment = packet.body
             protocol, header = _TCP, self._tcp(packet, name, segment)
-            place = 16
+            checksum_offset = 16
         else:
             protocol, header = _UDP, _UDP_HEADER.pack(*self._udp_ports(packet), length, 0)
-            place = 6
+            checksum_offset = 6
         pseudo = self._packed[packet.source] + self._packed[packet.destination] + struct.pack(">HH", protocol, length)
-        # Data of zeros adds nothing to a checksum. A sum of 0 is sent as all ones (RFC 768); of TCP that is the same.
+        # Zeros as data add nothing to a checksum. A sum of 0 is sent as all ones (RFC 768); for TCP both are valid.
         checksum = _checksum(pseudo + header) or 0xFFFF
-        return protocol, header[:place] + struct.pack(">H", checksum) + header[place + 2 :]
+        return protocol, header[:checksum_offset] + struct.pack(">H", checksum) + header[checksum_offset + 2 :]
 
-    def _number(self, flow: object) -> int:
+    def _flow_number(self, flow: object) -> int:
         return self._flows.setdefault(flow, len(self._flows)) % _PORTS
 
     def _udp_ports(self, packet: IpPacket) -> tuple[int, int]:
         if packet.transport == "topic":
             return _TOPIC_PORT, _DISCOVERY_PORT if packet.destination is None else _TOPIC_PORT
-        # Only of UDP itself the identity is a flow's; others count by themselves what is to be told apart.
+        # Only with UDP itself the identity names a flow; other transports number their own packets.
         ends = packet.transport, packet.source, packet.destination
-        number = self._number(packet.identity[0] if packet.transport == "udp" else ends)
-        return _EPHEMERAL + number, _FIRST_PORT + number
+        number = self._flow_number(packet.identity[0] if packet.transport == "udp" else ends)
+        return _FIRST_EPHEMERAL_PORT + number, _FIRST_PORT + number
 
     def _tcp(self, packet: IpPacket, name: ConnectionName, segment: Segment) -> bytes:
-        number = self._number(name)
-        ports = _EPHEMERAL + number, _FIRST_PORT + number
+        number = self._flow_number(name)
+        ports = _FIRST_EPHEMERAL_PORT + number, _FIRST_PORT + number
         options = _syn_options(segment) if segment.syn else _options(segment)
         flags = (_SYN if segment.syn else 0) | (_PUSH if segment.length else 0)
         flags |= 0 if segment.acknowledges is None else _ACK
-        # The window of a SYN is never scaled (RFC 7323, 2.2).
+        # The window of a SYN is not scaled (RFC 7323, section 2.2).
         window = segment.window_bytes >> (0 if segment.syn else _WINDOW_SCALE)
         return (
             _TCP_HEADER.pack(
@@ -135,7 +135,7 @@ def _ms(at_ns: int) -> int:
 
 
 def _syn_options(segment: Segment) -> bytes:
-    """Return MSS, SACK permitted, timestamps and window scale, in the order in which Linux has them."""
+    """Return the options MSS, SACK permitted, timestamps and window scale, in the order of Linux."""
     return struct.pack(">BBHBB", 2, 4, _MSS, 4, 2) + _timestamps(segment) + bytes((1, 3, 3, _WINDOW_SCALE))
 
 
@@ -148,7 +148,7 @@ def _options(segment: Segment) -> bytes:
 
 
 def _checksum(data: bytes) -> int:
-    """Return the internet checksum (RFC 1071) of an even number of bytes, in which it is still 0."""
+    """Return the internet checksum (RFC 1071) of an even number of bytes in which the checksum field is 0."""
     total: int = sum(struct.unpack(f">{len(data) // 2}H", data))
     while total >> 16:
         total = (total & 0xFFFF) + (total >> 16)

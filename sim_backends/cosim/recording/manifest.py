@@ -1,4 +1,4 @@
-"""`run.json` of a recording: what was run, with what, and how it ended."""
+"""`run.json` of a recording: the scenario and its settings, the software versions, and the end of the run."""
 
 import fcntl
 import hashlib
@@ -18,19 +18,19 @@ from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError
 
 SCHEMA_VERSION: Final = 2
-RUN_AGAIN: Final = "take a copy of the folder if there is one, or run the scenario in it again"
-"""What helps where a recording is damaged."""
+RUN_AGAIN: Final = "use a copy of the folder if there is one, or run the scenario in it again"
+"""Remedy for a damaged recording."""
 _NAME: Final = "run.json"
 _CHECKSUM: Final = "content_hash"
-"""Its key, beside those of `RunManifest`: SHA-256 of these."""
+"""Key of the SHA-256 over the other keys, which are those of `RunManifest`."""
 
 
 class RunEnding(StrEnum):
-    """How a run ended."""
+    """The end of a run."""
 
     UNDER_WAY = "under way"
     KILLED = "killed"
-    """Who is killed says no more: `run.json` says that it is under way, and nobody writes it."""
+    """Never in `run.json`: it says `under way`, but no process holds the lock."""
     WHOLE = "whole"
     INTERRUPTED = "interrupted"
     FAILED = "failed"
@@ -38,13 +38,13 @@ class RunEnding(StrEnum):
 
 @dataclass(frozen=True)
 class About:
-    """What is run.
+    """The scenario and the settings of a run.
 
     Attributes:
         scenario: Text of the scenario.
         policy: Name of the sync policy.
-        parameters: Its parameters, plain values.
-        seed: Of all random draws.
+        parameters: Parameters of the policy, plain values.
+        seed: Seed of all random draws.
     """
 
     scenario: str
@@ -60,17 +60,17 @@ class About:
 
 @dataclass(frozen=True)
 class RunManifest:
-    """What `run.json` holds.
+    """The content of `run.json`.
 
     Attributes:
-        about: What is run.
+        about: The scenario and its settings.
         scenario_hash: SHA-256 of the scenario's text.
-        schema_version: Of the recording.
-        versions: Of fieldkit, Python and the libraries whose numbers a run depends on.
-        ending: How it ended.
-        why: Who failed and how, else empty.
-        digest: Of all events (`EventDigest`), empty while it is under way.
-        parts: BLAKE2b of each file of a table, by its path in the folder; empty while it is under way.
+        schema_version: Schema version of the recording.
+        versions: Versions of fieldkit, Python and the libraries that affect the numbers of a run.
+        ending: The end of the run.
+        why: The error that ended the run, or empty.
+        digest: Hash over all events (`EventDigest`); empty during the run.
+        parts: BLAKE2b of each file of a table, by its path in the folder; empty during the run.
     """
 
     about: About
@@ -87,12 +87,12 @@ _CODEC: Final = Codec(RunManifest)
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that `RunManifest.versions` is about, of what runs now."""
+    """Return the versions for `RunManifest.versions` of the running software."""
     return {"python": platform.python_version()} | {name: version(name) for name in ("fieldkit", "numpy")}
 
 
 def write_manifest(folder: Path, manifest: RunManifest) -> None:
-    """Write `run.json`; the one before stays where that fails.
+    """Write `run.json`; if this fails, the previous file remains.
 
     Raises:
         OSError: It cannot be written.
@@ -103,11 +103,11 @@ def write_manifest(folder: Path, manifest: RunManifest) -> None:
 
 
 @contextmanager
-def being_written(folder: Path) -> Iterator[None]:
-    """Let readers know for as long as it lasts that a recording is being written; its end may be that of the process.
+def recording_lock(folder: Path) -> Iterator[None]:
+    """Hold the lock that marks a recording as being written; the kernel releases it if the process is killed.
 
     Raises:
-        OSError: It cannot be locked.
+        OSError: The folder cannot be locked.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -117,7 +117,7 @@ def being_written(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _is_being_written(folder: Path) -> bool:
+def _is_locked(folder: Path) -> bool:
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -129,17 +129,17 @@ def _is_being_written(folder: Path) -> bool:
 
 
 def read_manifest(folder: Path) -> RunManifest:
-    """Read `run.json`; of one that says that it is under way, find out whether it is.
+    """Read `run.json`; if it says that the run is under way, check that a process is still writing it.
 
     Raises:
-        EvidenceError: There is none, it is none, or it was changed.
+        EvidenceError: It does not exist, is invalid, or was changed.
     """
-    found = _read(folder)
-    if found.ending is RunEnding.UNDER_WAY and not _is_being_written(folder):
-        found = _read(folder)  # it may have come to its end meanwhile
-        if found.ending is RunEnding.UNDER_WAY:
-            return replace(found, ending=RunEnding.KILLED)
-    return found
+    manifest = _read(folder)
+    if manifest.ending is RunEnding.UNDER_WAY and not _is_locked(folder):
+        manifest = _read(folder)  # the run may have ended since the first read
+        if manifest.ending is RunEnding.UNDER_WAY:
+            return replace(manifest, ending=RunEnding.KILLED)
+    return manifest
 
 
 def _read(folder: Path) -> RunManifest:
@@ -147,32 +147,32 @@ def _read(folder: Path) -> RunManifest:
     try:
         content = json.loads(path.read_bytes())
         checksum = content.pop(_CHECKSUM, None) if isinstance(content, dict) else None
-        found = _CODEC.parse(content)
+        manifest = _CODEC.parse(content)
     except FileNotFoundError as error:
         raise EvidenceError(
             "there is no recording of a co-simulation", where=str(folder), remedy="name the folder that has run.json"
         ) from error
     except (OSError, ValueError, RecursionError) as error:
-        raise EvidenceError(f"this is no record of a run: {error}", where=str(path), remedy=RUN_AGAIN) from error
-    if found.schema_version != SCHEMA_VERSION:
+        raise EvidenceError(f"this is not the record of a run: {error}", where=str(path), remedy=RUN_AGAIN) from error
+    if manifest.schema_version != SCHEMA_VERSION:
         raise EvidenceError(
-            f"the recording has schema version {found.schema_version}, this fieldkit reads {SCHEMA_VERSION}",
+            f"the recording has schema version {manifest.schema_version}, this fieldkit reads {SCHEMA_VERSION}",
             where=str(path),
-            remedy=f"read it with fieldkit {found.versions.get('fieldkit', '')}".rstrip(),
+            remedy=f"read it with fieldkit {manifest.versions.get('fieldkit', '')}".rstrip(),
         )
-    if found.scenario_hash != found.about.scenario_hash:
+    if manifest.scenario_hash != manifest.about.scenario_hash:
         raise EvidenceError(
             "the scenario's text is not the one that was run: its hash differs", where=str(path), remedy=RUN_AGAIN
         )
-    if found.ending is RunEnding.WHOLE and not (found.digest and found.parts):
+    if manifest.ending is RunEnding.WHOLE and not (manifest.digest and manifest.parts):
         raise EvidenceError(
-            "a run that came to its end has a digest and parts, and this says none", where=str(path), remedy=RUN_AGAIN
+            "the run is complete, but the record has no digest or no parts", where=str(path), remedy=RUN_AGAIN
         )
     if checksum != _checksum(content):
         raise EvidenceError(
             "the record was changed after the run: its hash differs", where=str(path), remedy=RUN_AGAIN
         )
-    return found
+    return manifest
 
 
 def _checksum(content: Mapping[str, Any]) -> str:

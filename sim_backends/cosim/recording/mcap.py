@@ -1,7 +1,7 @@
-"""A recording as an MCAP file, for Foxglove and for whatever else reads MCAP: where robots were, and their packets.
+"""Exports a recording as an MCAP file, for Foxglove and other readers of MCAP: states of robots, and packets.
 
-The only module of `sim_backends` that imports mcap. File format: https://mcap.dev/spec; schemas of the names
-`foxglove.*` are those that Foxglove draws: https://docs.foxglove.dev/docs/sdk/schemas.
+The only module of `sim_backends` that imports mcap. File format: https://mcap.dev/spec; the schemas with names
+`foxglove.*` are those that Foxglove displays: https://docs.foxglove.dev/docs/sdk/schemas.
 """
 
 import heapq
@@ -62,13 +62,16 @@ _PACKET: Final = _object(
         "size_bytes": {"type": "integer"},
         "arrived": {
             "type": "boolean",
-            "description": "Whether it arrived; absent where that was not known at the end.",
+            "description": "Whether it arrived; absent if that was not known at the end.",
         },
         "reason": {"type": "string", "description": "Why it never arrived; absent otherwise."},
-        "delay_s": {"type": "number", "description": "From when its program sent it until it counted as arrived."},
+        "delay_s": {
+            "type": "number",
+            "description": "Time from its sending to its arrival as its receiver counts it.",
+        },
         "added_s": {
             "type": "number",
-            "description": "How much of that is the sync policy's, and none of the network's.",
+            "description": "Part of the delay that the sync policy added.",
         },
     },
     "arrived",
@@ -79,14 +82,14 @@ _PACKET: Final = _object(
 
 
 def write_mcap(file: BinaryIO, recording: Recording) -> None:
-    """Write a recording; the same one gives the same bytes. Times are simulated, from 0 on.
+    """Write a recording; equal recordings give equal bytes. Times are simulated, from 0 on.
 
-    Topics are `/tf` with where the robots stand in the frame `world`, `/states/ROBOT` with their velocities too, and
-    `/packets/FLOW` with each packet and its fate, when it was sent.
+    The topics are `/tf` with the positions of the robots in the frame `world`, `/states/ROBOT` with positions and
+    velocities, and `/packets/FLOW` with each packet and its fate, at the time of sending.
 
     Args:
-        file: Where to.
-        recording: What was recorded.
+        file: The file to write.
+        recording: The recording.
 
     Raises:
         OSError: The file cannot be written.
@@ -124,7 +127,7 @@ def _schema_of(topic: str) -> Json:
 def _states(recording: Recording) -> Iterator[Message]:
     for at_ns, agent, state in recording.states:
         time, position = _time(at_ns), _vector(state.position_m)
-        half_rad = (state.heading_rad or 0.0) / 2  # of a rotation about up; who has no heading looks east
+        half_rad = (state.heading_rad or 0.0) / 2  # rotation about the up axis; without a heading: east
         transform = {
             "timestamp": time,
             "parent_frame_id": "world",

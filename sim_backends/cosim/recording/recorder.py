@@ -1,4 +1,4 @@
-"""The recorder: an observer that writes what it sees into a folder, in parts that a kill leaves readable."""
+"""The recorder: an observer that writes a run into a folder, in parts that survive a kill of the process."""
 
 import errno
 import os
@@ -18,7 +18,7 @@ from sim_backends.cosim.recording.manifest import (
     About,
     RunEnding,
     RunManifest,
-    being_written,
+    recording_lock,
     versions,
     write_manifest,
 )
@@ -27,32 +27,32 @@ from sim_backends.cosim.recording.state import RecordingState, state_rows
 from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
 
-_MOST_WINDOWS: Final = 50_000
-"""In a part: until it is written it is in memory."""
+_MAX_WINDOWS: Final = 50_000
+"""Largest number of windows in a part, because a part is in memory until it is written."""
 _FULL: Final = {errno.ENOSPC, errno.EDQUOT}
 _RESERVE: Final = ".reserve"
 _RESERVE_BYTES: Final = 1 << 20
-"""Room on the disk that is set aside for the last windows and the end of a run whose disk gets full."""
-_NOT_KEPT: Final[Mapping[str, State]] = {}
+"""Disk space that is allocated in advance for the last windows and the manifest, in case the disk becomes full."""
+_NO_STATES: Final[Mapping[str, State]] = {}
 
 
 class RecordingError(ConfigurationError):
-    """A recording cannot be written on: what it had stays readable."""
+    """A recording cannot be continued; the parts written before remain readable."""
 
 
 class RunRecorder:
-    """Records a run into a folder; a context manager, whose body runs it.
+    """Records a run into a folder; a context manager around the run.
 
-    While the run goes on it takes note of windows. Every two seconds or so of wall time it writes them as one more
-    part of each table; the part of `windows` comes last, and says that those of the same number are whole. So a run
-    that is killed keeps all but its last seconds.
+    Windows are collected in memory. About every two seconds of wall time they are written as one more part of each
+    table. The part of `windows` is written last, so that the parts of the same number are complete if it exists. A
+    run that is killed therefore loses only its last seconds.
 
     Args:
-        folder: Where to; made when the run begins, so that a scenario that is refused leaves none.
-        about: What is run.
-        states_every_ns: How often true states are recorded, at ends of windows: simulated nanoseconds.
-        part_every_s: How often a part is written: seconds of wall time.
-        snap_bytes: How much of each IP packet is kept in `captures/`, which has a file for each robot, where the
+        folder: The folder; it is created at the beginning of the run, so a scenario that is refused creates none.
+        about: The scenario and its settings.
+        states_every_ns: Interval at which true states are recorded, at ends of windows, in simulated nanoseconds.
+        part_every_s: Interval at which parts are written, in seconds of wall time.
+        snap_bytes: Number of bytes kept of each IP packet in `captures/`, which has a file for each robot if the
             network is given `log_ip`.
     """
 
@@ -70,17 +70,17 @@ class RunRecorder:
         self._sampling = Sampling(states_every_ns)
         self._snap_bytes = snap_bytes
         self._captures: Captures | None = None
-        self._first_states = _NOT_KEPT
+        self._first_states = _NO_STATES
         self._windows: list[Window] = []
         self._state = RecordingState()
         self._written_s = time.perf_counter()
         self._manifest = RunManifest(about, about.scenario_hash, versions=versions())
         self._lock = ExitStack()
-        self._begun = False
-        self._broken = False
+        self._has_begun = False
+        self._has_failed = False
 
     def begin(self, states: Mapping[str, State]) -> None:
-        """Make the folder; see `WindowObserver.begin`.
+        """Create the folder, and lock it.
 
         Raises:
             ConfigurationError: There is a recording already.
@@ -89,60 +89,60 @@ class RunRecorder:
         try:
             for table in tables.TABLES:
                 (self._folder / table).mkdir(parents=True)
-            self._lock.enter_context(being_written(self._folder))
-            self._set_reserve_aside()
+            self._lock.enter_context(recording_lock(self._folder))
+            self._allocate_reserve()
             write_manifest(self._folder, self._manifest)
         except FileExistsError as error:
             raise ConfigurationError(
-                "there is a recording already", where=str(self._folder), remedy="name a folder that is not there yet"
+                "there is a recording already", where=str(self._folder), remedy="name a folder that does not exist"
             ) from error
         except OSError as error:
             raise self._error(error) from error
         self._first_states = states
-        self._begun = True
+        self._has_begun = True
 
     def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
-        """Take an IP packet that a robot sent or that arrived at it; see `RadioNetwork.log_ip`."""
+        """Add an IP packet that a robot sent or that arrived at it; see `RadioNetwork.log_ip`."""
         if self._captures is None:
             self._captures = Captures(self._folder / "captures", sorted(self._first_states), self._snap_bytes)
         self._captures.log(at_ns, name, fragment)
 
     def window(self, window: Window) -> None:
-        """See `WindowObserver.window`.
+        """Add a window, and write a part if it is due.
 
         Raises:
             RecordingError: A part cannot be written.
         """
-        kept = window.states if self._sampling.is_due(window.end_ns) else _NOT_KEPT
-        # States of all windows would fill the memory.
-        self._windows.append(Window(*window[:5], kept, _NOT_KEPT, window.wall_s))
-        if len(self._windows) >= _MOST_WINDOWS or time.perf_counter() - self._written_s >= self._part_every_s:
+        states = window.states if self._sampling.is_due(window.end_ns) else _NO_STATES
+        # The states of all windows would need too much memory.
+        self._windows.append(Window(*window[:5], states, _NO_STATES, window.wall_s))
+        if len(self._windows) >= _MAX_WINDOWS or time.perf_counter() - self._written_s >= self._part_every_s:
             self._write_part()
             self._written_s = time.perf_counter()
 
     def __enter__(self) -> Self:
-        """Return itself."""
+        """Return the recorder."""
         return self
 
     def __exit__(
         self, _kind: type[BaseException] | None, error: BaseException | None, _trace: TracebackType | None
     ) -> None:
-        """Write what is left, and how the run ended.
+        """Write the remaining windows and the end of the run.
 
         Raises:
-            RecordingError: That cannot be written.
+            RecordingError: They cannot be written.
         """
-        if not self._begun:
+        if not self._has_begun:
             return
         with self._lock:
-            self._end(error)
+            self._finish(error)
 
-    def _end(self, error: BaseException | None) -> None:
+    def _finish(self, error: BaseException | None) -> None:
         ending = RunEnding.WHOLE
         if error is not None:
             ending = RunEnding.INTERRUPTED if isinstance(error, KeyboardInterrupt) else RunEnding.FAILED
         why = f"{type(error).__name__}: {error}" if ending is RunEnding.FAILED else ""
-        if not self._broken:
+        if not self._has_failed:
             self._write_part(last=True)
         self._close()
         self._free_reserve()
@@ -150,32 +150,32 @@ class RunRecorder:
             self._manifest,
             ending=ending,
             why=why,
-            digest="" if self._broken else self._state.digest.hexdigest(),
+            digest="" if self._has_failed else self._state.digest.hexdigest(),
             parts=self._state.checksums,
         )
         try:
             write_manifest(self._folder, self._manifest)
-        except OSError as failure:
-            if not self._broken:  # else it was told already
-                raise self._error(failure) from failure
+        except OSError as manifest_error:
+            if not self._has_failed:  # otherwise an error was raised before
+                raise self._error(manifest_error) from manifest_error
 
     def _close(self) -> None:
-        """Close the captures; an error of a disk that refuses to is told once, and hides no other."""
+        """Close the captures; an error is raised unless writing has failed before."""
         try:
             if self._captures is not None:
                 self._captures.close()
         except OSError as error:
-            if not self._broken:
+            if not self._has_failed:
                 raise self._error(error) from error
 
     def _write_part(self, *, last: bool = False) -> None:
-        """Write what is not written yet; who interrupts it finds nothing counted twice.
+        """Write the collected windows; if this is interrupted, no window is counted twice.
 
-        Where the disk is full, tables come before captures: they get the room that was set aside for them, and of the
-        windows as many as that holds.
+        If the disk is full, tables have priority over captures: they get the reserved space, and as many windows are
+        written as fit into it.
 
         Raises:
-            RecordingError: Something of it cannot be written.
+            RecordingError: Some of it cannot be written.
         """
         failure: OSError | None = None
         try:
@@ -184,47 +184,47 @@ class RunRecorder:
         except OSError as error:
             failure = error
             self._free_reserve()
-        many = len(self._windows)
-        while many or last:
+        count = len(self._windows)
+        while count or last:
             try:
-                self._write_windows(many, last=last and failure is None)
+                self._write_windows(count, last=last and failure is None)
                 break
             except OSError as error:
                 failure = failure or error
                 self._free_reserve()
-                if not many:
+                if not count:
                     break
-                many //= 2
+                count //= 2
         if failure is not None:
             raise self._error(failure) from failure
 
-    def _write_windows(self, many: int, *, last: bool) -> None:
-        """Write the first windows that are not written yet as a part of each table."""
-        state, windows = self._state.copy(), self._windows[:many]
-        rows = state.take(windows)
+    def _write_windows(self, count: int, *, last: bool) -> None:
+        """Write the first `count` collected windows as a part of each table."""
+        state, windows = self._state.copy(), self._windows[:count]
+        rows = state.add_windows(windows)
         if not state.parts:
             rows["states"] = state_rows(0, self._first_states) + rows["states"]
         if last:
-            rows["packets"] += state.end()
+            rows["packets"] += state.undecided_rows()
         written: list[Path] = []
         try:
-            for table, its_rows in rows.items():
+            for table, table_rows in rows.items():
                 path = tables.part_path(table, state.parts)
                 written.append(self._folder / path)
-                state.checksums[path] = tables.write_part(self._folder, table, state.parts, its_rows)
+                state.checksums[path] = tables.write_part(self._folder, table, state.parts, table_rows)
         except OSError:
-            for unfinished in written:  # the room that they take is needed
+            for unfinished in written:  # to free their space
                 with suppress(OSError):
                     unfinished.unlink(missing_ok=True)
             raise
         state.parts += 1
-        self._state, self._windows = state, self._windows[many:]
+        self._state, self._windows = state, self._windows[count:]
 
-    def _set_reserve_aside(self) -> None:
-        """Set room aside; not on a file system that cannot, or where no file may be as large.
+    def _allocate_reserve(self) -> None:
+        """Allocate disk space; skipped if the file system does not support it, or limits the size of files.
 
         Raises:
-            OSError: There is no such room.
+            OSError: The disk has not enough space.
         """
         descriptor = os.open(self._folder / _RESERVE, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         try:
@@ -241,9 +241,9 @@ class RunRecorder:
             (self._folder / _RESERVE).unlink(missing_ok=True)
 
     def _error(self, error: OSError) -> RecordingError:
-        self._broken = True
+        self._has_failed = True
         return RecordingError(
-            f"the recording cannot be written: {error.strerror}; what it had stays readable",
+            f"the recording cannot be written: {error.strerror}; the parts written before remain readable",
             where=str(self._folder),
             remedy="free some space" if error.errno in {*_FULL, errno.EFBIG} else "choose another folder",
         )

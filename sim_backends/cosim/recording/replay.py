@@ -1,4 +1,4 @@
-"""Replay: reads a recording back as the run that it was, and tells one that was changed or cut."""
+"""Replay: reads a recording back as a run, and refuses one that was changed or truncated."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ class Recording:
     """A recording.
 
     Attributes:
-        manifest: What was run, and how it ended.
-        run: The run. Of one that is under way, or was killed, packets are missing whose fate was not known yet.
-        states: True states, as they were recorded: when, whose, and what.
-        decided_by: What decided the length of each window, empty where the policy did not say.
+        manifest: The scenario and its settings, and the end of the run.
+        run: The run. If it is under way or was killed, packets are missing whose fate was not decided yet.
+        states: True states as they were recorded: time in nanoseconds, agent, state.
+        decided_by: What determined the length of each window; empty if the policy does not report it.
     """
 
     manifest: RunManifest
@@ -32,10 +32,10 @@ class Recording:
 
 
 def read_recording(folder: Path) -> Recording:
-    """Read a recording, also of a run that goes on or was killed.
+    """Read a recording, also of a run that is under way or was killed.
 
     Raises:
-        EvidenceError: There is none, it is damaged, or it was changed or cut after the run.
+        EvidenceError: It does not exist, is damaged, or was changed or truncated after the run.
     """
     manifest = read_manifest(folder)
     _check_parts(folder, manifest)
@@ -45,50 +45,50 @@ def read_recording(folder: Path) -> Recording:
     run = Run(windows_ns=windows["end_ns"])
     run.fates = {fate.packet.identity: fate for fate in sorted(fates, key=lambda fate: fate.packet.packet_id)}
     for part in run.wall_s:
-        # In the order and by the operation of the run itself, so that the last bit is the same.
+        # Added in the same order as in the run, so that the sum is equal to the last bit.
         for spent_s in windows[f"{part}_s"]:
             run.wall_s[part] += spent_s
     if manifest.digest:
         run.digest = _digest(run, fates, packets["entered_window"], packets["ended_window"])
         if run.digest != manifest.digest:
             raise EvidenceError(
-                f"the recording was changed or cut: its events have digest {run.digest}, not {manifest.digest}",
+                f"the recording was changed or truncated: its events have digest {run.digest}, not {manifest.digest}",
                 where=str(folder),
                 remedy=RUN_AGAIN,
             )
-    true = [
+    true_states = [
         (at_ns, agent, State(position_m, velocity_m_s, heading_rad))
         for at_ns, agent, position_m, velocity_m_s, heading_rad in zip(*states.values(), strict=True)
     ]
-    return Recording(manifest, run, true, windows["decided_by"])
+    return Recording(manifest, run, true_states, windows["decided_by"])
 
 
 def _check_parts(folder: Path, manifest: RunManifest) -> None:
     for path, checksum in manifest.parts.items():
         try:
-            same = tables.checksum(folder / path) == checksum
+            is_same = tables.checksum(folder / path) == checksum
         except OSError as error:
             raise EvidenceError(
-                f"the recording was cut: this part cannot be read: {error.strerror}",
+                f"the recording was truncated: this part cannot be read: {error.strerror}",
                 where=str(folder / path),
                 remedy=RUN_AGAIN,
             ) from error
-        if not same:
+        if not is_same:
             raise EvidenceError("the recording was changed after the run", where=str(folder / path), remedy=RUN_AGAIN)
 
 
 def _digest(run: Run, fates: Sequence[Fate], entered: Sequence[int], ended: Sequence[int | None]) -> str:
-    """Return the digest of what was read; `fates` in the order in which they became known."""
-    windows_of = {fate.packet.packet_id: window for fate, window in zip(fates, entered, strict=True)}
-    entered_in: dict[int, list[Fate]] = {}
+    """Return the digest of the recorded events; `fates` is in the order in which they were decided."""
+    entered_window = {fate.packet.packet_id: window for fate, window in zip(fates, entered, strict=True)}
+    entered_by_window: dict[int, list[Fate]] = {}
     for fate in run.fates.values():
-        entered_in.setdefault(windows_of[fate.packet.packet_id], []).append(fate)
-    ended_in: dict[int | None, list[Fate]] = {}
+        entered_by_window.setdefault(entered_window[fate.packet.packet_id], []).append(fate)
+    ended_by_window: dict[int | None, list[Fate]] = {}
     for fate, window in zip(fates, ended, strict=True):
-        ended_in.setdefault(window, []).append(fate)
+        ended_by_window.setdefault(window, []).append(fate)
     digest = EventDigest()
     for window, end_ns in enumerate(run.windows_ns):
-        digest.window(end_ns, entered_in.get(window, ()), ended_in.get(window, ()))
+        digest.add_window(end_ns, entered_by_window.get(window, ()), ended_by_window.get(window, ()))
     return digest.hexdigest()
 
 
@@ -103,9 +103,12 @@ def _fate(row: Mapping[str, Any]) -> Fate:
         row["enters_ns"],
         row["protocol"],
     )
-    known, true = ((_state(row, f"{what}_source"), _state(row, f"{what}_destination")) for what in ("known", "true"))
-    return Fate(packet, known, true, row["arrived_ns"], row["counted_ns"], row["late_ns"], row["reason"])
+    # The columns `known_*` have the states that the network assumed.
+    assumed, true = (
+        (_state(row, f"{prefix}_source"), _state(row, f"{prefix}_destination")) for prefix in ("known", "true")
+    )
+    return Fate(packet, assumed, true, row["arrived_ns"], row["counted_ns"], row["late_ns"], row["reason"])
 
 
-def _state(row: Mapping[str, Any], of: str) -> State:
-    return State(row[f"{of}_m"], row[f"{of}_m_s"], row[f"{of}_heading_rad"])
+def _state(row: Mapping[str, Any], prefix: str) -> State:
+    return State(row[f"{prefix}_m"], row[f"{prefix}_m_s"], row[f"{prefix}_heading_rad"])

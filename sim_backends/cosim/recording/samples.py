@@ -1,4 +1,4 @@
-"""How often true states are kept: at the first end of a window in each interval."""
+"""Sampling of true states: at the first end of a window in each interval."""
 
 from collections.abc import Callable, Mapping
 from typing import Final
@@ -11,10 +11,10 @@ EVERY_NS: Final = 100_000_000
 
 
 class Sampling:
-    """Says at which ends of windows states are kept.
+    """Selects the ends of windows at which states are recorded.
 
     Args:
-        every_ns: How often, in simulated nanoseconds.
+        every_ns: Sampling interval, in simulated nanoseconds.
     """
 
     def __init__(self, every_ns: int = EVERY_NS) -> None:
@@ -22,7 +22,7 @@ class Sampling:
         self._due_ns = every_ns
 
     def is_due(self, end_ns: int) -> bool:
-        """Return whether those at the end of this window are kept."""
+        """Return True if the states at the end of this window are recorded; called once per window, in order."""
         if end_ns < self._due_ns:
             return False
         self._due_ns = (end_ns // self._every_ns + 1) * self._every_ns
@@ -30,14 +30,14 @@ class Sampling:
 
 
 class StateSamples:
-    """An observer that keeps the states which a recording has, and hands on what it is told.
+    """An observer that keeps the sampled states of a recording in memory, and forwards all calls to a recorder.
 
     Args:
-        recorder: Whom it tells; None for nobody.
+        recorder: The recorder, or None.
 
     Attributes:
-        states: When, whose, and what, as `Recording.states`.
-        log_ip: The recorder's, if it takes IP packets.
+        states: Time in nanoseconds, agent, state, as `Recording.states`.
+        log_ip: The recorder's method; missing if the recorder does not accept IP packets.
     """
 
     log_ip: Callable[[int, str, Fragment], None]
@@ -50,13 +50,13 @@ class StateSamples:
             self.log_ip = recorder.log_ip
 
     def begin(self, states: Mapping[str, State]) -> None:
-        """See `WindowObserver.begin`."""
+        """Add the states at time 0."""
         self.states += [(0, name, state) for name, state in states.items()]
         if self._recorder is not None:
             self._recorder.begin(states)
 
     def window(self, window: Window) -> None:
-        """See `WindowObserver.window`."""
+        """Add the states at the end of a window if they are due."""
         if self._sampling.is_due(window.end_ns):
             self.states += [(window.end_ns, name, state) for name, state in window.states.items()]
         if self._recorder is not None:

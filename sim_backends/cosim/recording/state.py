@@ -1,4 +1,4 @@
-"""What a recording has so far, and the rows that the next windows add to it."""
+"""The state of a recording between two parts, and the rows that windows add to its tables."""
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
@@ -20,11 +20,11 @@ class RecordingState:
     """The state of a recording between two parts.
 
     Attributes:
-        parts: How many there are of each table.
-        windows: How many windows are recorded.
-        digest: Of all their events.
-        under_way: Packets whose fate no window told yet, by packet id, each with the window in which it entered.
-        checksums: Of all files of tables, by path.
+        parts: Number of parts of each table.
+        windows: Number of recorded windows.
+        digest: Hash over all their events.
+        under_way: Packets whose fate is not decided yet, by packet id, each with the window in which it entered.
+        checksums: Checksums of all files of tables, by path.
     """
 
     parts: int = 0
@@ -34,20 +34,20 @@ class RecordingState:
     checksums: dict[str, str] = field(default_factory=dict)
 
     def copy(self) -> Self:
-        """Return one that goes on from here by itself."""
+        """Return an independent copy."""
         return replace(
             self, digest=deepcopy(self.digest), under_way=dict(self.under_way), checksums=dict(self.checksums)
         )
 
-    def take(self, windows: Sequence[Window]) -> Rows:
-        """Take windows into the state; return the rows of each table."""
+    def add_windows(self, windows: Sequence[Window]) -> Rows:
+        """Add windows to the state, and return the rows of each table."""
         rows: Rows = {table: [] for table in tables.TABLES}
         for window in windows:
             for fate in window.entered:
                 self.under_way[fate.packet.packet_id] = fate, self.windows
             for fate in window.ended:
-                _, entered = self.under_way.pop(fate.packet.packet_id)
-                rows["packets"].append(_packet(fate, entered, self.windows))
+                _, entered_window = self.under_way.pop(fate.packet.packet_id)
+                rows["packets"].append(_packet_row(fate, entered_window, self.windows))
             rows["windows"].append(
                 (
                     self.windows,
@@ -58,25 +58,27 @@ class RecordingState:
                 )
             )
             rows["states"] += state_rows(window.end_ns, window.states)
-            self.digest.window(window.end_ns, window.entered, window.ended)
+            self.digest.add_window(window.end_ns, window.entered, window.ended)
             self.windows += 1
         return rows
 
-    def end(self) -> list[Row]:
-        """Return rows of `packets` for those that are under way at the end."""
-        return [_packet(fate, entered, None) for fate, entered in self.under_way.values()]
+    def undecided_rows(self) -> list[Row]:
+        """Return the rows of `packets` for the packets that are under way."""
+        return [_packet_row(fate, entered_window, None) for fate, entered_window in self.under_way.values()]
 
 
-def state_rows(at_ns: int, of: Mapping[str, State]) -> list[Row]:
-    """Return rows of `states`."""
-    return [(at_ns, name, *_values(state)) for name, state in of.items()]
+def state_rows(at_ns: int, states: Mapping[str, State]) -> list[Row]:
+    """Return the rows of `states` at a time."""
+    return [(at_ns, name, *_values(state)) for name, state in states.items()]
 
 
-def _packet(fate: Fate, entered: int, ended: int | None) -> Row:
+def _packet_row(fate: Fate, entered_window: int, ended_window: int | None) -> Row:
     packet = fate.packet
-    # A window that was broken off may have told a fate that is not recorded.
-    told = (None, None, 0, "") if ended is None else (fate.arrived_ns, fate.counted_ns, fate.late_ns, fate.reason)
-    ends = (*fate.known, *fate.true)
+    # The fate may have been decided in a window that was interrupted and is not recorded.
+    outcome = (
+        (None, None, 0, "") if ended_window is None else (fate.arrived_ns, fate.counted_ns, fate.late_ns, fate.reason)
+    )
+    ends = (*fate.assumed, *fate.true)
     return (
         packet.packet_id,
         *packet.identity,
@@ -86,9 +88,9 @@ def _packet(fate: Fate, entered: int, ended: int | None) -> Row:
         packet.size_bytes,
         packet.sent_ns,
         packet.enters_ns,
-        entered,
-        *told,
-        ended,
+        entered_window,
+        *outcome,
+        ended_window,
         *(value for state in ends for value in _values(state)),
     )
 

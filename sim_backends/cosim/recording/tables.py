@@ -1,4 +1,4 @@
-"""Tables of a recording: each a folder of Parquet parts, of which each is whole.
+"""The tables of a recording: each is a folder of Parquet files, and each file is readable without the others.
 
 The only module of `sim_backends` that imports pyarrow.
 """
@@ -16,7 +16,7 @@ from fieldkit.core.errors import EvidenceError
 from sim_backends.cosim.recording.manifest import RUN_AGAIN
 
 Row = tuple[Any, ...]
-"""Values of a table's columns, in order; a vector is a tuple of three."""
+"""The values of a table's columns, in order; a vector is a tuple of three."""
 
 _TEXT: Final = pa.dictionary(pa.int32(), pa.string())
 _VECTOR: Final = pa.list_(pa.float64(), 3)
@@ -26,14 +26,14 @@ def _field(name: str, kind: pa.DataType, unit: str, meaning: str) -> pa.Field:
     return pa.field(name, kind, metadata={"unit": unit, "meaning": meaning})
 
 
-def _ends(what: str, said: str) -> list[pa.Field]:
+def _end_fields(prefix: str, meaning: str) -> list[pa.Field]:
     kinds = (
         ("m", _VECTOR, "m", "position, east, north, up"),
         ("m_s", _VECTOR, "m/s", "velocity, east, north, up"),
-        ("heading_rad", pa.float64(), "rad", "heading from east towards north, empty where that is not known"),
+        ("heading_rad", pa.float64(), "rad", "heading from east towards north, empty if there is none"),
     )
     return [
-        _field(f"{what}_{end}_{quantity}", kind, unit, f"{said} {end}'s {name}")
+        _field(f"{prefix}_{end}_{quantity}", kind, unit, f"{meaning} {end}: {name}")
         for end in ("source", "destination")
         for quantity, kind, unit, name in kinds
     ]
@@ -42,69 +42,71 @@ def _ends(what: str, said: str) -> list[pa.Field]:
 _SCHEMAS: Final[Mapping[str, pa.Schema]] = {
     "packets": pa.schema(
         [
-            _field("packet_id", pa.int64(), "", "counts the packets of the run"),
-            _field("flow", _TEXT, "", "stream of packets that it belongs to"),
-            _field("number", pa.int64(), "", "which it is of its flow"),
-            _field("source", _TEXT, "", "who sent it"),
-            _field("destination", _TEXT, "", "who was to get it"),
-            _field("protocol", _TEXT, "", "transport that carried it"),
+            _field("packet_id", pa.int64(), "", "number of the packet in the run"),
+            _field("flow", _TEXT, "", "name of its flow"),
+            _field("number", pa.int64(), "", "its number in the flow"),
+            _field("source", _TEXT, "", "sending agent"),
+            _field("destination", _TEXT, "", "receiving agent"),
+            _field("protocol", _TEXT, "", "its transport"),
             _field("size_bytes", pa.int64(), "B", "its size"),
-            _field("sent_ns", pa.int64(), "ns", "when its program sent it"),
-            _field("enters_ns", pa.int64(), "ns", "when the network got it"),
-            _field("entered_window", pa.int64(), "", "number of the window in which the network got it"),
-            _field("arrived_ns", pa.int64(), "ns", "when it arrived by the network's clock; empty if it did not"),
-            _field("counted_ns", pa.int64(), "ns", "when it arrived by the policy; empty if it did not"),
-            _field("late_ns", pa.int64(), "ns", "by how much its receiver had passed that time"),
+            _field("sent_ns", pa.int64(), "ns", "time when its program sent it"),
+            _field("enters_ns", pa.int64(), "ns", "time when it entered the network"),
+            _field("entered_window", pa.int64(), "", "number of the window in which it entered the network"),
+            _field(
+                "arrived_ns", pa.int64(), "ns", "time of arrival by the network's clock; empty if it never arrived"
+            ),
+            _field("counted_ns", pa.int64(), "ns", "time of arrival by the policy; empty if it never arrived"),
+            _field("late_ns", pa.int64(), "ns", "how far its receiver had passed that time"),
             _field("reason", _TEXT, "", "why it never arrived; empty if it did, or was under way at the end"),
-            _field("ended_window", pa.int64(), "", "number of the window in which its fate became known"),
-            *_ends("known", "what the network took, when it got the packet, for the"),
-            *_ends("true", "when the packet was sent, the"),
+            _field("ended_window", pa.int64(), "", "number of the window in which its fate was decided"),
+            *_end_fields("known", "assumed by the network when the packet entered it,"),
+            *_end_fields("true", "true when the packet was sent,"),
         ]
     ),
     "states": pa.schema(
         [
-            _field("at_ns", pa.int64(), "ns", "when"),
-            _field("agent", _TEXT, "", "whose state"),
-            _field("position_m", _VECTOR, "m", "where it was, east, north, up"),
-            _field("velocity_m_s", _VECTOR, "m/s", "how it moved, east, north, up"),
-            _field("heading_rad", pa.float64(), "rad", "its heading from east towards north; empty where not known"),
+            _field("at_ns", pa.int64(), "ns", "time"),
+            _field("agent", _TEXT, "", "name of the agent"),
+            _field("position_m", _VECTOR, "m", "its position, east, north, up"),
+            _field("velocity_m_s", _VECTOR, "m/s", "its velocity, east, north, up"),
+            _field("heading_rad", pa.float64(), "rad", "its heading from east towards north; empty if there is none"),
         ]
     ),
     "windows": pa.schema(
         [
             _field("window", pa.int64(), "", "its number, from 0"),
-            _field("begin_ns", pa.int64(), "ns", "when it began"),
-            _field("end_ns", pa.int64(), "ns", "when it ended"),
-            _field("decided_by", _TEXT, "", "what decided its length; empty where the policy does not say"),
+            _field("begin_ns", pa.int64(), "ns", "its beginning"),
+            _field("end_ns", pa.int64(), "ns", "its end"),
+            _field("decided_by", _TEXT, "", "what determined its length; empty if the policy does not report it"),
             _field("agents_s", pa.float64(), "s", "wall time of physics and programs"),
             _field("network_s", pa.float64(), "s", "wall time of the network"),
-            _field("exchange_s", pa.float64(), "s", "wall time of the policy and of what carries data between them"),
-            _field("wait_s", pa.float64(), "s", "wall time in which a federate itself only waited"),
+            _field("exchange_s", pa.float64(), "s", "wall time of the policy and the coordinator"),
+            _field("wait_s", pa.float64(), "s", "wall time in which federates only waited"),
         ]
     ),
 }
 
 TABLES: Final = tuple(_SCHEMAS)
-"""Their names, in the order in which parts are written: the part of the last says that the others are whole."""
+"""The names of the tables, in the order in which parts are written: when the last is there, all are complete."""
 
 
 def part_path(table: str, number: int) -> str:
-    """Return where a part of a table is in the folder of a recording."""
+    """Return the path of a part of a table, relative to the folder of the recording."""
     return f"{table}/{number:06d}.parquet"
 
 
 def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> str:
-    """Write a part of a table; while it is written, nobody sees it.
+    """Write a part of a table; it becomes visible when it is complete.
 
     Returns:
         BLAKE2b of the file, in hexadecimal.
 
     Raises:
-        OSError: It cannot be written; there is no part of it then.
+        OSError: It cannot be written; no file is left.
     """
     schema = _SCHEMAS[table]
     columns = zip(*rows, strict=True) if rows else [()] * len(schema)
-    arrays = [_array(values, one.type) for values, one in zip(columns, schema, strict=True)]
+    arrays = [_array(values, field.type) for values, field in zip(columns, schema, strict=True)]
     sink = pa.BufferOutputStream()
     pa.parquet.write_table(pa.Table.from_arrays(arrays, schema=schema), sink, compression="zstd")
     content = sink.getvalue()
@@ -113,7 +115,7 @@ def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> st
 
 
 def checksum(path: Path) -> str:
-    """Return what `write_part` returned for a file that nobody changed since.
+    """Return the BLAKE2b of a file, as `write_part` did.
 
     Raises:
         OSError: It cannot be read.
@@ -122,7 +124,7 @@ def checksum(path: Path) -> str:
 
 
 def read_parts(folder: Path, table: str, count: int) -> dict[str, list[Any]]:
-    """Return the columns of a table's first parts, vectors as tuples of three.
+    """Return the columns of the first parts of a table; vectors are tuples of three.
 
     Raises:
         EvidenceError: A part is missing or damaged.
@@ -149,7 +151,7 @@ def _array(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
     if kind == _TEXT:
         return pa.array(values, pa.string()).dictionary_encode()
     if kind == _VECTOR:
-        flat = pa.array([one for vector in values for one in vector], pa.float64())
+        flat = pa.array([component for vector in values for component in vector], pa.float64())
         return pa.FixedSizeListArray.from_arrays(flat, 3)
     return pa.array(values, kind)
 

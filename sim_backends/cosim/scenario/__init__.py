@@ -1,1 +1,1 @@
-"""Scenarios: files that say what a co-simulation has in it, and what is built from them."""
+"""Scenarios: files that describe a co-simulation, and the objects that are built from them."""

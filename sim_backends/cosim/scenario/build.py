@@ -1,4 +1,4 @@
-"""What a scenario is run with: agents, network and coordinator."""
+"""Builds a scenario: agents, network and coordinator."""
 
 from dataclasses import dataclass
 
@@ -26,8 +26,8 @@ class Simulation:
     """A scenario that is ready to run, once.
 
     Attributes:
-        scenario: What it was built from.
-        seed: Of its random draws.
+        scenario: The scenario.
+        seed: Seed of all random draws.
         policy: Its sync policy.
         agents: Bodies and programs.
         network: Carries packets.
@@ -42,14 +42,14 @@ class Simulation:
     coordinator: Coordinator
 
     def run(self, until_ns: int | None = None, progress: Progress | None = None) -> Run:
-        """Go on until a time, or to the scenario's end; return what was recorded so far.
+        """Simulate until a time, or until the scenario's end, and return the record so far.
 
         Args:
-            until_ns: Until when, in nanoseconds of simulated time.
-            progress: Is told how far it is, now and then.
+            until_ns: End time in nanoseconds of simulated time, or None.
+            progress: As for `Coordinator.advance`.
 
         Raises:
-            PolicyError: The policy has no window; what was recorded is in `coordinator.run`, as below.
+            PolicyError: The policy has no window. `coordinator.run` has the record so far, also after other errors.
             FederateError: Physics, network or a program failed, or did not answer in time.
         """
         return self.coordinator.advance(self.scenario.duration_ns if until_ns is None else until_ns, progress)
@@ -70,40 +70,40 @@ def build(
 
     Args:
         scenario: The scenario.
-        policy: Its sync policy, or the name of one; None for the scenario's.
-        seed: Of all random draws; None for the scenario's first.
-        recorder: Is told of every window, and handed every IP packet if it takes them; None for nobody.
-        deadline_s: Longest wait of a federate for an answer, in seconds of wall time; None for no deadline.
-        physics: Moves the agents in the place of the built-in bodies, of which it gets the commands.
-        network: Carries packets in the place of the built-in radio; faults of the radio are then its own.
-        measures_all: As of `Coordinator`.
+        policy: A sync policy or the name of one; None for the scenario's.
+        seed: Seed of all random draws; None for the scenario's first.
+        recorder: Receives every window, and every IP packet if it has `log_ip`; or None.
+        deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
+        physics: Replaces the built-in bodies, and receives their commands.
+        network: Replaces the built-in radio; faults of the radio are then its responsibility.
+        measures_all: As for `Coordinator`.
 
     Raises:
-        ConfigurationError: It cannot be run; says why.
+        ConfigurationError: The scenario cannot be run; the message says why.
     """
     seed = scenario.seeds[0] if seed is None else seed
     if policy is None or isinstance(policy, str):
         policy = make_policy(scenario.policy.name if policy is None else policy, **scenario.policy.parameters)
     world = load_world(scenario.world)
-    check(scenario, world, lambda place: f"scenario {scenario.name}: {'.'.join(map(str, place))}")
-    its_bodies = bodies(scenario, world)
-    running = programs(scenario, seed, controllers(scenario, its_bodies, seed), stops(its_bodies))
-    moves = physics or Bodies(its_bodies, world, step_ns=scenario.physics.step_ns)
-    carries = network or radio_network(scenario, world, seed, recorder)
+    check(scenario, world, lambda location: f"scenario {scenario.name}: {'.'.join(map(str, location))}")
+    scenario_bodies = bodies(scenario, world)
+    scenario_programs = programs(scenario, seed, controllers(scenario, scenario_bodies, seed), stops(scenario_bodies))
+    physics_federate = physics or Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns)
+    network_federate = network or radio_network(scenario, world, seed, recorder)
     for fault in scenario.faults:
         if isinstance(fault, StalledFederateFault):
             stall = Stall(fault.begin_ns, fault.stall, deadline_s)
             if fault.federate == "physics":
-                moves = stalled(moves, stall)
+                physics_federate = stalled(physics_federate, stall)
             else:
-                carries = stalled(carries, stall)
-    agents = Agents(moves, running)
+                network_federate = stalled(network_federate, stall)
+    agents = Agents(physics_federate, scenario_programs)
     coordinator = Coordinator(
         agents,
-        carries,
+        network_federate,
         policy,
         scenario.pairs,
         observer=recorder,
         measures_all=measures_all,
     )
-    return Simulation(scenario, seed, policy, agents, carries, coordinator)
+    return Simulation(scenario, seed, policy, agents, network_federate, coordinator)

@@ -1,6 +1,6 @@
-"""The JSON schema of scenario files, by which editors complete keys, explain them and mark what is wrong.
+"""The JSON schema of scenario files, with which editors complete, explain and check keys.
 
-An editor with a YAML language server takes it from a comment in the file's first line, see docs/cosim-api.md.
+An editor with a YAML language server finds it through a comment in the file's first line, see docs/cosim-api.md.
 """
 
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 
 
 def editor_schema() -> dict[str, Any]:
-    """Return the JSON schema (draft 2020-12) of a scenario file, each key with what it means."""
+    """Return the JSON schema (draft 2020-12) of a scenario file, with the meaning of each key."""
     whole = CosimScenario.model_json_schema()
     models = {model.__name__: model for model in _models(Strict)}
     for part in (whole, *whole["$defs"].values()):
@@ -25,7 +25,7 @@ def editor_schema() -> dict[str, Any]:
             value.pop("title", None)
             value["description"] = without_links(meanings[key])
             if not isinstance(value.get("default"), str) and "string" in _types(value):
-                value.pop("default", None)  # in SI units, and the file has text
+                value.pop("default", None)  # it is a number in SI units, but files have texts with units
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **whole}
 
 
@@ -36,4 +36,4 @@ def _models(base: type[Strict]) -> Iterator[type[Strict]]:
 
 
 def _types(value: dict[str, Any]) -> set[str]:
-    return {str(one.get("type")) for one in (value, *value.get("anyOf", ()))}
+    return {str(variant.get("type")) for variant in (value, *value.get("anyOf", ()))}

@@ -1,4 +1,4 @@
-"""Faults in a scenario file."""
+"""The faults in a scenario file."""
 
 from typing import Annotated, Literal
 
@@ -11,52 +11,52 @@ from sim_backends.world.obstacles import Place, Real
 
 
 class _Fault(Strict):
-    """What all faults say.
+    """Base class of all faults.
 
     Attributes:
-        from: When it begins.
+        from: Time when it begins.
     """
 
     begin: Annotated[Duration, Field(alias="from")] = 0.0
 
     @property
     def begin_ns(self) -> int:
-        """When it begins, in nanoseconds."""
+        """Time when it begins, in nanoseconds."""
         return round(self.begin * 1e9)
 
     @property
     def agents(self) -> tuple[tuple[str, str], ...]:
-        """The agents that it is about, each after the key that names it."""
+        """The agents that it names, each after the key that names it."""
         return ()
 
 
-class _Lasting(_Fault):
-    """What faults say that last.
+class _TimedFault(_Fault):
+    """Base class of faults that have an end.
 
     Attributes:
-        to: When it ends; left out, not before the run does.
+        to: Time when it ends; if omitted, it lasts until the end of the run.
     """
 
     end: Annotated[Duration | None, Field(alias="to")] = None
 
     @schema.model_validator(mode="after")
-    def _ends_later(self) -> "_Lasting":
+    def _ends_after_begin(self) -> "_TimedFault":
         if self.end is not None and self.end <= self.begin:
             raise schema.complaint(f"it ends at {self.end:g} s, not after it begins at {self.begin:g} s", "to")
         return self
 
     @property
     def end_ns(self) -> int | None:
-        """When it ends, in nanoseconds; None for never."""
+        """Time when it ends, in nanoseconds; None for never."""
         return None if self.end is None else round(self.end * 1e9)
 
 
-class NodeLossFault(_Lasting):
-    """An agent's computer is off: its programs and its radio are silent, and its body is told to stop.
+class NodeLossFault(_TimedFault):
+    """An agent's computer is off: its programs and its radio are silent, and its body is commanded to stop.
 
     Attributes:
         kind: `node-loss`.
-        agent: Whose.
+        agent: The agent.
     """
 
     kind: Literal["node-loss"]
@@ -68,12 +68,12 @@ class NodeLossFault(_Lasting):
         return (("agent", self.agent),)
 
 
-class LinkCutFault(_Lasting):
-    """Two agents do not hear each other.
+class LinkCutFault(_TimedFault):
+    """Two agents receive nothing from each other.
 
     Attributes:
         kind: `link-cut`.
-        between: Which two.
+        between: The two agents.
     """
 
     kind: Literal["link-cut"]
@@ -91,14 +91,14 @@ class LinkCutFault(_Lasting):
         return tuple(("between", name) for name in self.between)
 
 
-class JammerFault(_Lasting):
-    """Noise in the whole channel, without a pause.
+class JammerFault(_TimedFault):
+    """Continuous noise in the whole channel.
 
     Attributes:
         kind: `jammer`.
-        power_dbm: Power that it is sent with.
-        at_m: From where, metres east and north.
-        height: How high over the ground that is.
+        power_dbm: Transmit power of the noise.
+        at_m: Position of the jammer, metres east and north.
+        height: Height of the jammer over the ground.
         agent: Instead of `at_m`: the agent that carries the jammer.
     """
 
@@ -111,7 +111,7 @@ class JammerFault(_Lasting):
     @schema.model_validator(mode="after")
     def _one_place(self) -> "JammerFault":
         if (self.at_m is None) == (self.agent is None):
-            raise schema.complaint("a jammer stands either at_m: [EAST, NORTH], or is carried by an agent: NAME")
+            raise schema.complaint("a jammer needs either at_m: [EAST, NORTH], or an agent: NAME that carries it")
         return self
 
     @property
@@ -120,14 +120,15 @@ class JammerFault(_Lasting):
         return () if self.agent is None else (("agent", self.agent),)
 
 
-class ClockSkewFault(_Lasting):
-    """An agent's clock, by which its programs wake and stamp, is wrong; at the fault's end it is set right.
+class ClockSkewFault(_TimedFault):
+    """The clock of an agent, which its programs use to wake and stamp, is wrong; at the fault's end it is set right.
 
     Attributes:
         kind: `clock-skew`.
-        agent: Whose.
-        offset_ms: By how much it is fast from the fault's beginning on, in milliseconds; below 0 it is slow.
-        rate_ppm: By how much more it goes fast, in microseconds per second.
+        agent: The agent.
+        offset_ms: How far the clock is ahead at the beginning of the fault, in milliseconds; negative if it is
+            behind.
+        rate_ppm: By how much it gains from then on, in microseconds per second.
     """
 
     kind: Literal["clock-skew"]
@@ -142,12 +143,14 @@ class ClockSkewFault(_Lasting):
 
 
 class StalledFederateFault(_Fault):
-    """Physics or network does not answer for a while in wall time, once, when it is asked about `from` or later.
+    """Physics or network answers one request late, in wall time.
 
     Attributes:
         kind: `stalled-federate`.
-        federate: Which: `physics` or `network`.
-        stall: For how long, in wall time; longer than a run's deadline, and the run ends by naming who stalls.
+        from: Simulated time: the first request for this time or a later one is delayed.
+        federate: `physics` or `network`.
+        stall: Delay in wall time; if it exceeds the deadline of a run, the run fails with an error that names the
+            federate.
     """
 
     kind: Literal["stalled-federate"]
@@ -158,4 +161,4 @@ class StalledFederateFault(_Fault):
 Fault = Annotated[
     NodeLossFault | LinkCutFault | JammerFault | ClockSkewFault | StalledFederateFault, Field(discriminator="kind")
 ]
-"""What goes wrong."""
+"""A fault."""

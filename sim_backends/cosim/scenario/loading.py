@@ -14,10 +14,10 @@ _SHIPPED: Final = Path(__file__).parent / "scenarios"
 
 
 def scenario_files() -> dict[str, Path]:
-    """Return the file of each scenario by name: those that ship, and those of the lab's own folder `scenarios/`."""
+    """Return the files of all scenarios by name: shipped ones, and those in the folder `scenarios/` of the lab."""
     folders = (_SHIPPED, Path("scenarios"))
-    found = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
-    return dict(sorted(found.items()))
+    files = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
+    return dict(sorted(files.items()))
 
 
 def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = None) -> CosimScenario:
@@ -25,11 +25,11 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
 
     Args:
         name_or_path: Its name, or the path of a file that ends in `.yaml`.
-        changes: Values that take the place of the file's, by the keys that lead to them: `{"policy.window": "2ms",
+        changes: Values that replace those of the file, by their keys: `{"policy.window": "2ms",
             "agents.husky-2.along": "40m"}`.
 
     Raises:
-        ConfigurationError: There is none, or it is wrong; says where.
+        ConfigurationError: It does not exist, or is invalid; the message says where.
     """
     path = _path(str(name_or_path))
     document = schema.read(path)
@@ -49,10 +49,10 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
 
 
 def _change(data: Any, keys: list[str], value: Any) -> None:  # noqa: ANN401 (any YAML value)
-    """Put a value at the end of keys; mappings that are not there yet are made.
+    """Set the value of a key; missing mappings on the path to it are created.
 
     Raises:
-        ConfigurationError: The keys lead through what has no keys, or beyond the end of a list.
+        ConfigurationError: A key on the path has a value without keys, or an index is beyond the end of a list.
     """
     *parents, last = (int(key) if key.isdecimal() else key for key in keys)
     try:
@@ -61,16 +61,16 @@ def _change(data: Any, keys: list[str], value: Any) -> None:  # noqa: ANN401 (an
         data[last] = value
     except (IndexError, TypeError):
         raise ConfigurationError(
-            f"there is no {'.'.join(keys)} to be changed",
-            remedy="name keys as the scenario's file has them, and entries of a list by their number from 0 on",
+            f"the key {'.'.join(keys)} cannot be changed, because it does not exist",
+            remedy="use the keys of the scenario's file, and numbers from 0 for the items of a list",
         ) from None
 
 
 def _path(name_or_path: str) -> Path:
     if name_or_path.endswith(".yaml"):
         return Path(name_or_path)
-    known = scenario_files()
-    if name_or_path not in known:
-        hint = nearest(name_or_path, known, f"scenarios: {', '.join(known)}; or name a file that ends in .yaml")
+    files = scenario_files()
+    if name_or_path not in files:
+        hint = nearest(name_or_path, files, f"scenarios: {', '.join(files)}; or name a file that ends in .yaml")
         raise ConfigurationError(f"there is no scenario {name_or_path!r}", remedy=hint)
-    return known[name_or_path]
+    return files[name_or_path]

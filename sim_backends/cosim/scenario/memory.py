@@ -1,4 +1,4 @@
-"""How much memory a run will take, and how much there is."""
+"""Estimate of the memory that a run needs, and the memory that is available."""
 
 import math
 from pathlib import Path
@@ -7,31 +7,31 @@ from typing import Final
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 PACKET_BYTES: Final = 1200
-"""What the record of a packet takes: 1000 to 1130 bytes were measured over 20,000 packets of `baylands`."""
+"""Size of the record of a packet: 1000 to 1130 bytes were measured over 20,000 packets of `baylands`."""
 WINDOW_BYTES: Final = 40
-"""What the end of a window takes: an integer and its place in a list."""
+"""Size of the record of a window: an integer and its entry in a list."""
 PAIR_BYTES: Final = 1600
-"""What the radio takes at most for two stations: 1540 to 1660 bytes were measured while 100 to 300 got it."""
+"""Largest memory of the radio per pair of stations: 1540 to 1660 bytes were measured with 100 to 300 stations."""
 EVENTS_PER_PACKET: Final = 10
-"""Most windows for each packet where each event of the network ends one; 7 were measured with `baylands`."""
+"""Largest number of windows per packet if each network event ends a window; 7 were measured with `baylands`."""
 
 MEMINFO: Final = Path("/proc/meminfo")
 
 
 def needed_bytes(scenario: CosimScenario) -> int:
-    """Return about how much memory a run takes at most, its record and its radio, whatever its policy."""
-    packets = sum(one.packets(scenario.duration) for one in scenario.traffic)
+    """Return the approximate maximum memory that a run needs for its record and its radio, with any policy."""
+    packets = sum(traffic.packets(scenario.duration) for traffic in scenario.traffic)
     windows = scenario.duration / scenario.physics.step + packets * EVENTS_PER_PACKET
     return round(packets * PACKET_BYTES + windows * WINDOW_BYTES) + radio_bytes(scenario)
 
 
 def radio_bytes(scenario: CosimScenario) -> int:
-    """Return about how much of it the radio takes at most, which grows with the pairs of agents."""
+    """Return the approximate maximum memory of the radio, which is proportional to the number of pairs of agents."""
     return 0 if scenario.radio.fixed else math.comb(len(scenario.agents), 2) * PAIR_BYTES
 
 
 def available_bytes() -> int | None:
-    """Return how much memory this machine has left; None where it does not say."""
+    """Return the available memory of this machine; None if the system does not report it."""
     try:
         lines = MEMINFO.read_text(encoding="ascii").splitlines()
     except OSError:

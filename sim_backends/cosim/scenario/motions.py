@@ -1,4 +1,4 @@
-"""Motions in a scenario file."""
+"""The motions in a scenario file."""
 
 from typing import Annotated, Literal
 
@@ -7,11 +7,11 @@ from sim_backends.cosim.scenario.names import AgentNames
 from sim_backends.world.obstacles import Coordinate, Real
 
 Point = Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=3)]
-"""Metres east and north, and up for those who fly; without the last at the height that it started at."""
+"""Metres east and north, and up for agents that fly; without the last, the height at the start is kept."""
 
 
 class StandingPlan(Strict):
-    """The agent is told nothing, so that it stays where it starts.
+    """The agent gets no command, so that it stays where it starts.
 
     Attributes:
         kind: `standing`.
@@ -21,14 +21,14 @@ class StandingPlan(Strict):
 
 
 class WayPointsPlan(Strict):
-    """The agent goes from point to point, and stays at the last.
+    """The agent moves from point to point, and stays at the last.
 
     Attributes:
         kind: `way-points`.
-        points_m: Where it goes from its start: metres east and north, and up for those who fly.
-        speed: How fast.
-        relative: Whether the points are counted from its start.
-        wait: How long it stays at its start before.
+        points_m: The points after its start: metres east and north, and up for agents that fly.
+        speed: Its speed.
+        relative: True if the points are relative to its start.
+        wait: Time that it stays at its start before.
     """
 
     kind: Literal["way-points"]
@@ -42,10 +42,10 @@ class LegPlan(Strict):
     """A part of a velocity profile.
 
     Attributes:
-        duration: How long it lasts.
-        speed: How fast the agent goes meanwhile, the way it heads at the start if it flies, else straight ahead.
-        turn_deg_s: How fast it turns to the left if it drives, in degrees per second.
-        climb_m_s: How fast it climbs if it flies, in metres per second.
+        duration: Its duration.
+        speed: Speed of the agent: straight ahead if it drives, in the direction of its initial heading if it flies.
+        turn_deg_s: Rate of turn to the left if it drives, in degrees per second.
+        climb_m_s: Climb rate if it flies, in metres per second.
     """
 
     duration: Annotated[Duration, Field(gt=0)]
@@ -55,7 +55,7 @@ class LegPlan(Strict):
 
 
 class VelocityProfilePlan(Strict):
-    """The agent goes at one velocity after the other, and then stands.
+    """The agent moves with a sequence of velocities, and then stops.
 
     Attributes:
         kind: `velocity-profile`.
@@ -67,17 +67,17 @@ class VelocityProfilePlan(Strict):
 
 
 class FollowPlan(Strict):
-    """The agent follows others by what it hears of them over the network, and by nothing else.
+    """The agent follows others, using only their states that it receives over the network.
 
-    One that drives keeps behind one leader, by a distance and a time; one that flies keeps over the middle of one or
-    several. Traffic of the kind `stream` has to carry their states to it.
+    An agent that drives keeps behind one leader, by a distance and a time; an agent that flies keeps above the centre
+    of one or several leaders. Traffic of the kind `stream` must carry their states to it.
 
     Attributes:
         kind: `follow`.
-        leader: Whom it follows, one agent or, if it flies, a list of several.
-        distance: How far behind it stands, or how far above it flies; from antenna to antenna.
-        headway: By which time it drives behind, beside the distance.
-        timeout: After how long without a state it stops.
+        leader: The agent that it follows or, if it flies, a list of several.
+        distance: Distance behind the leader at standstill, or height above it; from antenna to antenna.
+        headway: Time headway behind the leader, in addition to the distance.
+        timeout: Time without a state after which it stops.
     """
 
     kind: Literal["follow"]
@@ -88,7 +88,7 @@ class FollowPlan(Strict):
 
 
 class StationKeepingPlan(Strict):
-    """The agent, which flies, steers back to where it started whenever it is elsewhere.
+    """The agent, which flies, holds its start position.
 
     Attributes:
         kind: `station-keeping`.
@@ -100,4 +100,4 @@ class StationKeepingPlan(Strict):
 MotionPlan = Annotated[
     StandingPlan | WayPointsPlan | VelocityProfilePlan | FollowPlan | StationKeepingPlan, Field(discriminator="kind")
 ]
-"""What an agent does."""
+"""A motion of an agent."""

@@ -1,4 +1,4 @@
-"""The network of a scenario: antennas, radio model, transports and what goes wrong with radios."""
+"""The network of a scenario: antennas, radio model, transports, and faults of radios."""
 
 from collections.abc import Iterator, Mapping
 from functools import partial
@@ -26,20 +26,21 @@ from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.world import World
 
-_STARTS_NS: Final = 100_000_000
-"""Within which time the participants of topics start: in one instant, all their multicasts would meet, and again."""
+_STARTS_WITHIN_NS: Final = 100_000_000
+"""Interval in which the participants of topics start. If all started at one time, their multicasts would collide, and
+so would all retransmissions."""
 
 
 def radio_network(
     scenario: CosimScenario, world: World, seed: int, observer: WindowObserver | None = None
 ) -> RadioNetwork:
-    """Return what carries the packets of a scenario that `checks` has nothing against.
+    """Return the network that carries the packets of a scenario, which must have passed `checks`.
 
     Args:
         scenario: The scenario.
         world: Its world.
-        seed: Of all random draws.
-        observer: Is handed all IP packets, if it takes them.
+        seed: Seed of all random draws.
+        observer: Receives all IP packets if it has `log_ip`.
     """
     stations = antennas(scenario)
     radio: RadioModel[Fragment] = (
@@ -47,51 +48,52 @@ def radio_network(
         if scenario.radio.fixed
         else WifiInWorld(seed, scenario.radio, stations, world)
     )
-    found = RadioNetwork(
+    network = RadioNetwork(
         radio,
         tuple(stations),
         transports=_transports(scenario, seed),
         disturbances=tuple(_disturbances(scenario, world)),
         relay=scenario.relay if scenario.topology is Topology.MASTER else None,
     )
-    if scenario.relay is not None:  # without an access point it is the host of a ROS 1 master, which talks too
-        found.transmitters |= {scenario.relay}
+    if scenario.relay is not None:  # even if it does not relay, it transmits as the host of the ROS 1 master
+        network.transmitters |= {scenario.relay}
     if isinstance(observer, IpObserver):
-        found.log_ip(observer.log_ip)
-    return found
+        network.log_ip(observer.log_ip)
+    return network
 
 
 def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFactory]:
-    """Return every transport, those of publish-subscribe only where they are used: they talk by themselves."""
+    """Return the transports; publish-subscribe ones only if they are used, as they send even without traffic."""
     topics: dict[str, TopicFlow] = {}
     ros1: dict[str, Ros1Flow] = {}
-    for one in scenario.traffic:
-        for flow, source, destination in one.flow_ends:
-            if one.transport == "topic":
-                topics[flow] = TopicFlow(source, destination, _qos(one), topic=f"rt/{one.title}")
-            elif one.transport == "ros1":
-                ros1[flow] = Ros1Flow(source, destination, "udpros" if one.protocol == "ros1-udp" else "tcpros")
+    for traffic in scenario.traffic:
+        for flow, source, destination in traffic.flow_ends:
+            if traffic.transport == "topic":
+                topics[flow] = TopicFlow(source, destination, _qos(traffic), topic=f"rt/{traffic.title}")
+            elif traffic.transport == "ros1":
+                ros1[flow] = Ros1Flow(source, destination, "udpros" if traffic.protocol == "ros1-udp" else "tcpros")
     tcp = TcpOptions(congestion=scenario.tcp.congestion)
-    found: dict[str, TransportFactory] = {"udp": Udp, "tcp": partial(Tcp, options=tcp)}
+    transports: dict[str, TransportFactory] = {"udp": Udp, "tcp": partial(Tcp, options=tcp)}
     if topics:
-        found["topic"] = partial(Topics, flows=topics, discovery=_discovery(topics, seed))
+        transports["topic"] = partial(Topics, flows=topics, discovery=_discovery(topics, seed))
     if ros1:
-        assert scenario.relay is not None  # by the schema
-        found["ros1"] = partial(Ros1, flows=ros1, master=scenario.relay, options=Ros1Options(tcp=tcp))
-    return found
+        assert scenario.relay is not None  # guaranteed by the schema
+        transports["ros1"] = partial(Ros1, flows=ros1, master=scenario.relay, options=Ros1Options(tcp=tcp))
+    return transports
 
 
 def _discovery(topics: Mapping[str, TopicFlow], seed: int) -> DiscoveryTiming:
     participants = {end for flow in topics.values() for end in (flow.publisher, flow.subscriber)}
     starts_ns = {
-        name: int(RandomStream(seed, name, "participant's start").draw(0) * _STARTS_NS) for name in participants
+        name: int(RandomStream(seed, name, "participant's start").draw(0) * _STARTS_WITHIN_NS)
+        for name in participants
     }
     return DiscoveryTiming(starts_ns=starts_ns)
 
 
-def _qos(one: Traffic) -> Qos:
-    said = one.qos or QosOptions()
-    return Qos(reliability=said.reliability, history=said.history, depth=said.depth)
+def _qos(traffic: Traffic) -> Qos:
+    options = traffic.qos or QosOptions()
+    return Qos(reliability=options.reliability, history=options.history, depth=options.depth)
 
 
 def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance]:

@@ -1,8 +1,8 @@
-"""Periods of a scenario that share a beat with windows, so that a run sees few phases of a window, or one.
+"""Periods that are commensurate with a window, so that a run samples only few phases of the window.
 
-What a method does wrong to a packet depends on when in a window it is sent. If b periods are a whole number of
-windows, packets meet b phases only, the same ones in every window, and an error is that of these phases, not of the
-method.
+The error of a method depends on the phase of the window at which a packet is sent. If b periods are a whole number of
+windows, packets are sent at b phases only, the same ones in every window, and the measured error is that of these
+phases, not of the method.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,20 +14,20 @@ from sim_backends.cosim.scenario.motions import FollowPlan
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.scenario.traffic import BagTraffic
 
-MOST_PHASES: Final = 10
-"""As many evenly spread phases have a mean that is off by a twentieth of a window at most."""
-_STEPS_OFF: Final = 100
+MAX_PHASES: Final = 10
+"""The mean over 10 evenly distributed phases is wrong by at most a twentieth of a window."""
+_MAX_STEPS: Final = 100
 
 
 @dataclass(frozen=True)
 class PeriodicEvent:
-    """Something periodic.
+    """A periodic event of a scenario.
 
     Attributes:
-        name: What it is.
+        name: Its name, for messages.
         period_s: Its period.
-        count: How often it happens in a run.
-        jitter_s: By how much it varies.
+        count: Number of times that it occurs in a run.
+        jitter_s: Its jitter.
     """
 
     name: str
@@ -37,60 +37,65 @@ class PeriodicEvent:
 
 
 @dataclass(frozen=True)
-class SharedBeat:
-    """A beat that meets few phases of a window.
+class CommensurateEvent:
+    """A periodic event that occurs at few phases of a window.
 
     Attributes:
-        beat: The beat.
+        event: The event.
         window_s: The window.
-        phases: How many it meets.
+        phases: Number of phases.
     """
 
-    beat: PeriodicEvent
+    event: PeriodicEvent
     window_s: float
     phases: int
 
 
-def beats(scenario: CosimScenario) -> Iterator[PeriodicEvent]:
-    """Yield what is periodic in a scenario and whose phase counts: traffic, and who steers by what it hears."""
-    for one in scenario.traffic:
-        if one.period_s:
-            jitter_s = one.jitter if isinstance(one, BagTraffic) else 0.0
-            flows = len(one.flow_ends)
-            yield PeriodicEvent(one.title, one.period_s, one.packets(scenario.duration) / flows, jitter_s)
+def periodic_events(scenario: CosimScenario) -> Iterator[PeriodicEvent]:
+    """Yield the periodic events of a scenario whose phase affects errors: traffic, and controllers of followers."""
+    for traffic in scenario.traffic:
+        if traffic.period_s:
+            jitter_s = traffic.jitter if isinstance(traffic, BagTraffic) else 0.0
+            flows = len(traffic.flow_ends)
+            yield PeriodicEvent(traffic.title, traffic.period_s, traffic.packets(scenario.duration) / flows, jitter_s)
     if any(isinstance(plan.motion, FollowPlan) for plan in scenario.agents.values()):
         period_s = PERIOD_NS / 1e9
         yield PeriodicEvent("the followers' controllers", period_s, scenario.duration / period_s)
 
 
-def shared_beats(scenario: CosimScenario, windows_s: Sequence[float]) -> list[SharedBeat]:
-    """Return the beats that meet few phases of a window in a run of a scenario."""
+def commensurate_events(scenario: CosimScenario, windows_s: Sequence[float]) -> list[CommensurateEvent]:
+    """Return the events that occur at few phases of one of the windows in a run of a scenario."""
     return [
-        SharedBeat(beat, window_s, phases)
+        CommensurateEvent(event, window_s, phases)
         for window_s in windows_s
-        for beat in beats(scenario)
-        if (phases := _phases(beat, window_s)) is not None
+        for event in periodic_events(scenario)
+        if (phases := _few_phases(event, window_s)) is not None
     ]
 
 
-def other_window_s(scenario: CosimScenario, window_s: float) -> float | None:
-    """Return the nearest window of whole steps that shares no beat with a scenario; None from half of it to twice."""
+def incommensurate_window_s(scenario: CosimScenario, window_s: float) -> float | None:
+    """Return the nearest window of whole steps without commensurate events; None if there is none of similar length.
+
+    The search is from half the length of the window to twice its length, and at most `_MAX_STEPS` above it.
+    """
     step_s = scenario.physics.step
     steps = round(window_s / step_s)
-    near = sorted(range(max(steps // 2, 1), min(2 * steps, steps + _STEPS_OFF) + 1), key=lambda one: abs(one - steps))
-    return next((one * step_s for one in near if not shared_beats(scenario, [one * step_s])), None)
+    near = sorted(
+        range(max(steps // 2, 1), min(2 * steps, steps + _MAX_STEPS) + 1), key=lambda count: abs(count - steps)
+    )
+    return next((count * step_s for count in near if not commensurate_events(scenario, [count * step_s])), None)
 
 
-def _phases(beat: PeriodicEvent, window_s: float) -> int | None:
-    """Return how many phases of a window a beat meets; None for enough.
+def _few_phases(event: PeriodicEvent, window_s: float) -> int | None:
+    """Return the number of phases of a window at which an event occurs; None if they are enough.
 
-    After b periods it is d windows off the phase that it had; in n periods that moves it by n d / b, and phases are
-    1 / b apart: they stay as few if n d < 1.
+    After b periods the phase has drifted by d windows, so in n periods it drifts by n d / b. The phases are 1 / b
+    apart, so their number stays b if n d < 1.
     """
-    if 2 * beat.jitter_s >= window_s:
+    if 2 * event.jitter_s >= window_s:
         return None
-    for phases in range(1, min(MOST_PHASES, int(beat.count / 2)) + 1):
-        windows = phases * beat.period_s / window_s
-        if round(windows) and abs(windows - round(windows)) * beat.count < 1:
+    for phases in range(1, min(MAX_PHASES, int(event.count / 2)) + 1):
+        windows = phases * event.period_s / window_s
+        if round(windows) and abs(windows - round(windows)) * event.count < 1:
             return phases
     return None

@@ -1,4 +1,4 @@
-"""Sync policies by name, with the parameters that each takes."""
+"""The sync policies by name, and their parameters."""
 
 import inspect
 from collections.abc import Callable
@@ -28,28 +28,28 @@ POLICIES: Final[dict[str, Callable[..., SyncPolicy]]] = {
         ErrorBounded,
     )
 }
-"""Every policy by its name, the exact ones first."""
+"""Every policy by its name, exact ones first."""
 
 _WINDOW_S: Final = 0.001
 """The paper's initial window, section V."""
 
 
 def make_policy(name: str, **parameters: float) -> SyncPolicy:
-    """Return a new policy; one serves one run.
+    """Return a new policy; a policy object serves one run.
 
     Args:
         name: One of `POLICIES`.
-        parameters: `window_s`, `longest_s`, `bound_m`, `bound_db`, `exponent`: those that it does not take are left
-            out.
+        parameters: `window_s`, `longest_s`, `bound_m`, `bound_db`, `exponent`; parameters that the policy does not
+            have are ignored.
 
     Raises:
-        ConfigurationError: There is no such policy, or one of its parameters is none.
+        ConfigurationError: There is no such policy, or the value of a parameter is invalid.
     """
     if name not in POLICIES:
         raise ConfigurationError(
             f"there is no sync policy {name!r}", remedy=nearest(name, POLICIES, f"policies: {', '.join(POLICIES)}")
         )
     kind = POLICIES[name]
-    taken = inspect.signature(kind).parameters
+    accepted = inspect.signature(kind).parameters
     given = {"window_s": _WINDOW_S} | parameters
-    return kind(**{key: value for key, value in given.items() if key in taken})
+    return kind(**{key: value for key, value in given.items() if key in accepted})

@@ -1,4 +1,4 @@
-"""What an agent's robot is: its body, and its radio."""
+"""The robots of agents: their bodies and their radios."""
 
 import math
 from dataclasses import replace
@@ -17,37 +17,37 @@ from sim_backends.world.world import World
 
 
 def robots() -> list[str]:
-    """Return every name that an agent's `robot` may have: kinds of bodies, and profiles of robots."""
+    """Return all valid values of an agent's `robot`: kinds of bodies, and names of robot profiles."""
     return sorted({*BODIES, *names("robots")})
 
 
 def limits(robot: str) -> DriveLimits | QuadrotorLimits:
-    """Return what a robot's body can do.
+    """Return the limits of a robot's body.
 
-    A profile that is no kind of body has that of the paper's robot of its kind, at the speed that it says.
+    A robot profile that is not a kind of body has the body of the paper's robot of its kind, with its own top speed.
     """
     if robot in BODIES:
         return BODIES[robot]
     profile = profiles.load_profile(robot)
-    like: DriveLimits | QuadrotorLimits = quadrotor(robot) if profile.kind == "uav" else TURTLEBOT3_BURGER
-    return replace(like, speed_m_s=float(profile.limits.max_speed_m_s))
+    similar: DriveLimits | QuadrotorLimits = quadrotor(robot) if profile.kind == "uav" else TURTLEBOT3_BURGER
+    return replace(similar, speed_m_s=float(profile.limits.max_speed_m_s))
 
 
 def bodies(scenario: CosimScenario, world: World) -> dict[str, Body[Any]]:
-    """Return the bodies of all agents, where they start."""
+    """Return the bodies of all agents, at their start positions."""
     return {name: _body(plan, scenario, world) for name, plan in scenario.agents.items()}
 
 
 def _body(plan: AgentPlan, scenario: CosimScenario, world: World) -> Body[Any]:
-    heading_rad, can = math.radians(plan.heading_deg), limits(plan.robot)
+    heading_rad, body_limits = math.radians(plan.heading_deg), limits(plan.robot)
     east_m, north_m, up_m = _start_m(plan, scenario, world)
-    if isinstance(can, QuadrotorLimits):
-        return Quadrotor(can, (east_m, north_m, up_m), heading_rad)
-    return DifferentialDrive(can, (east_m, north_m), heading_rad)
+    if isinstance(body_limits, QuadrotorLimits):
+        return Quadrotor(body_limits, (east_m, north_m, up_m), heading_rad)
+    return DifferentialDrive(body_limits, (east_m, north_m), heading_rad)
 
 
 def _start_m(plan: AgentPlan, scenario: CosimScenario, world: World) -> Vector:
-    """Return where an agent starts: metres east, north, up."""
+    """Return the start position of an agent: metres east, north, up."""
     place_m = plan.at_m
     if place_m is None:
         assert plan.along is not None
@@ -56,14 +56,14 @@ def _start_m(plan: AgentPlan, scenario: CosimScenario, world: World) -> Vector:
 
 
 def antennas(scenario: CosimScenario) -> dict[str, Antenna]:
-    """Return the antennas of those agents that have a radio: their own, or that of their robot profile."""
-    known = names("robots")
-    used = {plan.robot for plan in scenario.agents.values() if plan.radio is None and plan.robot in known}
-    of_profiles = {robot: antenna_of(profiles.load_profile(robot).radio) for robot in sorted(used)}
-    found = {}
+    """Return the antennas of the agents that have a radio, from their plan or from their robot profile."""
+    profile_names = names("robots")
+    used = {plan.robot for plan in scenario.agents.values() if plan.radio is None and plan.robot in profile_names}
+    profile_antennas = {robot: antenna_of(profiles.load_profile(robot).radio) for robot in sorted(used)}
+    agent_antennas = {}
     for name, plan in scenario.agents.items():
-        if (own := plan.radio) is not None:
-            found[name] = Antenna(own.standard, float(own.tx_power_dbm), float(own.sensitivity_dbm))
-        elif plan.robot in of_profiles:
-            found[name] = of_profiles[plan.robot]
-    return found
+        if (radio := plan.radio) is not None:
+            agent_antennas[name] = Antenna(radio.standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
+        elif plan.robot in profile_antennas:
+            agent_antennas[name] = profile_antennas[plan.robot]
+    return agent_antennas

@@ -1,4 +1,4 @@
-"""What a scenario file may say. What needs more than the file to be judged, `build` judges."""
+"""The schema of a scenario file. Checks that need more than the file are in `checks`."""
 
 from collections.abc import Iterator
 from typing import Annotated, Literal
@@ -20,7 +20,7 @@ from sim_backends.radio.options import RadioOptions
 from sim_backends.world.obstacles import Place, Real
 
 
-def _known_policy(name: str) -> str:
+def _check_policy_name(name: str) -> str:
     if name not in POLICIES:
         hint = nearest(name, POLICIES, f"policies: {', '.join(POLICIES)}")
         raise schema.complaint(f"there is no sync policy {name!r}; {hint}")
@@ -28,19 +28,18 @@ def _known_policy(name: str) -> str:
 
 
 class PolicyChoice(Strict):
-    """The sync policy of a scenario; its parameters count for every policy that has them, so in a shootout too.
+    """The sync policy of a scenario. Its parameters apply to every policy that has them, so also in a shootout.
 
     Attributes:
-        name: Of the policy that a run takes if it is not told another.
+        name: The default policy of a run.
         window: Length of a window, or the w of the velocity-aware policies.
-        longest: What no window of a policy exceeds whose windows differ.
-        bound: By how much the network's relative position of two agents that transmit may be wrong, for
-            `error_bounded`.
-        bound_db: Instead: by how much it may be wrong about the path loss between them in the open, in dB.
-        exponent: Of the log-distance law by which `bound_db` is told.
+        longest: Longest window of policies with variable windows.
+        bound: Largest error of the network's relative position of two agents that transmit, for `error_bounded`.
+        bound_db: Instead of `bound`: largest error of the path loss between them in free line of sight, in dB.
+        exponent: Exponent of the log-distance law for `bound_db`.
     """
 
-    name: Annotated[str, AfterValidator(_known_policy), Field(json_schema_extra={"enum": [*POLICIES]})] = (
+    name: Annotated[str, AfterValidator(_check_policy_name), Field(json_schema_extra={"enum": [*POLICIES]})] = (
         "event_driven"
     )
     window: Annotated[Duration, Field(gt=0)] = 0.001
@@ -51,23 +50,27 @@ class PolicyChoice(Strict):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The parameters as policies name them, in SI units."""
-        found = {"window_s": self.window, "longest_s": self.longest, "bound_m": self.bound}
-        return found if self.bound_db is None else found | {"bound_db": self.bound_db, "exponent": self.exponent}
+        """The parameters with the names that policies use, in SI units."""
+        parameters = {"window_s": self.window, "longest_s": self.longest, "bound_m": self.bound}
+        return (
+            parameters
+            if self.bound_db is None
+            else parameters | {"bound_db": self.bound_db, "exponent": self.exponent}
+        )
 
 
 class PhysicsOptions(Strict):
     """The physics of a scenario.
 
     Attributes:
-        step: Its own step.
+        step: Its time step.
     """
 
     step: Annotated[Duration, Field(ge=1e-6, le=1)] = 0.001
 
     @property
     def step_ns(self) -> int:
-        """Its own step in nanoseconds."""
+        """Its time step in nanoseconds."""
         return round(self.step * 1e9)
 
 
@@ -75,9 +78,9 @@ class AgentRadio(Strict):
     """The radio of an agent.
 
     Attributes:
-        standard: What it speaks.
-        tx_power_dbm: Power that it sends with.
-        sensitivity_dbm: Weakest frame that it detects.
+        standard: Its IEEE standard.
+        tx_power_dbm: Its transmit power.
+        sensitivity_dbm: Power of the weakest frame that it detects.
     """
 
     standard: Literal["802.11g", "802.11n"] = "802.11n"
@@ -89,15 +92,15 @@ class AgentPlan(Strict):
     """An agent of a scenario.
 
     Attributes:
-        robot: What it is: a kind of body, or a robot profile, which has a radio too.
-        at_m: Where it starts, metres east and north.
-        along: Instead: how far along the world's line it starts.
-        aside_m: How far to the left of that line.
-        height: How high over the ground it starts, for those who fly.
-        heading_deg: Where it heads at the start, from east towards north.
+        robot: A kind of body, or a robot profile, which also has a radio.
+        at_m: Start position, metres east and north.
+        along: Instead of `at_m`: start position along the world's line, as a distance from its beginning.
+        aside_m: Distance of the start from that line, to the left.
+        height: Height of the start over the ground, for agents that fly.
+        heading_deg: Initial heading, from east towards north.
         radio: Its radio, instead of that of its robot profile.
-        motion: What it does.
-        phase: When, within the 50 ms from one command to the next, its controller steers first; left out, drawn.
+        motion: Its motion.
+        phase: Time of its controller's first command, within the 50 ms between commands; if omitted, it is random.
     """
 
     robot: str
@@ -113,7 +116,9 @@ class AgentPlan(Strict):
     @schema.model_validator(mode="after")
     def _one_start(self) -> "AgentPlan":
         if (self.at_m is None) == (self.along is None):
-            raise schema.complaint("it starts either at_m: [EAST, NORTH], or along: 20m of the world's line")
+            raise schema.complaint(
+                "it needs either at_m: [EAST, NORTH], or along: 20m, a distance on the world's line"
+            )
         return self
 
 
@@ -139,19 +144,19 @@ class CosimScenario(Named):
     Attributes:
         name: The file's name without `.yaml`.
         summary: One line for people.
-        world: What stands around the agents: a file of the lab's own folder `worlds/`, or one that ships.
-        line: Which of the world's lines agents start along.
-        duration: How long it lasts, in simulated time.
-        seeds: Of the random draws, one for each run.
+        world: Surroundings of the agents: a file of the lab's folder `worlds/`, or a shipped one.
+        line: The line of the world along which agents start.
+        duration: Its duration, in simulated time.
+        seeds: Seeds of the random draws, one for each run.
         physics: The physics.
         radio: The radio.
         tcp: The TCP of all agents, also under ROS 1 topics.
-        topology: `masterless`, or `master`: everything passes the relay, which is also the host of a ROS 1 master.
-        relay: Whose access point relays.
+        topology: `masterless`, or `master`: all packets pass the relay, which is also the host of a ROS 1 master.
+        relay: The agent whose access point relays.
         policy: The sync policy.
         agents: The agents by name.
-        traffic: What they send.
-        faults: What goes wrong.
+        traffic: The traffic between them.
+        faults: The faults.
     """
 
     world: str
@@ -170,29 +175,29 @@ class CosimScenario(Named):
 
     @property
     def duration_ns(self) -> int:
-        """How long it lasts, in nanoseconds of simulated time."""
+        """Its duration in nanoseconds of simulated time."""
         return round(self.duration * 1e9)
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Who sends to whom, sorted; who answers a ping, too."""
-        return tuple(sorted({(source, to) for one in self.traffic for _, source, to in one.flow_ends}))
+        """Sender and receiver of all flows, including the replies to pings, sorted."""
+        return tuple(sorted({(source, to) for traffic in self.traffic for _, source, to in traffic.flow_ends}))
 
     @schema.model_validator(mode="after")
-    def _names_are_known(self) -> "CosimScenario":
-        for name, place in self._named():
+    def _named_agents_exist(self) -> "CosimScenario":
+        for name, location in self._agent_names():
             if name not in self.agents:
                 hint = nearest(name, self.agents, f"agents: {', '.join(self.agents)}")
-                raise schema.complaint(f"there is no agent {name!r}; {hint}", *place)
+                raise schema.complaint(f"there is no agent {name!r}; {hint}", *location)
         return self
 
-    def _named(self) -> Iterator[tuple[str, Location]]:
-        """Yield every name of an agent, with the keys that lead to it."""
+    def _agent_names(self) -> Iterator[tuple[str, Location]]:
+        """Yield every reference to an agent, with its keys."""
         if self.relay is not None:
             yield self.relay, ("relay",)
-        for number, one in enumerate(self.traffic):
-            yield one.source, ("traffic", number, "from")
-            yield from ((name, ("traffic", number, "to")) for name in one.to)
+        for number, traffic in enumerate(self.traffic):
+            yield traffic.source, ("traffic", number, "from")
+            yield from ((name, ("traffic", number, "to")) for name in traffic.to)
         for number, fault in enumerate(self.faults):
             yield from ((name, ("faults", number, key)) for key, name in fault.agents)
         for agent, plan in self.agents.items():
@@ -200,25 +205,27 @@ class CosimScenario(Named):
                 yield from ((name, ("agents", agent, "motion", "leader")) for name in plan.motion.leader)
 
     @schema.model_validator(mode="after")
-    def _relays(self) -> "CosimScenario":
+    def _relay_is_named(self) -> "CosimScenario":
         if self.topology is Topology.MASTER and self.relay is None:
-            raise schema.complaint("a master relays, so that a relay: AGENT is needed", "topology")
-        for number, one in enumerate(self.traffic):
-            if one.transport == "ros1" and self.relay is None:
+            raise schema.complaint("the topology master needs a relay: AGENT", "topology")
+        for number, traffic in enumerate(self.traffic):
+            if traffic.transport == "ros1" and self.relay is None:
                 raise schema.complaint(
                     "ros1 needs a master: name its host by relay: AGENT", "traffic", number, "protocol"
                 )
         return self
 
     @schema.model_validator(mode="after")
-    def _names_are_unique(self) -> "CosimScenario":
-        found: set[str] = set()
-        for number, one in enumerate(self.traffic):
-            if one.title in found:
+    def _traffic_names_are_unique(self) -> "CosimScenario":
+        titles: set[str] = set()
+        for number, traffic in enumerate(self.traffic):
+            if traffic.title in titles:
                 raise schema.complaint(
-                    f"two entries of the traffic are called {one.title!r}; give one another name", "traffic", number
+                    f"two entries of the traffic have the name {traffic.title!r}; rename one of them",
+                    "traffic",
+                    number,
                 )
-            found.add(one.title)
+            titles.add(traffic.title)
         return self
 
     @schema.model_validator(mode="after")
@@ -228,34 +235,35 @@ class CosimScenario(Named):
         return self
 
     @schema.model_validator(mode="after")
-    def _a_clock_is_wrong_once(self) -> "CosimScenario":
-        found: set[str] = set()
+    def _one_clock_skew_per_agent(self) -> "CosimScenario":
+        agents: set[str] = set()
         for number, fault in enumerate(self.faults):
             if isinstance(fault, ClockSkewFault):
-                if fault.agent in found:
-                    raise schema.complaint(f"the clock of {fault.agent} is wrong twice", "faults", number, "agent")
-                found.add(fault.agent)
+                if fault.agent in agents:
+                    raise schema.complaint(f"{fault.agent} has two clock-skew faults", "faults", number, "agent")
+                agents.add(fault.agent)
         return self
 
     @schema.model_validator(mode="after")
-    def _jammers_are_heard(self) -> "CosimScenario":
+    def _jammers_have_an_effect(self) -> "CosimScenario":
         for number, fault in enumerate(self.faults):
             if self.radio.fixed and isinstance(fault, JammerFault):
                 raise schema.complaint(
-                    "fixed links hear no jammer; leave it out, or loss, delay, rate and jitter of the radio",
+                    "fixed links ignore a jammer; remove it, or remove loss, delay, rate and jitter of the radio",
                     "faults",
                     number,
                 )
         return self
 
     @schema.model_validator(mode="after")
-    def _followers_hear_their_leaders(self) -> "CosimScenario":
-        heard = {(one.source, to) for one in self.traffic if isinstance(one, StreamTraffic) for to in one.to}
+    def _followers_receive_their_leaders(self) -> "CosimScenario":
+        streams = (traffic for traffic in self.traffic if isinstance(traffic, StreamTraffic))
+        received = {(stream.source, to) for stream in streams for to in stream.to}
         for agent, plan in self.agents.items():
             for leader in plan.motion.leader if isinstance(plan.motion, FollowPlan) else ():
-                if (leader, agent) not in heard:
+                if (leader, agent) not in received:
                     raise schema.complaint(
-                        f"{agent} follows {leader} and hears nothing of it; add to the traffic "
+                        f"{agent} follows {leader} and receives no states of it; add to the traffic "
                         f"{{kind: stream, from: {leader}, to: {agent}, rate: 10Hz}}",
                         "agents",
                         agent,
@@ -264,7 +272,7 @@ class CosimScenario(Named):
         return self
 
     @schema.model_validator(mode="after")
-    def _windows_are_steps(self) -> "CosimScenario":
+    def _window_is_at_least_a_step(self) -> "CosimScenario":
         if self.policy.window < self.physics.step:
             raise schema.complaint(
                 f"a window of {self.policy.window:.12g} s is shorter than the physics' own step of "

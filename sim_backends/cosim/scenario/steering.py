@@ -23,7 +23,7 @@ from sim_backends.physics.body import Body, Twist, Velocity
 from sim_backends.radio.random_streams import RandomStream
 
 STATION_M_S: Final = 1.0
-"""How fast an agent goes back to its station at most."""
+"""Largest speed at which an agent returns to its station."""
 
 
 def stops(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
@@ -32,17 +32,17 @@ def stops(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
 
 
 def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], seed: int) -> dict[str, Program]:
-    """Return what steers each agent; who stands has none.
+    """Return the controller of each agent; an agent that does not move has none.
 
     Args:
         scenario: The scenario.
-        bodies: What is steered, by agent.
-        seed: Of the phases that the scenario does not say: no two computers start their controllers together.
+        bodies: The body of each agent.
+        seed: Seed of the phases that the scenario does not set; controllers of different robots are not synchronous.
     """
-    found = {
+    programs = {
         name: _controller(plan, bodies[name], _phase_ns(name, plan, seed)) for name, plan in scenario.agents.items()
     }
-    return {name: program for name, program in found.items() if program is not None}
+    return {name: program for name, program in programs.items() if program is not None}
 
 
 def _phase_ns(name: str, plan: AgentPlan, seed: int) -> int:
@@ -58,14 +58,14 @@ def _controller(plan: AgentPlan, body: Body[Any], phase_ns: int) -> Program | No
             return None
         case WayPointsPlan():
             begin_ns = round(motion.wait * 1e9) + phase_ns
-            return _through(way_m(motion, body.place_m), motion.speed, body, begin_ns)
+            return _through(path_points_m(motion, body.place_m), motion.speed, body, begin_ns)
         case StationKeepingPlan():
             return _through([body.place_m], STATION_M_S, body, phase_ns)
         case VelocityProfilePlan():
             heading_rad = math.radians(plan.heading_deg)
             return VelocityProfile([_leg(leg, body, heading_rad) for leg in motion.legs])
         case FollowPlan():
-            return _following(motion, body, phase_ns)
+            return _follower(motion, body, phase_ns)
 
 
 def _leg(leg: LegPlan, body: Body[Any], heading_rad: float) -> ProfileLeg:
@@ -76,7 +76,7 @@ def _leg(leg: LegPlan, body: Body[Any], heading_rad: float) -> ProfileLeg:
     return ProfileLeg(round(leg.duration * 1e9), command)
 
 
-def _following(motion: FollowPlan, body: Body[Any], begin_ns: int) -> Program:
+def _follower(motion: FollowPlan, body: Body[Any], begin_ns: int) -> Program:
     timeout_ns = round(motion.timeout * 1e9)
     if body.flies:
         return HoldStation(motion.leader, above_m=motion.distance, timeout_ns=timeout_ns, begin_ns=begin_ns)
@@ -97,10 +97,10 @@ def _through(points_m: list[Vector], speed_m_s: float, body: Body[Any], begin_ns
     return DriveThrough([(east_m, north_m) for east_m, north_m, _ in points_m], speed_m_s, begin_ns=begin_ns)
 
 
-def way_m(plan: WayPointsPlan, begin_m: Vector) -> list[Vector]:
-    """Return the points of a way, metres east, north, up."""
-    from_m = begin_m if plan.relative else (0.0, 0.0, 0.0)
+def path_points_m(plan: WayPointsPlan, start_m: Vector) -> list[Vector]:
+    """Return the waypoints of a path, metres east, north, up."""
+    origin_m = start_m if plan.relative else (0.0, 0.0, 0.0)
     return [
-        (from_m[0] + east_m, from_m[1] + north_m, from_m[2] + up_m[0] if up_m else begin_m[2])
+        (origin_m[0] + east_m, origin_m[1] + north_m, origin_m[2] + up_m[0] if up_m else start_m[2])
         for east_m, north_m, *up_m in plan.points_m
     ]

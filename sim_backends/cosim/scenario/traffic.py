@@ -1,4 +1,4 @@
-"""Traffic in a scenario file."""
+"""The traffic in a scenario file."""
 
 from abc import ABC, abstractmethod
 from typing import Annotated, Literal
@@ -12,22 +12,22 @@ from sim_backends.cosim.scenario.names import AgentNames, Name
 
 Protocol = Literal["udp", "tcp", "topic", "ros1", "ros1-udp"]
 
-_MOST_BYTES = 65_000
-"""In one packet: UDP carries 65,507 bytes (RFC 768, RFC 791), and a topic's header stands in them."""
+_MAX_BYTES = 65_000
+"""Largest packet: UDP carries 65,507 bytes (RFC 768, RFC 791), which must also hold the header of a topic."""
 
-_MOST_MESSAGES = 10**6
-"""In a bag: it is in memory as a whole, 100 bytes for each, however much of it is played."""
+_MAX_MESSAGES = 10**6
+"""Largest bag: it is in memory as a whole, 100 bytes per message, even if only a part of it is played."""
 
-Bytes = Annotated[Int, Field(gt=0, le=_MOST_BYTES)]
+Bytes = Annotated[Int, Field(gt=0, le=_MAX_BYTES)]
 
 
 class QosOptions(Strict):
-    """What publisher and subscribers of a topic agree on, by ROS 2's names and with its defaults.
+    """The quality of service of a topic, with the names and defaults of ROS 2.
 
     Attributes:
-        reliability: `reliable`, which sends again what is lost, or `best_effort`.
+        reliability: `reliable`, which retransmits lost samples, or `best_effort`.
         history: `keep_last` samples up to `depth`, or `keep_all`, which makes the writer wait for readers.
-        depth: How many samples `keep_last` keeps.
+        depth: Number of samples that `keep_last` keeps.
     """
 
     reliability: Literal["reliable", "best_effort"] = "reliable"
@@ -36,17 +36,17 @@ class QosOptions(Strict):
 
 
 class _Traffic(Strict, ABC):
-    """What all traffic says.
+    """Base class of all traffic.
 
     Attributes:
-        name: Of it; `FROM-KIND` if left out. What goes to each receiver is the flow `NAME/RECEIVER`.
-        from: Who sends it.
-        to: Who gets it, one agent or a list of several.
-        protocol: What carries it: `udp`, `tcp`, `topic` (DDS's publish-subscribe, without a master), `ros1` (TCPROS)
-            or `ros1-udp` (UDPROS).
-        qos: Of a topic.
-        start: When it begins. The first packet follows at a random time within one period (a file: within 100 ms),
-            since nothing starts robots simultaneously.
+        name: Its name; `FROM-KIND` if omitted. The packets to each receiver are the flow `NAME/RECEIVER`.
+        from: The sending agent.
+        to: The receiving agent, or a list of several.
+        protocol: Transport: `udp`, `tcp`, `topic` (DDS's publish-subscribe, without a master), `ros1` (TCPROS) or
+            `ros1-udp` (UDPROS).
+        qos: Quality of service of a topic.
+        start: Time when it begins. The first packet is sent at a random time within one period after it (a file:
+            within 100 ms), because robots do not start at the same time.
     """
 
     kind: str
@@ -58,9 +58,9 @@ class _Traffic(Strict, ABC):
     start: Duration = 0.0
 
     @schema.model_validator(mode="after")
-    def _between_others(self) -> "_Traffic":
+    def _ends_are_different(self) -> "_Traffic":
         if self.qos is not None and self.protocol != "topic":
-            raise schema.complaint(f"only a topic has a qos, and this is {self.protocol}", "qos")
+            raise schema.complaint(f"only a topic has a qos, and the protocol is {self.protocol}", "qos")
         if self.source in self.to:
             raise schema.complaint(f"{self.source} sends to itself", "to")
         if len(set(self.to)) < len(self.to):
@@ -69,42 +69,42 @@ class _Traffic(Strict, ABC):
 
     @property
     def transport(self) -> str:
-        """Name of the transport that its packets go by."""
+        """Name of the transport of its packets."""
         return self.protocol.removesuffix("-udp")
 
     @property
     def title(self) -> str:
-        """Its name, or the one that it has if it says none."""
+        """Its name, or the default name."""
         return self.name or f"{self.source}-{self.kind}"
 
     @property
     def flows(self) -> dict[str, str]:
-        """Receiver of each of its flows, by the flow's name."""
+        """The receiver of each of its flows, by the flow's name."""
         return {f"{self.title}/{receiver}": receiver for receiver in self.to}
 
     @property
     def flow_ends(self) -> tuple[tuple[str, str, str], ...]:
-        """Name, source and destination of every flow, those of answers included."""
+        """Name, source and destination of every flow, including those of replies."""
         return tuple((flow, self.source, to) for flow, to in self.flows.items())
 
     @property
     @abstractmethod
     def period_s(self) -> float:
-        """From one packet to the next; 0 where there is none."""
+        """Time between packets; 0 if it is not periodic."""
 
     @abstractmethod
     def packets(self, duration_s: float) -> float:
-        """Return about how many packets it sends at most in a scenario of a duration."""
+        """Return the approximate maximum number of packets that it sends in a scenario of a duration."""
 
 
 class StreamTraffic(_Traffic):
-    """An agent that sends its own state at a constant rate, for followers and for load.
+    """An agent sends its own state at a constant rate, for followers and for load.
 
     Attributes:
         kind: `stream`.
         rate: Packets per second.
-        size_bytes: Of each packet, without the headers of what carries it.
-        stop: From when on nothing is sent; left out, never.
+        size_bytes: Size of each packet, without the headers of the transport.
+        stop: Time from which on nothing is sent; never if omitted.
     """
 
     kind: Literal["stream"]
@@ -124,18 +124,18 @@ class StreamTraffic(_Traffic):
 
 
 class BagTraffic(_Traffic):
-    """A recorded bag that is played back, each message at its own time.
+    """A recorded bag is played back, each message at its own time.
 
-    The defaults are the paper's: 10 s of accelerometer data. The size is that of a serialized `sensor_msgs/Imu` whose
-    frame is `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular velocity, 24 of acceleration, and 72 of
+    The defaults are the paper's: 10 s of accelerometer data. The size is that of a serialized `sensor_msgs/Imu` with
+    the frame `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular velocity, 24 of acceleration, and 72 of
     covariance with each. The rate is that of the Husky's simulated IMU.
 
     Attributes:
         kind: `bag`.
-        length: How long was recorded.
+        length: Length of the recording.
         rate: Messages per second.
-        size_bytes: Of each message.
-        jitter: Most that a message was recorded later than at its rate, as clocks and loads do; drawn for each.
+        size_bytes: Size of each message.
+        jitter: Largest random delay of the recording of a message, as clocks and load cause it.
     """
 
     kind: Literal["bag"]
@@ -145,10 +145,10 @@ class BagTraffic(_Traffic):
     jitter: Duration = 0.001
 
     @schema.model_validator(mode="after")
-    def _is_no_larger_than_bags_are(self) -> "BagTraffic":
-        if (messages := self.length * self.rate) > _MOST_MESSAGES:
+    def _size_is_limited(self) -> "BagTraffic":
+        if (messages := self.length * self.rate) > _MAX_MESSAGES:
             raise schema.complaint(
-                f"a bag has at most {_MOST_MESSAGES:,} messages, and {self.length:g} s of {self.rate:g} Hz are "
+                f"a bag has at most {_MAX_MESSAGES:,} messages, and {self.length:g} s of {self.rate:g} Hz are "
                 f"{messages:,.0f}",
                 "length",
             )
@@ -166,12 +166,12 @@ class BagTraffic(_Traffic):
 
 
 class FileTraffic(_Traffic):
-    """A file that is sent as fast as it goes, as netcat does.
+    """A file is sent as fast as possible, as by netcat.
 
     Attributes:
         kind: `file`.
-        size_bytes: Of the file.
-        piece_bytes: What the program hands over at a time: netcat reads 8192 bytes.
+        size_bytes: Size of the file.
+        piece_bytes: Size of each write to the transport: netcat uses 8192 bytes.
     """
 
     kind: Literal["file"]
@@ -189,13 +189,14 @@ class FileTraffic(_Traffic):
 
 
 class PingTraffic(_Traffic):
-    """Requests that are answered; the answers are the flow `NAME/RECEIVER/reply`.
+    """Requests that are replied to; the replies are the flow `NAME/RECEIVER/reply`.
 
     Attributes:
         kind: `ping`.
-        count: How many requests.
-        interval: From one to the next.
-        size_bytes: Of a request, and of its answer: 56 are what ping calls 64 bytes, with a header of 8 as UDP's.
+        count: Number of requests.
+        interval: Time between requests.
+        size_bytes: Size of a request and of its reply, without the header: ping reports 56 as 64 bytes, because
+            ICMP's header has 8 bytes, as UDP's.
     """
 
     kind: Literal["ping"]
@@ -220,4 +221,4 @@ class PingTraffic(_Traffic):
 
 
 Traffic = Annotated[StreamTraffic | BagTraffic | FileTraffic | PingTraffic, Field(discriminator="kind")]
-"""What an agent sends."""
+"""The traffic of an agent."""

@@ -1,1 +1,1 @@
-"""Studies over many runs: how wrong a sync policy is, and what it costs."""
+"""Studies over many runs: the errors and the costs of sync policies."""

@@ -1,8 +1,8 @@
-"""Errors in distribution: does a method give other losses, delays and distances than the reference, over seeds.
+"""Errors in distribution: the difference of losses, delays and distances from the reference, over seeds.
 
-Where contention and rate choice are chaotic, two runs differ packet by packet though neither is wrong. What has to
-agree is what a study would publish: shares and means over seeds. Each is paired by seed with the reference, so that
-what seeds have in common drops out.
+With chaotic contention and rate selection, two runs differ packet by packet although neither is wrong. What must
+agree are the results that a study would publish: shares and means over seeds. Each run is paired with the reference
+of the same seed, which cancels the variation between seeds.
 """
 
 import math
@@ -18,15 +18,15 @@ from sim_backends.cosim.studies.outcomes import Outcomes, RunOutcome
 
 
 def delay_s(outcome: RunOutcome) -> float:
-    """Return the mean delay of packets that arrived, as their receivers count it; nan for none."""
+    """Return the mean delay of packets that arrived, as their receivers count it; nan if none arrived."""
     delays_ns = [
         fate.counted_ns - fate.packet.sent_ns for fate in outcome.run.fates.values() if fate.counted_ns is not None
     ]
     return sum(delays_ns) / len(delays_ns) / 1e9 if delays_ns else math.nan
 
 
-def apart_m(outcome: RunOutcome) -> float:
-    """Return how far agents are apart, in the mean over time and all pairs; nan for one alone."""
+def mean_separation_m(outcome: RunOutcome) -> float:
+    """Return the mean distance between agents over time and all pairs; nan for a single agent."""
     places_m = outcome.tracks.places_m
     first, second = np.triu_indices(places_m.shape[1], k=1)
     if not len(first):
@@ -37,21 +37,21 @@ def apart_m(outcome: RunOutcome) -> float:
 MEASURES: Final[Mapping[str, Callable[[RunOutcome], float]]] = {
     "loss": lambda outcome: lost_share(outcome.run),
     "delay_s": delay_s,
-    "apart_m": apart_m,
+    "apart_m": mean_separation_m,
 }
-"""What is compared, by name."""
+"""The compared measures, by name."""
 
 
 @dataclass(frozen=True)
 class Bias:
-    """One measure by one policy, over seeds.
+    """The bias of one measure with one policy, over seeds.
 
     Attributes:
-        values: Of each seed, in their order; nan where the run has none.
+        values: The measure for each seed, in order; nan if a run has none.
         mean: Their mean.
-        bias: Mean of the differences from the reference's with the same seed.
+        bias: Mean of the differences from the reference with the same seed.
         deviation: Standard deviation of these differences.
-        seeds_needed: How many seeds it takes to see the bias; None where none was seen.
+        seeds_needed: Number of seeds needed to detect the bias; None if the bias is 0 or unknown.
     """
 
     values: Floats
@@ -61,19 +61,19 @@ class Bias:
     seeds_needed: int | None
 
 
-def biases(found: Outcomes) -> dict[str, dict[str, Bias]]:
-    """Return the bias of each policy that could be run with all seeds, and of each measure."""
-    complete = [name for name, runs in found.runs.items() if len(runs) == len(found.seeds)]
+def biases(outcomes: Outcomes) -> dict[str, dict[str, Bias]]:
+    """Return the bias of each measure for each policy that could be run with all seeds."""
+    complete = [name for name, runs in outcomes.runs.items() if len(runs) == len(outcomes.seeds)]
     return {
-        policy: {name: _bias(found, policy, measure) for name, measure in MEASURES.items()} for policy in complete
+        policy: {name: _bias(outcomes, policy, measure) for name, measure in MEASURES.items()} for policy in complete
     }
 
 
-def _bias(found: Outcomes, policy: str, measure: Callable[[RunOutcome], float]) -> Bias:
-    values = np.array([measure(found.runs[policy][seed]) for seed in found.seeds])
-    differences = values - np.array([measure(found.reference[seed]) for seed in found.seeds])
-    known = differences[np.isfinite(differences)]
-    bias = mean(known)
-    deviation = float(known.std(ddof=1)) if len(known) > 1 else math.nan
+def _bias(outcomes: Outcomes, policy: str, measure: Callable[[RunOutcome], float]) -> Bias:
+    values = np.array([measure(outcomes.runs[policy][seed]) for seed in outcomes.seeds])
+    differences = values - np.array([measure(outcomes.reference[seed]) for seed in outcomes.seeds])
+    finite = differences[np.isfinite(differences)]
+    bias = mean(finite)
+    deviation = float(finite.std(ddof=1)) if len(finite) > 1 else math.nan
     needed = None if math.isnan(deviation) else repeats_needed(bias.value, deviation)
     return Bias(values, mean(values[np.isfinite(values)]), bias, deviation, needed)

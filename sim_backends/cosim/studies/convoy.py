@@ -1,4 +1,4 @@
-"""Measures of a convoy, from where its vehicles were: spacing, station keeping and string stability."""
+"""Measures of a convoy from the positions of its vehicles: spacing, station keeping and string stability."""
 
 import math
 
@@ -8,11 +8,11 @@ from sim_backends.cosim.studies.intervals import Floats
 
 
 def speeds_m_s(times_s: Floats, places_m: Floats) -> Floats:
-    """Return how fast vehicles were, by central differences.
+    """Return the speeds of vehicles, by central differences.
 
     Args:
-        times_s: When, shape (times,).
-        places_m: Metres east, north, up, shape (times, vehicles, 3).
+        times_s: Times, shape (times,).
+        places_m: Positions in metres east, north, up, shape (times, vehicles, 3).
 
     Returns:
         Shape (times, vehicles).
@@ -22,13 +22,13 @@ def speeds_m_s(times_s: Floats, places_m: Floats) -> Floats:
 
 
 def spacing_errors_m(times_s: Floats, places_m: Floats, standstill_m: float, headway_s: float) -> Floats:
-    """Return by how much each follower was farther behind than it should be, which is `standstill_m + headway_s v`.
+    """Return how much the gap before each follower exceeds the desired one, which is `standstill_m + headway_s v`.
 
     Args:
-        times_s: When, shape (times,).
-        places_m: Of the vehicles, each behind the one before it, shape (times, vehicles, 3).
-        standstill_m: How far behind a vehicle stands.
-        headway_s: Time by which it is behind.
+        times_s: Times, shape (times,).
+        places_m: Positions of the vehicles in their order in the row, shape (times, vehicles, 3).
+        standstill_m: Desired gap at standstill.
+        headway_s: Time headway.
 
     Returns:
         Shape (times, vehicles - 1).
@@ -39,12 +39,12 @@ def spacing_errors_m(times_s: Floats, places_m: Floats, standstill_m: float, hea
 
 
 def station_errors_m(places_m: Floats, station_m: Floats, above_m: float) -> Floats:
-    """Return how far who holds station was from its place, `above_m` over the middle of the vehicles.
+    """Return the distance of a drone from its station, which is `above_m` above the centre of the vehicles.
 
     Args:
-        places_m: Of the vehicles, shape (times, vehicles, 3).
-        station_m: Of who holds station, shape (times, 3).
-        above_m: How far over them it should be.
+        places_m: Positions of the vehicles, shape (times, vehicles, 3).
+        station_m: Positions of the drone, shape (times, 3).
+        above_m: Height of its station above them.
 
     Returns:
         Shape (times,).
@@ -54,11 +54,11 @@ def station_errors_m(places_m: Floats, station_m: Floats, above_m: float) -> Flo
 
 
 def amplifications(signals: Floats) -> Floats:
-    """Return by how much each vehicle amplifies what the one before it does: the ratio of the L2 norms of a signal.
+    """Return the amplification of a signal by each vehicle: the ratio of its L2 norm to that of the vehicle ahead.
 
-    A convoy is string stable if none is above 1, whatever the first does: what disturbs one vehicle then dies out
+    A convoy is string stable if no ratio is above 1 for any motion of the first vehicle: then a disturbance decays
     along the row (Ploeg, van de Wouw and Nijmeijer, "Lp string stability of cascaded systems", IEEE Trans. Control
-    Syst. Technol. 22, 2014). Only what differs from a signal's mean counts; of what is periodic, give whole periods.
+    Syst. Technol. 22, 2014). The mean of each signal is subtracted; pass whole periods of a periodic signal.
 
     Args:
         signals: For example speeds, accelerations, or spacing errors, shape (times, vehicles).
@@ -72,13 +72,13 @@ def amplifications(signals: Floats) -> Floats:
 
 
 def gain(rate_rad_s: Floats, *, delay_s: float, headway_s: float, gain_per_s: float) -> Floats:
-    """Return |Gamma(jw)| of `programs.follow.FollowAtHeadway`, whose module has the formula.
+    """Return |Gamma(jw)| of `programs.follow.FollowAtHeadway`; the formula is in that module.
 
     Args:
         rate_rad_s: Angular frequencies w, shape (n,).
-        delay_s: How long a state is under way.
-        headway_s: Time by which it is behind.
-        gain_per_s: By what an error of the distance shrinks.
+        delay_s: Delay of received states.
+        headway_s: Time headway.
+        gain_per_s: Rate at which an error of the distance decays.
     """
     s = 1j * rate_rad_s
     extrapolated = s + gain_per_s * (1 + delay_s * s)

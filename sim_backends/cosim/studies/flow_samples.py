@@ -1,4 +1,4 @@
-"""What becomes of the traffic of many setups with many seeds: sums small enough to come from other processes."""
+"""The traffic of many setups with many seeds, reduced to sums that are small enough to pass between processes."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ UNDER_WAY = "under way when the run ended"
 
 @dataclass(frozen=True)
 class Setup:
-    """A scenario and the policy that it is run with.
+    """A scenario and the policy with which it is run.
 
     Attributes:
         scenario: The scenario.
@@ -32,14 +32,14 @@ class Setup:
 
 @dataclass(frozen=True)
 class FlowSample:
-    """What became of a flow in one run; of a ping, of its requests.
+    """The packets of a flow in one run; for a ping, its requests.
 
     Attributes:
-        sent: Packets.
-        arrived: Those of them that arrived, or were answered, before the run ended.
-        delay_sum_s: Sum of their delays, from sending to arrival as the receiver counts it, or of round trips; nan of
-            none, which is no fast transmission.
-        reasons: Why how many of the others did not.
+        sent: Number of packets.
+        arrived: Number of them that arrived, or were replied to, before the run ended.
+        delay_sum_s: Sum of their delays, from sending to arrival as the receiver counts it, or of round trips; nan if
+            none arrived, so that it is not mistaken for a fast transmission.
+        reasons: Number of the other packets by the reason why they did not arrive.
     """
 
     sent: int
@@ -49,12 +49,12 @@ class FlowSample:
 
     @property
     def loss(self) -> float:
-        """Share of the packets that did not arrive; nan of none."""
+        """Share of the packets that did not arrive; nan without packets."""
         return 1 - self.arrived / self.sent if self.sent else np.nan
 
     @property
     def delay_mean_s(self) -> float:
-        """Mean delay of those that arrived; nan of none."""
+        """Mean delay of packets that arrived; nan if none did."""
         return self.delay_sum_s / self.arrived if self.arrived else np.nan
 
 
@@ -65,32 +65,32 @@ def flow_samples(
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> dict[str, list[dict[str, FlowSample]]]:
-    """Return for each setup, and for each seed in their order, what became of each flow.
+    """Return, for each setup and each seed in order, a sample of each flow.
 
     Args:
-        setups: What is run, by a name.
-        seeds: Of random draws.
-        workers: As of `run_many`.
-        progress: As of `run_many`.
+        setups: The setups by name.
+        seeds: Seeds of the random draws.
+        workers: As for `run_many`.
+        progress: As for `run_many`.
 
     Raises:
         FieldkitError: A run failed.
     """
     tasks = [Task(setup.policy, seed, name) for name, setup in setups.items() for seed in seeds]
     samples = run_many(partial(_sample, dict(setups)), tasks, workers=workers, progress=progress)
-    found: dict[str, list[dict[str, FlowSample]]] = {name: [] for name in setups}
+    by_setup: dict[str, list[dict[str, FlowSample]]] = {name: [] for name in setups}
     for task, sample in zip(tasks, samples, strict=True):
-        found[task.setup].append(sample)
-    return found
+        by_setup[task.setup].append(sample)
+    return by_setup
 
 
 def _sample(setups: Mapping[str, Setup], task: Task) -> dict[str, FlowSample]:
     scenario = setups[task.setup].scenario
     run = build(scenario, policy=task.policy, seed=task.seed).run()
     return {
-        flow: _round_trips(run, flow) if isinstance(one, PingTraffic) else _deliveries(run, flow)
-        for one in scenario.traffic
-        for flow in one.flows
+        flow: _round_trips(run, flow) if isinstance(traffic, PingTraffic) else _deliveries(run, flow)
+        for traffic in scenario.traffic
+        for flow in traffic.flows
     }
 
 

@@ -1,4 +1,4 @@
-"""How well the followers of a scenario keep their place, from where agents were."""
+"""How well the followers of a scenario keep their positions."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -17,16 +17,17 @@ from sim_backends.physics.quadrotor import QuadrotorLimits
 
 @dataclass(frozen=True)
 class Formation:
-    """How far followers were off their place, in metres and in magnitude; nan where nobody has such a place.
+    """The position errors of followers, as magnitudes in metres; nan if there are no followers of that kind.
 
     Attributes:
-        spacing_mean_m: Mean over time and followers that drive, of the error of the distance to their leader.
+        spacing_mean_m: Error of the distance to the leader, mean over time and followers that drive.
         spacing_max_m: Its maximum.
-        station_mean_m: Mean over time and followers that fly, of the distance to their station over their leaders.
+        station_mean_m: Distance from the station above the leaders, mean over time and followers that fly.
         station_max_m: Its maximum.
-        amplification: The largest ratio of the L2 norm of the acceleration of one that drives to its leader's: the
-            row was string stable for what its first did if it is not above 1. Accelerations are 0 before and after
-            a change of speed, so that it does not matter when the run ends, unlike with speeds.
+        amplification: Largest ratio of the L2 norm of the acceleration of a follower that drives to that of its
+            leader: up to 1, the row was string stable for the motion of its first vehicle. Accelerations are 0 before
+                and
+            after a change of speed, so unlike with speeds, the end of the run does not matter.
     """
 
     spacing_mean_m: float
@@ -36,24 +37,24 @@ class Formation:
     amplification: float
 
 
-NOBODY = Formation(*(math.nan,) * 5)
-"""Of a scenario in which nobody follows anybody."""
+NO_FORMATION = Formation(*(math.nan,) * 5)
+"""The formation of a scenario without followers."""
 
 
 def has_followers(scenario: CosimScenario) -> bool:
-    """Return whether somebody in a scenario steers by what it hears."""
+    """Return True if an agent in a scenario follows another one."""
     return any(isinstance(plan.motion, FollowPlan) for plan in scenario.agents.values())
 
 
 def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
-    """Return how well followers kept their place; of less than two looks at the agents, `NOBODY`.
+    """Return how well followers kept their positions; `NO_FORMATION` if there are fewer than two samples.
 
     Args:
-        scenario: Says who follows whom, and how.
-        tracks: Where agents were.
+        scenario: The scenario with the followers.
+        tracks: The positions of the agents.
     """
     if len(tracks.times_s) < 2:
-        return NOBODY
+        return NO_FORMATION
     spacing: list[Floats] = []
     station: list[Floats] = []
     ratios: list[float] = []
@@ -61,24 +62,26 @@ def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
         if not isinstance(plan.motion, FollowPlan):
             continue
         leaders = _places_m(tracks, plan.motion.leader)
-        own = _places_m(tracks, [name])
+        follower = _places_m(tracks, [name])
         if isinstance(limits(plan.robot), QuadrotorLimits):
-            station.append(convoy.station_errors_m(leaders, own[:, 0], plan.motion.distance))
+            station.append(convoy.station_errors_m(leaders, follower[:, 0], plan.motion.distance))
         else:
-            row = np.concatenate([leaders, own], axis=1)
+            row = np.concatenate([leaders, follower], axis=1)
             errors_m = convoy.spacing_errors_m(tracks.times_s, row, plan.motion.distance, plan.motion.headway)
             spacing.append(errors_m[:, 0])
             ratios += _ratios(tracks.times_s, row)
-    return Formation(*_size(spacing), *_size(station), max(ratios, default=math.nan))
+    return Formation(*_mean_and_max(spacing), *_mean_and_max(station), max(ratios, default=math.nan))
 
 
 def mean_formation(several: Sequence[Formation]) -> Formation:
-    """Return the formations of several runs in one: means, but of maxima the largest.
+    """Return the formations of several runs as one: means, or the largest of maxima.
 
     Args:
         several: At least one.
     """
-    columns = {one.name: np.array([getattr(run, one.name) for run in several]) for one in fields(Formation)}
+    columns = {
+        field.name: np.array([getattr(formation, field.name) for formation in several]) for field in fields(Formation)
+    }
     return Formation(
         **{name: float(values.max() if "max" in name else values.mean()) for name, values in columns.items()}
     )
@@ -90,12 +93,12 @@ def _places_m(tracks: Tracks, names: Sequence[str]) -> Floats:
 
 def _ratios(times_s: Floats, row_m: Floats) -> Iterator[float]:
     accelerations_m_s2: Floats = np.gradient(convoy.speeds_m_s(times_s, row_m), times_s, axis=0)
-    found = convoy.amplifications(accelerations_m_s2)
-    return (float(ratio) for ratio in found if not math.isnan(ratio))
+    ratios = convoy.amplifications(accelerations_m_s2)
+    return (float(ratio) for ratio in ratios if not math.isnan(ratio))
 
 
-def _size(errors_m: Sequence[Floats]) -> tuple[float, float]:
-    """Return mean and maximum of magnitudes; nan of none."""
+def _mean_and_max(errors_m: Sequence[Floats]) -> tuple[float, float]:
+    """Return the mean and the maximum of magnitudes; nan if there are none."""
     if not errors_m:
         return math.nan, math.nan
     magnitudes = np.abs(np.concatenate(errors_m))

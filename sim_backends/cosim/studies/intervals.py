@@ -1,4 +1,4 @@
-"""Intervals at 95 % over independent repeats, in closed form: nothing is resampled, no figure depends on a seed."""
+"""95 % intervals over independent repeats, in closed form: without resampling, no result depends on a seed."""
 
 import math
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ Floats = NDArray[np.float64]
 
 CONFIDENCE: Final = 0.95
 POWER: Final = 0.8
-"""How likely a difference that is there shall be seen, by convention."""
+"""Probability with which an existing difference is detected, by convention."""
 
 
 @dataclass(frozen=True)
 class IntervalEstimate:
-    """A number and its interval; nan where there is none.
+    """A number and its interval; unknown values are nan.
 
     Attributes:
         value: The number.
@@ -32,12 +32,12 @@ class IntervalEstimate:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the interval leaves out 0, so that the number has a sign."""
+        """True if the interval excludes 0, so that the sign of the number is certain."""
         return self.low > 0 or self.high < 0
 
 
 def mean(values: Floats) -> IntervalEstimate:
-    """Return the mean of repeats with Student's interval; fewer than two have none."""
+    """Return the mean of repeats with Student's interval; fewer than two repeats have no interval."""
     count = len(values)
     value = float(values.mean()) if count else math.nan
     if count < 2:
@@ -47,13 +47,14 @@ def mean(values: Floats) -> IntervalEstimate:
 
 
 def jackknife(value: float, without: Floats) -> IntervalEstimate:
-    """Return a statistic of repeats with an interval from what it would be without each of them.
+    """Return a statistic of repeats with its jackknife interval.
 
     Args:
         value: The statistic of all repeats.
-        without: The statistic of all but one, for each, shape (n,).
+        without: The statistic of all repeats but one, for each, shape (n,).
 
-    The spread over these is that of the statistic, n - 1 times too small (Efron and Stein 1981, Ann. Stat. 9:586).
+    The variance over these is n - 1 times smaller than that of the statistic (Efron and Stein 1981, Ann. Stat.
+    9:586).
     """
     count = len(without)
     if count < 2 or not np.isfinite(without).all():
@@ -64,10 +65,10 @@ def jackknife(value: float, without: Floats) -> IntervalEstimate:
 
 
 def repeats_needed(difference: float, deviation: float) -> int | None:
-    """Return how many pairs of repeats show a difference in four of five studies, None for ever so many.
+    """Return the number of pairs of repeats that detect a difference in four of five studies; None if it is zero.
 
-    That is ((z_0.975 + z_0.8) s / d)^2 + z_0.975^2 / 2, whose second term makes up for the deviation being an
-    estimate (Guenther 1981, Am. Stat. 35:243); of few it may be one short.
+    It is ((z_0.975 + z_0.8) s / d)^2 + z_0.975^2 / 2; the second term compensates that the deviation is an estimate
+    (Guenther 1981, Am. Stat. 35:243). Small numbers may be one too low.
 
     Args:
         difference: Mean of the differences within pairs.
@@ -75,28 +76,28 @@ def repeats_needed(difference: float, deviation: float) -> int | None:
     """
     if not difference:
         return None
-    wide, reached = (NormalDist().inv_cdf(share) for share in ((1 + CONFIDENCE) / 2, POWER))
-    return max(math.ceil(((wide + reached) * deviation / difference) ** 2 + wide**2 / 2), 2)
+    z_interval, z_power = (NormalDist().inv_cdf(share) for share in ((1 + CONFIDENCE) / 2, POWER))
+    return max(math.ceil(((z_interval + z_power) * deviation / difference) ** 2 + z_interval**2 / 2), 2)
 
 
 @lru_cache(maxsize=1024)
-def student(free: int) -> float:
-    """Return the 97.5 % quantile of Student's t with `free` degrees of freedom, at least 1."""
-    low, high = 0.0, 13.0  # 12.7 with one degree
+def student(degrees: int) -> float:
+    """Return the 97.5 % quantile of Student's t distribution with at least 1 degree of freedom."""
+    low, high = 0.0, 13.0  # the quantile for one degree is 12.7
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if _within(middle, free) < CONFIDENCE else (low, middle)
+        low, high = (middle, high) if _probability_within(middle, degrees) < CONFIDENCE else (low, middle)
     return (low + high) / 2
 
 
-def _within(t: float, free: int) -> float:
+def _probability_within(t: float, degrees: int) -> float:
     """Return P(|T| < t) (Abramowitz and Stegun 1964, 26.7.3 and 26.7.4, which are finite sums)."""
-    angle = math.atan(t / math.sqrt(free))
+    angle = math.atan(t / math.sqrt(degrees))
     sine, square = math.sin(angle), math.cos(angle) ** 2
-    term = total = math.cos(angle) if free % 2 else 1.0
-    for step in range(2 + free % 2, free - 1, 2):
+    term = total = math.cos(angle) if degrees % 2 else 1.0
+    for step in range(2 + degrees % 2, degrees - 1, 2):
         term *= square * (step - 1) / step
         total += term
-    if free % 2 == 0:
+    if degrees % 2 == 0:
         return sine * total
-    return 2 / math.pi * (angle + (sine * total if free > 1 else 0.0))
+    return 2 / math.pi * (angle + (sine * total if degrees > 1 else 0.0))

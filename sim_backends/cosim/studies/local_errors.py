@@ -1,10 +1,10 @@
-"""Local errors: what one window of a method does wrong that begins in the exact reference's own state.
+"""Local errors: the errors of single windows of a method that begin in the exact reference's own state.
 
-As with solvers of differential equations: the reference goes on exactly; at many times a fork of it takes one window
-by the method and goes on exactly from there. What then differs from the reference is that window's own doing, and not
-the heritage of windows before. Halve the window, and the errors shrink by its order.
+The method is that for solvers of differential equations: the reference runs exactly; at many times a fork of it runs
+one window with the method and continues exactly. Differences from the reference are then caused by that window only,
+and not by earlier windows. If the window is halved, the errors decrease according to the order of the method.
 
-A window is charged with the packets that it touches: those that in the reference were sent, or arrived, within it.
+A window affects the packets that, in the reference, were sent or arrived within it.
 """
 
 import math
@@ -16,7 +16,7 @@ import numpy as np
 
 from fieldkit.core.errors import FieldkitError
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.geometry import displaced_m
+from sim_backends.cosim.geometry import position_error_m
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.run import Fate, Run
@@ -25,23 +25,23 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
-"""Delivery-time error; by how much receivers had passed an arrival; how far off the network took sender and receiver
-to be from each other; share of packets with another fate; how far off agents are at the window's end."""
+"""Error of the delivery time; how far the receiver had passed the time of an arrival; error of the network's relative
+position of sender and receiver; share of packets with another fate; position error of agents at the window's end."""
 
 TAIL_NS: Final = 200_000_000
-"""How long forks go on behind the window, so that the fates of what it touched are known."""
+"""Time that forks continue after the window, so that the fates of the affected packets are decided."""
 _LONGEST_NS: Final = 3_600_000_000_000
-"""No window is as long, where anything still happens."""
+"""Longer than any window, as long as there are events."""
 
 
 @dataclass(frozen=True)
 class LocalErrors:
-    """Local errors of one method, for several parameters of it, over windows that begin at the same times.
+    """Local errors of one method for several parameters, over windows that begin at the same times.
 
     Attributes:
         window_s: Lengths of the windows, shape (parameters, begins).
-        sums: Of each of `MEASURES`, the sum over what each window touched, same shape.
-        counts: How many packets, or agents, these are.
+        sums: For each of `MEASURES`, the sum over the affected packets or agents, same shape.
+        counts: The number of these packets or agents, same shape.
     """
 
     window_s: Floats
@@ -49,32 +49,33 @@ class LocalErrors:
     counts: Mapping[str, Floats]
 
     def mean(self, measure: str) -> Floats:
-        """Return the mean error for each parameter; nan where nothing was touched."""
+        """Return the mean error for each parameter; nan if the windows affected nothing."""
         sums, counts = self.sums[measure].sum(axis=1), self.counts[measure].sum(axis=1)
         return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
     def order(self, measure: str) -> IntervalEstimate:
-        """Return by which power of the window an error shrinks: the slope on logarithmic axes, with its interval.
+        """Return the power of the window with which an error decreases, as a slope on logarithmic axes.
 
-        The interval is over the times at which windows began; nan where no error was seen for two lengths.
+        Its interval is a jackknife over the times at which windows begin. The result is nan if fewer than two lengths
+        had an error.
         """
         sums, counts = self.sums[measure], self.counts[measure]
         value = _slope(self.window_s.mean(axis=1), sums.sum(axis=1), counts.sum(axis=1))
         begins = range(sums.shape[1])
         without = [
-            _slope(*(np.delete(of, one, axis=1).sum(axis=1) for of in (self.window_s, sums, counts)))
-            for one in begins
+            _slope(*(np.delete(values, begin, axis=1).sum(axis=1) for values in (self.window_s, sums, counts)))
+            for begin in begins
         ]
         return jackknife(value, np.array(without))
 
 
 def pooled(several: Iterable[LocalErrors]) -> LocalErrors:
     """Return the local errors of one method over the windows of several runs, for example of several seeds."""
-    all_of = list(several)
+    runs = list(several)
     return LocalErrors(
-        np.concatenate([one.window_s for one in all_of], axis=1),
-        {measure: np.concatenate([one.sums[measure] for one in all_of], axis=1) for measure in MEASURES},
-        {measure: np.concatenate([one.counts[measure] for one in all_of], axis=1) for measure in MEASURES},
+        np.concatenate([run.window_s for run in runs], axis=1),
+        {measure: np.concatenate([run.sums[measure] for run in runs], axis=1) for measure in MEASURES},
+        {measure: np.concatenate([run.counts[measure] for run in runs], axis=1) for measure in MEASURES},
     )
 
 
@@ -89,17 +90,17 @@ def local_errors(
 
     Args:
         make: Builds the co-simulation of one scenario and seed.
-        methods: Make a policy from a parameter, the length of a window in seconds or what stands for it.
-        parameters: These.
-        begins_ns: When windows begin, in rising order; whole steps of the physics.
-        tail_ns: How long forks go on behind the window; a packet whose fate is still unknown then does not count.
+        methods: Functions that return a policy for a parameter: the length of a window in seconds, or its equivalent.
+        parameters: The parameters.
+        begins_ns: Times when windows begin, ascending; whole steps of the physics.
+        tail_ns: Time that forks continue after the window; packets whose fate is undecided then are ignored.
 
     Raises:
         PolicyError: A method has no window for a situation.
-        FieldkitError: A fork changed what it was forked from: something in the scenario cannot be copied.
+        FieldkitError: A fork changed its original: the scenario has an object that cannot be copied.
     """
     shape = len(parameters), len(begins_ns)
-    found = {
+    results = {
         name: LocalErrors(
             np.zeros(shape), *({measure: np.zeros(shape) for measure in MEASURES} for _ in ("sums", "counts"))
         )
@@ -107,30 +108,30 @@ def local_errors(
     }
     reference = make(EventDriven())
     for column, begin_ns in enumerate(begins_ns):
-        _forget(reference.advance(begin_ns))
-        exact: dict[int, _Behind] = {}
+        _delete_decided(reference.advance(begin_ns))
+        exact: dict[int, _Aftermath] = {}
         for name, method in methods.items():
             for row, parameter in enumerate(parameters):
                 fork = reference.fork()
                 fork.policy = method(parameter)
-                end_ns = fork.advance(begin_ns + _LONGEST_NS, most_windows=1).windows_ns[-1]
+                end_ns = fork.advance(begin_ns + _LONGEST_NS, max_windows=1).windows_ns[-1]
                 if end_ns == begin_ns + _LONGEST_NS:
-                    continue  # nothing will ever happen
+                    continue  # there are no more events
                 if end_ns not in exact:
-                    exactly = reference.fork()
-                    exactly.advance(end_ns)
-                    exact[end_ns] = _behind(exactly, end_ns, tail_ns)
-                tried = _behind(fork, end_ns, tail_ns)
-                found[name].window_s[row, column] = (end_ns - begin_ns) / 1e9
-                for measure, values in _differences(begin_ns, end_ns, exact[end_ns], tried).items():
-                    found[name].sums[measure][row, column] = sum(values)
-                    found[name].counts[measure][row, column] = len(values)
-    _check_untouched(make, begins_ns, reference)
-    return found
+                    exact_fork = reference.fork()
+                    exact_fork.advance(end_ns)
+                    exact[end_ns] = _aftermath(exact_fork, end_ns, tail_ns)
+                actual = _aftermath(fork, end_ns, tail_ns)
+                results[name].window_s[row, column] = (end_ns - begin_ns) / 1e9
+                for measure, values in _differences(begin_ns, end_ns, exact[end_ns], actual).items():
+                    results[name].sums[measure][row, column] = sum(values)
+                    results[name].counts[measure][row, column] = len(values)
+    _check_unchanged(make, begins_ns, reference)
+    return results
 
 
-def spread_over(begin_ns: int, end_ns: int, count: int, step_ns: int) -> list[int]:
-    """Return times at whole steps, spread evenly, whose place within any period is as good as random.
+def low_discrepancy_times_ns(begin_ns: int, end_ns: int, count: int, step_ns: int) -> list[int]:
+    """Return evenly distributed times at whole steps, whose phases within any period are practically random.
 
     They are multiples of the golden ratio modulo 1, the sequence of lowest discrepancy in one dimension.
     """
@@ -140,64 +141,65 @@ def spread_over(begin_ns: int, end_ns: int, count: int, step_ns: int) -> list[in
 
 
 @dataclass(frozen=True)
-class _Behind:
-    """What is known behind a window: the fates of packets, and where agents were at its end."""
+class _Aftermath:
+    """The fates of packets some time after a window, and the states of the agents at its end."""
 
     fates: Mapping[PacketIdentity, Fate]
     states: Mapping[str, State]
 
 
-def _behind(fork: Coordinator, end_ns: int, tail_ns: int) -> _Behind:
-    """Let a fork that has come to the end of a window go on exactly."""
+def _aftermath(fork: Coordinator, end_ns: int, tail_ns: int) -> _Aftermath:
+    """Continue a fork exactly that has reached the end of a window."""
     states = fork.situation.states
     fork.policy = EventDriven()
-    return _Behind(fork.advance(end_ns + tail_ns).fates, states)
+    return _Aftermath(fork.advance(end_ns + tail_ns).fates, states)
 
 
-def _differences(begin_ns: int, end_ns: int, exact: _Behind, tried: _Behind) -> dict[str, list[float]]:
-    """Return each error of a window, for all that it touched."""
-    found: dict[str, list[float]] = {measure: [] for measure in MEASURES}
+def _differences(begin_ns: int, end_ns: int, exact: _Aftermath, actual: _Aftermath) -> dict[str, list[float]]:
+    """Return each error of a window for all packets and agents that it affected."""
+    differences: dict[str, list[float]] = {measure: [] for measure in MEASURES}
     for identity, fate in exact.fates.items():
-        other = tried.fates.get(identity)
-        sent = begin_ns < fate.packet.sent_ns <= end_ns
-        arrived = fate.arrived_ns is not None and begin_ns < fate.arrived_ns <= end_ns
-        if not (sent or arrived) or other is None or not (fate.is_known and other.is_known):
+        other = actual.fates.get(identity)
+        is_sent = begin_ns < fate.packet.sent_ns <= end_ns
+        has_arrived = fate.arrived_ns is not None and begin_ns < fate.arrived_ns <= end_ns
+        if not (is_sent or has_arrived) or other is None or not (fate.is_decided and other.is_decided):
             continue
-        if sent:
-            found["position_m"].append(displaced_m(other))
-        found["fates"].append(float(bool(fate.reason) != bool(other.reason)))
+        if is_sent:
+            differences["position_m"].append(position_error_m(other))
+        differences["fates"].append(float(bool(fate.reason) != bool(other.reason)))
         if fate.counted_ns is not None and other.counted_ns is not None:
-            found["delivery_s"].append(abs(fate.counted_ns - other.counted_ns) / 1e9)
-            found["late_s"].append(other.late_ns / 1e9)
-    found["path_m"] = [
-        math.dist(state.position_m, tried.states[name].position_m) for name, state in exact.states.items()
+            differences["delivery_s"].append(abs(fate.counted_ns - other.counted_ns) / 1e9)
+            differences["late_s"].append(other.late_ns / 1e9)
+    differences["path_m"] = [
+        math.dist(state.position_m, actual.states[name].position_m) for name, state in exact.states.items()
     ]
-    return found
+    return differences
 
 
 def _slope(window_s: Floats, sums: Floats, counts: Floats) -> float:
     """Return the slope of mean errors over windows on logarithmic axes, by least squares."""
-    seen = sums > 0
-    if np.count_nonzero(seen) < 2:
+    is_positive = sums > 0
+    if np.count_nonzero(is_positive) < 2:
         return math.nan
-    return float(np.polyfit(np.log(window_s[seen]), np.log(sums[seen] / counts[seen]), 1)[0])
+    means = sums[is_positive] / counts[is_positive]
+    return float(np.polyfit(np.log(window_s[is_positive]), np.log(means), 1)[0])
 
 
-def _forget(run: Run) -> None:
-    """Let forks be copied without the packets whose fate is known already."""
-    for identity in [identity for identity, fate in run.fates.items() if fate.is_known]:
+def _delete_decided(run: Run) -> None:
+    """Delete the packets whose fate is decided, so that forks do not copy them."""
+    for identity in [identity for identity, fate in run.fates.items() if fate.is_decided]:
         del run.fates[identity]
     run.windows_ns.clear()
 
 
-def _check_untouched(
+def _check_unchanged(
     make: Callable[[SyncPolicy], Coordinator], begins_ns: Sequence[int], reference: Coordinator
 ) -> None:
-    alone = make(EventDriven())
+    without_forks = make(EventDriven())
     for begin_ns in begins_ns:
-        _forget(alone.advance(begin_ns))
-    if alone.run.digest != reference.run.digest:
+        _delete_decided(without_forks.advance(begin_ns))
+    if without_forks.run.digest != reference.run.digest:
         raise FieldkitError(
-            "a fork changed the run that it was forked from, so its errors are not its own",
-            remedy="let federates and programs keep nothing that their copies share (copy.deepcopy), nor closures",
+            "a fork changed the run from which it was forked, so the measured errors are wrong",
+            remedy="let copy.deepcopy copy all data of federates and programs, and use no closures",
         )

@@ -1,4 +1,4 @@
-"""Runs of one scenario by several policies and seeds, and what came of each."""
+"""Runs of one scenario with several policies and seeds, and their outcomes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from sim_backends.cosim.policies.base import PolicyError
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.run import Run
 from sim_backends.cosim.studies.seeds import Task, run_many
-from sim_backends.cosim.studies.tracks import Tracked, Tracks
+from sim_backends.cosim.studies.tracks import SampledPhysics, Tracks
 
-LOOK_NS = 100_000_000
-"""How often agents are looked at."""
+SAMPLING_NS = 100_000_000
+"""Interval at which the positions of agents are sampled."""
 
 
 class Simulated(Protocol):
@@ -23,21 +23,21 @@ class Simulated(Protocol):
     agents: Agents
 
     def run(self) -> Run:
-        """Go on until the scenario's end."""
+        """Simulate until the scenario's end."""
         ...
 
 
 Make = Callable[[str, int], Simulated]
-"""Builds one for the name of a policy and a seed."""
+"""Builds the scenario for the name of a policy and a seed."""
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What came of a run.
+    """The outcome of a run.
 
     Attributes:
-        run: What was recorded.
-        tracks: Where agents were.
+        run: The record.
+        tracks: The sampled positions of agents.
     """
 
     run: Run
@@ -46,13 +46,13 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What came of all runs of a scenario.
+    """The outcomes of all runs of a scenario.
 
     Attributes:
         seeds: The seeds.
-        reference: Of the exact reference, by seed.
-        runs: By policy, the reference among them, and seed; without those that could not be run.
-        failures: Why a policy could not be run, with the first seed that it failed with.
+        reference: Outcomes with the exact reference, by seed.
+        runs: Outcomes by policy, including the reference, and by seed; runs that failed are missing.
+        failures: The error of each policy that failed, with the first seed for which it did.
     """
 
     seeds: Sequence[int]
@@ -61,9 +61,9 @@ class Outcomes:
     failures: Mapping[str, PolicyError]
 
     def errors(self, policy: str, seed: int) -> Errors:
-        """Return the coupled errors of one run."""
-        reference, one = self.reference[seed], self.runs[policy][seed]
-        return errors(reference.run, one.run, one.tracks.apart_m(reference.tracks))
+        """Return the errors of one run relative to the reference with the same seed."""
+        reference, outcome = self.reference[seed], self.runs[policy][seed]
+        return errors(reference.run, outcome.run, outcome.tracks.distances_m(reference.tracks))
 
 
 def outcomes(
@@ -74,36 +74,36 @@ def outcomes(
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Outcomes:
-    """Run a scenario by each policy with each seed, by the exact reference too.
+    """Run a scenario with each policy and each seed, including the exact reference.
 
     Args:
-        make: Builds the scenario; can be pickled.
+        make: Builds the scenario; it must be picklable.
         policies: Names of policies.
         seeds: The seeds.
-        workers: As of `run_many`.
-        progress: As of `run_many`.
+        workers: As for `run_many`.
+        progress: As for `run_many`.
 
     Raises:
-        FieldkitError: A run failed otherwise than by its policy having no window.
+        FieldkitError: A run failed for another reason than that its policy had no window.
     """
     names = [EventDriven.name, *(name for name in policies if name != EventDriven.name)]
     tasks = [Task(name, seed) for name in names for seed in seeds]
-    found = run_many(partial(_outcome, make), tasks, workers=workers, progress=progress)
+    results = run_many(partial(_outcome, make), tasks, workers=workers, progress=progress)
     runs: dict[str, dict[int, RunOutcome]] = {name: {} for name in names}
     failures: dict[str, PolicyError] = {}
-    for task, outcome in zip(tasks, found, strict=True):
-        if isinstance(outcome, PolicyError):
-            failures.setdefault(task.policy, outcome)
+    for task, result in zip(tasks, results, strict=True):
+        if isinstance(result, PolicyError):
+            failures.setdefault(task.policy, result)
         else:
-            runs[task.policy][task.seed] = outcome
+            runs[task.policy][task.seed] = result
     return Outcomes(tuple(seeds), runs[EventDriven.name], runs, failures)
 
 
 def _outcome(make: Make, task: Task) -> RunOutcome | PolicyError:
     simulated = make(task.policy, task.seed)
-    tracked = Tracked(simulated.agents.physics, LOOK_NS)
-    simulated.agents.physics = tracked
+    sampled = SampledPhysics(simulated.agents.physics, SAMPLING_NS)
+    simulated.agents.physics = sampled
     try:
-        return RunOutcome(simulated.run(), tracked.tracks)
+        return RunOutcome(simulated.run(), sampled.tracks)
     except PolicyError as error:
         return error

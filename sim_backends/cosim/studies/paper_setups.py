@@ -1,4 +1,4 @@
-"""What the paper's simulations are run with here: shipped scenarios, and what each row of a table changes in them.
+"""The setups that reproduce the paper's simulations: shipped scenarios, and the changes for each row of a table.
 
 Values that the paper does not state are those of the scenario's file and of the default radio: docs/studies/paper.md.
 """
@@ -16,25 +16,25 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.flow_samples import Setup
 
 Changes = Mapping[str, Any]
-"""Other values of a scenario's file, as of `load_scenario`."""
+"""Changes of a scenario's file, as for `load_scenario`."""
 
 RADIOS: Final[Mapping[str, Changes]] = MappingProxyType(
     {"wifi": MappingProxyType({}), "1 Mbit/s": MappingProxyType({"radio": {"rate": "1Mbit/s"}})}
 )
-"""Radios of the mesh: that of its file, and fixed links as EMANE's model RF Pipe has them."""
+"""Radios of the mesh: the one in its file, and fixed links as in EMANE's model RF Pipe."""
 
 _DURATION: Final = "20s"
-"""9 s beyond the last packet of a bag: what is under way even then counts as lost."""
+"""The run ends 9 s after the last packet of a bag; packets that are still under way then count as lost."""
 
 
 def masterless(line: Sight, distance_m: float, changes: Changes, *, flying: bool = False) -> Setup:
-    """Return what a row of tables 1 and 2 is run with: a topic from one agent to another.
+    """Return the setup of a row of tables 1 and 2: a topic from one agent to another.
 
     Args:
         line: With line of sight or without.
-        distance_m: Between the two along that line.
-        changes: What is changed in all rows.
-        flying: Whether the drone sends, and not a ground robot.
+        distance_m: Distance between the two along that line.
+        changes: Changes that apply to all rows.
+        flying: True if the drone sends, instead of a ground robot.
     """
     source, destination, moved = ("iris", "husky-1", "iris") if flying else ("husky-1", "husky-2", "husky-2")
     places = {f"agents.{moved}.along": f"{distance_m}m"}
@@ -42,13 +42,13 @@ def masterless(line: Sight, distance_m: float, changes: Changes, *, flying: bool
 
 
 def master_based(line: Sight, distance_m: float, protocol: str, changes: Changes) -> Setup:
-    """Return what a row of table 3 is run with: all passes the drone, which stands in the air halfway.
+    """Return the setup of a row of table 3: all packets pass the drone, which hovers halfway.
 
     Args:
         line: With line of sight or without.
-        distance_m: Between the two ground robots along that line.
+        distance_m: Distance between the two ground robots along that line.
         protocol: `ros1` (TCP) or `ros1-udp`.
-        changes: What is changed in all rows.
+        changes: Changes that apply to all rows.
     """
     master = {
         "topology": "master",
@@ -61,17 +61,17 @@ def master_based(line: Sight, distance_m: float, protocol: str, changes: Changes
 
 
 def mesh(radio: Changes, changes: Changes) -> Setup:
-    """Return what the experiment with EMANE is run with: exactly, as an emulator synchronizes nothing.
+    """Return the setup of the experiment with EMANE. It is run exactly, as an emulator has no synchronization method.
 
     Args:
         radio: One of `RADIOS`.
-        changes: What is changed beside.
+        changes: Further changes.
     """
     return Setup(load_scenario("ten_node_mesh", {**radio, **changes}), EventDriven.name)
 
 
 def the_flow(setup: Setup) -> str:
-    """Return the name of the one flow of a setup."""
+    """Return the name of the only flow of a setup."""
     (traffic,) = setup.scenario.traffic
     (flow,) = traffic.flows
     return flow
@@ -81,5 +81,5 @@ def _bag(source: str, destination: str, protocol: str) -> dict[str, Any]:
     return {"traffic": [{"kind": "bag", "from": source, "to": destination, "protocol": protocol, "start": "500ms"}]}
 
 
-def _baylands(line: Sight, own: Changes, changes: Changes) -> CosimScenario:
-    return load_scenario("baylands", {"line": str(line), "duration": _DURATION, **own, **changes})
+def _baylands(line: Sight, row_changes: Changes, changes: Changes) -> CosimScenario:
+    return load_scenario("baylands", {"line": str(line), "duration": _DURATION, **row_changes, **changes})

@@ -1,8 +1,8 @@
-"""The paper's tables of delay and loss: what is run for each row, and how it compares with what was printed.
+"""The paper's tables of delay and loss: the setup of each row, and its comparison with the printed numbers.
 
 A row of tables 1 to 3 is one transmission of 10 s of accelerometer data. Its delay is the sum of the delays of its
-packets, as the paper defines its "average delay" (section "Simulation Results"), its loss the share of them that did
-not arrive.
+packets, as the paper defines its "average delay" (section "Simulation Results"); its loss is the share of packets
+that did not arrive.
 """
 
 from collections import Counter
@@ -21,11 +21,11 @@ from sim_backends.cosim.studies.printed_values import DISTANCES_M, EMANE, PRINTE
 TABLES: Final = (*PRINTED, "emane")
 
 _LABELS: Final = {"topic": "topic", "ros1": "tcp", "ros1-udp": "udp"}
-"""Protocols as the paper calls them."""
+"""The paper's names of protocols."""
 
 
 Labels = Mapping[str, str | int]
-"""What tells rows of a table from each other: line of sight, distance and protocol, or which radio, and when."""
+"""The labels of a row: line of sight, distance and protocol, or which radio, and when."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class PaperCell:
     """A number of a table.
 
     Attributes:
-        printed: As the paper has it.
-        ours: Mean over seeds with its interval at 95 %, in SI units.
-        seeds: With how many of them there was a number.
+        printed: The paper's number.
+        ours: Mean over seeds with its 95 % interval, in SI units.
+        seeds: Number of seeds that had a value.
     """
 
     printed: Printed
@@ -44,18 +44,18 @@ class PaperCell:
 
     @property
     def agreement(self) -> Agreement:
-        """How ours stands to the printed one."""
+        """The relation of our number to the printed one."""
         return agreement(self.printed, self.ours)
 
     @property
     def agrees_by_mean(self) -> bool:
-        """Whether the mean itself rounds to what is printed, and not only some value of its interval."""
+        """True if the mean itself rounds to the printed number, and not only a value in its interval."""
         alone = IntervalEstimate(self.ours.value, np.nan, np.nan)
         return agreement(self.printed, alone) is Agreement.AGREES
 
     @property
     def off(self) -> float:
-        """By how much ours is above the printed one; nan without ours."""
+        """Difference of our number from the printed one; nan without ours."""
         return self.ours.value - self.printed.value
 
 
@@ -64,10 +64,10 @@ class PaperRow:
     """A row of a table.
 
     Attributes:
-        labels: Of the row.
+        labels: Labels of the row.
         delay: Sum of the delays of a transmission, or mean round trip, in seconds.
-        loss: Share that did not arrive.
-        reason: Why most of what did not arrive did not; empty where all did.
+        loss: Share of packets that did not arrive.
+        reason: The most frequent reason why packets did not arrive; empty if all arrived.
     """
 
     labels: Labels
@@ -77,12 +77,12 @@ class PaperRow:
 
 
 class RowSource(NamedTuple):
-    """Where a row is taken from.
+    """The source of a row.
 
     Attributes:
-        labels: Of the row.
-        setup: Name of what is run.
-        flow: Which flow of it.
+        labels: Labels of the row.
+        setup: Name of the setup.
+        flow: Name of the flow in it.
         printed: The paper's delay and loss.
     """
 
@@ -94,12 +94,12 @@ class RowSource(NamedTuple):
 
 @dataclass(frozen=True)
 class PaperTable:
-    """What is run for a table, and how its rows come of that.
+    """The setups of a table, and the sources of its rows.
 
     Attributes:
-        setups: What is run, by name.
-        sources: Of the rows.
-        delay_s: What of a sample is a delay of this table.
+        setups: The setups by name.
+        sources: The sources of the rows.
+        delay_s: Returns the delay of a sample, as this table defines it.
     """
 
     setups: Mapping[str, Setup]
@@ -107,43 +107,45 @@ class PaperTable:
     delay_s: Callable[[FlowSample], float]
 
     def rows(self, samples: Mapping[str, Sequence[Mapping[str, FlowSample]]]) -> list[PaperRow]:
-        """Return its rows.
+        """Return the rows.
 
         Args:
-            samples: What `flow_samples` returned for the setups.
+            samples: The result of `flow_samples` for the setups.
         """
-        return [self._row(one, [of_seed[one.flow] for of_seed in samples[one.setup]]) for one in self.sources]
+        return [
+            self._row(source, [of_seed[source.flow] for of_seed in samples[source.setup]]) for source in self.sources
+        ]
 
     def _row(self, source: RowSource, samples: Sequence[FlowSample]) -> PaperRow:
         delay, loss = source.printed
         reasons = sum((Counter(sample.reasons) for sample in samples), Counter())
         return PaperRow(
             source.labels,
-            _cell(delay, [self.delay_s(sample) for sample in samples], most=np.inf),
-            _cell(loss, [sample.loss for sample in samples], most=1.0),
+            _cell(delay, [self.delay_s(sample) for sample in samples], highest=np.inf),
+            _cell(loss, [sample.loss for sample in samples], highest=1.0),
             max(sorted(reasons), key=reasons.__getitem__, default=""),
         )
 
 
 def paper_table(table: str, changes: Mapping[str, Any]) -> PaperTable:
-    """Return one of the paper's tables as something to run.
+    """Return one of the paper's tables.
 
     Args:
         table: One of `TABLES`.
-        changes: Other values of the scenario's file, as of `load_scenario`.
+        changes: Changes of the scenario's file, as for `load_scenario`.
 
     Raises:
-        ConfigurationError: The changes cannot be made.
+        ConfigurationError: The changes are invalid.
     """
     return _emane(changes) if table == "emane" else _transmissions(table, changes)
 
 
-def _cell(printed: Printed, values: Sequence[float], most: float) -> PaperCell:
-    """Return a cell by the values of all seeds, nan where there is none; none is below 0 or above `most`."""
-    known = np.array([value for value in values if np.isfinite(value)])
-    ours = mean(known)
-    low, high = np.clip((ours.low, ours.high), 0, most).tolist()
-    return PaperCell(printed, IntervalEstimate(ours.value, low, high), len(known))
+def _cell(printed: Printed, values: Sequence[float], highest: float) -> PaperCell:
+    """Return a cell for the values of all seeds, nan if unknown; its interval is clipped to 0 to `highest`."""
+    finite = np.array([value for value in values if np.isfinite(value)])
+    ours = mean(finite)
+    low, high = np.clip((ours.low, ours.high), 0, highest).tolist()
+    return PaperCell(printed, IntervalEstimate(ours.value, low, high), len(finite))
 
 
 def _transmissions(table: str, changes: Mapping[str, Any]) -> PaperTable:

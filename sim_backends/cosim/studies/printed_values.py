@@ -1,4 +1,4 @@
-"""The numbers of the paper's tables, as printed. LaTeX labels and sections are those of its source."""
+"""The numbers of the paper's tables, as printed. LaTeX labels and section names are those of its source."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -8,7 +8,7 @@ from fieldkit.core.model import Scenario as Sight
 from sim_backends.cosim.studies.agreement import Printed
 
 DISTANCES_M: Final = (20, 40, 60, 80, 100)
-"""Of every table."""
+"""The distances of every table."""
 
 
 class PrintedColumns(NamedTuple):
@@ -24,10 +24,10 @@ class PrintedColumns(NamedTuple):
 
 
 def _columns(delays_s: str, losses_percent: str) -> PrintedColumns:
-    """Return columns by their digits.
+    """Return columns from their digits.
 
-    A delay of `1` stands among others of `0.8`, and means `1.0`. All 40 losses are multiples of 10 %: that is their
-    step.
+    A delay of `1` is printed in columns with values such as `0.8`, and means `1.0`. All 40 losses are multiples of
+    10 %, which is taken as their precision.
     """
     return PrintedColumns(
         tuple(Printed(text, step="" if "." in text else "0.1") for text in delays_s.split()),
@@ -56,7 +56,7 @@ PRINTED: Final[Mapping[str, Mapping[tuple[Sight, str], PrintedColumns]]] = Mappi
         },
     }
 )
-"""By table, and by line of sight and protocol."""
+"""The columns by table, and by line of sight and protocol."""
 
 EMANE: Final[Mapping[str, tuple[Printed, Printed]]] = MappingProxyType(
     {
@@ -82,4 +82,4 @@ CLAIMS: Final[Mapping[tuple[str, str], tuple[Printed, Printed]]] = MappingProxyT
         (MASTER, Sight.NLOS): (Printed("-40", per_si=100), Printed("-20", per_si=100)),
     }
 )
-"""Relative change of delay, and change of loss in points, by what the own system is compared with, and lines."""
+"""Relative change of delay, and change of loss in percentage points, by compared system and lines."""

@@ -1,11 +1,12 @@
-"""The paper's satisfaction loop: a round is run again with another window until the loss that it gives is accepted.
+"""The paper's satisfaction loop: a round is repeated with another window until its loss is accepted.
 
 The paper (section III, below algorithm 1): the network's loss is compared with a threshold; while it is above, the
 window is changed by algorithm 1, and the same round is run again, until a result "is deemed to be satisfactory". The
-window of a round is what the rule made of the one before.
+window of a round is the result of the rule in the previous round.
 
-A synchronizer does not change what the radio loses. So each round is told beside the exact reference of the same
-scenario and seed, whose loss no window changes: what the loop chooses is an error, and what it costs is every round.
+A synchronization method does not change the losses of the radio. So each round is compared with the exact reference
+of the same scenario and seed, whose loss does not depend on a window. The loop only changes the error of the result,
+and every round adds to its cost.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,11 +25,11 @@ class Round:
     """One round.
 
     Attributes:
-        window_s: The w that it began with.
-        median_window_s: What the rule made of it: the median of its windows.
-        loss: Share of packets lost, of those whose fate is known.
-        errors: Beside the reference.
-        exchanges: Its windows.
+        window_s: Its initial w.
+        median_window_s: Median of the windows that the rule computed from it.
+        loss: Share of packets lost, of those whose fate is decided.
+        errors: Errors relative to the reference.
+        exchanges: Number of windows.
     """
 
     window_s: float
@@ -40,14 +41,14 @@ class Round:
 
 @dataclass(frozen=True)
 class Satisfaction:
-    """What the loop came to.
+    """The result of the loop.
 
     Attributes:
         rounds: All rounds.
-        satisfied: Whether the last one's loss was accepted.
-        reference_loss: What the exact reference loses.
-        reference_exchanges: Its windows.
-        reason: Why it ended without; empty if it was satisfied.
+        satisfied: True if the loss of the last round was accepted.
+        reference_loss: Loss of the exact reference.
+        reference_exchanges: Number of windows of the exact reference.
+        reason: Why the loop ended without an accepted round; empty if it was satisfied.
     """
 
     rounds: Sequence[Round]
@@ -58,8 +59,8 @@ class Satisfaction:
 
     @property
     def exchanges(self) -> int:
-        """What all rounds cost."""
-        return sum(one.exchanges for one in self.rounds)
+        """Number of windows of all rounds."""
+        return sum(round_.exchanges for round_ in self.rounds)
 
 
 def satisfy(
@@ -68,34 +69,34 @@ def satisfy(
     *,
     threshold: float,
     window_s: float = 0.001,
-    most_rounds: int = 20,
+    max_rounds: int = 20,
 ) -> Satisfaction:
-    """Run rounds until one is satisfactory, or none will be.
+    """Run rounds until one is satisfactory, or none can be.
 
     Args:
-        run: Runs a round, always the same, by a policy.
-        rule: Makes the policy of a round from its w: `VelocityAwareRaw`, or `VelocityAware`.
-        threshold: Loss that is accepted.
+        run: Runs the same scenario and seed with a policy.
+        rule: Returns the policy of a round for its w: `VelocityAwareRaw`, or `VelocityAware`.
+        threshold: Accepted loss.
         window_s: w of the first round.
-        most_rounds: After how many it gives up.
+        max_rounds: Largest number of rounds.
     """
     reference = run(EventDriven())
     rounds: list[Round] = []
-    reason = f"{most_rounds} rounds were not enough"
-    for _ in range(most_rounds):
+    reason = f"{max_rounds} rounds were not enough"
+    for _ in range(max_rounds):
         try:
-            found = run(rule(window_s))
+            result = run(rule(window_s))
         except PolicyError as error:
             reason = str(error)
             break
-        median_s = float(np.median(np.diff(found.windows_ns, prepend=0))) / 1e9
-        loss = lost_share(found)
-        rounds.append(Round(window_s, median_s, loss, errors(reference, found), len(found.windows_ns)))
+        median_s = float(np.median(np.diff(result.windows_ns, prepend=0))) / 1e9
+        loss = lost_share(result)
+        rounds.append(Round(window_s, median_s, loss, errors(reference, result), len(result.windows_ns)))
         if loss <= threshold:
             reason = ""
             break
         if median_s == window_s:
-            reason = "the rule leaves the window as it is, and another round would be the same"
+            reason = "the rule does not change the window, so another round would be the same"
             break
         window_s = median_s
     return Satisfaction(rounds, not reason, lost_share(reference), len(reference.windows_ns), reason)

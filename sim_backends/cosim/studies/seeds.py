@@ -22,8 +22,8 @@ class Task:
 
     Attributes:
         policy: Name of its sync policy.
-        seed: Of its random draws.
-        setup: Which of several setups is run; empty where there is one.
+        seed: Seed of its random draws.
+        setup: Name of its setup; empty if there is only one.
     """
 
     policy: str
@@ -41,53 +41,51 @@ def run_many(
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[Result]:
-    """Return what `work` makes of each task, in the order of the tasks.
+    """Return the result of `work` for each task, in the order of the tasks.
 
-    The first error, and Ctrl-C, end all that is under way.
+    After the first error, and after Ctrl-C, all tasks are stopped.
 
     Args:
-        work: Called in another process, unless there is one worker: what it is made of, and what it returns, can be
-            pickled.
+        work: Called in another process, unless there is only one worker; it and its results must be picklable.
         tasks: The tasks.
-        workers: How many processes; None for as many as there are processors for this one.
-        progress: Called with how many tasks are done.
+        workers: Number of processes; None for the number of processors that this process may use.
+        progress: Called with the number of finished tasks.
 
     Raises:
-        FieldkitError: A task failed, or its process died; names the task. Errors of the harness keep their family.
+        FieldkitError: A task failed, or its process died; the error names the task. Errors of fieldkit keep their
+            class.
     """
     results: dict[int, Result] = {}
-    for number, result in as_they_end(work, tasks, workers=workers):
+    for number, result in as_completed_tasks(work, tasks, workers=workers):
         results[number] = result
         if progress is not None:
             progress(len(results))
     return [results[number] for number in range(len(tasks))]
 
 
-def as_they_end(
+def as_completed_tasks(
     work: Callable[[Task], Result], tasks: Sequence[Task], *, workers: int | None = None
 ) -> Iterator[tuple[int, Result]]:
-    """Yield what `work` makes of each task with the task's number, as they end; else as `run_many`."""
+    """Yield the number and the result of each task when it has finished; otherwise like `run_many`."""
     workers = min(workers or len(os.sched_getaffinity(0)), len(tasks))
-    return _side_by_side(work, tasks, workers) if workers > 1 else _one_by_one(work, tasks)
+    return _in_parallel(work, tasks, workers) if workers > 1 else _in_sequence(work, tasks)
 
 
-def _one_by_one(work: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
+def _in_sequence(work: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
     for number, task in enumerate(tasks):
-        yield number, _done(work, task)
+        yield number, _run_task(work, task)
 
 
-def _side_by_side(
-    work: Callable[[Task], Result], tasks: Sequence[Task], workers: int
-) -> Iterator[tuple[int, Result]]:
-    """Yield results as they come; if the generator ends early, the processes end immediately."""
+def _in_parallel(work: Callable[[Task], Result], tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Result]]:
+    """Yield results when they are available; if the generator is closed early, the processes exit immediately."""
     stop_reader, stop_writer = multiprocessing.Pipe(duplex=False)
     executor = ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), initializer=_end_with, initargs=(stop_reader,)
+        workers, multiprocessing.get_context("spawn"), initializer=_exit_with_parent, initargs=(stop_reader,)
     )
     futures: list[Future[Result]] = []
     with stop_reader:
         try:
-            futures.extend(executor.submit(_done, work, task) for task in tasks)
+            futures.extend(executor.submit(_run_task, work, task) for task in tasks)
             numbers = {future: number for number, future in enumerate(futures)}
             for future in as_completed(futures):
                 yield numbers[future], future.result()
@@ -108,8 +106,8 @@ def _is_broken(future: Future[Result]) -> bool:
     return future.done() and isinstance(future.exception(), BrokenProcessPool)
 
 
-def _end_with(stop_reader: Connection) -> None:
-    """Let this process ignore Ctrl-C and end when the other end of the pipe closes, as when its caller is killed."""
+def _exit_with_parent(stop_reader: Connection) -> None:
+    """Ignore Ctrl-C in this process, and exit when the other end of the pipe is closed, as when the parent dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def wait() -> None:
@@ -119,7 +117,7 @@ def _end_with(stop_reader: Connection) -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _done(work: Callable[[Task], Result], task: Task) -> Result:
+def _run_task(work: Callable[[Task], Result], task: Task) -> Result:
     """Return the result of a task.
 
     Raises:
@@ -131,5 +129,5 @@ def _done(work: Callable[[Task], Result], task: Task) -> Result:
         error.where = f"{task}: {error.where}" if error.where else str(task)
         raise
     except Exception as error:
-        remedy = "this is a fault of the program; a single worker shows where"
+        remedy = "this is a bug in the program; run it with a single worker to locate it"
         raise FieldkitError(f"{type(error).__name__}: {error}", where=str(task), remedy=remedy) from error

@@ -1,4 +1,4 @@
-"""Where agents are at equal times of several runs, whatever their windows."""
+"""Positions of agents, sampled at equal times in several runs, independently of their windows."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,64 +17,65 @@ class Tracks:
 
     Attributes:
         names: The agents.
-        times_s: When, shape (times,).
-        places_m: Metres east, north, up, shape (times, agents, 3).
+        times_s: Times, shape (times,).
+        places_m: Positions in metres east, north, up, shape (times, agents, 3).
     """
 
     names: Sequence[str]
     times_s: Floats
     places_m: Floats
 
-    def apart_m(self, other: "Tracks") -> Floats:
-        """Return how far each agent is from where it is in another run, as long as both go, shape (times, agents)."""
+    def distances_m(self, other: "Tracks") -> Floats:
+        """Return the distance of each agent from its position in another run, shape (common times, agents)."""
         shorter = min(len(self.times_s), len(other.times_s))
-        apart_m: Floats = np.linalg.norm(self.places_m[:shorter] - other.places_m[:shorter], axis=2)
-        return apart_m
+        distances_m: Floats = np.linalg.norm(self.places_m[:shorter] - other.places_m[:shorter], axis=2)
+        return distances_m
 
 
 def tracks_of(states: Iterable[tuple[int, str, State]]) -> Tracks:
-    """Return the tracks of states as a recording has them, of all agents at each of its times.
+    """Return the tracks of recorded states; each of their times must have the states of all agents.
 
     Args:
-        states: When in nanoseconds, whose, and what, in the order of time.
+        states: Time in nanoseconds, agent, state, in the order of time.
     """
-    seen: dict[int, dict[str, State]] = {}
+    by_time: dict[int, dict[str, State]] = {}
     for at_ns, name, state in states:
-        seen.setdefault(at_ns, {})[name] = state
-    return _tracks(np.array([*seen], dtype=np.float64) / 1e9, [*seen.values()])
+        by_time.setdefault(at_ns, {})[name] = state
+    return _tracks(np.array([*by_time], dtype=np.float64) / 1e9, [*by_time.values()])
 
 
-def _tracks(times_s: Floats, seen: Sequence[Mapping[str, State]]) -> Tracks:
-    names = tuple(seen[0]) if seen else ()
-    places_m = [[states[name].position_m for name in names] for states in seen]
-    return Tracks(names, times_s, np.array(places_m, dtype=np.float64).reshape(len(seen), len(names), 3))
+def _tracks(times_s: Floats, samples: Sequence[Mapping[str, State]]) -> Tracks:
+    names = tuple(samples[0]) if samples else ()
+    places_m = [[states[name].position_m for name in names] for states in samples]
+    return Tracks(names, times_s, np.array(places_m, dtype=np.float64).reshape(len(samples), len(names), 3))
 
 
-class Tracked:
-    """Physics whose agents are looked at in equal intervals; how they move it leaves as it is.
+class SampledPhysics:
+    """Physics whose states are sampled at equal intervals, which does not change the motion.
 
     Args:
         physics: The physics.
-        interval_ns: From one look to the next: whole steps of the physics.
+        interval_ns: Sampling interval; it is rounded up to whole steps of the physics.
     """
 
     def __init__(self, physics: PhysicsFederate, interval_ns: int) -> None:
         self._physics = physics
         self._interval_ns = -(-interval_ns // physics.step_ns) * physics.step_ns
         self._next_ns = 0
-        self._seen: list[Mapping[str, State]] = []
+        self._samples: list[Mapping[str, State]] = []
         self.step_ns = physics.step_ns
         self.limits_m_s2 = physics.limits_m_s2
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        """See `PhysicsFederate.advance`."""
+        """Advance the physics, and take the samples that are due."""
         while self._next_ns <= to_ns:
-            self._seen.append(self._physics.advance(self._next_ns, commands))
+            self._samples.append(self._physics.advance(self._next_ns, commands))
             self._next_ns += self._interval_ns
             commands = {}
         return self._physics.advance(to_ns, commands)
 
     @property
     def tracks(self) -> Tracks:
-        """What was seen so far."""
-        return _tracks(np.arange(len(self._seen), dtype=np.float64) * (self._interval_ns / 1e9), self._seen)
+        """The samples so far."""
+        times_s = np.arange(len(self._samples), dtype=np.float64) * (self._interval_ns / 1e9)
+        return _tracks(times_s, self._samples)

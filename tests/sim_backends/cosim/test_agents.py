@@ -1,4 +1,4 @@
-"""When programs are woken, whatever they plan and however often they plan anew."""
+"""Wake times of programs, for any sequence of planned times, and agents that appear during a run."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,7 +19,7 @@ from sim_backends.world.motion import State
 NAMES = ("a", "b", "c")
 MS = 1_000_000
 END_NS = 100
-MAIL_AT_NS = range(0, END_NS, 10)
+RECEIVED_AT_NS = range(0, END_NS, 10)
 
 
 class Still:
@@ -30,8 +30,8 @@ class Still:
         return dict.fromkeys(NAMES, State((0.0, 0.0, 0.0)))
 
 
-class Fickle:
-    """Plans, each time that it wakes, the next entry of a list: so long after now, or never."""
+class Planned:
+    """Plans its next wake time, each time that it wakes, by the next entry of a list: a delay, or None for never."""
 
     def __init__(self, name: str, after_ns: Sequence[int | None], woke: list[tuple[int, str]]) -> None:
         self._name = name
@@ -46,7 +46,7 @@ class Fickle:
     def next_wake_ns(self) -> int | None:
         return self._wake_ns
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
         self._woke.append((now_ns, self._name))
         self._wake_ns = self._next_ns(now_ns)
         return Action()
@@ -55,34 +55,34 @@ class Fickle:
 PLANS = st.fixed_dictionaries(
     {name: st.lists(st.one_of(st.integers(1, 60), st.none()), max_size=12) for name in NAMES}
 )
-MAIL = st.lists(st.sets(st.sampled_from(NAMES)), min_size=len(MAIL_AT_NS), max_size=len(MAIL_AT_NS))
+RECEIVERS = st.lists(st.sets(st.sampled_from(NAMES)), min_size=len(RECEIVED_AT_NS), max_size=len(RECEIVED_AT_NS))
 
 
-@given(PLANS, MAIL)
-def test_each_wakes_when_it_said_last_and_when_it_has_mail(
-    plans: dict[str, list[int | None]], mail: list[set[str]]
+@given(PLANS, RECEIVERS)
+def test_programs_wake_at_their_last_planned_time_and_when_they_receive(
+    plans: dict[str, list[int | None]], receivers: list[set[str]]
 ) -> None:
     woke: list[tuple[int, str]] = []
-    agents = Agents(Still(), {name: Fickle(name, plan, woke) for name, plan in plans.items()})
+    agents = Agents(Still(), {name: Planned(name, plan, woke) for name, plan in plans.items()})
     expected: list[tuple[int, str]] = []
-    programs = {name: Fickle(name, plan, expected) for name, plan in plans.items()}
-    own = State((0.0, 0.0, 0.0))
-    for now_ns, names in zip(MAIL_AT_NS, mail, strict=True):
+    programs = {name: Planned(name, plan, expected) for name, plan in plans.items()}
+    state = State((0.0, 0.0, 0.0))
+    for now_ns, names in zip(RECEIVED_AT_NS, receivers, strict=True):
         for name in sorted(names):
-            agents.hand_over(name, Received("x", None, now_ns, now_ns))
-            programs[name].wake(now_ns, own, ())
+            agents.deliver(name, Received("x", None, now_ns, now_ns))
+            programs[name].wake(now_ns, state, ())
         agents.advance(now_ns, now_ns + 9, now_ns + 9)
         for at_ns in range(now_ns, now_ns + 10):
             for name in NAMES:
                 if programs[name].next_wake_ns() == at_ns:
-                    programs[name].wake(at_ns, own, ())
+                    programs[name].wake(at_ns, state, ())
         assert woke == expected
-        planned_ns = [wake_ns for one in programs.values() if (wake_ns := one.next_wake_ns()) is not None]
+        planned_ns = [wake_ns for program in programs.values() if (wake_ns := program.next_wake_ns()) is not None]
         assert agents.next_wake_ns() == min(planned_ns, default=None)
 
 
 class Growing(Still):
-    """An agent appears within a window."""
+    """Physics in which an agent appears within a window."""
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
         late = {"late": State((3.0, 4.0, 0.0))} if to_ns >= 12 * MS else {}
@@ -91,7 +91,7 @@ class Growing(Still):
 
 @pytest.mark.parametrize("extrapolates", [False, True])
 @pytest.mark.parametrize("policy", POLICIES)
-def test_an_agent_that_appears_during_a_run_is_sent_to_with_every_policy(policy: str, *, extrapolates: bool) -> None:
+def test_an_agent_that_appears_during_a_run_can_receive_with_every_policy(policy: str, *, extrapolates: bool) -> None:
     physics = Growing()
     physics.step_ns = MS
     programs = {
@@ -103,5 +103,5 @@ def test_an_agent_that_appears_during_a_run_is_sent_to_with_every_policy(policy:
     run = Coordinator(Agents(physics, programs), network, make, [("b", "a")]).advance(60 * MS)
     to_late = [fate for fate in run.fates.values() if fate.packet.destination == "late"]
     assert len(to_late) >= 5
-    assert all(fate.known[1].position_m == (3.0, 4.0, 0.0) for fate in to_late)
+    assert all(fate.assumed[1].position_m == (3.0, 4.0, 0.0) for fate in to_late)
     assert not any(fate.reason for fate in run.fates.values())

@@ -1,4 +1,4 @@
-"""The coordinator with federates whose every answer was written down beforehand, at random."""
+"""The coordinator with federates that give random scripted answers."""
 
 import hashlib
 import heapq
@@ -28,54 +28,54 @@ LOST = None
 
 
 class Drifting:
-    """Agents that are where the time is, in metres, at whole steps."""
+    """Agents whose position in metres is the time in nanoseconds, at whole steps."""
 
     def __init__(self, names: Sequence[str], step_ns: int) -> None:
         self._names = names
         self.step_ns = step_ns
         self.limits_m_s2: Mapping[str, float] = dict.fromkeys(names, 0.0)
-        self.asked: list[int] = [0]
+        self.times_ns: list[int] = [0]
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        assert to_ns >= self.asked[-1], "asked with times that never go back"
-        self.asked.append(to_ns)
+        assert to_ns >= self.times_ns[-1], "times never decrease"
+        self.times_ns.append(to_ns)
         return {name: State((float(to_ns // self.step_ns * self.step_ns), 0.0, 0.0)) for name in self._names}
 
 
 class Scripted:
-    """Sends at given times, and answers every datagram that is no answer."""
+    """Sends at given times, and replies to every datagram that is not a reply."""
 
     def __init__(self, name: str, sends: Sequence[tuple[int, str]]) -> None:
         self._name = name
         self._sends = sorted(sends)[::-1]
         self._numbers: dict[str, int] = {}
-        self.heard: list[tuple[int, Received]] = []
+        self.received: list[tuple[int, Received]] = []
 
     def next_wake_ns(self) -> int | None:
         return self._sends[-1][0] if self._sends else None
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-        self.heard += [(now_ns, one) for one in received]
-        to = [one.source for one in received if one.payload == "question"]
-        datagrams = [self._datagram(name, "answer") for name in to]
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        self.received += [(now_ns, datagram) for datagram in received]
+        to = [datagram.source for datagram in received if datagram.payload == "request"]
+        datagrams = [self._datagram(name, "reply") for name in to]
         while self._sends and self._sends[-1][0] <= now_ns:
-            datagrams.append(self._datagram(self._sends.pop()[1], "question"))
+            datagrams.append(self._datagram(self._sends.pop()[1], "request"))
         return Action(datagrams)
 
-    def _datagram(self, to: str, what: str) -> Datagram:
+    def _datagram(self, to: str, payload: str) -> Datagram:
         flow = f"{self._name} to {to}"
         number = self._numbers[flow] = self._numbers.get(flow, -1) + 1
-        return Datagram(to, 10, flow, number, what)
+        return Datagram(to, 10, flow, number, payload)
 
 
 class Delays:
-    """A network in which the n-th packet takes the n-th delay, or is lost after 0 ns for None."""
+    """A network in which the n-th packet has the n-th delay, or is dropped after 0 ns if that is None."""
 
     def __init__(self, delays_ns: Sequence[int | None]) -> None:
         self._delays_ns = delays_ns
         self._events: list[tuple[int, int, bool, str]] = []
         self._now_ns = 0
-        self.got: list[Packet] = []
+        self.entered: list[Packet] = []
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
@@ -86,7 +86,7 @@ class Delays:
             delay_ns = self._delays_ns[packet.packet_id % len(self._delays_ns)]
             event = packet.enters_ns + (delay_ns or 0), packet.packet_id, delay_ns is not LOST, packet.destination
             heapq.heappush(self._events, event)
-        self.got += packets
+        self.entered += packets
         self._now_ns = to_ns
         arrivals, drops = [], []
         while self._events and self._events[0][0] <= to_ns:
@@ -103,31 +103,31 @@ class Delays:
 
 @dataclass
 class ScriptedPolicy:
-    """A policy whose windows were written down, of any kind."""
+    """A policy with scripted windows and any combination of flags."""
 
     lengths_ns: Sequence[int]
-    holds_sends: bool
-    knows_end: bool
-    holds_arrivals: bool
+    defers_sends: bool
+    uses_end_states: bool
+    defers_arrivals: bool
     name: str = "scripted"
     exact: bool = False
-    asked: int = 0
+    calls: int = 0
 
     def next_window(self, situation: Situation) -> int:
-        self.asked += 1
-        return situation.now_ns + self.lengths_ns[self.asked % len(self.lengths_ns)]
+        self.calls += 1
+        return situation.now_ns + self.lengths_ns[self.calls % len(self.lengths_ns)]
 
 
 @dataclass
 class Setting:
-    """A co-simulation that can be run again.
+    """A co-simulation that can be run repeatedly.
 
     Attributes:
-        lengths_ns: Of its windows, in turn.
-        flags: Of its policy.
-        sends: What each agent sends: when, and to whom.
-        delays_ns: Of its network.
-        step_ns: Of its physics.
+        lengths_ns: Lengths of its windows, repeated.
+        flags: Flags of its policy.
+        sends: Times and receivers of the datagrams of each agent.
+        delays_ns: Delays of its network.
+        step_ns: Step of its physics.
     """
 
     lengths_ns: Sequence[int]
@@ -143,7 +143,7 @@ class Setting:
         self.programs = {name: Scripted(name, self.sends[name]) for name in names}
         self.network = Delays(self.delays_ns)
         agents = Agents(Drifting(names, self.step_ns), self.programs)
-        pairs = [(one, other) for one in NAMES for other in NAMES if one != other]
+        pairs = [(source, to) for source in NAMES for to in NAMES if source != to]
         policy = ScriptedPolicy(self.lengths_ns, *self.flags)
         return Coordinator(agents, self.network, policy, pairs, observer=observer).advance(END_NS)
 
@@ -160,42 +160,44 @@ SETTINGS = st.builds(
 
 
 @given(SETTINGS)
-def test_nothing_is_delivered_before_it_was_sent_and_everything_ends_once(setting: Setting) -> None:
+def test_packets_are_delivered_after_they_were_sent_and_decided_once(setting: Setting) -> None:
     run = setting.run()
-    holds_sends, knows_end, holds_arrivals = setting.flags
+    defers_sends, uses_end_states, defers_arrivals = setting.flags
     assert run.windows_ns == sorted(set(run.windows_ns))
     assert run.windows_ns[-1] == END_NS
     lengths_ns = [end_ns - begin_ns for begin_ns, end_ns in pairwise([0, *run.windows_ns])]
     script = islice(cycle(setting.lengths_ns), 1, len(lengths_ns))
-    assert lengths_ns[:-1] == list(script), "windows are as the policy said, but for the last"
-    assert [packet.packet_id for packet in setting.network.got] == list(range(1, len(setting.network.got) + 1))
+    assert lengths_ns[:-1] == list(script), "all windows but the last have the lengths of the policy"
+    assert [packet.packet_id for packet in setting.network.entered] == list(
+        range(1, len(setting.network.entered) + 1)
+    )
     for fate in run.fates.values():
         packet = fate.packet
-        assert fate.packet.enters_ns in run.windows_ns if holds_sends else packet.enters_ns == packet.sent_ns
+        assert fate.packet.enters_ns in run.windows_ns if defers_sends else packet.enters_ns == packet.sent_ns
         delay_ns = setting.delays_ns[packet.packet_id % len(setting.delays_ns)]
         at_ns = packet.enters_ns + (delay_ns or 0)
-        last_ns = END_NS if knows_end else END_NS - 1
-        assert fate.is_known == (at_ns <= last_ns), "what has an end by now has it, what has none yet is under way"
+        last_ns = END_NS if uses_end_states else END_NS - 1
+        assert fate.is_decided == (at_ns <= last_ns), "packets whose event is after the end are under way"
         if fate.reason:
             assert delay_ns is LOST
         elif fate.arrived_ns is not None and fate.counted_ns is not None:
             assert fate.arrived_ns == at_ns
             assert fate.counted_ns >= fate.arrived_ns
-            assert fate.late_ns == 0 or not holds_arrivals
+            assert fate.late_ns == 0 or not defers_arrivals
             assert fate.counted_ns + fate.late_ns in run.windows_ns
-    heard = [(name, *one) for name, program in setting.programs.items() for one in program.heard]
-    for _, now_ns, received in heard:
+    all_received = [item for program in setting.programs.values() for item in program.received]
+    for now_ns, received in all_received:
         assert received.sent_ns <= received.arrived_ns <= now_ns
     arrived = [fate for fate in run.fates.values() if fate.arrived_ns is not None]
-    assert len(heard) <= len(arrived), "what arrives in the last window is not heard any more"
-    assert len(arrived) - len(heard) == sum(
+    assert len(all_received) <= len(arrived), "arrivals in the last window are not delivered any more"
+    assert len(arrived) - len(all_received) == sum(
         fate.counted_ns is not None and fate.counted_ns + fate.late_ns == END_NS for fate in arrived
     )
 
 
 @dataclass
 class Watching:
-    """An observer that keeps everything."""
+    """An observer that keeps all windows."""
 
     windows: list[Window] = field(default_factory=list)
     ended: list[tuple[tuple[str, int], int | None]] = field(default_factory=list)
@@ -209,45 +211,45 @@ class Watching:
 
 
 @given(SETTINGS)
-def test_the_network_knows_the_states_that_the_policy_says(setting: Setting) -> None:
+def test_the_network_assumes_the_states_that_the_policy_determines(setting: Setting) -> None:
     watching = Watching()
     setting.run(watching)
     for window in watching.windows:
-        known_at_ns = window.end_ns if setting.flags[1] else window.begin_ns
+        assumed_at_ns = window.end_ns if setting.flags[1] else window.begin_ns
         for fate in window.entered:
-            for known, true in zip(fate.known, fate.true, strict=True):
-                assert known.position_m[0] == known_at_ns // setting.step_ns * setting.step_ns
+            for assumed, true in zip(fate.assumed, fate.true, strict=True):
+                assert assumed.position_m[0] == assumed_at_ns // setting.step_ns * setting.step_ns
                 assert true.position_m[0] == fate.packet.sent_ns // setting.step_ns * setting.step_ns
 
 
 @given(SETTINGS)
-def test_the_digest_depends_on_no_observer_and_no_order_of_names(setting: Setting) -> None:
+def test_the_digest_is_independent_of_observers_and_of_the_order_of_names(setting: Setting) -> None:
     run, watching = setting.run(), Watching()
     assert setting.run(watching).digest == run.digest
     assert setting.run(backwards=True).digest == run.digest
 
 
 @given(SETTINGS)
-def test_an_observer_is_told_everything_once_and_in_order(setting: Setting) -> None:
+def test_an_observer_receives_everything_once_and_in_order(setting: Setting) -> None:
     watching = Watching()
     run = setting.run(watching)
     assert [window.end_ns for window in watching.windows] == run.windows_ns
     assert [window.begin_ns for window in watching.windows] == [0, *run.windows_ns[:-1]]
     entered = [fate for window in watching.windows for fate in window.entered]
     assert entered == list(run.fates.values())
-    known: list[Fate] = [fate for fate in run.fates.values() if fate.is_known]
-    assert sorted(watching.ended) == sorted((fate.packet.identity, fate.arrived_ns) for fate in known)
+    decided: list[Fate] = [fate for fate in run.fates.values() if fate.is_decided]
+    assert sorted(watching.ended) == sorted((fate.packet.identity, fate.arrived_ns) for fate in decided)
     for part, total_s in run.wall_s.items():
         assert sum(window.wall_s[part] for window in watching.windows) == pytest.approx(total_s)
     before = watching.first
     for window in watching.windows:
-        assert window.known == (window.states if setting.flags[1] else before)
+        assert window.assumed == (window.states if setting.flags[1] else before)
         before = window.states
 
 
 @given(SETTINGS, SETTINGS)
-def test_other_runs_have_other_digests(one: Setting, other: Setting) -> None:
-    first, second = one.run(), other.run()
+def test_different_runs_have_different_digests(setting: Setting, other: Setting) -> None:
+    first, second = setting.run(), other.run()
     same = first.windows_ns == second.windows_ns and [
         (fate.packet, fate.arrived_ns, fate.reason) for fate in first.fates.values()
     ] == [(fate.packet, fate.arrived_ns, fate.reason) for fate in second.fates.values()]
@@ -261,12 +263,12 @@ ARRIVED = Fate(SENT, (HERE, HERE), (HERE, HERE), arrived_ns=120, counted_ns=130)
 
 def digest(entered: Sequence[Fate], ended: Sequence[Fate], end_ns: int = 130) -> str:
     """Return the digest of one window."""
-    found = EventDigest()
-    found.window(end_ns, entered, ended)
-    return found.hexdigest()
+    event_digest = EventDigest()
+    event_digest.add_window(end_ns, entered, ended)
+    return event_digest.hexdigest()
 
 
-def test_whatever_differs_in_a_window_is_in_the_digest() -> None:
+def test_every_difference_in_a_window_changes_the_digest() -> None:
     fields: dict[str, Any] = {
         "packet_id": 8,
         "source": "c",
@@ -279,23 +281,23 @@ def test_whatever_differs_in_a_window_is_in_the_digest() -> None:
     others.append(replace(ARRIVED, packet=replace(SENT, identity=("a to c", 3))))
     fates = [ARRIVED, replace(ARRIVED, arrived_ns=121)]
     fates += [replace(ARRIVED, arrived_ns=None, reason=reason) for reason in ("lost", "late")]
-    found = [digest([one], [ARRIVED]) for one in (ARRIVED, *others)]
-    found += [digest([ARRIVED], [one]) for one in fates[1:]]
-    found += [digest([ARRIVED], []), digest([], [ARRIVED]), digest([ARRIVED], [ARRIVED], 131)]
-    assert len(set(found)) == len(found) == len(fields) + 2 + 3 + 3
+    digests = [digest([fate], [ARRIVED]) for fate in (ARRIVED, *others)]
+    digests += [digest([ARRIVED], [fate]) for fate in fates[1:]]
+    digests += [digest([ARRIVED], []), digest([], [ARRIVED]), digest([ARRIVED], [ARRIVED], 131)]
+    assert len(set(digests)) == len(digests) == len(fields) + 2 + 3 + 3
 
 
-def test_quiet_windows_are_hashed_as_all_others() -> None:
-    """By hand, as recordings have it: each event's mark, number and time, in order."""
-    found = EventDigest()
+def test_quiet_windows_are_hashed_like_all_others() -> None:
+    """Computed by hand: the mark, number and time of each event, in order."""
+    event_digest = EventDigest()
     for end_ns in (100, 110):
-        found.quiet_ns.append(end_ns)
-    found.window(130, [ARRIVED], [ARRIVED])
-    found.quiet_ns.append(140)
+        event_digest.quiet_ends_ns.append(end_ns)
+    event_digest.add_window(130, [ARRIVED], [ARRIVED])
+    event_digest.quiet_ends_ns.append(140)
     events = struct.pack("<cQQcQQ", b"w", 0, 100, b"w", 1, 110)
     events += struct.pack("<QqqQQ", 7, 3, 10, 100, 110) + b"a\0b\0a to b\0udp\0"
     events += struct.pack("<cQQcQQcQQ", b"a", 7, 120, b"w", 2, 130, b"w", 3, 140)
-    assert found.hexdigest() == hashlib.blake2b(events, digest_size=16).hexdigest()
-    found.quiet_ns.append(150)
+    assert event_digest.hexdigest() == hashlib.blake2b(events, digest_size=16).hexdigest()
+    event_digest.quiet_ends_ns.append(150)
     events += struct.pack("<cQQ", b"w", 4, 150)
-    assert found.hexdigest() == hashlib.blake2b(events, digest_size=16).hexdigest()
+    assert event_digest.hexdigest() == hashlib.blake2b(events, digest_size=16).hexdigest()

@@ -1,4 +1,4 @@
-"""A party that does not answer in time, fails, or gives an impossible answer is named."""
+"""A federate or program that fails, times out, or gives an impossible answer is named in the error."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -37,7 +37,7 @@ def periodic(destination: str = "b") -> Periodic:
     return Periodic("ab", destination, period_ns=10 * MS, first_ns=2 * MS)
 
 
-def two(
+def pair(
     *,
     physics: PhysicsFederate | None = None,
     network: NetworkFederate | None = None,
@@ -55,68 +55,68 @@ def two(
 
 
 @pytest.mark.parametrize(
-    ("who", "asked"),
+    ("federate", "message"),
     [
         ("physics", "physics has not answered for 0.25 s: asked to advance from 0.006 s to 0.009 s"),
         ("network", "network has not answered for 0.25 s: asked to advance from 0.006 s to 0.009 s"),
         ("program", "the program of a has not answered for 0.25 s: asked to act at 0.012 s"),
     ],
 )
-def test_who_does_not_answer_within_the_deadline_is_named_with_what_it_was_asked(who: str, asked: str) -> None:
+def test_a_timeout_names_the_federate_and_the_request(federate: str, message: str) -> None:
     stall = Stall(7 * MS, FOR_EVER_S, LIMIT_S)
     hanging = {
-        "physics": lambda: two(physics=stalled(paths(), stall)),
-        "network": lambda: two(network=stalled(Disc(1.0, MS), stall)),
-        "program": lambda: two(program=stalled(periodic(), stall)),
-    }[who]()
+        "physics": lambda: pair(physics=stalled(paths(), stall)),
+        "network": lambda: pair(network=stalled(Disc(1.0, MS), stall)),
+        "program": lambda: pair(program=stalled(periodic(), stall)),
+    }[federate]()
     with pytest.raises(UnansweredError) as raised:
         hanging.advance(1000 * MS)
-    assert raised.value.what == asked
+    assert raised.value.what == message
     assert raised.value.remedy
-    whole = {"physics": 6, "network": 6, "program": 9}[who] * MS
-    assert hanging.run.windows_ns[-1] == whole, "what went before is kept"
-    assert hanging.run.digest == two().advance(whole).digest
+    complete_ns = {"physics": 6, "network": 6, "program": 9}[federate] * MS
+    assert hanging.run.windows_ns[-1] == complete_ns, "the windows before are kept"
+    assert hanging.run.digest == pair().advance(complete_ns).digest
 
 
-def test_a_policy_that_looks_ahead_is_named_with_how_far_the_window_has_come() -> None:
+def test_an_error_of_a_policy_that_looks_ahead_has_the_time_that_the_window_has_reached() -> None:
     class Faulty(ErrorBounded):
-        def goes_on(self, situation: Situation) -> int:
+        def extended_end_ns(self, situation: Situation) -> int:
             if situation.now_ns >= 7 * MS:
                 next(iter(()))
             return situation.now_ns + MS
 
     with pytest.raises(FederateError, match=r"policy error_bounded failed when .* StopIteration") as raised:
-        two(policy=Faulty()).advance(1000 * MS)
-    assert "say until when the window goes on that has come to 0.007 s" in str(raised.value)
+        pair(policy=Faulty()).advance(1000 * MS)
+    assert "extend the window beyond 0.007 s" in str(raised.value)
 
 
-@pytest.mark.parametrize("who", ["agents", "network"])
-def test_a_stall_below_the_deadline_is_wait_and_changes_nothing_else(who: str) -> None:
+@pytest.mark.parametrize("part", ["agents", "network"])
+def test_a_stall_below_the_deadline_only_adds_waiting_time(part: str) -> None:
     stall = Stall(7 * MS, 0.03, LIMIT_S)
     waiting = (
-        two(physics=stalled(paths(), stall)) if who == "agents" else two(network=stalled(Disc(1.0, MS), stall))
+        pair(physics=stalled(paths(), stall)) if part == "agents" else pair(network=stalled(Disc(1.0, MS), stall))
     ).advance(1000 * MS)
-    plain = two().advance(1000 * MS)
+    plain = pair().advance(1000 * MS)
     assert waiting.wall_s["wait"] >= 0.03
-    assert waiting.wall_s[who] > 0, "it did not wait only"
+    assert waiting.wall_s[part] > 0, "the other time is not waiting time"
     assert plain.wall_s["wait"] == 0
     assert (waiting.digest, waiting.fates) == (plain.digest, plain.fates)
 
 
-def test_what_stalls_can_be_copied_and_has_what_its_party_has() -> None:
+def test_a_stalled_federate_can_be_copied_and_has_its_attributes() -> None:
     copied = copy.deepcopy(stalled(paths(), Stall(7 * MS, 0.0)))
     assert copied.step_ns == paths().step_ns
     assert not hasattr(copied, "next_event_ns")
 
 
-def test_all_stalls_of_one_party_are_wait() -> None:
+def test_all_stalls_of_one_federate_count_as_waiting_time() -> None:
     network = Disc(1.0, MS)
     twice = stalled(stalled(network, Stall(7 * MS, 0.01)), Stall(20 * MS, 0.02))
-    assert two(network=twice).advance(1000 * MS).wall_s["wait"] >= 0.03
+    assert pair(network=twice).advance(1000 * MS).wall_s["wait"] >= 0.03
 
 
 class Failing:
-    """Fails, as everything may, from a time on."""
+    """Physics and program that fail from a time on."""
 
     step_ns = MS
     limits_m_s2: Mapping[str, float] = {}
@@ -129,7 +129,7 @@ class Failing:
             raise KeyError("wheel")
         return dict.fromkeys("ab", State((0.0, 0.0, 0.0)))
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
         raise RuntimeError("no plan")
 
     def next_wake_ns(self) -> int:
@@ -153,7 +153,7 @@ class Broken(Disc):
 
 
 @pytest.mark.parametrize(
-    ("of", "said"),
+    ("parts", "message"),
     [
         ({"physics": Failing(10 * MS)}, r"physics failed when .* from 0\.009 s to 0\.012 s: KeyError: 'wheel'"),
         ({"network": FailingDisc(1.0, MS)}, r"network failed when .* from 0 s to 0\.003 s: ValueError: no air"),
@@ -162,17 +162,17 @@ class Broken(Disc):
             r"network failed when .* its next event after 0 s: ValueError: no heap",
         ),
         ({"program": Failing(MS)}, r"the program of a failed when .* act at 0\.005 s: RuntimeError: no plan"),
-        ({"program": Failing(0)}, r"the program of a failed when .* wakes next after 0 s: OSError: no clock"),
+        ({"program": Failing(0)}, r"the program of a failed when .* next wake time after 0 s: OSError: no clock"),
     ],
 )
-def test_who_fails_is_named_with_its_last_time(of: dict[str, Any], said: str) -> None:
-    with pytest.raises(FederateError, match=said) as raised:
-        two(**of).advance(1000 * MS)
+def test_a_failure_names_the_federate_and_its_last_time(parts: dict[str, Any], message: str) -> None:
+    with pytest.raises(FederateError, match=message) as raised:
+        pair(**parts).advance(1000 * MS)
     assert raised.value.__cause__ is not None
 
 
 class Answers:
-    """A network that gives the answer it is told to, in the window in which it gets its first packet."""
+    """A network that gives a fixed answer in the window in which its first packet enters."""
 
     def __init__(self, arrivals: Sequence[Arrival] = (), drops: Sequence[Drop] = ()) -> None:
         self._answer = list(arrivals), list(drops)
@@ -187,19 +187,19 @@ class Answers:
 
 
 @pytest.mark.parametrize(
-    ("answer", "said"),
+    ("answer", "message"),
     [
-        (Answers([Arrival(2, "b", 2 * MS)]), "told the fate of packet 2, which it never got"),
-        (Answers([Arrival(1, "b", 2 * MS)] * 2), "packet 1, whose fate it has told already"),
-        (Answers([Arrival(1, "b", 2 * MS)], [Drop(1, "lost")]), "packet 1, whose fate it has told already"),
+        (Answers([Arrival(2, "b", 2 * MS)]), "reported the fate of packet 2, which it never got"),
+        (Answers([Arrival(1, "b", 2 * MS)] * 2), "packet 1, which was reported before"),
+        (Answers([Arrival(1, "b", 2 * MS)], [Drop(1, "lost")]), "packet 1, which was reported before"),
         (Answers([Arrival(1, "a", 2 * MS)]), "delivered packet 1 for b to a"),
         (Answers([Arrival(1, "b", 2 * MS - 1)]), r"0 s to 0\.003 s, .* entered at 0\.002 s, at 0\.001999999 s"),
         (Answers([Arrival(1, "b", 3 * MS + 1)]), r"packet 1, .* at 0\.003000001 s"),
     ],
 )
-def test_answers_of_the_network_that_cannot_be_are_refused(answer: Answers, said: str) -> None:
-    with pytest.raises(FederateError, match=f"network.*{said}"):
-        two(network=answer).advance(1000 * MS)
+def test_impossible_answers_of_the_network_are_refused(answer: Answers, message: str) -> None:
+    with pytest.raises(FederateError, match=f"network.*{message}"):
+        pair(network=answer).advance(1000 * MS)
 
 
 def test_a_physics_that_loses_an_agent_is_refused() -> None:
@@ -210,36 +210,36 @@ def test_a_physics_that_loses_an_agent_is_refused() -> None:
 
     losing = Losing([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
     with pytest.raises(FederateError, match=r"physics, asked to advance to 0\.006 s, has no state of b"):
-        two(physics=losing).advance(1000 * MS)
+        pair(physics=losing).advance(1000 * MS)
 
 
-def test_agents_that_nobody_moves_are_told_before_the_run() -> None:
+def test_agents_without_physics_are_refused_before_the_run() -> None:
     with pytest.raises(FederateError, match="no state of c"):
         Agents(paths(), {"c": periodic()}).states(0)
-    with pytest.raises(ConfigurationError, match="c, d may send or receive"):
+    with pytest.raises(ConfigurationError, match="c, d may send, receive or interfere"):
         Coordinator(Agents(paths(), {}), Disc(1.0, MS), EventDriven(), [("a", "c"), ("d", "b")])
 
 
-def test_a_datagram_to_nobody_or_of_a_number_that_was_is_refused() -> None:
-    with pytest.raises(FederateError, match="the program of a sent to c, who is no agent"):
-        two(program=periodic("c")).advance(1000 * MS)
+def test_a_datagram_to_an_unknown_agent_or_with_a_used_number_is_refused() -> None:
+    with pytest.raises(FederateError, match="the program of a sent to c, which is not an agent"):
+        pair(program=periodic("c")).advance(1000 * MS)
 
     class Twice(Periodic):
-        def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-            super().wake(now_ns, own, received)
+        def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+            super().wake(now_ns, own_state, received)
             return Action((Datagram("b", 10, "ab", 7),))
 
     with pytest.raises(FederateError, match="program of a sent two packets of flow ab with the number 7"):
-        two(program=Twice("ab", "b", period_ns=MS)).advance(1000 * MS)
+        pair(program=Twice("ab", "b", period_ns=MS)).advance(1000 * MS)
 
 
-def test_progress_is_told_seldom_and_grows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A clock of the test's own: each look at it takes 1 ms."""
+def test_progress_is_reported_at_a_limited_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock is replaced by one that advances by 1 ms at each reading."""
     ticks = iter(range(10**9))
     monkeypatch.setattr("time.perf_counter", lambda: next(ticks) / 1000)
-    told: list[tuple[int, float]] = []
-    two().advance(1000 * MS, lambda now_ns, wall_s: told.append((now_ns, wall_s)))
-    assert 3 < len(told) < 100
-    assert told == sorted(told)
-    assert all(later[1] - earlier[1] >= 0.2 for earlier, later in pairwise(told))
-    assert told[-1][0] <= 1000 * MS
+    reports: list[tuple[int, float]] = []
+    pair().advance(1000 * MS, lambda now_ns, wall_s: reports.append((now_ns, wall_s)))
+    assert 3 < len(reports) < 100
+    assert reports == sorted(reports)
+    assert all(later[1] - earlier[1] >= 0.2 for earlier, later in pairwise(reports))
+    assert reports[-1][0] <= 1000 * MS

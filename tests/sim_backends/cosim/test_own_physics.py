@@ -1,4 +1,4 @@
-"""A physics class as docs/cosim-api.md shows it, by the page's own code; and errors of one that lacks something."""
+"""The physics class of docs/cosim-api.md, from the code on that page; and errors of incomplete physics classes."""
 
 import math
 import re
@@ -20,7 +20,7 @@ SCENARIO = load_scenario("convoy", {"duration": "1s"})
 
 
 @pytest.fixture(scope="module")
-def carts() -> Any:  # noqa: ANN401 (a class of the page)
+def carts() -> Any:  # noqa: ANN401 (a class defined on the page)
     page = (ROOT / "docs" / "cosim-api.md").read_text(encoding="utf-8")
     (source,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Carts" in block)
     names: dict[str, Any] = {"__name__": "example"}
@@ -32,7 +32,7 @@ def physics(carts: Any) -> Any:  # noqa: ANN401 (as above)
     return carts(build(SCENARIO).agents.states(0))
 
 
-# The rule as printed stops where a subscriber is faster, which the drone is at once.
+# The paper's rule as printed stops if a subscriber is faster, as the drone is immediately.
 @pytest.mark.parametrize("policy", sorted({*POLICIES} - {"velocity_aware_raw"}))
 def test_the_class_of_the_page_runs_with_every_policy(policy: str, carts: Any) -> None:  # noqa: ANN401 (as above)
     simulation = build(SCENARIO, policy=policy, physics=physics(carts))
@@ -43,10 +43,10 @@ def test_the_class_of_the_page_runs_with_every_policy(policy: str, carts: Any) -
         assert errors(exact, run).delivery_error_s.largest == 0
 
 
-def test_its_commands_reach_it_and_forks_leave_it_alone(carts: Any) -> None:  # noqa: ANN401 (as above)
+def test_the_class_receives_commands_and_forks_do_not_change_it(carts: Any) -> None:  # noqa: ANN401 (as above)
     simulation = build(SCENARIO, physics=physics(carts))
     simulation.run(1000 * MS)
-    # The leader is told 0.4 m/s, which it does at once.
+    # The leader is commanded 0.4 m/s, which this physics reaches immediately.
     assert simulation.agents.states(1000 * MS)["leader"].position_m[0] == pytest.approx(20.4, abs=0.001)
     measured = local_errors(
         lambda policy: build(SCENARIO, policy=policy, physics=physics(carts)).coordinator,
@@ -64,26 +64,26 @@ LACKING = [
     ({"limits_m_s2": None}, "no limits_m_s2, a mapping from each agent to a number"),
     ({"advance": None}, r"no method advance\(to_ns, commands\)"),
     ({"advance": lambda to_ns, commands: {}}, "has no state of drone, follower, leader"),
-    ({"advance": lambda to_ns, commands: dict.fromkeys(SCENARIO.agents, (0, 0, 0))}, "which is no State"),
-    ({"advance": lambda to_ns, commands: None}, "which is no mapping of states"),
+    ({"advance": lambda to_ns, commands: dict.fromkeys(SCENARIO.agents, (0, 0, 0))}, "which is not a State"),
+    ({"advance": lambda to_ns, commands: None}, "which is not a mapping of states"),
     ({"advance": lambda to_ns: {}}, "physics failed when it was asked to advance"),
 ]
 
 
-@pytest.mark.parametrize(("changes", "said"), LACKING)
-def test_what_a_physics_lacks_is_named_before_the_run(changes: dict[str, Any], said: str, carts: Any) -> None:  # noqa: ANN401
+@pytest.mark.parametrize(("changes", "message"), LACKING)
+def test_an_incomplete_physics_is_refused_before_the_run(changes: dict[str, Any], message: str, carts: Any) -> None:  # noqa: ANN401
     lacking = physics(carts)
     vars(lacking).update(changes)
-    with pytest.raises(FieldkitError, match=said):
+    with pytest.raises(FieldkitError, match=message):
         build(SCENARIO, physics=lacking)
 
 
-def test_states_without_a_heading_are_named_where_a_program_has_to_drive(carts: Any) -> None:  # noqa: ANN401 (as above)
+def test_a_program_that_drives_requires_states_with_a_heading(carts: Any) -> None:  # noqa: ANN401 (as above)
     lacking = physics(carts)
     advance = lacking.advance
     lacking.advance = lambda to_ns, commands: {
         name: State(state.position_m) for name, state in advance(to_ns, commands).items()
     }
-    with pytest.raises(FieldkitError, match="where its robot heads"):
+    with pytest.raises(FieldkitError, match="the heading of its robot"):
         build(SCENARIO, physics=lacking).run()
     assert math.isfinite(lacking.step_ns)

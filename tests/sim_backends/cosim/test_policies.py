@@ -1,4 +1,4 @@
-"""Sync policies against what can be worked out on paper: robots pass each other, links have a hard range limit."""
+"""Sync policies against results computed by hand: robots pass each other, links have a hard range limit."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from sim_backends.cosim.comparison import Spread, errors
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federate_errors import FederateError
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.geometry import displaced_m
+from sim_backends.cosim.geometry import position_error_m
 from sim_backends.cosim.policies.base import PolicyError, Situation, SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -44,15 +44,15 @@ FIXED = [Scheduled, SlidingWindow, TimeStepped]
 
 
 def passing(
-    policy: SyncPolicy, *, one_m_s: float = 1.0, other_m_s: float = 0.7, to_ns: int = END_NS, step_ns: int = MS
+    policy: SyncPolicy, *, a_m_s: float = 1.0, b_m_s: float = 0.7, to_ns: int = END_NS, step_ns: int = MS
 ) -> Run:
-    """Let two robots pass each other 1 m aside; one sends to the other."""
-    ways = {
+    """Let two robots pass each other at a distance of 1 m; one sends to the other."""
+    paths = {
         "a": [(0.0, 0.0, 0.0), (100.0, 0.0, 0.0)],
         "b": [(FAR_M, ASIDE_M, 0.0), (FAR_M - 100.0, ASIDE_M, 0.0)],
     }
-    speeds = {"a": one_m_s, "b": other_m_s}
-    physics = Paths([WayPoints(name, way, speeds[name]) for name, way in ways.items()], step_ns=step_ns)
+    speeds = {"a": a_m_s, "b": b_m_s}
+    physics = Paths([WayPoints(name, path, speeds[name]) for name, path in paths.items()], step_ns=step_ns)
     agents = Agents(physics, {"a": Periodic("a", "b", period_ns=PERIOD_NS)})
     network = Disc(RANGE_M, DELAY_NS, extrapolates=True)
     return Coordinator(agents, network, policy, [("a", "b")]).advance(to_ns)
@@ -80,66 +80,67 @@ def same(at_ns: int) -> int:
 
 
 @dataclass(frozen=True)
-class Paper:
-    """A policy on paper: when packets enter, which moment the network knows then, and when arrivals count."""
+class Expected:
+    """A policy, and functions for the entry time of packets, the time of assumed states, and the counted arrival."""
 
     policy: SyncPolicy
     enters: Callable[[int], int] = same
-    knows: Callable[[int], int] = same
+    assumes: Callable[[int], int] = same
     counts: Callable[[int], int] = same
 
 
 W_NS = 1_100_000
-PAPERS = [
-    Paper(EventDriven()),
-    Paper(VariableStepped()),
-    Paper(TimeStepped(0.0011), enters=end(W_NS), counts=end(W_NS)),
-    Paper(Scheduled(0.0011), knows=begin(W_NS), counts=end(W_NS)),
-    Paper(SlidingWindow(0.0011), knows=closed_end(W_NS)),
-    Paper(SlidingWindow(0.25), knows=closed_end(250 * MS)),
+EXPECTATIONS = [
+    Expected(EventDriven()),
+    Expected(VariableStepped()),
+    Expected(TimeStepped(0.0011), enters=end(W_NS), counts=end(W_NS)),
+    Expected(Scheduled(0.0011), assumes=begin(W_NS), counts=end(W_NS)),
+    Expected(SlidingWindow(0.0011), assumes=closed_end(W_NS)),
+    Expected(SlidingWindow(0.25), assumes=closed_end(250 * MS)),
     # 1 ms and the 0.3 ms by which the publisher is faster.
-    Paper(VelocityAwareRaw(0.001), knows=closed_end(1_300_000)),
+    Expected(VelocityAwareRaw(0.001), assumes=closed_end(1_300_000)),
     # 1 ms and the 1.7 ms of the relative velocity.
-    Paper(VelocityAware(0.001), knows=closed_end(2_700_000)),
-    # Who keeps their velocities are where they are taken to be, for as long as a window may last.
-    Paper(ErrorBounded(0.1), counts=end(100 * MS)),
+    Expected(VelocityAware(0.001), assumes=closed_end(2_700_000)),
+    # At constant velocities the extrapolation is exact, so the window has its maximum length.
+    Expected(ErrorBounded(0.1), counts=end(100 * MS)),
 ]
 
 
-@pytest.mark.parametrize("paper", PAPERS, ids=lambda paper: paper.policy.name)
-def test_fates_and_times_are_those_worked_out_on_paper(paper: Paper) -> None:
-    run = passing(paper.policy)
+@pytest.mark.parametrize("expected", EXPECTATIONS, ids=lambda expected: expected.policy.name)
+def test_fates_and_times_equal_those_computed_by_hand(expected: Expected) -> None:
+    run = passing(expected.policy)
     assert len(run.fates) == -(-END_NS // PERIOD_NS)
     lost = 0
     for (flow, number), fate in run.fates.items():
         sent_ns = number * PERIOD_NS
-        enters_ns = paper.enters(sent_ns)
+        enters_ns = expected.enters(sent_ns)
         arrives_ns = enters_ns + DELAY_NS
         assert (flow, fate.packet.sent_ns, fate.packet.enters_ns) == ("a", sent_ns, enters_ns)
-        if not in_range(paper.knows(enters_ns)):
+        if not in_range(expected.assumes(enters_ns)):
             assert (fate.reason, fate.arrived_ns) == ("out of range", None)
             lost += 1
         elif fate.arrived_ns is None:
             assert arrives_ns > END_NS - 250 * MS, "under way at the end"
         else:
             assert fate.arrived_ns == arrives_ns
-            assert fate.counted_ns == paper.counts(arrives_ns)
+            assert fate.counted_ns == expected.counts(arrives_ns)
     assert lost > 100
 
 
-def test_exact_policies_agree_packet_by_packet_and_late_ones_only_where_nothing_is_exact() -> None:
+def test_exact_policies_agree_in_each_packet_and_only_sliding_windows_are_late() -> None:
     reference, merged = passing(EventDriven()), passing(VariableStepped())
     for identity, fate in reference.fates.items():
         other = merged.fates[identity]
-        assert (fate.arrived_ns, fate.reason, fate.known) == (other.arrived_ns, other.reason, other.known)
-        assert displaced_m(fate) == pytest.approx(1.7 * (fate.packet.sent_ns % MS) / 1e9, abs=1e-9), "held"
+        assert (fate.arrived_ns, fate.reason, fate.assumed) == (other.arrived_ns, other.reason, other.assumed)
+        held_m = 1.7 * (fate.packet.sent_ns % MS) / 1e9
+        assert position_error_m(fate) == pytest.approx(held_m, abs=1e-9), "states are held for a step"
         assert not fate.late_ns
-    assert any(fate.late_ns for fate in passing(SlidingWindow(0.05)).fates.values()), "receivers had passed"
+    assert any(fate.late_ns for fate in passing(SlidingWindow(0.05)).fates.values()), "receivers had passed the time"
     assert not any(fate.late_ns for fate in passing(Scheduled(0.05)).fates.values())
 
 
 def windows(kind: Callable[[float], SyncPolicy]) -> st.SearchStrategy[Callable[[], SyncPolicy]]:
-    """Return ways to make a policy from a window in seconds, or a bound in metres."""
+    """Return functions that make a policy from a window in seconds, or a bound in metres."""
     return st.floats(0.001, 0.3).map(lambda value: partial(kind, value))
 
 
@@ -152,13 +153,13 @@ POLICIES: st.SearchStrategy[Callable[[], SyncPolicy]] = st.one_of(
 
 
 @given(POLICIES, st.floats(0.0, 3.0), st.floats(0.0, 3.0))
-def test_nothing_arrives_before_it_was_sent_and_equal_runs_are_equal(
-    make: Callable[[], SyncPolicy], one_m_s: float, other_m_s: float
+def test_packets_arrive_after_they_were_sent_and_equal_runs_have_equal_digests(
+    make: Callable[[], SyncPolicy], a_m_s: float, b_m_s: float
 ) -> None:
     policy = make()
-    one_m_s, other_m_s = max(one_m_s, 0.01), max(other_m_s, 0.01)
-    run = passing(policy, one_m_s=one_m_s, other_m_s=other_m_s, to_ns=1000 * MS)
-    assert passing(make(), one_m_s=one_m_s, other_m_s=other_m_s, to_ns=1000 * MS).digest == run.digest
+    a_m_s, b_m_s = max(a_m_s, 0.01), max(b_m_s, 0.01)
+    run = passing(policy, a_m_s=a_m_s, b_m_s=b_m_s, to_ns=1000 * MS)
+    assert passing(make(), a_m_s=a_m_s, b_m_s=b_m_s, to_ns=1000 * MS).digest == run.digest
     assert run.windows_ns == sorted(run.windows_ns)
     assert run.windows_ns[-1] == 1000 * MS
     if not policy.exact:
@@ -170,27 +171,27 @@ def test_nothing_arrives_before_it_was_sent_and_equal_runs_are_equal(
 
 
 @given(st.floats(1e6, 1e8), st.integers(0, 10**12))
-def test_windows_of_any_length_do_not_drift_over_a_million(length_ns: float, begin_ns: int) -> None:
+def test_windows_of_any_length_do_not_drift(length_ns: float, begin_ns: int) -> None:
     windows, now_ns = Windows(), begin_ns
     for _ in range(1000):
         now_ns = windows.end_ns(now_ns, length_ns)
-    # What a thousand windows carry is within half an attosecond each.
+    # The rounding error of each of the thousand windows is at most half an attosecond.
     assert abs(now_ns - begin_ns - 1000 * Fraction(length_ns)) < 1
 
 
-def test_a_million_windows_end_where_a_million_times_their_length_is() -> None:
+def test_a_million_windows_end_at_a_million_times_their_length() -> None:
     windows, now_ns = Windows(), 0
     for _ in range(10**6):
         now_ns = windows.end_ns(now_ns, 1_100_000 + 1 / 3)
     assert abs(now_ns - 10**6 * Fraction(1_100_000 + 1 / 3)) < 1
 
 
-def test_errors_are_those_worked_out_on_paper() -> None:
-    """Over many packets, whose times lie anywhere in a window, waiting for its end takes half of it."""
+def test_errors_equal_those_computed_by_hand() -> None:
+    """Packets are sent at all phases of a window, so waiting for its end takes half a window on average."""
     reference, window_s = passing(EventDriven()), 0.05
     exact = errors(reference, passing(VariableStepped()))
     assert exact.delivery_error_s == Spread(0, 0, 0)
-    assert exact.position_error_m.mean == pytest.approx(1.7 * 0.001 / 2, rel=0.12), "held for a step of 1 ms"
+    assert exact.position_error_m.mean == pytest.approx(1.7 * 0.001 / 2, rel=0.12), "states are held for 1 ms"
     assert exact.position_error_m.largest <= 1.7 * 0.001
     assert (exact.fate_disagreement, exact.first_disagreement, exact.causality_violations) == (0, None, 0)
     sampled = errors(reference, passing(Scheduled(window_s)))
@@ -199,10 +200,10 @@ def test_errors_are_those_worked_out_on_paper() -> None:
     assert sampled.delay_added_s == pytest.approx(window_s / 2, rel=0.01)
     assert sampled.exchanges_per_s == pytest.approx(1 / window_s)
     assert sampled.causality_violations == 0
-    # They part at 1.7 m/s; states are those of the window's begin.
+    # Their relative speed is 1.7 m/s; the states are those at the beginning of the window.
     assert sampled.position_error_m.largest == pytest.approx(1.7 * window_s, rel=0.03)
     assert sampled.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.02)
-    # In a window in which they come into range, or leave it, packets meet another fate.
+    # Only in windows in which they enter or leave the range, packets have another fate.
     differing = sampled.fate_disagreement * sampled.packets
     assert 1 <= differing <= 2 * window_s * 1e9 / PERIOD_NS + 2
     assert sampled.first_disagreement is not None
@@ -211,20 +212,18 @@ def test_errors_are_those_worked_out_on_paper() -> None:
     assert late.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.02)
     assert late.causality_violations > 0.9 * sum(not fate.reason for fate in reference.fates.values())
     stepped = errors(reference, passing(TimeStepped(window_s)))
-    # Half a window before the network, and behind it what the link leaves of one.
+    # Half a window before the network; after it, the rest of a window that the delay of the link leaves.
     assert stepped.delay_added_s == pytest.approx(1.5 * window_s - DELAY_NS / 1e9, rel=0.01)
 
 
 @pytest.mark.parametrize("step_ns", [5 * MS, 10 * MS], ids=["half the window", "the window"])
-@pytest.mark.parametrize(
-    ("policy", "kept_for_s"), [*((kind, 0.01) for kind in FIXED), (lambda _: EventDriven(), None)]
-)
-def test_errors_of_places_are_half_a_window_whatever_the_step_of_the_physics_is(
-    policy: Callable[[float], SyncPolicy], kept_for_s: float | None, step_ns: int
+@pytest.mark.parametrize(("policy", "window_s"), [*((kind, 0.01) for kind in FIXED), (lambda _: EventDriven(), None)])
+def test_position_errors_are_half_a_window_for_any_step_of_the_physics(
+    policy: Callable[[float], SyncPolicy], window_s: float | None, step_ns: int
 ) -> None:
-    """All fixed windows are as wrong as the next one; who is exact otherwise is wrong by half a step."""
+    """All fixed windows have the same error; the exact policy has an error of half a step."""
     error_m = errors(passing(EventDriven()), passing(policy(0.01), step_ns=step_ns)).position_error_m
-    held_s = step_ns / 1e9 if kept_for_s is None else kept_for_s
+    held_s = step_ns / 1e9 if window_s is None else window_s
     assert error_m.mean == pytest.approx(1.7 * held_s / 2, rel=0.02)
     assert error_m.largest == pytest.approx(1.7 * held_s, rel=0.02)
 
@@ -235,29 +234,29 @@ def test_half_the_window_has_half_the_error(policy: type[Scheduled | SlidingWind
     reference = passing(EventDriven())
     coarse, fine = (errors(reference, passing(policy(window_s))) for window_s in (0.08, 0.04))
     orders = [
-        math.log2(one / other)
-        for one, other in (
+        math.log2(coarse_error / fine_error)
+        for coarse_error, fine_error in (
             (coarse.delivery_error_s.mean, fine.delivery_error_s.mean),
             (coarse.position_error_m.mean, fine.position_error_m.mean),
         )
-        if one
+        if coarse_error
     ]
     assert orders
     assert orders == pytest.approx([1.0] * len(orders), abs=0.1)
 
 
 @pytest.mark.parametrize(("subscriber_m_s", "word"), [(2.0, "stops"), (2.5, "runs backwards")])
-def test_the_rule_as_printed_stops_where_the_subscriber_is_faster(subscriber_m_s: float, word: str) -> None:
+def test_the_rule_as_printed_fails_if_the_subscriber_is_faster(subscriber_m_s: float, word: str) -> None:
     with pytest.raises(PolicyError, match=rf"a publishes at 1 m/s to b at {subscriber_m_s:g} m/s.*time {word}"):
-        passing(VelocityAwareRaw(0.001), one_m_s=1.0, other_m_s=subscriber_m_s)
-    # The other way round the same pair has a window of 2 ms and more.
-    assert passing(VelocityAwareRaw(0.001), one_m_s=subscriber_m_s, other_m_s=1.0, to_ns=100 * MS).fates
+        passing(VelocityAwareRaw(0.001), a_m_s=1.0, b_m_s=subscriber_m_s)
+    # With exchanged speeds the same pair has a window of 2 ms and more.
+    assert passing(VelocityAwareRaw(0.001), a_m_s=subscriber_m_s, b_m_s=1.0, to_ns=100 * MS).fates
 
 
 @pytest.mark.parametrize("window_s", [0.0, -1.0, math.inf, math.nan])
-def test_a_window_that_is_no_positive_time_is_refused(window_s: float) -> None:
+def test_a_window_that_is_not_a_positive_time_is_refused(window_s: float) -> None:
     for kind in (TimeStepped, Scheduled, SlidingWindow):
-        with pytest.raises(PolicyError, match="no positive time"):
+        with pytest.raises(PolicyError, match="not a positive time"):
             kind(window_s)
 
 
@@ -273,11 +272,11 @@ STATES = st.tuples(SPEEDS, SPEEDS, SPEEDS).map(lambda velocity: State((0.0, 0.0,
 @given(
     st.lists(STATES, min_size=2, max_size=5), st.floats(0.002, 2), st.floats(0, 5), st.floats(-1, 1), st.booleans()
 )
-def test_error_bounded_keeps_its_bound_whatever_agents_do_within_their_limits(
+def test_error_bounded_keeps_its_bound_for_any_motion_within_the_limits(
     states: Sequence[State], bound_m: float, limit_m_s2: float, share: float, moves: bool
 ) -> None:
     names = [f"r{number}" for number in range(len(states))]
-    pairs = [(one, other) for one in names for other in names if one != other]
+    pairs = [(publisher, subscriber) for publisher in names for subscriber in names if publisher != subscriber]
     situation = Situation(
         7 * MS,
         dict(zip(names, states, strict=True)),
@@ -289,11 +288,11 @@ def test_error_bounded_keeps_its_bound_whatever_agents_do_within_their_limits(
         7 * MS,
     )
     if moves:
-        situation.known = situation.states
+        situation.assumed = situation.states
     try:
         end_ns = ErrorBounded(bound_m, 100.0).next_window(situation)
     except PolicyError:
-        # One step may take a pair, or an agent, farther than the bound.
+        # The motion in one step may exceed the bound.
         speeds_m_s = [math.dist(a.velocity_m_s, b.velocity_m_s) for a in [*states, State(STILL)] for b in states]
         assert not moves
         assert max(speeds_m_s) * 0.001 > bound_m
@@ -302,27 +301,28 @@ def test_error_bounded_keeps_its_bound_whatever_agents_do_within_their_limits(
     assert (end_ns - 7 * MS) % MS == 0
     if end_ns == 8 * MS:
         return  # the window of one step, in which nothing changes
-    for one, other in pairs:
-        v = [a - b for a, b in zip(*(situation.states[name].velocity_m_s for name in (one, other)), strict=True)]
-        # Both accelerate as far as they can, away from each other and along their relative velocity, or against it.
+    for publisher, subscriber in pairs:
+        ends = (situation.states[name].velocity_m_s for name in (publisher, subscriber))
+        v = [a - b for a, b in zip(*ends, strict=True)]
+        # Both accelerate at their limit in opposite directions, along or against their relative velocity.
         speed_m_s = math.hypot(*v)
-        displaced_m = (0 if moves else speed_m_s * window_s) + share * limit_m_s2 * window_s**2
-        assert abs(displaced_m) <= bound_m * (1 + 1e-9)
+        error_m = (0 if moves else speed_m_s * window_s) + share * limit_m_s2 * window_s**2
+        assert abs(error_m) <= bound_m * (1 + 1e-9)
 
 
 class Echo:
-    """Answers every datagram at once, `times` times."""
+    """Replies to every datagram immediately, `times` times."""
 
     def __init__(self, peer: str, times: int, *, begins: bool) -> None:
         self._peer, self._left, self._begins = peer, times, begins
-        self.heard: list[int] = []
+        self.received_ns: list[int] = []
 
     def next_wake_ns(self) -> int | None:
         return 0 if self._begins else None
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
         self._begins = False
-        self.heard += [now_ns for _ in received]
+        self.received_ns += [now_ns for _ in received]
         self._left -= 1
         if self._left < 0:
             return Action()
@@ -334,31 +334,32 @@ class Echo:
     [
         (EventDriven(), 2 * DELAY_NS),
         (VariableStepped(), 2 * DELAY_NS),
-        # Each way waits for the end of a window of 5 ms.
+        # In each direction a datagram waits for the end of a window of 5 ms.
         (Scheduled(0.005), 2 * 5 * MS),
-        # And each datagram for the end of another, before it enters.
+        # In addition, each datagram waits for the end of a window before it enters.
         (TimeStepped(0.005), 2 * 10 * MS),
     ],
     ids=lambda value: getattr(value, "name", value),
 )
-def test_answers_at_once_come_as_late_as_the_policy_lets_them(policy: SyncPolicy, round_ns: int) -> None:
-    asks, answers = Echo("b", 5, begins=True), Echo("a", 5, begins=False)
+def test_round_trips_of_immediate_replies_have_the_delay_of_the_policy(policy: SyncPolicy, round_ns: int) -> None:
+    requester, responder = Echo("b", 5, begins=True), Echo("a", 5, begins=False)
     physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
-    Coordinator(Agents(physics, {"a": asks, "b": answers}), Disc(1.0, DELAY_NS), policy, [("a", "b")]).advance(END_NS)
-    assert asks.heard[:4] == [round_ns * number for number in range(1, 5)]
+    agents = Agents(physics, {"a": requester, "b": responder})
+    Coordinator(agents, Disc(1.0, DELAY_NS), policy, [("a", "b")]).advance(END_NS)
+    assert requester.received_ns[:4] == [round_ns * number for number in range(1, 5)]
 
 
 class Restless:
-    """Wakes for ever at one time."""
+    """Wakes endlessly at one time."""
 
     def next_wake_ns(self) -> int:
         return 5
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
         return Action()
 
 
-def test_a_program_that_wakes_for_ever_is_named_not_waited_for() -> None:
+def test_a_program_that_wakes_endlessly_is_named() -> None:
     physics = Paths([WayPoints("a", [(0.0, 0.0, 0.0)], 1.0)])
     with pytest.raises(FederateError, match=r"program of a woke 1001 times at 0\.000000005 s"):
         Coordinator(Agents(physics, {"a": Restless()}), Disc(1.0, 1), EventDriven(), []).advance(10)

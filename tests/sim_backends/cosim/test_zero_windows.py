@@ -1,4 +1,4 @@
-"""Windows of no length: what happens at one instant takes as many of them as it has turns, and no time."""
+"""Windows of length 0: successive events at one instant take one window each, and no time."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ BEGINS_NS = 7 * MS + 3
 
 
 class Returns:
-    """Sends a ball, or returns it, at the instant at which it comes, so many times in all."""
+    """Sends a ball, or returns it at the instant of its arrival, a limited number of times."""
 
     def __init__(self, peer: str, times: int, *, begins: bool = False) -> None:
         self._peer, self._left, self._begins = peer, times, begins
@@ -35,7 +35,7 @@ class Returns:
     def next_wake_ns(self) -> int | None:
         return BEGINS_NS if self._begins else None
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
         self._begins = False
         self.woken_ns.append(now_ns)
         if not self._left:
@@ -45,14 +45,14 @@ class Returns:
 
 
 def rally(returns: int, observer: WindowObserver | None = None) -> tuple[Coordinator, list[Returns]]:
-    """Return a co-simulation of two that play at an instant, over a network without delay."""
+    """Return a co-simulation of two players that return a ball at one instant, over a network without delay."""
     programs = [Returns("b", returns, begins=True), Returns("a", returns)]
     physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
     agents = Agents(physics, dict(zip("ab", programs, strict=True)))
     return Coordinator(agents, Disc(1.0, 0), EventDriven(), [("a", "b"), ("b", "a")], observer=observer), programs
 
 
-def test_what_happens_at_an_instant_happens_at_it_and_time_goes_on() -> None:
+def test_events_at_one_instant_are_simulated_at_it_and_time_advances() -> None:
     coordinator, programs = rally(20)
     run = coordinator.advance(100 * MS)
     assert len(run.fates) == 40
@@ -62,32 +62,32 @@ def test_what_happens_at_an_instant_happens_at_it_and_time_goes_on() -> None:
     assert {at_ns for program in programs for at_ns in program.woken_ns} == {BEGINS_NS}
     assert run.windows_ns == sorted(run.windows_ns)
     assert run.windows_ns[-1] == 100 * MS
-    # A window up to it, and one for each further stroke, which is mail of the one before.
+    # One window until then, and one for each further return, which follows an arrival.
     assert Counter(run.windows_ns)[BEGINS_NS] >= 40
     assert errors(run, run).delivery_error_s.largest == 0
 
 
-def test_a_recording_of_them_is_the_run_again(tmp_path: Path) -> None:
+def test_a_recording_of_empty_windows_equals_the_run(tmp_path: Path) -> None:
     with RunRecorder(tmp_path / "run", About("a: 1", "event_driven", {}, 1)) as recorder:
         live = rally(20, recorder)[0].advance(100 * MS)
-    found = read_recording(tmp_path / "run").run
-    assert (found.digest, found.windows_ns) == (live.digest, live.windows_ns)
+    replayed = read_recording(tmp_path / "run").run
+    assert (replayed.digest, replayed.windows_ns) == (live.digest, live.windows_ns)
 
 
-def test_whom_an_instant_never_ends_for_is_told() -> None:
+def test_an_instant_that_never_ends_is_an_error() -> None:
     coordinator, _ = rally(10_000)
-    with pytest.raises(PolicyError, match=f"time does not go on beyond {BEGINS_NS} ns"):
+    with pytest.raises(PolicyError, match=f"time does not advance beyond {BEGINS_NS} ns"):
         coordinator.advance(100 * MS)
     assert coordinator.run.windows_ns[-1] == BEGINS_NS
 
 
-def test_a_policy_that_goes_back_is_told_at_once() -> None:
+def test_a_window_that_ends_before_it_begins_is_an_error() -> None:
     class Back(EventDriven):
         def next_window(self, situation: Situation) -> int | None:
             return situation.now_ns - 1 if situation.now_ns else 5 * MS
 
     coordinator, _ = rally(1)
     coordinator.policy = Back()
-    with pytest.raises(PolicyError, match="time does not go on beyond 5000000 ns"):
+    with pytest.raises(PolicyError, match="time does not advance beyond 5000000 ns"):
         coordinator.advance(100 * MS)
     assert coordinator.run.windows_ns == [5 * MS]

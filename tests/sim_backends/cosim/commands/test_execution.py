@@ -1,4 +1,4 @@
-"""Runs of many seeds, and what ends them."""
+"""Runs of many seeds, and how they end."""
 
 import os
 
@@ -11,16 +11,16 @@ from sim_backends.cosim.scenario.loading import load_scenario
 
 
 def ignore(_: Event) -> None:
-    """Take an event."""
+    """Ignore an event."""
 
 
-def test_ctrl_c_ends_all_seeds_where_there_is_one_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """There a run is in the process that Ctrl-C meets."""
-    asked: list[int | None] = []
+def test_ctrl_c_ends_all_seeds_on_a_single_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a single processor, the runs are in the process that receives the signal."""
+    started: list[int | None] = []
 
     def interrupted(*arguments: object, seed: int, **options: object) -> object:
         simulation = build(*arguments, seed=seed, **options)  # type: ignore[arg-type]
-        asked.append(seed)
+        started.append(seed)
         if seed == 2:
 
             def run(**_: object) -> object:
@@ -34,6 +34,6 @@ def test_ctrl_c_ends_all_seeds_where_there_is_one_processor(monkeypatch: pytest.
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
     scenario = load_scenario("baylands", {"duration": "50ms"})
     results, ended = execution.simulate_all(scenario, "scheduled", [1, 2, 3], None, sink=ignore)
-    assert (asked, ended) == ([1, 2], True)
+    assert (started, ended) == ([1, 2], True)
     assert [(result.seed, result.is_interrupted) for result in results] == [(1, False), (2, True)]
     assert results[1].simulated_s == 0.02

@@ -1,4 +1,4 @@
-"""What became of a flow, against a run that can be worked out on paper, and the harness's own jitter."""
+"""Results of flows, against a run computed by hand, and the harness's own jitter."""
 
 import math
 from dataclasses import replace
@@ -15,44 +15,44 @@ from sim_backends.world.motion import State
 MS = 1_000_000
 
 
-def fate(number: int, delay_ms: float | None, *, known: bool = True, held_ms: float = 2.0) -> Fate:
-    """One packet every 10 ms from a sender that goes east at 3 m/s from 4 m away; the policy holds it for 2 ms."""
+def fate(number: int, delay_ms: float | None, *, decided: bool = True, held_ms: float = 2.0) -> Fate:
+    """A packet of one every 10 ms, from a sender 4 m away that drives east at 3 m/s; the policy delays it by 2 ms."""
     sent_ns = number * 10 * MS
     enters_ns = sent_ns + round(held_ms * MS)
     packet = Packet(number, "a", "b", 100, ("flow", number), sent_ns, enters_ns, "udp")
     ends = State((4.0 + 0.03 * number, 0.0, 0.0), (3.0, 0.0, 0.0)), State((0.0, 0.0, 0.0), (0.0, 4.0, 0.0))
     if delay_ms is None:
-        return Fate(packet, ends, ends, reason="lost" if known else "")
+        return Fate(packet, ends, ends, reason="lost" if decided else "")
     arrived_ns = enters_ns + round(delay_ms * MS)
     return Fate(packet, ends, ends, arrived_ns, arrived_ns + 5 * MS)
 
 
 def run_of(*fates: Fate) -> Run:
-    return Run(fates={one.packet.identity: one for one in fates})
+    return Run(fates={fate.packet.identity: fate for fate in fates})
 
 
-def test_a_flow_is_what_its_packets_came_to() -> None:
+def test_the_result_of_a_flow_follows_from_its_packets() -> None:
     (flow,) = flow_results(
-        run_of(fate(0, 1.0), fate(1, 3.0), fate(2, None), fate(3, 2.0), fate(4, None, known=False))
+        run_of(fate(0, 1.0), fate(1, 3.0), fate(2, None), fate(3, 2.0), fate(4, None, decided=False))
     )
     assert (flow.sent, flow.arrived, flow.under_way, flow.sent_bytes, flow.arrived_bytes) == (4, 3, 1, 400, 300)
     assert flow.loss == pytest.approx(0.25)
     delay_s = flow.delay_s
     assert (delay_s.least, delay_s.median, delay_s.mean, delay_s.most) == pytest.approx((0.001, 0.002, 0.002, 0.003))
-    assert flow.added_s == pytest.approx(0.007), "2 ms before the network, 5 ms behind it"
+    assert flow.added_s == pytest.approx(0.007), "2 ms before the network, 5 ms after it"
     assert flow.first_to_last_s == pytest.approx(0.031)
     assert flow.distances_m == pytest.approx((4.0, 4.0, 4.06, 4.12))
     assert (flow.sender_m_s, flow.relative_m_s) == pytest.approx((3.0, 5.0))
 
 
-def test_jitter_is_that_of_the_harness_in_the_order_of_arrival() -> None:
+def test_jitter_equals_that_of_the_harness_in_the_order_of_arrival() -> None:
     delays_ms = [1.0, 14.0, 2.0, 1.5, 30.0, 0.5]
     (flow,) = flow_results(run_of(*(fate(number, delay_ms) for number, delay_ms in enumerate(delays_ms))))
     order = np.argsort([10 * number + delay_ms for number, delay_ms in enumerate(delays_ms)])
     assert flow.jitter_s == pytest.approx(jitter_s(np.rint(np.array(delays_ms)[order] * MS).astype(np.int64)))
 
 
-def test_where_nothing_arrived_nothing_is_made_up() -> None:
+def test_values_without_arrivals_are_nan() -> None:
     ends = fate(0, None).true
     under_way = Fate(Packet(9, "a", "b", 1, ("waiting", 0), 0, 0, "tcp"), ends, ends)
     lost, waiting = flow_results(run_of(fate(0, None), under_way))
@@ -64,27 +64,27 @@ def test_where_nothing_arrived_nothing_is_made_up() -> None:
         )
 
 
-def test_a_round_trip_is_the_networks_there_and_back_and_counts_when_its_end_is_known() -> None:
-    """One request is lost, one answer is, and one is under way; what the policy added, 2 and 5 ms, does not count."""
+def test_a_round_trip_is_the_time_in_the_network_and_counts_when_it_is_decided() -> None:
+    """A request and a reply are lost, and one is under way; the 2 and 5 ms that the policy added do not count."""
 
-    def as_reply(one: Fate) -> Fate:
-        packet = one.packet
+    def as_reply(request: Fate) -> Fate:
+        packet = request.packet
         identity = ("flow/reply", packet.identity[1])
-        return replace(one, packet=replace(packet, source="b", destination="a", identity=identity))
+        return replace(request, packet=replace(packet, source="b", destination="a", identity=identity))
 
     requests = [fate(0, 1.0), fate(1, 2.0), fate(2, None), fate(3, 1.0), fate(4, 1.0)]
-    replies = [fate(0, 3.0), fate(1, 5.0), fate(3, None), fate(4, None, known=False)]
-    flow, answers = flow_results(run_of(*requests, *map(as_reply, replies)))
+    replies = [fate(0, 3.0), fate(1, 5.0), fate(3, None), fate(4, None, decided=False)]
+    flow, reply_flow = flow_results(run_of(*requests, *map(as_reply, replies)))
     trips = flow.round_trips
     assert trips is not None
     assert (trips.sent, trips.answered) == (4, 2)
     spread_s = trips.network_s
     assert (spread_s.least, spread_s.mean, spread_s.most) == pytest.approx((0.004, 0.0055, 0.007))
     assert trips.jitter_s == pytest.approx(0.003)
-    assert answers.round_trips is None
+    assert reply_flow.round_trips is None
 
 
-def test_flows_come_by_name() -> None:
+def test_flows_are_sorted_by_name_and_immutable() -> None:
     assert [flow.name for flow in flow_results(Run())] == []
     with pytest.raises(AttributeError):
         flow_results(run_of(fate(0, 1.0)))[0].sent = 3  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Tables in four forms: what is missing is missing, and numbers are in SI units where programs read them."""
+"""Tables in four formats: missing values stay missing, and CSV and JSON have SI units."""
 
 import csv
 import io
@@ -14,15 +14,15 @@ from sim_backends.cosim.commands.sheets import FORMS, Sheet, SheetColumn, SheetP
 SHEET = Sheet(
     (
         SheetColumn("policy", "policy", ""),
-        SheetColumn("delay_s", "delay (ms)", "how long", 1e3),
-        SheetColumn("packets", "packets", "how many"),
+        SheetColumn("delay_s", "delay (ms)", "mean delay", 1e3),
+        SheetColumn("packets", "packets", "number of packets"),
     ),
     [("a | b", 0.0015, 12345), ("c", math.nan, None)],
     [SheetPart("all", ("policy", "delay_s", "packets")), SheetPart("some", ("policy", "delay_s"))],
 )
 
 
-def test_programs_get_si_units_and_nothing_for_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_csv_and_json_have_si_units_and_no_values_for_missing_ones(capsys: pytest.CaptureFixture[str]) -> None:
     SHEET.show("csv")
     rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
     assert [row["delay_s"] for row in rows] == ["0.0015", ""]
@@ -33,22 +33,22 @@ def test_programs_get_si_units_and_nothing_for_nothing(capsys: pytest.CaptureFix
     ]
 
 
-def test_people_get_each_part_and_each_meaning_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_have_each_part_and_each_meaning_once(capsys: pytest.CaptureFixture[str]) -> None:
     SHEET.show("table")
-    said = capsys.readouterr().out
-    assert said.count("delay: how long") == 1
-    assert [line.split() for line in said.splitlines() if line.startswith(" c ")] == [["c", "-", "-"], ["c", "-"]]
-    assert "12,345" in said
+    out = capsys.readouterr().out
+    assert out.count("delay: mean delay") == 1
+    assert [line.split() for line in out.splitlines() if line.startswith(" c ")] == [["c", "-", "-"], ["c", "-"]]
+    assert "12,345" in out
     SHEET.show("markdown")
     assert "| a &#124; b | 1.5 | 12,345 |" in capsys.readouterr().out
 
 
-def test_a_table_without_rows_is_no_error(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_without_rows_is_not_an_error(capsys: pytest.CaptureFixture[str]) -> None:
     for form in FORMS:
         Sheet(SHEET.columns, [], SHEET.parts).show(form)
     assert "policy,delay_s,packets" in capsys.readouterr().out
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False, width=32))
-def test_a_number_is_within_a_half_of_its_third_digit(value: float) -> None:
+def test_a_number_is_rounded_to_three_digits(value: float) -> None:
     assert float(number(value).replace(",", "")) == pytest.approx(value, rel=0.005)

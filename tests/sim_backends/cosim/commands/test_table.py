@@ -1,4 +1,4 @@
-"""Tables of the paper for people and programs."""
+"""Tables of the paper in all formats."""
 
 import csv
 import io
@@ -27,7 +27,7 @@ CLAIMS = [
 ]
 
 
-def test_programs_get_si_units_and_every_column(capsys: pytest.CaptureFixture[str]) -> None:
+def test_csv_has_si_units_and_every_column(capsys: pytest.CaptureFixture[str]) -> None:
     table.paper_sheet("title", ROWS, is_ping=False).show("csv")
     first, second = csv.DictReader(io.StringIO(capsys.readouterr().out))
     assert (first["protocol"], first["delay_s"], first["delay_agreement"]) == ("topic", "", "no value")
@@ -35,19 +35,19 @@ def test_programs_get_si_units_and_every_column(capsys: pytest.CaptureFixture[st
     assert float(second["delay_off_s"]) == pytest.approx(30.0 - 54.309)
 
 
-def test_people_get_what_differs_between_rows_and_digits_as_printed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_have_labels_that_differ_between_rows_and_printed_digits(capsys: pytest.CaptureFixture[str]) -> None:
     table.paper_sheet("title", ROWS, is_ping=False).show("table")
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["nlos", "54.309", "30", "0", "60", "3", "agrees", "-24.3"] in lines, "neither distance nor protocol"
     assert ["los", "10", "7", "6.5", "7.5", "agrees", "-3", "out", "of", "range"] in lines
 
 
-def test_who_agrees_by_a_wide_interval_only_is_counted_apart() -> None:
-    said = table.summary(ROWS)
-    assert "3 of 4 cells agree: 2 by our mean, 1 only because our interval is that wide" in said
+def test_cells_that_agree_only_by_a_wide_interval_are_counted_separately() -> None:
+    text = table.summary(ROWS)
+    assert "3 of 4 cells agree: 2 by our mean, 1 only because our interval is that wide" in text
 
 
-def test_claims_stand_beside_words_and_tables(capsys: pytest.CaptureFixture[str]) -> None:
+def test_claims_are_next_to_the_papers_statements_and_tables(capsys: pytest.CaptureFixture[str]) -> None:
     sheet = table.claim_sheet("title", CLAIMS)
     sheet.show("table")
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]

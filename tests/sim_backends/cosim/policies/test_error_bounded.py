@@ -1,4 +1,4 @@
-"""The bound of `error_bounded`: in whole runs of bodies that accelerate and run into things, and in decibel."""
+"""The bound of `error_bounded`: in complete runs of bodies that accelerate and collide, and in decibels."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.geometry import displaced_m
+from sim_backends.cosim.geometry import position_error_m
 from sim_backends.cosim.policies.base import PolicyError, Situation
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.network.disc import Disc
@@ -36,7 +36,7 @@ END_NS = 1_200_000_000
 
 
 class Driver:
-    """Drives by a list of twists, one each 0.2 s, and publishes, by default at every step of the physics."""
+    """Drives by a list of twists, one every 0.2 s, and publishes, by default at every step of the physics."""
 
     def __init__(self, peer: str, twists: Sequence[Twist], period_ns: int = STEP_NS) -> None:
         self._peer, self._twists, self._period_ns = peer, twists, period_ns
@@ -48,7 +48,7 @@ class Driver:
     def next_send_ns(self) -> int:
         return self._number * self._period_ns
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
         self._steps = now_ns // STEP_NS + 1
         command = self._twists[now_ns // 200_000_000 % len(self._twists)]
         if now_ns < self.next_send_ns():
@@ -63,14 +63,14 @@ TWISTS = st.lists(st.builds(Twist, st.floats(-1, 1), st.floats(-2, 2)), min_size
 
 @settings(max_examples=12)
 @given(TWISTS, TWISTS, st.floats(0.002, 0.3), st.booleans(), st.integers(STEP_NS, 100 * STEP_NS))
-def test_the_bound_holds_in_every_run_whatever_bodies_do_and_run_into(
-    one: Sequence[Twist], other: Sequence[Twist], bound_m: float, extrapolates: bool, period_ns: int
+def test_the_bound_holds_for_any_motion_and_any_collision(
+    a_twists: Sequence[Twist], b_twists: Sequence[Twist], bound_m: float, extrapolates: bool, period_ns: int
 ) -> None:
     bodies = Bodies(
         {"a": DifferentialDrive(HUSKY_A200, (-1.0, 0.0)), "b": DifferentialDrive(HUSKY_A200, (1.0, 0.5), math.pi)},
         YARD,
     )
-    agents = Agents(bodies, {"a": Driver("b", one), "b": Driver("a", other, period_ns)})
+    agents = Agents(bodies, {"a": Driver("b", a_twists), "b": Driver("a", b_twists, period_ns)})
     policy = ErrorBounded(bound_m, longest_s=1.0)
     network = Disc(100.0, STEP_NS, extrapolates=extrapolates)
     coordinator = Coordinator(agents, network, policy, [("a", "b"), ("b", "a")])
@@ -78,15 +78,15 @@ def test_the_bound_holds_in_every_run_whatever_bodies_do_and_run_into(
         run = coordinator.advance(END_NS)
     except PolicyError:
         assert not extrapolates
-        assert bound_m < 2 * 1.0 * 0.001, "one step breaks it"
+        assert bound_m < 2 * 1.0 * 0.001, "one step exceeds it"
         return
     assert len(run.fates) == END_NS // STEP_NS + -(-END_NS // period_ns)
-    assert max(displaced_m(fate) for fate in run.fates.values()) <= bound_m * (1 + 1e-9)
-    assert len(run.windows_ns) < END_NS / STEP_NS, "it takes more than a step where it can"
+    assert max(position_error_m(fate) for fate in run.fates.values()) <= bound_m * (1 + 1e-9)
+    assert len(run.windows_ns) < END_NS / STEP_NS, "windows are longer than a step if they can be"
 
 
-def test_a_bound_is_kept_where_agents_steer_often_and_send_seldom() -> None:
-    """Nobody asks for places while they drive, so that a window goes on over any way, and ends before they send."""
+def test_a_bound_is_kept_if_agents_steer_often_and_send_rarely() -> None:
+    """Positions are not used while they drive, so a window continues over any motion, and ends before they send."""
     bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (0.0, -8.0)), "b": DifferentialDrive(HUSKY_A200, (0.0, 8.0))})
     turns = [Twist(1.0, 2.0), Twist(1.0, -2.0)]
     agents = Agents(bodies, {"a": Driver("b", turns, 700_500_000), "b": Driver("a", [Twist(-1.0)], 700_500_000)})
@@ -94,27 +94,27 @@ def test_a_bound_is_kept_where_agents_steer_often_and_send_seldom() -> None:
         agents, Disc(100.0, STEP_NS, extrapolates=True), ErrorBounded(0.005, 0.5), [("a", "b")]
     ).advance(3 * END_NS)
     assert len(run.fates) == 2 * 6
-    assert max(displaced_m(fate) for fate in run.fates.values()) <= 0.005
-    assert run.windows_ns[0] < 100 * STEP_NS, "what they sent at 0 may be under way, so that places count"
-    assert max(np.diff(run.windows_ns)) == 500 * STEP_NS, "nothing is under way, and nobody sends until 700 ms"
+    assert max(position_error_m(fate) for fate in run.fates.values()) <= 0.005
+    assert run.windows_ns[0] < 100 * STEP_NS, "datagrams sent at 0 may be under way, so positions are used"
+    assert max(np.diff(run.windows_ns)) == 500 * STEP_NS, "nothing is under way, and nothing is sent until 700 ms"
     assert 700 * STEP_NS in run.windows_ns, "the last step before they send"
     assert len(run.windows_ns) < 60
 
 
-def test_who_runs_into_a_wall_does_not_break_the_bound() -> None:
-    """Side by side they do not displace each other, until one of them is stopped at once."""
+def test_a_collision_with_a_wall_does_not_exceed_the_bound() -> None:
+    """Side by side their relative position is constant, until one of them stops suddenly."""
     start = {"a": (0.0, -1.0), "b": (0.0, 6.0)}
     bodies = Bodies({name: DifferentialDrive(HUSKY_A200, place_m) for name, place_m in start.items()}, YARD)
     agents = Agents(bodies, {name: Driver(peer, [Twist(1.0)]) for name, peer in ("ab", "ba")})
     run = Coordinator(agents, Disc(100.0, STEP_NS, extrapolates=True), ErrorBounded(0.02, 1.0), [("a", "b")]).advance(
         3 * END_NS
     )
-    assert [one.obstacle for one in bodies.collisions] == ["wall"]
-    assert 0.005 < max(displaced_m(fate) for fate in run.fates.values()) <= 0.02
+    assert [collision.obstacle for collision in bodies.collisions] == ["wall"]
+    assert 0.005 < max(position_error_m(fate) for fate in run.fates.values()) <= 0.02
 
 
-def test_a_window_goes_on_while_nobody_asks_for_the_geometry() -> None:
-    """A bound of 1 mm at 1 m/s is one step; the window in which something happens begins at most one before."""
+def test_a_window_continues_while_positions_are_not_used() -> None:
+    """At 1 m/s a bound of 1 mm is one step; the window with an event begins at most one step before it."""
     states = {"a": State((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), "b": State((5.0, 0.0, 0.0))}
     limits = dict.fromkeys("ab", 0.0)
     policy = ErrorBounded(0.001, longest_s=0.1)
@@ -131,24 +131,25 @@ def test_a_window_goes_on_while_nobody_asks_for_the_geometry() -> None:
     assert ends_ns(0, None, None) == ends_ns(0, 10**12, None) == 100 * STEP_NS
 
 
-def test_a_window_goes_on_until_what_was_seen_leaves_less_than_a_step() -> None:
-    """A pair that parts at 1 m/s from where it is taken to be, with a bound of 10 mm, may go on for what is left."""
+def test_a_window_continues_until_the_error_leaves_less_than_a_step() -> None:
+    """With an error rate of 1 m/s and a bound of 10 mm, the window may continue for the rest of the bound."""
     states = {"a": State((0.0, 0.0, 0.0)), "b": State((5.0, 0.0, 0.0), (1.0, 0.0, 0.0))}
     limits = dict.fromkeys("ab", 0.0)
     begin = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, limits, 0, states)
     policy = ErrorBounded(0.01, longest_s=0.1)
-    assert policy.next_window(begin) == 100 * STEP_NS, "it keeps its velocity"
+    assert policy.next_window(begin) == 100 * STEP_NS, "at a constant velocity there is no error"
 
-    def goes_on_ns(off_m: float, sends_ns: int = 0) -> int:
-        known = states | {"b": State((5.0 - off_m, 0.0, 0.0))}
+    def extended_ns(error_m: float, sends_ns: int = 0) -> int:
+        assumed = states | {"b": State((5.0 - error_m, 0.0, 0.0))}
         now_ns = 30 * STEP_NS
-        return policy.goes_on(replace(begin, now_ns=now_ns, known=known, next_send_ns=max(sends_ns, now_ns)))
+        situation = replace(begin, now_ns=now_ns, assumed=assumed, next_send_ns=max(sends_ns, now_ns))
+        return policy.extended_end_ns(situation)
 
-    assert goes_on_ns(0.0) == goes_on_ns(0.0, 35 * STEP_NS) == 40 * STEP_NS
-    assert goes_on_ns(0.0055) == 34 * STEP_NS
-    assert goes_on_ns(0.0095) == goes_on_ns(0.5) == 30 * STEP_NS
-    assert goes_on_ns(0.5, 34_999_999) == 34 * STEP_NS
-    assert goes_on_ns(0.5, 10**12) == 100 * STEP_NS
+    assert extended_ns(0.0) == extended_ns(0.0, 35 * STEP_NS) == 40 * STEP_NS
+    assert extended_ns(0.0055) == 34 * STEP_NS
+    assert extended_ns(0.0095) == extended_ns(0.5) == 30 * STEP_NS
+    assert extended_ns(0.5, 34_999_999) == 34 * STEP_NS
+    assert extended_ns(0.5, 10**12) == 100 * STEP_NS
 
 
 def loss_db(metres: float) -> float:
@@ -156,16 +157,16 @@ def loss_db(metres: float) -> float:
 
 
 def window_ns(
-    apart_m: float,
+    separation_m: float,
     velocity_m_s: tuple[float, float, float],
     bound_db: float,
-    known_m_s: tuple[float, float, float] = STILL,
+    assumed_m_s: tuple[float, float, float] = STILL,
 ) -> int:
-    """Return how long a window is in which b is taken to move otherwise than it does."""
-    states = {"a": State((0.0, 0.0, 0.0)), "b": State((apart_m, 0.0, 0.0), velocity_m_s)}
-    known = states | {"b": State((apart_m, 0.0, 0.0), known_m_s)}
+    """Return the length of a window in which b moves at another velocity than the network assumes."""
+    states = {"a": State((0.0, 0.0, 0.0)), "b": State((separation_m, 0.0, 0.0), velocity_m_s)}
+    assumed = states | {"b": State((separation_m, 0.0, 0.0), assumed_m_s)}
     limits = dict.fromkeys("ab", 0.0)
-    situation = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, limits, 0, known)
+    situation = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, limits, 0, assumed)
     return ErrorBounded(longest_s=10.0, bound_db=bound_db, exponent=EXPONENT).next_window(situation)
 
 
@@ -176,24 +177,24 @@ def window_ns(
     st.floats(-math.pi, math.pi),
     st.floats(-10.0, 10.0),
 )
-def test_the_loss_of_a_pair_is_wrong_by_no_more_than_the_bound(
-    apart_m: float, speed_m_s: float, bound_db: float, course_rad: float, known_m_s: float
+def test_the_path_loss_error_of_a_pair_does_not_exceed_the_bound(
+    separation_m: float, speed_m_s: float, bound_db: float, course_rad: float, assumed_m_s: float
 ) -> None:
     e_m_s, n_m_s = speed_m_s * math.cos(course_rad), speed_m_s * math.sin(course_rad)
     try:
-        end_ns = window_ns(apart_m, (e_m_s, n_m_s, 0.0), bound_db, (known_m_s, 0.0, 0.0))
+        end_ns = window_ns(separation_m, (e_m_s, n_m_s, 0.0), bound_db, (assumed_m_s, 0.0, 0.0))
     except PolicyError:
-        bound_m = max(apart_m, 1.0) * (1 - 10 ** (-bound_db / (10 * EXPONENT)))
-        assert math.hypot(e_m_s - known_m_s, n_m_s) * 0.001 > bound_m, "one step breaks it"
+        bound_m = max(separation_m, 1.0) * (1 - 10 ** (-bound_db / (10 * EXPONENT)))
+        assert math.hypot(e_m_s - assumed_m_s, n_m_s) * 0.001 > bound_m, "one step exceeds it"
         return
     if end_ns == STEP_NS:
         return  # the window of one step, in which nothing changes
-    later_m = math.hypot(apart_m + e_m_s * end_ns / 1e9, n_m_s * end_ns / 1e9)
-    known_m = abs(apart_m + known_m_s * end_ns / 1e9)
-    assert abs(loss_db(later_m) - loss_db(known_m)) <= bound_db * (1 + 1e-9)
+    true_m = math.hypot(separation_m + e_m_s * end_ns / 1e9, n_m_s * end_ns / 1e9)
+    assumed_m = abs(separation_m + assumed_m_s * end_ns / 1e9)
+    assert abs(loss_db(true_m) - loss_db(assumed_m)) <= bound_db * (1 + 1e-9)
 
 
-def test_who_comes_straight_nearer_uses_the_whole_bound() -> None:
+def test_a_direct_approach_uses_the_whole_bound() -> None:
     end_ns = window_ns(50.0, (-2.0, 0.0, 0.0), 1.0)
     assert loss_db(50.0) - loss_db(50.0 - 2.0 * end_ns / 1e9) == pytest.approx(1.0, rel=0.001)
 

@@ -1,4 +1,4 @@
-"""Clocks that are wrong for a while, and programs that know no other."""
+"""Clocks that are wrong for a time, and programs that have no other clock."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -29,52 +29,52 @@ CLOCKS = st.builds(
 
 
 @given(CLOCKS, TIMES)
-def test_a_clock_shows_what_offset_and_rate_make_of_the_time(clock: AgentClock, now_ns: int) -> None:
+def test_the_reading_of_a_clock_follows_from_offset_and_rate(clock: AgentClock, now_ns: int) -> None:
     wrong = clock.begin_ns <= now_ns and (clock.end_ns is None or now_ns < clock.end_ns)
     exact = now_ns + wrong * (clock.offset_ns + Fraction(clock.rate_ppb, 10**9) * (now_ns - clock.begin_ns))
-    assert 0 <= exact - clock.shows_ns(now_ns) < 1
+    assert 0 <= exact - clock.reading_ns(now_ns) < 1
 
 
 @given(CLOCKS, TIMES)
-def test_a_time_is_waited_for_until_the_clock_first_shows_it_and_no_longer(clock: AgentClock, shown_ns: int) -> None:
+def test_first_ns_is_the_first_time_at_which_the_clock_shows_a_reading(clock: AgentClock, shown_ns: int) -> None:
     first_ns = clock.first_ns(shown_ns)
-    assert clock.shows_ns(first_ns) >= shown_ns
-    # Within a stretch it never goes back, so the nanosecond before is the latest of all before.
+    assert clock.reading_ns(first_ns) >= shown_ns
+    # Within an interval the reading never decreases, so the nanosecond before is the latest of all before.
     edges = [at_ns for at_ns in (clock.begin_ns, clock.end_ns) if at_ns is not None]
     before = [at_ns - 1 for at_ns in (first_ns, *edges) if 0 < at_ns <= first_ns]
-    assert all(clock.shows_ns(at_ns) < shown_ns for at_ns in before)
+    assert all(clock.reading_ns(at_ns) < shown_ns for at_ns in before)
 
 
 @pytest.mark.parametrize("rate_ppb", [-(10**9), -2 * 10**9])
-def test_a_clock_that_stands_or_goes_back_is_refused(rate_ppb: int) -> None:
-    with pytest.raises(ConfigurationError, match="stands or goes back"):
+def test_a_clock_that_stops_or_runs_backwards_is_refused(rate_ppb: int) -> None:
+    with pytest.raises(ConfigurationError, match="stops or runs backwards"):
         AgentClock(rate_ppb=rate_ppb)
     assert AgentClock(rate_ppb=1 - 10**9).first_ns(1) == 10**9
 
 
 class Listener:
-    """Keeps what it hears, with its own time."""
+    """Keeps received datagrams with the time of its own clock."""
 
     def __init__(self) -> None:
-        self.heard: list[tuple[int, Received]] = []
+        self.received: list[tuple[int, Received]] = []
 
     def next_wake_ns(self) -> None:
         return None
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-        self.heard += [(now_ns, one) for one in received]
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        self.received += [(now_ns, datagram) for datagram in received]
         return Action()
 
 
 def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
-    """Let a program run by itself; return what it sends, each with the true time."""
-    found = []
+    """Run a program alone, and return the datagrams that it sends, each with the true time."""
+    datagrams = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= to_ns:
-        found += [(wake_ns, one) for one in program.wake(wake_ns, HERE, ()).datagrams]
-    return found
+        datagrams += [(wake_ns, datagram) for datagram in program.wake(wake_ns, HERE, ()).datagrams]
+    return datagrams
 
 
-def test_a_fast_clock_sends_more_often_and_stamps_what_it_shows() -> None:
+def test_a_program_with_a_fast_clock_sends_more_often_and_stamps_the_reading() -> None:
     fast = AgentClock(rate_ppb=100_000_000)
     packets = sent(Clocked(Periodic("a", "b", period_ns=11 * MS), fast), 100 * MS)
     assert [at_ns for at_ns, _ in packets] == [number * 10 * MS for number in range(11)]
@@ -83,18 +83,18 @@ def test_a_fast_clock_sends_more_often_and_stamps_what_it_shows() -> None:
     program = Clocked(listener, slow)
     for at_ns, datagram in packets[:2]:
         program.wake(at_ns + 7 * MS, HERE, [Received("a", datagram.payload, at_ns, at_ns + 6 * MS)])
-    assert listener.heard == [
+    assert listener.received == [
         (2 * MS, Received("a", HERE, 0, 1 * MS)),
         (12 * MS, Received("a", HERE, 11 * MS, 11 * MS)),
     ]
 
 
-def test_a_clock_that_is_set_right_makes_nobody_catch_up_or_repeat() -> None:
+def test_after_a_clock_was_set_right_no_datagram_is_repeated_or_sent_later() -> None:
     ahead = AgentClock(begin_ns=20 * MS, end_ns=50 * MS, offset_ns=15 * MS)
     times_ns = [at_ns for at_ns, _ in sent(Clocked(Periodic("a", "b", period_ns=10 * MS), ahead), 100 * MS)]
-    # At 20 ms it shows 35, at 50 ms it is back at 50 and has shown 60 already, so that the next is due at 70.
+    # The reading is 35 ms at 20 ms. At 50 ms it is 50 again after it has been 60, so the next datagram is due at 70.
     assert times_ns == [0, 10 * MS, 20 * MS, 25 * MS, 35 * MS, 45 * MS, 70 * MS, 80 * MS, 90 * MS, 100 * MS]
     behind = AgentClock(end_ns=10_000 * MS, offset_ns=-9_000 * MS)
     packets = sent(Clocked(Periodic("a", "b", period_ns=MS), behind), 10_001 * MS)
     assert [at_ns for at_ns, _ in packets[-3:]] == [9_999 * MS, 10_000 * MS, 10_001 * MS]
-    assert [one.number for _, one in packets] == list(range(len(packets)))
+    assert [datagram.number for _, datagram in packets] == list(range(len(packets)))

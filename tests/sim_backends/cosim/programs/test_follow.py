@@ -1,4 +1,4 @@
-"""Programs that follow others: what they make of what they hear, and of nothing."""
+"""Programs that follow others: their commands with and without received states."""
 
 import math
 
@@ -26,7 +26,7 @@ MS = 1_000_000
 S = 1000 * MS
 
 
-def heard(
+def state_of(
     place_m: Vector, velocity_m_s: Vector = (0.0, 0.0, 0.0), *, sent_ns: int = 0, source: str = "a"
 ) -> Received:
     return Received(source, State(place_m, velocity_m_s), sent_ns, sent_ns)
@@ -35,36 +35,36 @@ def heard(
 OWN = State((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
 
 
-def test_it_believes_a_leader_to_go_on_since_it_was_sent() -> None:
-    """At 5 m and 1 m/s 0.3 s ago it is at 5.3 m; at 2 m behind that is 3.3 m too far for who stands."""
+def test_the_state_of_a_leader_is_extrapolated_from_its_time_stamp() -> None:
+    """At 5 m and 1 m/s 0.3 s ago it is at 5.3 m, which is 3.3 m more than the desired 2 m at standstill."""
     program = FollowAtHeadway("a", headway_s=0.5, standstill_m=2.0, gain_per_s=0.4)
     program.wake(0, OWN, [])
-    twist = program.wake(350 * MS, OWN, [heard((5.0, 0.0, 0.0), (1.0, 0.0, 0.0), sent_ns=50 * MS)]).command
-    wanted_m_s2 = (1.0 + 0.4 * 3.3) / 0.5
-    assert (twist.forward_m_s, twist.turn_rad_s) == pytest.approx((0.05 * wanted_m_s2, 0.0))
+    twist = program.wake(350 * MS, OWN, [state_of((5.0, 0.0, 0.0), (1.0, 0.0, 0.0), sent_ns=50 * MS)]).command
+    acceleration_m_s2 = (1.0 + 0.4 * 3.3) / 0.5
+    assert (twist.forward_m_s, twist.turn_rad_s) == pytest.approx((0.05 * acceleration_m_s2, 0.0))
 
 
-def test_what_comes_late_or_from_others_or_says_no_state_changes_nothing() -> None:
+def test_older_states_and_other_datagrams_are_ignored() -> None:
     program = FollowAtHeadway("a")
-    known = heard((5.0, 0.0, 0.0), sent_ns=40 * MS)
-    alone = FollowAtHeadway("a").wake(50 * MS, OWN, [known])
-    others = [
-        heard((9.0, 0.0, 0.0), sent_ns=30 * MS),
-        heard((9.0, 0.0, 0.0), source="b", sent_ns=50 * MS),
+    latest = state_of((5.0, 0.0, 0.0), sent_ns=40 * MS)
+    expected = FollowAtHeadway("a").wake(50 * MS, OWN, [latest])
+    ignored = [
+        state_of((9.0, 0.0, 0.0), sent_ns=30 * MS),
+        state_of((9.0, 0.0, 0.0), source="b", sent_ns=50 * MS),
         Received("a", "hello", 50 * MS, 50 * MS),
     ]
-    assert program.wake(50 * MS, OWN, [known, *others]) == alone
+    assert program.wake(50 * MS, OWN, [latest, *ignored]) == expected
 
 
 @pytest.mark.parametrize(
     ("place_m", "command"), [((-5.0, 0.0, 0.0), Twist(0.0, 2 * math.pi)), ((0.0, 0.0, 0.0), Twist())]
 )
-def test_it_turns_to_a_leader_behind_it_and_waits_for_one_where_it_is(place_m: Vector, command: Twist) -> None:
-    found = FollowAtHeadway("a").wake(0, OWN, [heard(place_m)]).command
-    assert (found.forward_m_s, abs(found.turn_rad_s)) == pytest.approx((command.forward_m_s, command.turn_rad_s))
+def test_it_turns_to_a_leader_behind_it_and_stops_at_one_in_its_position(place_m: Vector, command: Twist) -> None:
+    actual = FollowAtHeadway("a").wake(0, OWN, [state_of(place_m)]).command
+    assert (actual.forward_m_s, abs(actual.turn_rad_s)) == pytest.approx((command.forward_m_s, command.turn_rad_s))
 
 
-def test_a_follower_stops_when_it_hears_nothing_any_more_and_goes_on_when_it_does() -> None:
+def test_a_follower_stops_without_states_and_continues_when_it_receives_them_again() -> None:
     bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (4.0, 0.0)), "b": DifferentialDrive(HUSKY_A200, (0.0, 0.0))})
     programs: dict[str, Program] = {
         "a": Several(
@@ -83,14 +83,14 @@ def test_a_follower_stops_when_it_hears_nothing_any_more_and_goes_on_when_it_doe
         return math.hypot(*bodies.advance(at_ns, {})["b"].velocity_m_s)
 
     assert speed_m_s(5900 * MS) == pytest.approx(0.5, abs=0.1)
-    # The last was sent at 4.9 s and came 3 ms later. The command after a second more is at 5.95 s, and brakes.
+    # The last state was sent at 4.9 s and arrived 3 ms later. It expires after 1 s; the command at 5.95 s brakes.
     assert speed_m_s(5950 * MS) > 0.3
     assert speed_m_s(6200 * MS) == 0.0
     assert speed_m_s(11_900 * MS) == 0.0
     assert speed_m_s(14_000 * MS) > 0.5
 
 
-def test_who_holds_station_flies_over_the_middle_of_those_it_hears() -> None:
+def test_a_drone_that_holds_station_flies_above_the_centre_of_its_leaders() -> None:
     bodies = Bodies(
         {
             "a": DifferentialDrive(HUSKY_A200, (4.0, 0.0), antenna_m=0.0),
@@ -98,9 +98,9 @@ def test_who_holds_station_flies_over_the_middle_of_those_it_hears() -> None:
             "uav": Quadrotor(IRIS, (0.0, 0.0, 5.0)),
         }
     )
-    ahead = VelocityProfile([ProfileLeg(100 * S, Twist(0.8))])
+    forward = VelocityProfile([ProfileLeg(100 * S, Twist(0.8))])
     programs: dict[str, Program] = {
-        "a": Several([ahead, Periodic("a", "uav", period_ns=50 * MS)]),
+        "a": Several([forward, Periodic("a", "uav", period_ns=50 * MS)]),
         "b": Several([VelocityProfile([ProfileLeg(100 * S, Twist(0.8))]), Periodic("b", "uav", period_ns=50 * MS)]),
         "uav": HoldStation(["a", "b"], above_m=8.0),
     }
@@ -114,25 +114,25 @@ def test_who_holds_station_flies_over_the_middle_of_those_it_hears() -> None:
     assert states["uav"].velocity_m_s == pytest.approx((0.8, 0.0, 0.0), abs=0.01)
 
 
-def test_who_holds_station_hovers_when_it_hears_nobody() -> None:
+def test_a_drone_that_holds_station_hovers_without_states() -> None:
     program = HoldStation(["a", "b"], above_m=8.0, gain_per_s=1.0, timeout_ns=S)
     assert program.wake(0, OWN, []).command == Velocity()
-    one = program.wake(50 * MS, OWN, [heard((2.0, 0.0, -8.0), (0.3, 0.0, 0.0), sent_ns=50 * MS)]).command
-    assert one.velocity_m_s == pytest.approx((2.3, 0.0, 0.0))
+    velocity = program.wake(50 * MS, OWN, [state_of((2.0, 0.0, -8.0), (0.3, 0.0, 0.0), sent_ns=50 * MS)]).command
+    assert velocity.velocity_m_s == pytest.approx((2.3, 0.0, 0.0))
     assert program.wake(2 * S, OWN, []).command == Velocity()
 
 
 @pytest.mark.parametrize("wrong", [{"headway_s": 0.0}, {"standstill_m": -1.0}, {"period_ns": 0}, {"timeout_ns": 0}])
-def test_numbers_that_lead_nowhere_are_refused(wrong: dict[str, float]) -> None:
+def test_parameters_that_are_not_above_0_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigurationError, match="above 0"):
         FollowAtHeadway("a", **wrong)  # type: ignore[arg-type]
-    with pytest.raises(ConfigurationError, match="nobody flies"):
+    with pytest.raises(ConfigurationError, match="cannot fly"):
         HoldStation(["a"], above_m=0.0)
-    with pytest.raises(ConfigurationError, match="nobody to follow"):
+    with pytest.raises(ConfigurationError, match="no agent to follow"):
         HoldStation([])
 
 
-def test_a_profile_goes_from_leg_to_leg_and_stops() -> None:
+def test_a_profile_commands_its_legs_in_order_and_stops() -> None:
     bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (0.0, 0.0))})
     legs = [ProfileLeg(2 * S, Twist(0.9)), ProfileLeg(S, Twist(0.3, 0.5))]
     agents = Agents(bodies, {"a": VelocityProfile(legs, begin_ns=S)})
@@ -141,5 +141,5 @@ def test_a_profile_goes_from_leg_to_leg_and_stops() -> None:
         _, states = agents.advance((at_s - 1) * S, at_s * S - 1, at_s * S)
         speeds.append(math.hypot(*states["a"].velocity_m_s))
     assert speeds == pytest.approx([0.0, 0.0, 0.9, 0.9, 0.3, 0.0])
-    with pytest.raises(ConfigurationError, match="lasts no time"):
+    with pytest.raises(ConfigurationError, match="has no duration"):
         VelocityProfile([])

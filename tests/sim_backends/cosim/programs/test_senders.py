@@ -1,4 +1,4 @@
-"""Programs that play bags, send files, ask and answer, side by side and while their computer is off."""
+"""Programs that play bags, send files and pings, combined, and while their computer is off."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from sim_backends.cosim.federates import Action, Program
 from sim_backends.cosim.programs.bags import BagMessage, Playback, pieces, recorded
 from sim_backends.cosim.programs.outages import Outage
 from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.programs.pings import EchoRequester, PingAnswers, PingRequest
+from sim_backends.cosim.programs.pings import EchoRequester, EchoResponder, PingRequest
 from sim_backends.cosim.programs.several import Several
 from sim_backends.cosim.scenario.traffic import BagTraffic
 from sim_backends.network.packets import Datagram, Received
@@ -23,15 +23,15 @@ MS = 1_000_000
 
 
 def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
-    """Let a program run by itself; return what it sends, each with when."""
-    found = []
+    """Run a program alone, and return the datagrams that it sends, each with its time."""
+    datagrams = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= to_ns:
-        found += [(wake_ns, one) for one in program.wake(wake_ns, HERE, ()).datagrams]
-    return found
+        datagrams += [(wake_ns, datagram) for datagram in program.wake(wake_ns, HERE, ()).datagrams]
+    return datagrams
 
 
 @given(st.integers(0, 10 * MS), st.floats(1, 1000), st.integers(0, 2**32))
-def test_a_recorded_bag_is_as_long_as_its_rate_says_and_no_later_than_its_jitter(
+def test_a_recorded_bag_has_the_length_of_its_rate_and_delays_up_to_its_jitter(
     jitter_ns: int, rate_hz: float, seed: int
 ) -> None:
     bag = recorded(
@@ -39,13 +39,13 @@ def test_a_recorded_bag_is_as_long_as_its_rate_says_and_no_later_than_its_jitter
     )
     assert len(bag) == round(0.5 * rate_hz)
     assert bag == sorted(bag, key=lambda message: message.at_ns)
-    # One that comes after a late one is as late as that.
+    # A message may have the delay of an earlier one, as the order is kept.
     late_ns = [message.at_ns - round(number / rate_hz * 1e9) for number, message in enumerate(bag)]
     assert all(0 <= late <= jitter_ns for late in late_ns)
     assert len(set(late_ns)) > 1 or len(bag) < 2 or jitter_ns < 1000
 
 
-def test_a_message_of_the_papers_bag_is_as_large_as_ros_makes_it() -> None:
+def test_a_message_of_the_papers_bag_has_the_size_of_a_serialized_ros_message() -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
     types = store.types
     vector = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=9.8)
@@ -60,89 +60,91 @@ def test_a_message_of_the_papers_bag_is_as_large_as_ros_makes_it() -> None:
         linear_acceleration=vector,
         linear_acceleration_covariance=np.zeros(9),
     )
-    said = BagTraffic.model_validate({"kind": "bag", "from": "a", "to": "b"})
-    assert said.size_bytes == len(store.serialize_ros1(imu, "sensor_msgs/msg/Imu"))
-    assert said.packets(60.0) == 500
+    traffic = BagTraffic.model_validate({"kind": "bag", "from": "a", "to": "b"})
+    assert traffic.size_bytes == len(store.serialize_ros1(imu, "sensor_msgs/msg/Imu"))
+    assert traffic.packets(60.0) == 500
 
 
-def test_playback_sends_each_message_at_its_time_and_all_that_are_due() -> None:
+def test_playback_sends_each_message_at_its_time() -> None:
     bag = [BagMessage(0, 10), BagMessage(3 * MS, 20), BagMessage(3 * MS, 30), BagMessage(9 * MS, 40)]
     packets = sent(Playback("f", "b", bag, begin_ns=5 * MS, protocol="tcp"), 100 * MS)
-    assert [(at_ns, one.size_bytes, one.number) for at_ns, one in packets] == [
+    assert [(at_ns, datagram.size_bytes, datagram.number) for at_ns, datagram in packets] == [
         (5 * MS, 10, 0),
         (8 * MS, 20, 1),
         (8 * MS, 30, 2),
         (14 * MS, 40, 3),
     ]
-    assert {(one.flow, one.destination, one.protocol) for _, one in packets} == {("f", "b", "tcp")}
+    assert {(datagram.flow, datagram.destination, datagram.protocol) for _, datagram in packets} == {
+        ("f", "b", "tcp")
+    }
 
 
 @given(st.integers(1, 10**6), st.integers(500, 65_000))
-def test_a_file_in_pieces_is_whole(size_bytes: int, piece_bytes: int) -> None:
+def test_a_file_in_pieces_is_complete(size_bytes: int, piece_bytes: int) -> None:
     sizes = [piece.size_bytes for piece in pieces(size_bytes, piece_bytes)]
     assert sum(sizes) == size_bytes
     assert set(sizes[:-1]) <= {piece_bytes}
     assert 0 < sizes[-1] <= piece_bytes
 
 
-def test_a_ping_asks_so_often_and_every_request_is_answered_alike() -> None:
-    asks = sent(
+def test_a_ping_sends_its_requests_and_every_request_gets_an_equal_reply() -> None:
+    requests = sent(
         EchoRequester("p/b", "b", count=3, interval_ns=100 * MS, size_bytes=56, first_ns=MS, protocol="tcp"), 10**12
     )
-    assert [at_ns for at_ns, _ in asks] == [MS, 101 * MS, 201 * MS]
-    arrived = [Received("a", one.payload, at_ns, at_ns + MS) for at_ns, one in asks]
+    assert [at_ns for at_ns, _ in requests] == [MS, 101 * MS, 201 * MS]
+    arrived = [Received("a", request.payload, at_ns, at_ns + MS) for at_ns, request in requests]
     other = Received("a", HERE, 0, MS)
-    answers = PingAnswers().wake(202 * MS, HERE, [*arrived, other]).datagrams
-    assert answers == [Datagram("a", 56, "p/b/reply", number, None, "tcp") for number in range(3)]
-    assert all(isinstance(one.payload, PingRequest) for _, one in asks)
+    replies = EchoResponder().wake(202 * MS, HERE, [*arrived, other]).datagrams
+    assert replies == [Datagram("a", 56, "p/b/reply", number, None, "tcp") for number in range(3)]
+    assert all(isinstance(request.payload, PingRequest) for _, request in requests)
 
 
-def test_a_periodic_program_stops_when_it_is_told_to() -> None:
+def test_a_periodic_program_stops_at_its_stop_time() -> None:
     packets = sent(Periodic("f", "b", period_ns=10 * MS, first_ns=5 * MS, stop_ns=25 * MS, protocol="tcp"), 10**12)
     assert [at_ns for at_ns, _ in packets] == [5 * MS, 15 * MS]
 
 
 class Steering:
-    """Commands when it wakes, and keeps what it hears."""
+    """Gives a command at given times, and keeps received datagrams."""
 
     def __init__(self, command: str, *wakes_ns: int) -> None:
         self._command = command
         self._wakes_ns = list(wakes_ns)
-        self.heard: list[Received] = []
+        self.received: list[Received] = []
 
     def next_wake_ns(self) -> int | None:
         return self._wakes_ns[0] if self._wakes_ns else None
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
-        self.heard += received
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        self.received += received
         if self._wakes_ns and self._wakes_ns[0] <= now_ns:
             self._wakes_ns.pop(0)
             return Action(command=self._command)
         return Action()
 
 
-def test_several_programs_wake_when_each_wants_to_and_all_hear() -> None:
-    one, other = Steering("one", 3, 7), Steering("other", 5, 7)
-    program = Several([one, other])
+def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -> None:
+    first, second = Steering("first", 3, 7), Steering("second", 5, 7)
+    program = Several([first, second])
     commands = []
     while (wake_ns := program.next_wake_ns()) is not None:
         commands.append((wake_ns, program.wake(wake_ns, HERE, ()).command))
-    assert commands == [(3, "one"), (5, "other"), (7, "other")]
-    mail = [Received("a", None, 0, 9)]
-    assert program.wake(9, HERE, mail) == Action()
-    assert one.heard == other.heard == mail
-    # A clock that runs fast may show a later time when it wakes.
-    assert Several([Steering("one", 3), Steering("other", 5)]).wake(4, HERE, ()).command == "one"
+    assert commands == [(3, "first"), (5, "second"), (7, "second")]
+    received = [Received("a", None, 0, 9)]
+    assert program.wake(9, HERE, received) == Action()
+    assert first.received == second.received == received
+    # With a fast clock a program may wake later than planned.
+    assert Several([Steering("first", 3), Steering("second", 5)]).wake(4, HERE, ()).command == "first"
 
 
-def test_a_computer_that_is_off_hears_and_sends_nothing_and_stops_its_body() -> None:
+def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() -> None:
     sends, steers = Periodic("f", "b", period_ns=10), Steering("go", 5, 15, 35)
     program = Outage(Several([sends, steers]), 12, 31, "stop")
-    done = []
+    actions = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= 50:
         action = program.wake(wake_ns, HERE, ())
-        done.append((wake_ns, [one.number for one in action.datagrams], action.command))
-    assert done == [
+        actions.append((wake_ns, [datagram.number for datagram in action.datagrams], action.command))
+    assert actions == [
         (0, [0], None),
         (5, [], "go"),
         (10, [1], None),
@@ -155,11 +157,11 @@ def test_a_computer_that_is_off_hears_and_sends_nothing_and_stops_its_body() -> 
         (50, [5], None),
     ]
     during, after = Received("a", 1, 0, 29), Received("a", 2, 0, 31)
-    again = Outage(steers, 12, 31)
-    assert again.wake(29, HERE, [during]) == Action()
-    again.wake(31, HERE, [after])
-    assert steers.heard == [after]
+    outage = Outage(steers, 12, 31)
+    assert outage.wake(29, HERE, [during]) == Action()
+    outage.wake(31, HERE, [after])
+    assert steers.received == [after]
 
 
-def test_a_computer_that_never_comes_back_stays_off() -> None:
+def test_a_computer_without_an_end_of_its_outage_stays_off() -> None:
     assert [at_ns for at_ns, _ in sent(Outage(Periodic("f", "b", period_ns=10), 12, None), 100)] == [0, 10]

@@ -1,4 +1,4 @@
-"""Programs that steer through points, on the bodies that they steer."""
+"""Programs that steer through waypoints, with the bodies that they steer."""
 
 import math
 
@@ -33,13 +33,13 @@ def test_it_drives_through_all_points_and_stops_at_the_last() -> None:
     assert agents.next_wake_ns() is None
 
 
-def test_it_needs_to_know_where_it_heads() -> None:
+def test_it_requires_states_with_a_heading() -> None:
     agents = Agents(Paths([WayPoints("a", [(0.0, 0.0, 0.0)], 1.0)]), {"a": DriveThrough([(1.0, 1.0)], 1.0)})
-    with pytest.raises(FederateError, match="where its robot heads"):
+    with pytest.raises(FederateError, match="the heading of its robot"):
         agents.advance(0, MS, MS)
 
 
 @pytest.mark.parametrize(("points", "speed"), [([], 1.0), ([(0.0, 1.0)], 0.0), ([(0.0, 1.0)], math.inf)])
-def test_a_way_that_leads_nowhere_is_refused(points: list[tuple[float, float]], speed: float) -> None:
-    with pytest.raises(ConfigurationError, match="no way"):
+def test_a_path_without_points_or_speed_is_refused(points: list[tuple[float, float]], speed: float) -> None:
+    with pytest.raises(ConfigurationError, match="not a path"):
         DriveThrough(points, speed)

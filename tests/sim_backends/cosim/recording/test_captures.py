@@ -1,4 +1,4 @@
-"""Captures as scapy and tcpdump read them: what each robot sent and got, to the nanosecond and the bit."""
+"""Captures as scapy and tcpdump read them: the packets that each robot sent and received, exact in every bit."""
 
 import os
 import re
@@ -20,7 +20,7 @@ from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.recording.captures import Captures
-from sim_backends.cosim.recording.internet import InternetBytes
+from sim_backends.cosim.recording.internet import IpEncoder
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.network.ip import Fragment
@@ -42,11 +42,11 @@ ADDRESSES = {name: f"10.0.0.{number}" for number, name in enumerate(NAMES, start
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording of a run, and what the network itself logged.
+    """A recording of a run, and the packets that the network logged.
 
     Attributes:
         folder: The recording.
-        log: What each robot sent or got, in order.
+        log: The packets that each robot sent or received, in order.
     """
 
     folder: Path
@@ -55,7 +55,7 @@ class Recorded:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """Three robots talk over links that lose a tenth: UDP in fragments, and TCP that has to send again."""
+    """Three robots send over links with 10 % loss: UDP in fragments, and TCP with retransmissions."""
     folder = tmp_path_factory.mktemp("captures") / "run"
     links: UniformLinks[Fragment] = UniformLinks(
         1, RadioOptions.model_validate({"delay": "5ms", "rate": "20Mbit/s", "loss": "10%"})
@@ -71,11 +71,11 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     log: list[tuple[int, str, Fragment]] = []
     with RunRecorder(folder, ABOUT, snap_bytes=65535, part_every_s=0.02) as recorder:
 
-        def both(at_ns: int, host: str, fragment: Fragment) -> None:
+        def log_twice(at_ns: int, host: str, fragment: Fragment) -> None:
             log.append((at_ns, host, fragment))
             recorder.log_ip(at_ns, host, fragment)
 
-        network.log_ip(both)
+        network.log_ip(log_twice)
         Coordinator(Agents(physics, programs), network, EventDriven(), pairs, observer=recorder).advance(700 * MS)
     assert read_recording(folder).run.fates
     return Recorded(folder, log)
@@ -86,7 +86,7 @@ def dissected(recorded: Recorded, name: str) -> list[Packet]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_scapy_reads_what_the_network_logged(recorded: Recorded, name: str) -> None:
+def test_scapy_reads_the_packets_that_the_network_logged(recorded: Recorded, name: str) -> None:
     frames = dissected(recorded, name)
     logged = [(at_ns, fragment) for at_ns, host, fragment in recorded.log if host == name]
     assert len(frames) == len(logged) > 100
@@ -99,12 +99,12 @@ def test_scapy_reads_what_the_network_logged(recorded: Recorded, name: str) -> N
         assert (ip.len, len(frame), ip.id) == (fragment.size_bytes, fragment.size_bytes, fragment.ip_id % 65536)
         assert (ip.frag * 8, "MF" in ip.flags) == (fragment.offset_bytes, fragment.index + 1 < fragment.count)
         if packet.transport == "tcp":
-            as_simulated(ip[TCP], packet.body[1], forth=packet.source == "bravo")
+            check_tcp(ip[TCP], packet.body[1], forth=packet.source == "bravo")
         elif not fragment.index:
             assert ip[UDP].len == packet.size_bytes - 20
 
 
-def as_simulated(tcp: Packet, segment: Segment, *, forth: bool) -> None:
+def check_tcp(tcp: Packet, segment: Segment, *, forth: bool) -> None:
     options: Mapping[str, Any] = dict(tcp.options)
     assert (tcp.seq, tcp.ack) == (segment.first, segment.acknowledges or 0)
     flags = {"S": segment.syn, "A": segment.acknowledges is not None, "P": bool(segment.length)}
@@ -122,54 +122,54 @@ def as_simulated(tcp: Packet, segment: Segment, *, forth: bool) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_checksums_are_those_that_scapy_works_out(recorded: Recorded, name: str) -> None:
+def test_checksums_equal_those_that_scapy_computes(recorded: Recorded, name: str) -> None:
     packets = [frame[IP] for frame in dissected(recorded, name)]
     for packet in packets:
         assert packet.chksum == rebuilt(packet, IP).chksum
     whole = [packet for packet in packets if not packet.frag and "MF" not in packet.flags]
     together = reassembled(packets)
-    assert bool(together) == (name in {"alpha", "bravo"}), "the two ends of what is too large for a frame"
+    assert bool(together) == (name in {"alpha", "bravo"}), "both ends of the packets that need fragments"
     for packet in whole + together:
         kind = TCP if TCP in packet else UDP
         assert packet[kind].chksum == rebuilt(packet, kind)[kind].chksum
 
 
 def rebuilt(packet: Packet, kind: type[Packet]) -> Packet:
-    """Return a packet with a checksum that scapy worked out anew."""
-    again = IP(bytes(packet))
-    del again[kind].chksum
-    return IP(bytes(again))
+    """Return a packet with a checksum that scapy has computed."""
+    copy = IP(bytes(packet))
+    del copy[kind].chksum
+    return IP(bytes(copy))
 
 
 def reassembled(packets: Sequence[Packet]) -> list[Packet]:
-    """Return the packets of which all fragments are there, whole."""
+    """Return the packets of which all fragments were captured, reassembled."""
     parts: dict[tuple[str, int], dict[int, Packet]] = {}
     for packet in packets:
         if packet.frag or "MF" in packet.flags:
             parts.setdefault((packet.src, packet.id), {})[packet.frag * 8] = packet
-    found: list[Packet] = []
+    complete: list[Packet] = []
     for by_offset in parts.values():
         last = by_offset[max(by_offset)]
         data = b"".join(bytes(by_offset[offset].payload) for offset in sorted(by_offset))
         if "MF" not in last.flags and len(data) == max(by_offset) + len(last.payload):
-            found.append(IP(bytes(IP(src=last.src, dst=last.dst, proto=last.proto) / data)))
-    return found
+            complete.append(IP(bytes(IP(src=last.src, dst=last.dst, proto=last.proto) / data)))
+    return complete
 
 
 @pytest.mark.emulated
-def test_tcpdump_finds_every_checksum_correct(recorded: Recorded) -> None:
+def test_tcpdump_reports_every_checksum_as_correct(recorded: Recorded) -> None:
     for name in NAMES:
         command = ["tcpdump", "-n", "-vv", "-r", str(recorded.folder / "captures" / f"{name}.pcap")]
-        said = subprocess.run(command, capture_output=True, text=True, check=True)
-        assert "link-type RAW (Raw IP)" in said.stderr
-        assert not re.findall("bad|incorrect|truncated|wrong|invalid", said.stdout)
-    # The last: it got all of bravo's TCP, and lost some.
-    assert said.stdout.count("(correct)") > 100
-    assert re.search(r"options \[nop,nop,TS val \d+ ecr \d+,nop,nop,sack 1 \{\d+:\d+\}\]", said.stdout)
-    assert re.search(r"Flags \[S\.\], .* options \[mss 1460,sackOK,TS val \d+ ecr \d+,nop,wscale 7\]", said.stdout)
+        result = subprocess.run(command, capture_output=True, text=True, check=True)
+        assert "link-type RAW (Raw IP)" in result.stderr
+        assert not re.findall("bad|incorrect|truncated|wrong|invalid", result.stdout)
+    # The last capture, carol's, has all of bravo's TCP, with losses.
+    assert result.stdout.count("(correct)") > 100
+    assert re.search(r"options \[nop,nop,TS val \d+ ecr \d+,nop,nop,sack 1 \{\d+:\d+\}\]", result.stdout)
+    assert re.search(r"Flags \[S\.\], .* options \[mss 1460,sackOK,TS val \d+ ecr \d+,nop,wscale 7\]", result.stdout)
 
 
-def test_robots_of_a_scenario_capture_what_their_network_carries(tmp_path: Path) -> None:
+def test_the_robots_of_a_scenario_capture_the_packets_of_their_network(tmp_path: Path) -> None:
     scenario = load_scenario("baylands")
     with RunRecorder(tmp_path / "run", ABOUT) as recorder:
         run = build(scenario, policy="scheduled", recorder=recorder).run(2000 * MS)
@@ -177,12 +177,10 @@ def test_robots_of_a_scenario_capture_what_their_network_carries(tmp_path: Path)
     captured = {path.stem: len(list(PcapReader(str(path)))) for path in (tmp_path / "run" / "captures").iterdir()}
     assert captured.keys() == scenario.agents.keys()
     arrived = sum(fate.arrived_ns is not None for fate in run.fates.values())
-    assert sum(captured.values()) >= len(run.fates) + arrived > 10, (
-        "each packet where it is sent, and where it arrives"
-    )
+    assert sum(captured.values()) >= len(run.fates) + arrived > 10, "each packet at its sender, and at its receiver"
 
 
-def test_snapped_packets_say_how_long_they_were(tmp_path: Path) -> None:
+def test_truncated_packets_have_their_original_length(tmp_path: Path) -> None:
     captures = Captures(tmp_path / "captures", NAMES, snap_bytes=60)
     packet = IpPacket("alpha", None, "topic", 1400, ("topic", 0), object())
     captures.log(1_234_567_890_123, "alpha", Fragment(packet, 65537, 0, 1, 0, 1400))
@@ -191,10 +189,10 @@ def test_snapped_packets_say_how_long_they_were(tmp_path: Path) -> None:
     (frame,) = PcapReader(str(tmp_path / "captures" / "alpha.pcap"))
     assert (round(frame.time * 10**9), len(frame), frame.wirelen) == (1_234_567_890_123, 60, 1400)
     assert (frame[IP].dst, frame[IP].id, frame[UDP].dport) == ("239.255.0.1", 1, 7400)
-    assert {path.name for path in (tmp_path / "captures").iterdir()} == {"alpha.pcap"}, "who sent nothing has none"
+    assert {path.name for path in (tmp_path / "captures").iterdir()} == {"alpha.pcap"}, "others have sent nothing"
 
 
-def test_numbers_wrap_where_those_of_the_wire_do() -> None:
+def test_sequence_numbers_wrap_as_on_the_wire() -> None:
     segment = Segment(
         syn=False,
         first=2**32 + 5,
@@ -209,14 +207,14 @@ def test_numbers_wrap_where_those_of_the_wire_do() -> None:
     )
     body = ConnectionName("alpha", "bravo", "stream", 0), segment
     packet = IpPacket("alpha", "bravo", "tcp", segment.size_bytes, ("stream", 0), body)
-    tcp = IP(InternetBytes(NAMES).of(Fragment(packet, 0, 0, 1, 0, segment.size_bytes), 65535))[TCP]
+    tcp = IP(IpEncoder(NAMES).encode(Fragment(packet, 0, 0, 1, 0, segment.size_bytes), 65535))[TCP]
     assert (tcp.seq, tcp.ack, tcp.window) == (5, 6, 65535)
     assert dict(tcp.options)["Timestamp"] == (3, 4)
     assert dict(tcp.options)["SAck"] == (7, 9)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_capture_that_is_interrupted_between_writing_and_noting_it_has_nothing_twice(
+def test_a_capture_that_is_interrupted_after_a_write_has_no_packet_twice(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     captures = Captures(tmp_path / "captures", NAMES, snap_bytes=60)

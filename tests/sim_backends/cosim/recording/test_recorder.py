@@ -1,4 +1,4 @@
-"""A recording is the run that it was, whenever and however that ended."""
+"""A recording equals its run, however and whenever the run ended."""
 
 import errno
 import json
@@ -48,19 +48,19 @@ def record(folder: Path, policy: SyncPolicy | None = None, part_every_s: float =
 
 
 @pytest.mark.parametrize(
-    "policy", [TimeStepped(0.0011), Scheduled(0.05), EventDriven(), ErrorBounded(0.1)], ids=lambda one: one.name
+    "policy", [TimeStepped(0.0011), Scheduled(0.05), EventDriven(), ErrorBounded(0.1)], ids=lambda policy: policy.name
 )
-def test_a_recording_gives_every_number_again(tmp_path: Path, policy: SyncPolicy) -> None:
+def test_a_recording_reproduces_every_number(tmp_path: Path, policy: SyncPolicy) -> None:
     reference = passing_robots(policy=EventDriven()).advance(END_NS)
     live = record(tmp_path / "run", policy)
-    found = read_recording(tmp_path / "run")
-    assert found.run == live
-    assert repr(errors(reference, found.run)) == repr(errors(reference, live)), "also where values are nan"
-    assert list(found.run.fates) == list(live.fates), "in the same order, by which means are rounded"
-    assert found.manifest.ending is RunEnding.WHOLE
-    assert found.manifest.about == ABOUT
-    # At 10 Hz, at the first end of a window from then on; a goes at 1 m/s, in steps of 1 ms.
-    of_a = [(at_ns, state) for at_ns, agent, state in found.states if agent == "a"]
+    recording = read_recording(tmp_path / "run")
+    assert recording.run == live
+    assert repr(errors(reference, recording.run)) == repr(errors(reference, live)), "also if values are nan"
+    assert list(recording.run.fates) == list(live.fates), "in the same order, which affects the rounding of means"
+    assert recording.manifest.ending is RunEnding.WHOLE
+    assert recording.manifest.about == ABOUT
+    # States are at 10 Hz, at the first end of a window from then on; a drives at 1 m/s, in steps of 1 ms.
+    of_a = [(at_ns, state) for at_ns, agent, state in recording.states if agent == "a"]
     assert [at_ns // (100 * MS) for at_ns, _ in of_a] == list(range(len(of_a)))
     assert len(of_a) >= END_NS // (100 * MS)
     assert all(state.position_m[0] == pytest.approx(at_ns // MS / 1000) for at_ns, state in of_a)
@@ -76,13 +76,13 @@ def test_a_recording_gives_every_number_again(tmp_path: Path, policy: SyncPolicy
     ],
     ids=lambda value: getattr(value, "name", value),
 )
-def test_windows_say_what_decided_them(tmp_path: Path, policy: SyncPolicy, pair: str) -> None:
-    """With the rule as printed, the window is shortest where the slower one publishes."""
+def test_windows_have_the_pair_that_determined_them(tmp_path: Path, policy: SyncPolicy, pair: str) -> None:
+    """With the rule as printed, the window is shortest if the slower robot publishes."""
     record(tmp_path / "run", policy, 1.0, 100 * MS)
     assert set(read_recording(tmp_path / "run").decided_by) == {pair}
 
 
-def test_anybody_can_read_the_tables(tmp_path: Path) -> None:
+def test_the_tables_can_be_read_without_fieldkit(tmp_path: Path) -> None:
     live = record(tmp_path / "run")
     packets = pq.read_table(tmp_path / "run" / "packets").to_pandas()
     arrived = packets[packets.flow == "ab"].dropna(subset=["arrived_ns"])
@@ -97,7 +97,7 @@ def test_anybody_can_read_the_tables(tmp_path: Path) -> None:
 
 @contextmanager
 def child(folder: Path, *limit_bytes: int) -> Iterator[subprocess.Popen[str]]:
-    """Let another process record a run without end, which says in a line how far it is."""
+    """Let another process record an endless run, which prints its progress in lines."""
     command = [sys.executable, "-m", "tests.helpers.passing_robots", str(folder), *map(str, limit_bytes)]
     with subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         try:
@@ -106,17 +106,17 @@ def child(folder: Path, *limit_bytes: int) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def same_as_alone(run: Run) -> None:
-    """Check that what was recorded is what the run without a recorder has."""
-    alone = passing_robots().advance(run.windows_ns[-1])
-    assert run.windows_ns == alone.windows_ns
-    assert all(fate == alone.fates[identity] for identity, fate in run.fates.items())
-    known = {identity for identity, fate in alone.fates.items() if fate.is_known}
-    assert known <= run.fates.keys(), "what had a fate is there"
+def check_equals_run(run: Run) -> None:
+    """Check that a recorded run equals the same run without a recorder."""
+    expected = passing_robots().advance(run.windows_ns[-1])
+    assert run.windows_ns == expected.windows_ns
+    assert all(fate == expected.fates[identity] for identity, fate in run.fates.items())
+    decided = {identity for identity, fate in expected.fates.items() if fate.is_decided}
+    assert decided <= run.fates.keys(), "all decided packets are recorded"
 
 
 @pytest.mark.parametrize("hundreds", [1, 6, 30])
-def test_a_run_that_is_killed_keeps_what_it_had_recorded(tmp_path: Path, hundreds: int) -> None:
+def test_a_run_that_is_killed_keeps_the_parts_written_before(tmp_path: Path, hundreds: int) -> None:
     with child(tmp_path / "run") as process:
         assert process.stdout is not None
         for _ in range(hundreds):
@@ -125,17 +125,17 @@ def test_a_run_that_is_killed_keeps_what_it_had_recorded(tmp_path: Path, hundred
         before = len(list((tmp_path / "run" / "windows").glob("*.parquet")))
         process.send_signal(signal.SIGKILL)
         process.wait(30)
-    found = read_recording(tmp_path / "run")
-    assert (found.manifest.ending, found.run.digest) == (RunEnding.KILLED, "")
+    recording = read_recording(tmp_path / "run")
+    assert (recording.manifest.ending, recording.run.digest) == (RunEnding.KILLED, "")
     assert len(list((tmp_path / "run" / "windows").glob("*.parquet"))) >= before
     if before:
-        same_as_alone(found.run)
-        captured(tmp_path / "run", found.run)
+        check_equals_run(recording.run)
+        check_captures(tmp_path / "run", recording.run)
     assert before or hundreds < 30
 
 
-def captured(folder: Path, run: Run) -> None:
-    """Check that captures end with a whole packet, and have at least all that the tables have."""
+def check_captures(folder: Path, run: Run) -> None:
+    """Check that captures end with a complete packet, and have at least the packets of the tables."""
     for name in "ab":
         path = folder / "captures" / f"{name}.pcap"
         frames = [data for data, _ in RawPcapReader(str(path))]
@@ -143,36 +143,36 @@ def captured(folder: Path, run: Run) -> None:
         assert len(frames) >= sum(fate.packet.source == name for fate in run.fates.values()) > 0
 
 
-def test_a_run_that_is_interrupted_ends_with_all_it_had(tmp_path: Path) -> None:
+def test_a_run_that_is_interrupted_is_recorded_completely(tmp_path: Path) -> None:
     with child(tmp_path / "run") as process:
         assert process.stdout is not None
         for _ in range(5):
             process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=30)
-    assert "KeyboardInterrupt" in said
-    found = read_recording(tmp_path / "run")
-    assert found.manifest.ending is RunEnding.INTERRUPTED
-    assert len(found.run.windows_ns) >= 500
-    same_as_alone(found.run)
-    assert found.run.digest == passing_robots().advance(found.run.windows_ns[-1]).digest
+        _, stderr = process.communicate(timeout=30)
+    assert "KeyboardInterrupt" in stderr
+    recording = read_recording(tmp_path / "run")
+    assert recording.manifest.ending is RunEnding.INTERRUPTED
+    assert len(recording.run.windows_ns) >= 500
+    check_equals_run(recording.run)
+    assert recording.run.digest == passing_robots().advance(recording.run.windows_ns[-1]).digest
 
 
-def test_a_disk_that_is_full_ends_the_run_and_leaves_what_was_there(tmp_path: Path) -> None:
-    """A limit on the size of files is the full disk that needs no disk of its own."""
+def test_a_full_disk_ends_the_run_and_keeps_the_parts_written_before(tmp_path: Path) -> None:
+    """A limit on the size of files stands in for a full disk."""
     with child(tmp_path / "run", 20_000) as process:
-        _, said = process.communicate(timeout=60)
-    assert "RecordingError" in said
-    assert f"{tmp_path / 'run'}: the recording cannot be written: File too large" in said
-    found = read_recording(tmp_path / "run")
-    assert found.manifest.ending is RunEnding.FAILED
-    assert "File too large" in found.manifest.why
+        _, stderr = process.communicate(timeout=60)
+    assert "RecordingError" in stderr
+    assert f"{tmp_path / 'run'}: the recording cannot be written: File too large" in stderr
+    recording = read_recording(tmp_path / "run")
+    assert recording.manifest.ending is RunEnding.FAILED
+    assert "File too large" in recording.manifest.why
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("size", ["1300k", "3m"])
-def test_a_full_disk_is_named_and_what_it_holds_is_kept(tmp_path: Path, size: str, untouched: object) -> None:
-    """Captures fill it; packets, which come after them, get what was set aside."""
+def test_a_full_disk_is_reported_and_the_packets_are_kept(tmp_path: Path, size: str, untouched: object) -> None:
+    """Captures fill the disk; the tables, which are written after them, use the reserved space."""
     disk = tmp_path / "disk"
     disk.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "full", disk], check=True)
@@ -186,15 +186,15 @@ def test_a_full_disk_is_named_and_what_it_holds_is_kept(tmp_path: Path, size: st
         assert done.returncode == 2, done.stdout
         assert "the recording cannot be written: No space left on device" in " ".join(done.stderr.split())
         assert "Traceback" not in done.stderr
-        found = read_recording(disk / "run")
-        assert found.run.fates
-        assert found.manifest.ending is RunEnding.FAILED
-        assert "No space left on device" in found.manifest.why
+        recording = read_recording(disk / "run")
+        assert recording.run.fates
+        assert recording.manifest.ending is RunEnding.FAILED
+        assert "No space left on device" in recording.manifest.why
     finally:
         subprocess.run(["umount", disk], check=True)
 
 
-def test_a_disk_without_room_is_refused_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_without_space_is_refused_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(descriptor: int, offset: int, length: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -204,7 +204,7 @@ def test_a_disk_without_room_is_refused_before_the_run(tmp_path: Path, monkeypat
     assert raised.value.remedy == "free some space"
 
 
-def test_who_fails_is_named_in_the_recording(tmp_path: Path) -> None:
+def test_the_recording_names_what_failed(tmp_path: Path) -> None:
     class Failing(EventDriven):
         def next_window(self, situation: Situation) -> int | None:
             return super().next_window(situation) if situation.now_ns < 100 * MS else 1 // 0
@@ -214,12 +214,16 @@ def test_who_fails_is_named_in_the_recording(tmp_path: Path) -> None:
         RunRecorder(tmp_path / "run", ABOUT) as recorder,
     ):
         passing_robots(recorder, Failing()).advance(MS * 200)
-    found = read_recording(tmp_path / "run")
-    assert (found.manifest.ending, found.manifest.why) == (RunEnding.FAILED, f"FederateError: {raised.value}")
-    assert found.run.digest == passing_robots(policy=EventDriven()).advance(found.run.windows_ns[-1]).digest
+    recording = read_recording(tmp_path / "run")
+    assert (recording.manifest.ending, recording.manifest.why) == (
+        RunEnding.FAILED,
+        f"FederateError: {raised.value}",
+    )
+    expected = passing_robots(policy=EventDriven()).advance(recording.run.windows_ns[-1])
+    assert recording.run.digest == expected.digest
 
 
-def test_a_scenario_that_is_refused_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_scenario_that_is_refused_leaves_no_files(tmp_path: Path) -> None:
     with (
         pytest.raises(ConfigurationError, match="no sync policy"),
         RunRecorder(tmp_path / "run", ABOUT) as recorder,
@@ -228,13 +232,13 @@ def test_a_scenario_that_is_refused_leaves_nothing_behind(tmp_path: Path) -> Non
     assert not list(tmp_path.iterdir())
 
 
-def test_a_recording_is_never_written_over(recorded: Path) -> None:
+def test_a_recording_is_not_overwritten(recorded: Path) -> None:
     with pytest.raises(ConfigurationError, match="a recording already"):
         record(recorded)
 
 
 def damage(folder: Path, column: str, *, forge: bool) -> None:
-    """Change the first value there is in a column of packets; with `forge`, the checksum of its part too."""
+    """Change the first value in a column of packets; with `forge`, also the checksum of its part."""
     paths = sorted((folder / "packets").glob("*.parquet"))
     path, table = next(
         (path, table)
@@ -254,7 +258,7 @@ def damage(folder: Path, column: str, *, forge: bool) -> None:
 
 
 @pytest.mark.parametrize("column", ["arrived_ns", "known_source_m", "late_ns"])
-def test_a_recording_that_was_changed_is_told(tmp_path: Path, recorded: Path, column: str) -> None:
+def test_a_recording_that_was_changed_is_refused(tmp_path: Path, recorded: Path, column: str) -> None:
     shutil.copytree(recorded, tmp_path / "run")
     damage(tmp_path / "run", column, forge=False)
     with pytest.raises(EvidenceError, match="changed after the run"):
@@ -262,7 +266,7 @@ def test_a_recording_that_was_changed_is_told(tmp_path: Path, recorded: Path, co
 
 
 @pytest.mark.parametrize("column", ["arrived_ns", "sent_ns", "size_bytes", "packet_id", "number"])
-def test_an_event_that_was_changed_is_told_by_the_digest_alone(tmp_path: Path, recorded: Path, column: str) -> None:
+def test_the_digest_alone_detects_a_changed_event(tmp_path: Path, recorded: Path, column: str) -> None:
     shutil.copytree(recorded, tmp_path / "run")
     damage(tmp_path / "run", column, forge=True)
     with pytest.raises(EvidenceError, match="its events have digest"):
@@ -276,7 +280,7 @@ def test_an_event_that_was_changed_is_told_by_the_digest_alone(tmp_path: Path, r
     at=st.integers(0),
     how=st.sampled_from(["cut", "gone", "flip"]),
 )
-def test_a_recording_that_was_cut_or_damaged_anywhere_is_told(
+def test_a_recording_that_was_truncated_or_damaged_anywhere_is_refused(
     recorded: Path, table: str, which: int, at: int, how: str
 ) -> None:
     parts = sorted((recorded / table).glob("*.parquet"))
@@ -290,7 +294,7 @@ def test_a_recording_that_was_cut_or_damaged_anywhere_is_told(
             path.write_bytes(content[:at])
         else:
             path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
-        with pytest.raises(EvidenceError, match=r"cut|changed"):
+        with pytest.raises(EvidenceError, match=r"truncated|changed"):
             read_recording(recorded)
     finally:
         path.write_bytes(content)
@@ -305,24 +309,24 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_no_recording_is_no_traceback(tmp_path: Path) -> None:
+def test_a_folder_without_a_recording_is_reported_without_a_traceback(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="there is no recording"):
         read_recording(tmp_path)
     (tmp_path / "run.json").write_text("{")
-    with pytest.raises(EvidenceError, match="no record of a run"):
+    with pytest.raises(EvidenceError, match="not the record of a run"):
         read_recording(tmp_path)
     (tmp_path / "run.json").write_text("[" * 100_000, encoding="utf-8")
-    with pytest.raises(EvidenceError, match="no record of a run"):
+    with pytest.raises(EvidenceError, match="not the record of a run"):
         read_recording(tmp_path)
 
 
 @pytest.mark.parametrize("key", ["digest", "parts"])
-def test_a_whole_run_that_hides_what_it_is_checked_by_is_told(tmp_path: Path, recorded: Path, key: str) -> None:
+def test_a_complete_run_without_digest_or_parts_is_refused(tmp_path: Path, recorded: Path, key: str) -> None:
     shutil.copytree(recorded, tmp_path / "changed")
     manifest = tmp_path / "changed" / "run.json"
-    written = json.loads(manifest.read_bytes())
-    manifest.write_text(json.dumps(written | {key: type(written[key])()}), encoding="utf-8")
-    with pytest.raises(EvidenceError, match="has a digest and parts, and this says none") as caught:
+    content = json.loads(manifest.read_bytes())
+    manifest.write_text(json.dumps(content | {key: type(content[key])()}), encoding="utf-8")
+    with pytest.raises(EvidenceError, match="the record has no digest or no parts") as caught:
         read_recording(tmp_path / "changed")
     assert caught.value.remedy
 
@@ -331,7 +335,9 @@ def test_a_whole_run_that_hides_what_it_is_checked_by_is_told(tmp_path: Path, re
     ("old", "new"),
     [('"seed": 1', '"seed": 2'), ('"policy": "', '"policy": "not_'), ('"ending": "whole"', '"ending": "failed"')],
 )
-def test_a_record_that_was_changed_afterwards_is_told(tmp_path: Path, recorded: Path, old: str, new: str) -> None:
+def test_a_manifest_that_was_changed_afterwards_is_refused(
+    tmp_path: Path, recorded: Path, old: str, new: str
+) -> None:
     shutil.copytree(recorded, tmp_path / "run")
     path = tmp_path / "run" / "run.json"
     text = path.read_text(encoding="utf-8")
@@ -340,10 +346,10 @@ def test_a_record_that_was_changed_afterwards_is_told(tmp_path: Path, recorded: 
     with pytest.raises(EvidenceError, match="the record was changed after the run"):
         read_recording(tmp_path / "run")
     path.write_text(json.dumps(json.loads(text)), encoding="utf-8")
-    assert read_recording(tmp_path / "run").manifest.about == ABOUT, "how it is written down says nothing"
+    assert read_recording(tmp_path / "run").manifest.about == ABOUT, "the formatting does not matter"
 
 
-def test_a_scenario_that_was_changed_afterwards_is_told(tmp_path: Path, recorded: Path) -> None:
+def test_a_scenario_that_was_changed_afterwards_is_refused(tmp_path: Path, recorded: Path) -> None:
     shutil.copytree(recorded, tmp_path / "run")
     path = tmp_path / "run" / "run.json"
     path.write_text(path.read_text().replace("robots: two", "robots: three"))

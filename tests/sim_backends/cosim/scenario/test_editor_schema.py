@@ -1,4 +1,4 @@
-"""The JSON schema of scenario files, by a validator that knows nothing of the models it is made of."""
+"""The JSON schema of scenario files, with a validator that is independent of the models."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ def test_it_is_a_json_schema() -> None:
 
 
 @pytest.mark.parametrize("name", scenario_files())
-def test_every_scenario_that_ships_is_valid_by_it(name: str) -> None:
+def test_every_shipped_scenario_is_valid(name: str) -> None:
     jsonschema.validate(data_of(name), SCHEMA)
 
 
@@ -41,7 +41,7 @@ def test_every_scenario_that_ships_is_valid_by_it(name: str) -> None:
     ],
     ids=str,
 )
-def test_what_is_wrong_is_invalid_by_it(keys: tuple[str | int, ...], value: object) -> None:
+def test_wrong_scenarios_are_invalid(keys: tuple[str | int, ...], value: object) -> None:
     data = data_of("baylands")
     inner = data
     for key in keys[:-1]:
@@ -51,8 +51,8 @@ def test_what_is_wrong_is_invalid_by_it(keys: tuple[str | int, ...], value: obje
         jsonschema.validate(data, SCHEMA)
 
 
-def test_every_key_says_what_it_means() -> None:
+def test_every_key_has_a_meaning() -> None:
     for part in (SCHEMA, *SCHEMA["$defs"].values()):
         for key, value in part.get("properties", {}).items():
             assert value["description"].endswith("."), key
-    assert attributes(JammerFault)["to"] == "When it ends; left out, not before the run does."
+    assert attributes(JammerFault)["to"] == "Time when it ends; if omitted, it lasts until the end of the run."

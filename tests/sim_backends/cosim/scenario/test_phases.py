@@ -1,4 +1,4 @@
-"""Periods that share a beat with windows, against the phases that packets meet when they are counted."""
+"""Periods that are commensurate with windows, against counted phases of packets."""
 
 from fractions import Fraction
 
@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.scenario.phases import MOST_PHASES, other_window_s, shared_beats
+from sim_backends.cosim.scenario.phases import MAX_PHASES, commensurate_events, incommensurate_window_s
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 AGENTS = {
@@ -23,41 +23,41 @@ def pair(rate: str = "50Hz") -> CosimScenario:
 
 @settings(max_examples=25)
 @given(period_ms=st.integers(5, 200), window_ms=st.integers(1, 100))
-def test_a_shared_beat_is_found_where_few_phases_are_counted(period_ms: int, window_ms: int) -> None:
-    """Of whole milliseconds the phases repeat after the window's share of the period in lowest terms."""
+def test_events_are_commensurate_if_few_phases_are_counted(period_ms: int, window_ms: int) -> None:
+    """With whole milliseconds, the number of phases is the denominator of period over window in lowest terms."""
     phases = Fraction(period_ms, window_ms).denominator
-    beats = shared_beats(pair(rate=f"{1000 / period_ms:.20f}Hz"), [window_ms / 1000])
+    commensurate = commensurate_events(pair(rate=f"{1000 / period_ms:.20f}Hz"), [window_ms / 1000])
     events = 10_000 // period_ms
     counted = len({number * period_ms % window_ms for number in range(events)})
     assert counted == min(phases, events)
-    if phases <= MOST_PHASES:
-        assert [beat.phases for beat in beats] == [phases]
-    for beat in beats:
-        # Of more phases those that stay near as few others: an event that far on is at nearly the same phase.
-        moved_ms = [number * period_ms % window_ms for number in range(0, events, beat.phases)]
-        assert all(min(ms, window_ms - ms) < window_ms / beat.phases for ms in moved_ms)
+    if phases <= MAX_PHASES:
+        assert [item.phases for item in commensurate] == [phases]
+    for item in commensurate:
+        # If there are more phases, they are near the reported ones: that many events later the phase is about equal.
+        moved_ms = [number * period_ms % window_ms for number in range(0, events, item.phases)]
+        assert all(min(ms, window_ms - ms) < window_ms / item.phases for ms in moved_ms)
 
 
 @pytest.mark.parametrize(
     ("rate", "window_s", "phases"),
     [("50Hz", 0.01, [1]), ("50Hz", 0.04, [2]), ("47Hz", 0.01, []), ("50Hz", 0.011, []), ("50.001Hz", 0.01, [1])],
 )
-def test_near_enough_is_shared_and_a_drift_over_all_phases_is_not(
+def test_nearly_commensurate_events_are_reported_unless_they_drift_over_all_phases(
     rate: str, window_s: float, phases: list[int]
 ) -> None:
-    assert [one.phases for one in shared_beats(pair(rate=rate), [window_s])] == phases
+    assert [item.phases for item in commensurate_events(pair(rate=rate), [window_s])] == phases
 
 
-def test_the_window_that_is_proposed_shares_no_beat() -> None:
+def test_the_proposed_window_is_not_commensurate() -> None:
     scenario = pair()
-    proposed_s = other_window_s(scenario, 0.01)
+    proposed_s = incommensurate_window_s(scenario, 0.01)
     assert proposed_s == pytest.approx(0.011)
-    assert not shared_beats(scenario, [proposed_s or 0.0])
-    assert other_window_s(scenario, 0.001) is None, "whole steps of 1 ms share a beat with 20 ms"
+    assert not commensurate_events(scenario, [proposed_s or 0.0])
+    assert incommensurate_window_s(scenario, 0.001) is None, "whole steps of 1 ms are commensurate with 20 ms"
 
 
 @pytest.mark.parametrize("kind", [{"kind": "file", "size_bytes": 100}, {}, {"kind": "ping"}, {"kind": "bag"}])
-def test_every_flow_begins_at_a_phase_that_its_seed_draws(kind: dict[str, object]) -> None:
+def test_every_flow_begins_at_a_random_phase(kind: dict[str, object]) -> None:
     keys = {"kind": "stream", "rate": "2Hz"} | kind
     if kind:
         del keys["rate"]
@@ -70,4 +70,4 @@ def test_every_flow_begins_at_a_phase_that_its_seed_draws(kind: dict[str, object
         firsts_ns.add(wakes_ns)
     assert len(firsts_ns) == 8
     assert min(firsts_ns) >= 100_000_000
-    assert len({at_ns % 10_000_000 // 1_000_000 for at_ns in firsts_ns}) > 3, "of a window of 10 ms"
+    assert len({at_ns % 10_000_000 // 1_000_000 for at_ns in firsts_ns}) > 3, "phases of a window of 10 ms"

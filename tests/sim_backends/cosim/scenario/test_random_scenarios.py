@@ -1,4 +1,4 @@
-"""Any scenario within the schema either runs, or is refused before it does with where and what to do."""
+"""Any scenario within the schema either runs, or is refused before the run with its place and a remedy."""
 
 import json
 import re
@@ -19,7 +19,7 @@ UNTIL_NS = 30_000_000
 
 
 def some(**values: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
-    """Return mappings that have any of these keys."""
+    """Return a strategy for mappings that have any of these keys."""
     return st.fixed_dictionaries({}, optional=values)
 
 
@@ -60,7 +60,7 @@ ROBOTS = st.sampled_from((*("turtlebot3_burger", "duckiedrone") * 10, "husky", "
 
 
 def agents(east_m: int) -> st.SearchStrategy[dict[str, Any]]:
-    """Return agents that start about there, so that most do not start in each other."""
+    """Return a strategy for agents that start near an easting, so that few overlap."""
     places = st.tuples(st.integers(east_m, east_m + 10), st.integers(0, 40)).map(list)
     flying = {"robot": st.sampled_from(("iris", "duckiedrone")), "along": written("m", east_m, east_m + 5)}
     radio = some(tx_power_dbm=st.integers(0, 20), standard=st.sampled_from(("802.11n", "802.11g")))
@@ -78,15 +78,15 @@ TRAFFIC = st.one_of(
     kind("file", SENDS | {"size_bytes": st.integers(1, 20_000)}, **SENDING),
     kind("ping", SENDS, **SENDING, interval=written("ms", 5, 10), count=st.integers(1, 9)),
 )
-LASTS = {"from": TIMES, "to": TIMES}
+TIMED = {"from": TIMES, "to": TIMES}
 FAULTS = st.one_of(
-    kind("node-loss", {"agent": AGENT}, **LASTS),
-    kind("link-cut", {"between": st.lists(AGENT, min_size=2, max_size=2)}, **LASTS),
-    kind("jammer", {"power_dbm": st.integers(-50, 40)}, **LASTS, at_m=PLACES, agent=AGENT),
+    kind("node-loss", {"agent": AGENT}, **TIMED),
+    kind("link-cut", {"between": st.lists(AGENT, min_size=2, max_size=2)}, **TIMED),
+    kind("jammer", {"power_dbm": st.integers(-50, 40)}, **TIMED, at_m=PLACES, agent=AGENT),
     kind(
         "clock-skew",
         {"agent": AGENT},
-        **LASTS,
+        **TIMED,
         offset_ms=st.integers(-10, 10),
         rate_ppm=st.integers(-100_000, 100_000),
     ),
@@ -114,7 +114,7 @@ SCENARIOS = st.fixed_dictionaries(
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(SCENARIOS)
-def test_any_scenario_runs_or_is_refused_with_where_and_remedy(tmp_path: Path, data: dict[str, Any]) -> None:
+def test_any_scenario_runs_or_is_refused_with_its_place_and_a_remedy(tmp_path: Path, data: dict[str, Any]) -> None:
     path = tmp_path / "any.yaml"
     path.write_text(json.dumps(data, indent=1), encoding="utf-8")
     refused: ConfigurationError | None = None

@@ -1,4 +1,4 @@
-"""Scenarios that are wrong are refused before anything runs: what, in which line, and what to do."""
+"""Wrong scenarios are refused before anything runs, with a message, a line and a remedy."""
 
 import re
 from pathlib import Path
@@ -57,7 +57,7 @@ WRONG = [
     ("duration: 2s", "duration: 0s", 4, "greater than 0"),
     ("duration: 2s", "duration: 2s\nseeds: [-1]", 5, "greater than or equal to 0"),
     ("duration: 2s\n", "", 1, "required key 'duration' is missing"),
-    ("topology: masterless", "topology: master", 6, "a master relays, so that a relay: AGENT is needed"),
+    ("topology: masterless", "topology: master", 6, "the topology master needs a relay: AGENT"),
     ("topology: masterless", "relay: for", 6, "no agent 'for'; did you mean 'four'|agents: one, two, three"),
     ("  one: {robot", "  ONE: {robot", 8, "'ONE' cannot be a key here"),
     ("robot: turtlebot3_burger, at_m", "robot: turtlebot3, at_m", 8, "no robot 'turtlebot3'.*\n.*turtlebot3_burger"),
@@ -73,12 +73,12 @@ WRONG = [
         "kind: follow\n      leader: one\n      distance: 2m",
         "kind: station-keeping",
         12,
-        "turtlebot3_burger does not fly, so that it keeps its station",
+        "turtlebot3_burger does not fly, and only robots that fly keep their station",
     ),
     ("kind: follow", "kind: folow", 12, "no kind 'folow'; did you mean 'follow'"),
     ("      kind: follow\n", "", 12, "required key 'kind' is missing"),
     ("leader: one", "leader: noone", 14, "no agent 'noone'; did you mean 'one'"),
-    ("leader: one", "leader: [one, three]", 12, "two follows three and hears nothing of it; add to the traffic"),
+    ("leader: one", "leader: [one, three]", 12, "two follows three and receives no states of it; add to the traffic"),
     ("distance: 2m", "distance: 0m", 15, "greater than 0"),
     ("from: one, to: two", "from: one, to: twö", 18, "'twö' is not a name: small letters"),
     ("from: one, to: two", "from: one, to: tow", 18, "no agent 'tow'; did you mean 'two'"),
@@ -88,10 +88,10 @@ WRONG = [
     ("to: [one]", "to: [three]", 16, "three sends, receives or relays and has no radio"),
     ("to: two, rate", "to: two, protocol: dds, rate", 18, "'udp', 'tcp', 'topic', 'ros1' or 'ros1-udp'"),
     ("to: two, rate", "to: two, protocol: ros1, rate", 18, "ros1 needs a master: name its host by relay: AGENT"),
-    ("to: two, rate", "to: two, qos: {depth: 3}, rate", 18, "only a topic has a qos, and this is udp"),
+    ("to: two, rate", "to: two, qos: {depth: 3}, rate", 18, "only a topic has a qos, and the protocol is udp"),
     ("rate: 10Hz", "rate: 10", 18, "'10' has no unit; write for example 10Hz"),
     ("rate: 10Hz", "rate: 10Hz, size_bytes: 70000", 18, "less than or equal to 65000"),
-    ("kind: bag", "name: one-stream\n    kind: bag", 19, "two entries of the traffic are called 'one-stream'"),
+    ("kind: bag", "name: one-stream\n    kind: bag", 19, "two entries of the traffic have the name 'one-stream'"),
     (
         "kind: bag",
         "length: 1000000s\n    kind: bag",
@@ -102,7 +102,7 @@ WRONG = [
     ("kind: node-loss", "kind: nodeloss", 24, "no kind 'nodeloss'; did you mean 'node-loss'"),
     ("agent: one, from", "agent: on, from", 24, "no agent 'on'; did you mean 'one'"),
     ("from: 500ms, to: 1s", "from: 2s, to: 1s", 24, "ends at 1 s, not after it begins at 2 s"),
-    ("node-loss, agent: one", "jammer, power_dbm: 20", 24, r"stands either at_m: \[EAST, NORTH\], or is carried"),
+    ("node-loss, agent: one", "jammer, power_dbm: 20", 24, r"needs either at_m: \[EAST, NORTH\], or an agent: NAME"),
     ("node-loss, agent: one", "link-cut, between: [one]", 24, "this list needs more values"),
     ("node-loss, agent: one", "link-cut, between: [one, one]", 24, "one has no link to itself"),
     ("faults:\n", "faults:\n  - &x {}\n  - *x\n", 25, "aliases"),
@@ -111,7 +111,7 @@ WRONG = [
 
 @pytest.fixture(autouse=True)
 def _a_body_without_a_profile(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every body that ships has a profile, and with it a radio."""
+    """Add a body without a profile; every shipped body has a profile, and with it a radio."""
     monkeypatch.setitem(known.BODIES, "cart", HUSKY_A200)
 
 
@@ -121,18 +121,16 @@ def refused(text: str, folder: Path) -> ConfigurationError:
     return caught.value
 
 
-@pytest.mark.parametrize(("right", "wrong", "line", "said"), WRONG, ids=lambda value: str(value).strip()[:40])
-def test_what_is_wrong_is_told_with_its_line_and_a_remedy(
-    right: str, wrong: str, line: int, said: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("right", "wrong", "line", "message"), WRONG, ids=lambda value: str(value).strip()[:40])
+def test_an_error_has_its_line_and_a_remedy(right: str, wrong: str, line: int, message: str, tmp_path: Path) -> None:
     assert SCENARIO.count(right) >= 1
     error = refused(SCENARIO.replace(right, wrong, 1), tmp_path)
-    assert re.search(said, str(error)), str(error)
+    assert re.search(message, str(error)), str(error)
     assert error.where == f"{tmp_path / 'meadow.yaml'}:{line}"
     assert error.remedy
 
 
-def test_the_scenario_that_these_are_made_of_is_right(tmp_path: Path) -> None:
+def test_the_scenario_without_errors_runs(tmp_path: Path) -> None:
     text = SCENARIO.replace("kind: follow", "kind: standing").replace("      leader: one\n      distance: 2m\n", "")
     run = build(load_scenario(_written(text, tmp_path))).run(100_000_000)
     assert run.windows_ns == [number * 5_000_000 for number in range(1, 21)]
@@ -141,23 +139,23 @@ def test_the_scenario_that_these_are_made_of_is_right(tmp_path: Path) -> None:
 def test_a_jammer_among_fixed_links_is_refused(tmp_path: Path) -> None:
     text = SCENARIO.replace("node-loss, agent: one", "jammer, power_dbm: 20, agent: one")
     error = refused(text.replace("topology: masterless", "radio: {loss: 10%}"), tmp_path)
-    assert "fixed links hear no jammer" in error.what
+    assert "fixed links ignore a jammer" in error.what
     assert error.where.endswith(":24")
 
 
-def test_who_drives_follows_one_leader_only(tmp_path: Path) -> None:
+def test_a_robot_that_drives_cannot_follow_several_leaders(tmp_path: Path) -> None:
     text = SCENARIO.replace("leader: one", "leader: [one, three]").replace(
         "{robot: cart,", "{robot: cart, radio: {},"
     )
     text = text.replace("to: [one]", "to: [one, three]")
     text = text.replace("faults:", "  - {kind: stream, from: three, to: two, rate: 10Hz}\nfaults:")
     error = refused(text, tmp_path)
-    assert "does not fly, so that it follows one leader only" in error.what
+    assert "does not fly, and only robots that fly follow several leaders" in error.what
     assert error.where.endswith(":14")
     assert error.remedy == "name one of one, three"
 
 
-def test_a_scenario_that_is_not_there_is_told_with_those_that_are() -> None:
+def test_an_unknown_scenario_is_reported_with_the_existing_ones() -> None:
     with pytest.raises(ConfigurationError, match=r"no scenario 'bayland'.*\n.*did you mean 'baylands'"):
         load_scenario("bayland")
     with pytest.raises(ConfigurationError, match=r"scenarios: baylands, .*; or name a file that ends in .yaml"):
@@ -166,38 +164,50 @@ def test_a_scenario_that_is_not_there_is_told_with_those_that_are() -> None:
         load_scenario("nowhere.yaml")
 
 
-ASKED_TOO_MUCH = [
-    ("husky", "kind: way-points, points_m: [[20, 10]], speed: 1.01m/s", "a speed of 1.01 m/s, and husky does 1 m/s"),
-    ("husky", "kind: velocity-profile, legs: [{duration: 1s, speed: 20m/s}]", "a speed of 20 m/s, .* does 1 m/s"),
+TOO_FAST = [
+    (
+        "husky",
+        "kind: way-points, points_m: [[20, 10]], speed: 1.01m/s",
+        "a speed of 1.01 m/s, and husky reaches 1 m/s",
+    ),
+    ("husky", "kind: velocity-profile, legs: [{duration: 1s, speed: 20m/s}]", "a speed of 20 m/s, .* reaches 1 m/s"),
     (
         "husky",
         "kind: velocity-profile, legs: [{duration: 1s, turn_deg_s: -120}]",
         "turn of 120 deg/s, .* 114.592 deg",
     ),
-    ("iris", "kind: way-points, points_m: [[20, 10]], speed: 12.5m/s", "a speed of 12.5 m/s, .* does 12 m/s"),
-    ("iris", "kind: way-points, points_m: [[11, 10, 90]], speed: 4m/s", "a climb rate of 3.91.* m/s, .* does 3 m/s"),
+    ("iris", "kind: way-points, points_m: [[20, 10]], speed: 12.5m/s", "a speed of 12.5 m/s, .* reaches 12 m/s"),
+    (
+        "iris",
+        "kind: way-points, points_m: [[11, 10, 90]], speed: 4m/s",
+        "a climb rate of 3.91.* m/s, .* 3 m/s at most",
+    ),
     ("iris", "kind: velocity-profile, legs: [{duration: 1s, climb_m_s: -2}]", "a sink rate of 2 m/s, .* 1.5 m/s"),
 ]
 
 
-@pytest.mark.parametrize(("robot", "motion", "said"), ASKED_TOO_MUCH)
-def test_what_a_body_cannot_do_is_refused_and_not_clipped(robot: str, motion: str, said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("robot", "motion", "message"), TOO_FAST)
+def test_a_motion_beyond_the_limits_is_refused_and_not_clipped(
+    robot: str, motion: str, message: str, tmp_path: Path
+) -> None:
     text = SCENARIO.replace(
         "robot: cart, at_m: [30, 10]", f"robot: {robot}, at_m: [30, 10],\n    motion: {{{motion}}}"
     )
     error = refused(text, tmp_path)
-    assert re.search(f"three is asked for .*{said}", error.what), error.what
+    assert re.search(f"three has .*{message}", error.what), error.what
     assert error.where.endswith(":17"), error.where
-    assert error.remedy == f"let it be slower, or take a robot that is faster than {robot}"
+    assert error.remedy == f"choose a lower value, or a robot that is faster than {robot}"
 
 
-def test_what_a_body_can_just_do_is_run(tmp_path: Path) -> None:
+def test_a_motion_at_the_limits_is_accepted(tmp_path: Path) -> None:
     motion = "kind: way-points, points_m: [[20, 10]], speed: 1m/s"
     text = SCENARIO.replace("robot: cart, at_m: [30, 10]", f"robot: husky, at_m: [30, 10], motion: {{{motion}}}")
     build(load_scenario(_written(text, tmp_path)))
 
 
-def test_a_labs_own_scenario_comes_before_one_that_ships(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scenario_of_the_lab_has_priority_over_a_shipped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenarios").mkdir()
     text = SCENARIO.replace("name: meadow", "name: baylands")
@@ -208,35 +218,35 @@ def test_a_labs_own_scenario_comes_before_one_that_ships(tmp_path: Path, monkeyp
         load_scenario("meadow")
 
 
-def test_values_are_changed_by_the_keys_that_lead_to_them() -> None:
+def test_values_are_changed_by_their_keys() -> None:
     changed = load_scenario("baylands", {"agents.husky-2.along": "40m", "traffic.0.size_bytes": 64, "line": "nlos"})
     assert (changed.agents["husky-2"].along, changed.traffic[0].size_bytes, changed.line) == (40, 64, "nlos")
     assert load_scenario("baylands", {"physics.step": "2ms", "policy.window": "4ms"}).physics.step_ns == 2_000_000
     for key in ("traffic.9.rate", "traffic.x.rate", "name.x", "traffic.0.kind.x.y"):
-        with pytest.raises(ConfigurationError, match=f"with {key}=1: there is no {key} to be changed"):
+        with pytest.raises(ConfigurationError, match=f"with {key}=1: the key {key} cannot be changed"):
             load_scenario("baylands", {key: 1})
     with pytest.raises(ConfigurationError, match=r"baylands.yaml:\d+ with policy.name=x: .*no sync policy 'x'"):
         load_scenario("baylands", {"policy.name": "x"})
 
 
-def test_a_record_that_memory_does_not_hold_is_refused_with_both_figures(
+def test_a_run_that_needs_too_much_memory_is_refused_with_both_sizes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemTotal:  8 kB\nMemAvailable:    1000 kB\n", encoding="ascii")
     monkeypatch.setattr(memory, "MEMINFO", meminfo)
-    # 10 Hz for 2 s and a bag of 100 packets: 120 of 1200 bytes, and 2000 windows and 10 for each packet of 40 bytes;
-    # and three pairs of agents.
+    # 10 Hz for 2 s and a bag of 100 packets are 120 packets of 1200 bytes; 2000 windows and 10 per packet have 40
+    # bytes each; and there are three pairs of agents.
     assert memory.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40 + 3 * 1600
     error = refused(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
-    assert "2 s of 3 agents would take 3.4 MB of memory, and 1.0 MB are left" in error.what
-    assert "let it last shorter, or send less: one-stream alone has 2,000 packets" in error.remedy
+    assert "2 s of 3 agents would need 3.4 MB of memory, and 1.0 MB are available" in error.what
+    assert "choose a shorter duration, or send less: one-stream alone has 2,000 packets" in error.remedy
     assert error.where.endswith(":4")
     monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
     assert memory.available_bytes() is None
 
 
-def test_more_agents_than_memory_holds_are_refused_before_anything_is_made_of_them(
+def test_too_many_agents_for_the_memory_are_refused_before_they_are_built(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text, _, rest = SCENARIO.partition("  one: ")
@@ -244,11 +254,11 @@ def test_more_agents_than_memory_holds_are_refused_before_anything_is_made_of_th
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemAvailable:    70200 kB\n", encoding="ascii")
     monkeypatch.setattr(memory, "MEMINFO", meminfo)
-    # 44,850 pairs take 72 MB. That all stand in one place is what would be told of the bodies.
+    # 44,850 pairs need 72 MB. If the bodies were built, the error would be that all are in one place.
     error = refused(f"{text}{agents}  one: {rest}", tmp_path)
-    assert "2 s of 303 agents would take 73 MB of memory, and 72 MB are left" in error.what
+    assert "2 s of 303 agents would need 73 MB of memory, and 72 MB are available" in error.what
     assert error.where.endswith(":7")
-    assert error.remedy == "have fewer agents"
+    assert error.remedy == "use fewer agents"
 
 
 def _written(text: str, folder: Path) -> Path:

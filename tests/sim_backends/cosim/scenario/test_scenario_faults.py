@@ -1,4 +1,4 @@
-"""Faults of a scenario do what they say, to whom they say, and what comes after them is measured."""
+"""The effects of faults in a scenario, and the measured recovery after them."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -41,7 +41,7 @@ RunOf = Callable[..., tuple[CosimScenario, Run]]
 
 @pytest.fixture
 def run_of(tmp_path: Path) -> RunOf:
-    """Return what runs the scenario with a fault, and changes if they are given."""
+    """Return a function that runs the scenario with a fault, and with changes if they are given."""
 
     def run(fault: str, changes: Mapping[str, Any] | None = None) -> tuple[CosimScenario, Run]:
         path = tmp_path / "line.yaml"
@@ -57,7 +57,7 @@ def sent_ms(run: Run, flow: str) -> list[float]:
 
 
 def lost_ms(run: Run, flow: str) -> list[float]:
-    """Return when the packets of a flow were sent that never arrived, in ms."""
+    """Return the times of sending, in ms, of the packets of a flow that never arrived."""
     return [fate.packet.sent_ns / MS for (name, _), fate in run.fates.items() if name == flow and fate.reason]
 
 
@@ -65,7 +65,7 @@ def within(times_ms: list[float], begin_ms: float, end_ms: float) -> bool:
     return all(begin_ms <= at_ms < end_ms for at_ms in times_ms)
 
 
-def test_who_is_lost_sends_and_hears_nothing_and_comes_back(run_of: RunOf) -> None:
+def test_an_agent_that_is_off_sends_and_receives_nothing_and_recovers(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: node-loss, agent: c, from: 1s, to: 2s}")
     assert not [at_ms for at_ms in sent_ms(run, "cb/b") if 1000 <= at_ms < 2000]
     assert len(sent_ms(run, "cb/b")) == pytest.approx(200, abs=1)
@@ -73,20 +73,21 @@ def test_who_is_lost_sends_and_hears_nothing_and_comes_back(run_of: RunOf) -> No
     lost = lost_ms(run, "ping/c")
     assert len(lost) == 10
     assert within(lost, 1000, 2000)
-    found = {one.flow: one for one in recoveries(scenario, run)}
-    assert found.keys() == ALL - {"ab/b"}
-    assert {flow: one.lost for flow, one in found.items()} == {"cb/b": 0, "ping/c": 10, "ping/c/reply": 0}
+    by_flow = {recovery.flow: recovery for recovery in recoveries(scenario, run)}
+    assert by_flow.keys() == ALL - {"ab/b"}
+    lost_packets = {flow: recovery.lost for flow, recovery in by_flow.items()}
+    assert lost_packets == {"cb/b": 0, "ping/c": 10, "ping/c/reply": 0}
     for flow, period_s in (("cb/b", 0.01), ("ping/c", 0.1), ("ping/c/reply", 0.1)):
-        recovered_s = found[flow].recovered_s
+        recovered_s = by_flow[flow].recovered_s
         assert recovered_s is not None
         assert 0 < recovered_s < period_s + 0.01
 
 
 @pytest.mark.parametrize("lost", ["b", "c"])
-def test_a_timer_that_was_moved_and_came_due_while_its_host_was_off_rings_when_that_is_on(
+def test_a_timer_that_was_moved_and_came_due_while_its_host_was_off_fires_when_the_host_is_on(
     run_of: RunOf, lost: str
 ) -> None:
-    """While they register at the master, whose connection's timers move with every answer."""
+    """The fault is during registration at the master, when every reply moves the timers of the connection."""
     ros1 = {"traffic.1.protocol": "ros1", "relay": "b"}
     _, run = run_of(f"{{kind: node-loss, agent: {lost}, from: 10ms, to: 500ms}}", ros1)
     late = [fate for (flow, _), fate in run.fates.items() if flow == "cb/b" and fate.packet.sent_ns > 2500 * MS]
@@ -95,79 +96,82 @@ def test_a_timer_that_was_moved_and_came_due_while_its_host_was_off_rings_when_t
 
 
 TOPIC = {"traffic.1.protocol": "topic"}
-FOUND_MS = 200
-"""When publishers and subscribers have found each other."""
+DISCOVERED_MS = 200
+"""Time at which discovery of publishers and subscribers is complete."""
 
 
-def test_a_topic_gives_a_subscriber_that_was_lost_for_less_than_a_lease_what_its_writer_kept(run_of: RunOf) -> None:
+def test_a_subscriber_that_was_off_for_less_than_a_lease_gets_the_history_of_its_writer(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: node-loss, agent: b, from: 1s, to: 2s}", TOPIC)
-    fates = [fate for (flow, _), fate in run.fates.items() if flow == "cb/b" and fate.packet.sent_ns > FOUND_MS * MS]
+    fates = [
+        fate for (flow, _), fate in run.fates.items() if flow == "cb/b" and fate.packet.sent_ns > DISCOVERED_MS * MS
+    ]
     lost = [fate for fate in fates if fate.reason]
     assert {fate.reason for fate in lost} == {"pushed out of the writer's history before it was acknowledged"}
     assert within([fate.packet.sent_ns / MS for fate in lost], 990, 1910)
-    # It keeps the last ten; each comes when b is back, within the time from one heartbeat to the next.
+    # The writer keeps the last ten samples; each arrives within a heartbeat period after b is on.
     kept = [fate for fate in fates if not fate.reason and 1000 * MS < fate.packet.sent_ns < 2000 * MS]
     assert len(lost) + len(kept) == pytest.approx(100, abs=1)
     assert 9 <= len(kept) <= 10
     assert all(fate.arrived_ns is not None and 2000 < fate.arrived_ns / MS < 2120 for fate in kept)
-    (found,) = (one for one in recoveries(scenario, run) if one.flow == "cb/b")
-    assert found.lost == pytest.approx(len(lost), abs=1)
+    (recovery,) = (recovery for recovery in recoveries(scenario, run) if recovery.flow == "cb/b")
+    assert recovery.lost == pytest.approx(len(lost), abs=1)
 
 
-def test_a_topic_whose_publisher_was_lost_loses_nothing_that_it_published(run_of: RunOf) -> None:
+def test_a_topic_whose_publisher_was_off_loses_no_published_sample(run_of: RunOf) -> None:
     _, run = run_of("{kind: node-loss, agent: c, from: 1s, to: 2s}", TOPIC)
     assert len(sent_ms(run, "cb/b")) == pytest.approx(200, abs=1)
-    assert within(lost_ms(run, "cb/b"), 0, FOUND_MS)
+    assert within(lost_ms(run, "cb/b"), 0, DISCOVERED_MS)
 
 
 @pytest.mark.parametrize("reliability", ["reliable", "best_effort"])
-def test_a_topic_forgets_who_is_lost_for_longer_than_a_lease_and_finds_it_again(
+def test_a_topic_removes_a_subscriber_whose_lease_has_expired_and_discovers_it_again(
     run_of: RunOf, reliability: str
 ) -> None:
     slow = {"duration": "40s", "traffic.0.rate": "1Hz", "traffic.1.rate": "10Hz"}
     qos = {"traffic.1.qos": {"reliability": reliability}}
     scenario, run = run_of("{kind: node-loss, agent: b, from: 5s, to: 20s}", TOPIC | slow | qos)
-    (found,) = (one for one in recoveries(scenario, run) if one.flow == "cb/b")
-    assert found.lost == 150, "after a lease of 10 s nothing is kept for it"
-    # Announcements come every 8 s, and one that was due while it was off as soon as it is back.
-    assert found.recovered_s is not None
-    assert 0 < found.recovered_s < 8.2
-    lost = [at_ms for at_ms in lost_ms(run, "cb/b") if at_ms > FOUND_MS]
-    assert within(lost, 5000, 20_000 + 1000 * found.recovered_s)
+    (recovery,) = (recovery for recovery in recoveries(scenario, run) if recovery.flow == "cb/b")
+    assert recovery.lost == 150, "after a lease of 10 s no sample is kept for it"
+    # Announcements are sent every 8 s; one that was due during the fault is sent when the agent is on again.
+    assert recovery.recovered_s is not None
+    assert 0 < recovery.recovered_s < 8.2
+    lost = [at_ms for at_ms in lost_ms(run, "cb/b") if at_ms > DISCOVERED_MS]
+    assert within(lost, 5000, 20_000 + 1000 * recovery.recovered_s)
     reasons = {fate.reason for (flow, _), fate in run.fates.items() if flow == "cb/b"}
     assert ("the subscriber's lease ran out" in reasons) == (reliability == "reliable")
     assert "not matched yet" in reasons
 
 
-def test_a_cut_link_is_cut_for_both_ends_and_nobody_else(run_of: RunOf) -> None:
+def test_a_cut_link_affects_both_ends_and_no_other_agent(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: link-cut, between: [c, a], from: 500ms, to: 1500ms}")
     assert not lost_ms(run, "ab/b")
     assert not lost_ms(run, "cb/b")
     assert len(lost_ms(run, "ping/c")) == 10
     assert within(lost_ms(run, "ping/c"), 500, 1500)
-    assert {one.flow for one in recoveries(scenario, run)} == {"ping/c", "ping/c/reply"}
+    assert {recovery.flow for recovery in recoveries(scenario, run)} == {"ping/c", "ping/c/reply"}
     trips_s = round_trips_s(run, "ping/c")
     assert (trips_s.shape, np.isnan(trips_s).sum()) == ((28,), 10)
     assert np.nanmax(trips_s) < 0.02
 
 
-def test_a_relay_that_is_lost_or_cut_off_takes_all_that_passes_it(run_of: RunOf) -> None:
+def test_a_fault_of_the_relay_affects_all_flows_that_pass_it(run_of: RunOf) -> None:
     master = {"topology": "master", "relay": "b"}
     scenario, run = run_of("{kind: link-cut, between: [a, b], from: 500ms, to: 1500ms}", master)
     assert len(lost_ms(run, "ping/c")) == 10
-    assert {one.flow for one in recoveries(scenario, run)} == ALL - {"cb/b"}
+    assert {recovery.flow for recovery in recoveries(scenario, run)} == ALL - {"cb/b"}
     scenario, run = run_of("{kind: node-loss, agent: b, from: 500ms, to: 1500ms}", master)
     assert len(lost_ms(run, "ping/c")) == 10
-    assert {one.flow for one in recoveries(scenario, run)} == ALL
+    assert {recovery.flow for recovery in recoveries(scenario, run)} == ALL
 
 
-def test_a_jammer_silences_everybody_and_what_never_ends_has_no_recovery(run_of: RunOf) -> None:
+def test_a_jammer_affects_all_agents_and_without_an_end_has_no_recovery(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: jammer, power_dbm: 60, at_m: [20, 12], from: 1s, to: 2s}")
-    # Who senses the noise waits, so that what was not lost comes late.
+    # Stations that sense the noise defer, so that packets that are not lost arrive late.
     arrived_ms = [fate.arrived_ns / MS for fate in run.fates.values() if fate.arrived_ns is not None]
     assert not [at_ms for at_ms in arrived_ms if 1010 < at_ms < 2000]
-    assert {one.flow for one in recoveries(scenario, run)} == ALL
-    assert all(one.recovered_s is not None and one.recovered_s < 0.3 for one in recoveries(scenario, run))
+    after = recoveries(scenario, run)
+    assert {recovery.flow for recovery in after} == ALL
+    assert all(recovery.recovered_s is not None and recovery.recovered_s < 0.3 for recovery in after)
     scenario, run = run_of("{kind: jammer, power_dbm: 60, agent: b, from: 1s}")
     assert not recoveries(scenario, run)
     assert max(fate.arrived_ns or 0 for fate in run.fates.values()) < 1100 * MS
@@ -180,13 +184,13 @@ def test_a_fast_clock_sends_more(run_of: RunOf) -> None:
     assert len(sent_ms(fast, "ab/b")) - len(sent_ms(right, "ab/b")) == pytest.approx(0, abs=1)
     during = [at_ms for at_ms in sent_ms(fast, "ab/b") if 1000 <= at_ms < 2000]
     assert len(during) == pytest.approx(110, abs=1)
-    # Set back by 100 ms, it waits until it shows the time again that it showed.
+    # After it was set back by 100 ms, the program waits until the clock reaches the same reading again.
     assert not [at_ms for at_ms in sent_ms(fast, "ab/b") if 2000 <= at_ms < 2099]
     assert len([at_ms for at_ms in sent_ms(fast, "cb/b") if 1000 <= at_ms < 2000]) == 100
 
 
 @pytest.mark.parametrize("federate", ["physics", "network"])
-def test_a_federate_that_stalls_is_named_and_what_was_recorded_is_kept(tmp_path: Path, federate: str) -> None:
+def test_a_federate_that_stalls_is_named_and_the_record_is_kept(tmp_path: Path, federate: str) -> None:
     path = tmp_path / "line.yaml"
     text = SCENARIO + f"  - {{kind: stalled-federate, federate: {federate}, from: 500ms, stall: 1min}}\n"
     path.write_text(text, encoding="utf-8")
@@ -205,7 +209,7 @@ def test_a_run_has_a_row_per_packet(run_of: RunOf) -> None:
         "flow number source destination protocol size_bytes sent_ns enters_ns arrived_ns counted_ns late_ns reason"
     )
     assert set(table) == set(names.split())
-    assert set(table) <= set(tables._SCHEMAS["packets"].names), "as in the recorded file"
+    assert set(table) <= set(tables._SCHEMAS["packets"].names), "the columns of the recorded file"
     assert {len(column) for column in table.values()} == {len(run.fates)}
     for row, ((flow, number), fate) in enumerate(run.fates.items()):
         assert (table["flow"][row], table["number"][row]) == (flow, number)

@@ -1,4 +1,4 @@
-"""Shipped scenarios load, run with every policy, and give the same run again, in another process too."""
+"""Shipped scenarios run with every policy, and reproduce the same run, also in another process."""
 
 import json
 import os
@@ -16,8 +16,8 @@ SECOND_NS = 1_000_000_000
 AGAIN = """
 import json, sys
 from sim_backends.cosim import build, load_scenario
-until_ns, *asked = json.loads(sys.argv[1])
-runs = [build(load_scenario(name), policy=policy).run(until_ns) for name, policy in asked]
+until_ns, *pairs = json.loads(sys.argv[1])
+runs = [build(load_scenario(name), policy=policy).run(until_ns) for name, policy in pairs]
 print(json.dumps([run.digest for run in runs]))
 """
 
@@ -34,16 +34,18 @@ def test_every_scenario_runs_with_every_policy(name: str, policy: str) -> None:
             assert fate.packet.enters_ns < fate.arrived_ns <= fate.counted_ns
 
 
-def test_another_process_comes_to_the_same() -> None:
-    asked = [(name, policy) for name in scenario_files() for policy in POLICIES]
+def test_another_process_gives_the_same_digests() -> None:
+    pairs = [(name, policy) for name in scenario_files() for policy in POLICIES]
     until_ns = SECOND_NS * 6 // 10
-    digests = [build(load_scenario(name), policy=policy).run(until_ns).digest for name, policy in asked]
-    assert len(set(digests)) > len(asked) / 2
-    # Another order of everything that is hashed.
+    digests = [build(load_scenario(name), policy=policy).run(until_ns).digest for name, policy in pairs]
+    assert len(set(digests)) > len(pairs) / 2
+    # Another hash seed gives another order of sets.
     environment = os.environ | {"PYTHONHASHSEED": "7"}
-    command = sys.executable, "-c", AGAIN, json.dumps([until_ns, *asked])
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True, timeout=300)
-    assert json.loads(done.stdout) == digests
+    command = sys.executable, "-c", AGAIN, json.dumps([until_ns, *pairs])
+    result = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True, timeout=300
+    )
+    assert json.loads(result.stdout) == digests
 
 
 def test_another_seed_gives_another_run() -> None:

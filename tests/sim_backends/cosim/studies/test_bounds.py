@@ -1,4 +1,4 @@
-"""What a bound costs, against what can be worked out on paper."""
+"""The cost of a bound, against results computed by hand."""
 
 import math
 
@@ -9,7 +9,7 @@ from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.run import Run
-from sim_backends.cosim.studies.bounds import FixedCost, bound_cost, kept_by_all
+from sim_backends.cosim.studies.bounds import FixedCost, bound_cost, longest_for_all
 from sim_backends.network.disc import Disc
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import Motion, State, WayPoints
@@ -18,16 +18,16 @@ MS = 1_000_000
 
 
 class Sprint(Motion):
-    """Stands for 4 s, and then goes at 2 m/s; it is what its limit lets it do."""
+    """Does not move for 4 s, and then moves at 2 m/s; it accelerates at its limit."""
 
     end_ns = None
 
     def at(self, time_ns: int) -> dict[str, State]:
-        gone_s = max(time_ns / 1e9 - 4, 0.0)
-        # It speeds up by 4 m/s^2 for half a second.
-        speed_m_s = min(4 * gone_s, 2.0)
-        way_m = 2 * gone_s**2 if gone_s < 0.5 else 0.5 + 2 * (gone_s - 0.5)
-        return {"a": State((way_m, 0.0, 0.0), (speed_m_s, 0.0, 0.0))}
+        moving_s = max(time_ns / 1e9 - 4, 0.0)
+        # It accelerates at 4 m/s^2 for half a second.
+        speed_m_s = min(4 * moving_s, 2.0)
+        distance_m = 2 * moving_s**2 if moving_s < 0.5 else 0.5 + 2 * (moving_s - 0.5)
+        return {"a": State((distance_m, 0.0, 0.0), (speed_m_s, 0.0, 0.0))}
 
 
 def sprint(policy: SyncPolicy) -> Run:
@@ -36,42 +36,42 @@ def sprint(policy: SyncPolicy) -> Run:
     return Coordinator(agents, Disc(100.0, 10, extrapolates=True), policy, [("a", "b")]).advance(5_000 * MS)
 
 
-def test_who_keeps_their_velocity_most_of_the_time_needs_few_exchanges() -> None:
-    """A fixed window has to be as short as the fastest second needs; the bound spends on what changes velocities."""
+def test_an_agent_with_a_mostly_constant_velocity_needs_few_exchanges() -> None:
+    """A fixed window must be short enough for the fastest second; the bound only limits changes of the velocity."""
     cost = bound_cost(sprint, 0.01, step_s=0.001)
     assert cost.largest_m <= 0.01
-    # At 2 m/s a window of 5 ms keeps 10 mm; states are those of steps, and packets come every 2.3 ms.
+    # At 2 m/s a window of 5 ms keeps 10 mm; states are those at steps, and packets are sent every 2.3 ms.
     assert cost.window_s == pytest.approx(0.005, rel=0.2)
     assert cost.fixed_exchanges == pytest.approx(5 / cost.window_s, rel=0.01)
-    # For half a second 4 m/s^2 allow windows of t: 4 m/s^2 t^2 / 2 = 10 mm, t = 70.7 ms. Else they last 0.1 s.
+    # For half a second 4 m/s^2 allow windows of t: 4 m/s^2 t^2 / 2 = 10 mm, t = 70.7 ms. Otherwise they last 0.1 s.
     assert 45 + 0.5 / 0.0708 <= cost.exchanges <= 45 + 0.5 / 0.068 + 2
     assert cost.factor == cost.fixed_exchanges / cost.exchanges
     assert cost.factor > 15
 
 
-def test_a_bound_that_no_fixed_window_of_one_step_keeps_has_no_factor() -> None:
-    """A window that does not end at whole steps of the physics is wrong by a step."""
+def test_a_bound_that_no_fixed_window_keeps_has_no_factor() -> None:
+    """A window that does not end at whole steps of the physics has an error of a step."""
     cost = bound_cost(sprint, 1e-6, step_s=0.0015)
     assert cost.largest_m <= 1e-6
     assert math.isnan(cost.factor)
 
 
-def test_the_longest_window_is_taken_where_it_keeps_the_bound() -> None:
+def test_the_longest_window_is_the_result_if_it_keeps_the_bound() -> None:
     cost = bound_cost(sprint, 1.0, step_s=0.001)
     assert (cost.window_s, cost.fixed_exchanges, cost.exchanges) == (0.1, 50, 50)
 
 
-def test_the_window_of_all_runs_is_one_that_keeps_the_bound_in_each() -> None:
-    """The second run is wrong by 2 m/s times the window, and by chance not between 10 and 11 ms."""
+def test_the_window_for_all_runs_keeps_the_bound_in_each() -> None:
+    """The second run has an error of 2 m/s times the window, except, by chance, between 10 and 11 ms."""
 
     def costs(window_s: float) -> list[FixedCost]:
         other_m = 0.0 if 0.01 < window_s < 0.011 else 2 * window_s
         return [FixedCost(window_s, round(1 / window_s)), FixedCost(other_m, round(1 / window_s))]
 
-    window_s, fixed = kept_by_all([0.017, 0.0105], costs, 0.0105)
+    window_s, fixed = longest_for_all([0.017, 0.0105], costs, 0.0105)
     assert fixed == costs(window_s)
     assert window_s == 0.0105
-    window_s, fixed = kept_by_all([0.009, 0.0105], costs, 0.0105)
+    window_s, fixed = longest_for_all([0.009, 0.0105], costs, 0.0105)
     assert 0.00525 / 1.02 <= window_s <= 0.00525
-    assert [one.exchanges for one in fixed] == [round(1 / window_s)] * 2
-    assert kept_by_all([0.01, math.nan], costs, 0.01)[1] == ()
+    assert [cost.exchanges for cost in fixed] == [round(1 / window_s)] * 2
+    assert longest_for_all([0.01, math.nan], costs, 0.01)[1] == ()

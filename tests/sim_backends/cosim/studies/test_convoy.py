@@ -1,4 +1,4 @@
-"""Convoys against transfer functions worked out on paper, on a network whose delay is constant."""
+"""Convoys against transfer functions derived by hand, on a network with a constant delay."""
 
 import math
 
@@ -19,53 +19,53 @@ HEADWAY_S, GAIN_PER_S, RATE_RAD_S = 0.3, 2.0, 2.0
 PERIOD_S = math.tau / RATE_RAD_S
 
 
-def test_the_border_of_string_stability_is_where_the_gain_leaves_one() -> None:
+def test_the_limit_of_string_stability_is_where_the_gain_exceeds_one() -> None:
     rates = np.geomspace(1e-3, 1e3, 2000)
     for headway_s, gain_per_s in ((0.3, 2.0), (1.0, 1.0), (0.5, 0.2)):
-        border_s = convoy.longest_delay_s(headway_s, gain_per_s)
-        for delay_s in (0.0, 0.5 * border_s, 0.99 * border_s):
+        limit_s = convoy.longest_delay_s(headway_s, gain_per_s)
+        for delay_s in (0.0, 0.5 * limit_s, 0.99 * limit_s):
             gains = convoy.gain(rates, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s)
             assert gains.max() <= 1 + 1e-12
-        for delay_s in (1.01 * border_s, 2 * border_s):
+        for delay_s in (1.01 * limit_s, 2 * limit_s):
             assert convoy.gain(rates, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s).max() > 1 + 1e-9
 
 
 @pytest.mark.parametrize(("delay_s", "stable"), [(0.04, True), (0.3, False)])
-def test_a_row_amplifies_or_damps_as_its_transfer_function_says(delay_s: float, stable: bool) -> None:
-    """On both sides of the border, which is at 83 ms."""
+def test_a_row_amplifies_as_its_transfer_function_predicts(delay_s: float, stable: bool) -> None:
+    """On both sides of the limit, which is at 83 ms."""
     assert (delay_s < convoy.longest_delay_s(HEADWAY_S, GAIN_PER_S)) == stable
     settled_s = 3 * PERIOD_S
     times_s, places = places_m(
         EventDriven(), delay_s=delay_s, headway_s=HEADWAY_S, followers=2, seconds=settled_s + PERIOD_S
     )
     speeds = convoy.speeds_m_s(times_s, places)[times_s >= settled_s]
-    found = convoy.amplifications(speeds)
-    # A state is sent every 10 ms, and a command holds for as long: half of each is delay, too.
+    ratios = convoy.amplifications(speeds)
+    # A state is sent every 10 ms, and a command is held for 10 ms: half of each adds to the delay.
     expected = convoy.gain(np.array([RATE_RAD_S]), delay_s=delay_s + 0.01, headway_s=HEADWAY_S, gain_per_s=GAIN_PER_S)
-    assert found == pytest.approx([expected[0]] * 2, rel=0.01)
-    assert all((ratio <= 1) == stable for ratio in found)
+    assert ratios == pytest.approx([expected[0]] * 2, rel=0.01)
+    assert all((ratio <= 1) == stable for ratio in ratios)
 
 
 def run(policy: SyncPolicy) -> tuple[Floats, Floats]:
     return places_m(policy, delay_s=0.0537, headway_s=0.5, period_ms=10, seconds=3.0)
 
 
-def test_the_loop_goes_wrong_as_far_as_a_policy_is_wrong_in_time() -> None:
+def test_the_position_error_of_a_closed_loop_grows_with_the_window() -> None:
     times_s, reference = run(EventDriven())
-    assert np.array_equal(run(VariableStepped())[1], reference), "exact, so the same to the last digit"
+    assert np.array_equal(run(VariableStepped())[1], reference), "exact, so equal to the last digit"
     for kind in (Scheduled, SlidingWindow, TimeStepped):
-        off_m = [
+        errors_m = [
             np.linalg.norm(run(kind(window_s))[1] - reference, axis=2)[:, 1].max()
             for window_s in (0.011, 0.043, 0.17)
         ]
-        assert 0 < off_m[0] < off_m[1] < off_m[2]
-    errors_m = convoy.spacing_errors_m(times_s, reference, STANDSTILL_M, 0.5)
-    # 1 - Gamma (h s + 1), which is nearly d s^2 / (s + k), of the 0.1 m by which the leader's place goes up and down.
+        assert 0 < errors_m[0] < errors_m[1] < errors_m[2]
+    spacing_m = convoy.spacing_errors_m(times_s, reference, STANDSTILL_M, 0.5)
+    # 1 - Gamma (h s + 1), which is about d s^2 / (s + k), times the 0.1 m by which the leader's position oscillates.
     expected_m = 0.1 * 0.0537 * RATE_RAD_S**2 / math.hypot(RATE_RAD_S, GAIN_PER_S)
-    assert np.abs(errors_m[times_s > 2]).max() == pytest.approx(expected_m, rel=0.2)
+    assert np.abs(spacing_m[times_s > 2]).max() == pytest.approx(expected_m, rel=0.2)
 
 
-def test_measures_are_those_of_a_row_that_is_known() -> None:
+def test_measures_of_a_known_row() -> None:
     times_s = np.linspace(0, 10, 1001)
     lead = np.stack([2 * times_s, 0 * times_s, 0 * times_s], axis=-1)
     behind = lead - np.array([5.0, 0.0, 0.0])

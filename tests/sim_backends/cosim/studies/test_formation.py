@@ -1,4 +1,4 @@
-"""How followers keep their place, on ways that are known."""
+"""How well followers keep their positions, on known paths."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_backends.cosim.scenario.loading import load_scenario
-from sim_backends.cosim.studies.formation import NOBODY, Formation, formation, has_followers, mean_formation
+from sim_backends.cosim.studies.formation import NO_FORMATION, Formation, formation, has_followers, mean_formation
 from sim_backends.cosim.studies.tracks import Tracks, tracks_of
 from sim_backends.world.motion import State
 
@@ -14,44 +14,44 @@ TIMES_S = np.arange(0, 20.0, 0.1)
 
 
 def tracks(gap_m: float, above_m: float) -> Tracks:
-    """Return a convoy that goes east at 1 m/s plus a swing, the follower's half the leader's."""
-    swing_m = np.sin(math.tau * TIMES_S / 10)
-    up_m = np.zeros_like(TIMES_S)
-    leader = np.stack([TIMES_S + 0.2 * swing_m, up_m, up_m], axis=-1)
-    follower = np.stack([TIMES_S - gap_m + 0.1 * swing_m, up_m, up_m], axis=-1)
+    """Return a convoy that drives east at 1 m/s plus an oscillation; the follower's is half the leader's."""
+    oscillation_m = np.sin(math.tau * TIMES_S / 10)
+    zero_m = np.zeros_like(TIMES_S)
+    leader = np.stack([TIMES_S + 0.2 * oscillation_m, zero_m, zero_m], axis=-1)
+    follower = np.stack([TIMES_S - gap_m + 0.1 * oscillation_m, zero_m, zero_m], axis=-1)
     drone = (leader + follower) / 2 + (0.0, 0.0, above_m)
     return Tracks(("drone", "follower", "leader"), TIMES_S, np.stack([drone, follower, leader], axis=1))
 
 
-def test_the_shipped_convoy_is_measured_as_its_file_says() -> None:
-    """2 m and 1 s behind, 8 m above: at 1 m/s the follower is 3 m behind; its swing is half as large."""
+def test_the_shipped_convoy_is_measured_with_the_distances_of_its_file() -> None:
+    """2 m and 1 s behind, 8 m above: at 1 m/s the follower is 3 m behind; its oscillation is half as large."""
     scenario = load_scenario("convoy")
-    found = formation(scenario, tracks(gap_m=3.0, above_m=8.5))
-    assert (found.station_mean_m, found.station_max_m) == pytest.approx((0.5, 0.5))
-    assert found.amplification == pytest.approx(0.5, rel=0.01)
+    measured = formation(scenario, tracks(gap_m=3.0, above_m=8.5))
+    assert (measured.station_mean_m, measured.station_max_m) == pytest.approx((0.5, 0.5))
+    assert measured.amplification == pytest.approx(0.5, rel=0.01)
     # 0.1 sin wt of the gap less 1 s times 0.1 w cos wt of the speed: the amplitude is 0.1 sqrt(1 + w^2).
     amplitude_m = 0.1 * math.hypot(1, math.tau / 10)
-    assert found.spacing_max_m == pytest.approx(amplitude_m, rel=0.02)
-    assert found.spacing_mean_m == pytest.approx(amplitude_m * 2 / math.pi, rel=0.02)
+    assert measured.spacing_max_m == pytest.approx(amplitude_m, rel=0.02)
+    assert measured.spacing_mean_m == pytest.approx(amplitude_m * 2 / math.pi, rel=0.02)
     assert formation(scenario, tracks(gap_m=4.0, above_m=8.0)).spacing_mean_m == pytest.approx(1, rel=0.02)
 
 
-def test_who_follows_nobody_has_no_place() -> None:
+def test_a_scenario_without_followers_has_no_formation() -> None:
     scenario = load_scenario("baylands")
     assert not has_followers(scenario)
     assert has_followers(load_scenario("convoy"))
     assert all(math.isnan(value) for value in vars(formation(scenario, tracks(3.0, 8.0))).values())
-    assert formation(load_scenario("convoy"), tracks_of([(0, "leader", State((0.0, 0.0, 0.0)))])) is NOBODY
+    assert formation(load_scenario("convoy"), tracks_of([(0, "leader", State((0.0, 0.0, 0.0)))])) is NO_FORMATION
 
 
-def test_of_several_runs_means_are_meant_and_maxima_the_largest() -> None:
-    found = mean_formation([Formation(1.0, 2.0, 3.0, 4.0, 0.5), Formation(3.0, 6.0, 5.0, 1.0, 0.7)])
-    assert found == Formation(2.0, 6.0, 4.0, 4.0, (0.5 + 0.7) / 2)
+def test_the_mean_of_several_runs_has_means_and_the_largest_maxima() -> None:
+    mean = mean_formation([Formation(1.0, 2.0, 3.0, 4.0, 0.5), Formation(3.0, 6.0, 5.0, 1.0, 0.7)])
+    assert mean == Formation(2.0, 6.0, 4.0, 4.0, (0.5 + 0.7) / 2)
 
 
 def test_tracks_of_a_recording_have_every_agent_at_every_time() -> None:
     rows = [(0, "b", 0.0), (0, "a", 5.0), (10**8, "b", 1.0), (10**8, "a", 5.0)]
-    found = tracks_of((at_ns, name, State((east_m, 0.0, 0.0))) for at_ns, name, east_m in rows)
-    assert (found.names, found.times_s.tolist()) == (("b", "a"), [0.0, 0.1])
-    assert found.places_m[:, :, 0].tolist() == [[0.0, 5.0], [1.0, 5.0]]
+    recorded = tracks_of((at_ns, name, State((east_m, 0.0, 0.0))) for at_ns, name, east_m in rows)
+    assert (recorded.names, recorded.times_s.tolist()) == (("b", "a"), [0.0, 0.1])
+    assert recorded.places_m[:, :, 0].tolist() == [[0.0, 5.0], [1.0, 5.0]]
     assert tracks_of([]).places_m.shape == (0, 0, 3)

@@ -1,4 +1,4 @@
-"""Local errors against what can be worked out on paper: a moving pair, a hard range limit, a constant delay."""
+"""Local errors against results computed by hand: a moving pair, a hard range limit, a constant delay."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -21,8 +21,8 @@ from sim_backends.cosim.policies.variable_stepped import VariableStepped
 from sim_backends.cosim.policies.velocity_aware import VelocityAware
 from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
 from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.studies.local_errors import MEASURES, local_errors, pooled, spread_over
-from sim_backends.cosim.studies.tracks import Tracked, Tracks
+from sim_backends.cosim.studies.local_errors import MEASURES, local_errors, low_discrepancy_times_ns, pooled
+from sim_backends.cosim.studies.tracks import SampledPhysics, Tracks
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
 from sim_backends.world.motion import State
@@ -31,8 +31,8 @@ from tests.helpers.moving_pair import DELAY_NS, LEAVES_NS, PERIOD_NS, SPEED_M_S,
 MS = 1_000_000
 DELAY_S = DELAY_NS / 1e9
 WINDOWS_S = (0.02, 0.06, 0.2)
-WITHIN = spread_over(4_000 * MS, 7_500 * MS, 30, STEP_NS)
-"""Begins of windows all of which end within range."""
+WITHIN = low_discrepancy_times_ns(4_000 * MS, 7_500 * MS, 30, STEP_NS)
+"""Beginnings of windows that are within range until their end."""
 
 
 def half(window_s: float) -> float:
@@ -40,12 +40,12 @@ def half(window_s: float) -> float:
 
 
 def held(window_s: float) -> float:
-    """Return what the packets that arrive in a window wait for its end, over all that it touches."""
+    """Return the mean time that packets which arrive in a window wait for its end, over all affected packets."""
     return window_s**2 / 2 / (window_s + DELAY_S)
 
 
 def held_twice(window_s: float) -> float:
-    """Return the same where packets also wait for the end of the window in which they are sent."""
+    """Return the same if packets also wait for the end of the window in which they are sent."""
     return (window_s**2 / 2 + DELAY_S * (window_s - DELAY_S / 2)) / (window_s + DELAY_S)
 
 
@@ -54,7 +54,7 @@ def path(window_s: float) -> float:
 
 
 HELD_M = SPEED_M_S * STEP_NS / 1e9
-"""What the one moves in a step of the physics, for which states are held."""
+"""Motion during a step of the physics, for which states are held."""
 
 
 Law = Callable[[float], float]
@@ -64,48 +64,48 @@ LAWS: dict[str, tuple[Callable[[float], SyncPolicy], dict[str, Law]]] = {
     "sliding_window": (SlidingWindow, {"late_s": held, "position_m": path}),
     "velocity_aware_raw": (VelocityAwareRaw, {"late_s": held, "position_m": path}),
     "velocity_aware": (lambda window_s: VelocityAware(window_s, 1.0), {"late_s": held, "position_m": path}),
-    # Both keep their velocities, so that they are where they are taken to be, and windows as long as they may be.
+    # Both keep their velocities, so the extrapolation is exact, and windows have their maximum length.
     "error_bounded": (lambda window_s: ErrorBounded(1e-9, window_s), {"delivery_s": held}),
     "variable_stepped": (lambda _: VariableStepped(), {}),
     "event_driven": (lambda _: EventDriven(), {}),
 }
 
 
-def test_each_method_has_the_errors_and_the_order_worked_out_on_paper() -> None:
-    found = local_errors(
+def test_each_method_has_the_errors_and_the_order_computed_by_hand() -> None:
+    by_policy = local_errors(
         moving_pair, {name: kind for name, (kind, _) in LAWS.items()}, WINDOWS_S, WITHIN, tail_ns=20 * MS
     )
     for name, (_, laws) in LAWS.items():
-        errors = found[name]
+        errors = by_policy[name]
         lengths_s = errors.window_s.mean(axis=1)
         for measure in MEASURES:
             if measure not in laws:
-                most = HELD_M * errors.counts[measure] if measure == "position_m" else 1e-9
-                assert (errors.sums[measure] <= most).all(), f"{name} has no error in {measure}"
+                limit = HELD_M * errors.counts[measure] if measure == "position_m" else 1e-9
+                assert (errors.sums[measure] <= limit).all(), f"{name} has no error in {measure}"
                 continue
             expected = [laws[measure](length_s) for length_s in lengths_s]
             assert errors.mean(measure) == pytest.approx(expected, rel=0.05), f"{name} {measure}"
             order = errors.order(measure)
             assert order.value == pytest.approx(1.0, abs=0.05), f"{name} {measure}"
-            assert order.low < order.value < order.high < order.low + 0.1, "an interval that tells something"
-    assert found["velocity_aware_raw"].window_s[0] == pytest.approx(0.02 + SPEED_M_S / 1000)
+            assert order.low < order.value < order.high < order.low + 0.1, "a narrow interval"
+    assert by_policy["velocity_aware_raw"].window_s[0] == pytest.approx(0.02 + SPEED_M_S / 1000)
 
 
-def test_a_share_of_packets_in_proportion_to_the_window_meets_another_fate_at_the_border_of_the_range() -> None:
-    """A window that begins at t before the border knows it at its begin, or its end: half of all, in the mean."""
+def test_the_share_of_packets_with_another_fate_at_the_range_limit_is_proportional_to_the_window() -> None:
+    """The states are those at the beginning or the end of a window, so on average half of its packets are wrong."""
     windows_s = (0.04, 0.08, 0.16)
     begins_ns = range(LEAVES_NS // MS * MS - 170 * MS, LEAVES_NS, 2 * MS)
     methods: dict[str, Callable[[float], SyncPolicy]] = {"scheduled": Scheduled, "sliding_window": SlidingWindow}
     for name, errors in local_errors(moving_pair, methods, windows_s, begins_ns, tail_ns=5 * MS).items():
-        # Of the begins, over 170 ms, a share of w / 170 ms has the border in its window, and of its packets half are
-        # wrong; those that were sent before and arrive in it are not.
+        # A share of w / 170 ms of the windows contains the range limit, and half of the packets sent in them are
+        # wrong; packets that were sent before and arrive in them are not.
         expected = [window_s / 0.17 / 2 * window_s / (window_s + DELAY_S) for window_s in windows_s]
         assert errors.mean("fates") == pytest.approx(expected, rel=0.12), name
         assert errors.order("fates").value == pytest.approx(1.0, abs=0.1), name
 
 
 class Chased:
-    """One body that stands, and one that goes with the velocity that it was told last, in steps of 10 us."""
+    """A stationary body, and one that moves at the last commanded velocity, in steps of 10 us."""
 
     step_ns = STEP_NS
 
@@ -125,7 +125,7 @@ class Chased:
 
 
 class Faster:
-    """Asks for 1 mm/s more at every datagram."""
+    """Increases its speed by 1 mm/s for every received datagram."""
 
     def __init__(self) -> None:
         self._speed_m_s = 0.0
@@ -133,7 +133,7 @@ class Faster:
     def next_wake_ns(self) -> None:
         return None
 
-    def wake(self, now_ns: int, own: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
         self._speed_m_s += 0.001 * len(received)
         return Action(command=self._speed_m_s)
 
@@ -143,39 +143,39 @@ def chase(policy: SyncPolicy, physics: PhysicsFederate | None = None) -> Coordin
     return Coordinator(Agents(physics or Chased(), programs), Disc(100.0, 100_000), policy, [("lead", "chaser")])
 
 
-def test_in_a_closed_loop_the_error_of_position_in_one_window_is_of_the_second_order() -> None:
-    """It speeds up by 2 m/s^2; a window of w in which it hears nothing takes w^2 from its way: half of 2 m/s^2."""
-    begins_ns = spread_over(100 * MS, 900 * MS, 6, STEP_NS)
+def test_the_position_error_of_one_window_in_a_closed_loop_is_of_the_second_order() -> None:
+    """It accelerates by 2 m/s^2; without datagrams in a window w its path is shorter by w^2: half of 2 m/s^2."""
+    begins_ns = low_discrepancy_times_ns(100 * MS, 900 * MS, 6, STEP_NS)
     errors = local_errors(chase, {"scheduled": Scheduled}, WINDOWS_S, begins_ns, tail_ns=5 * MS)["scheduled"]
-    # The mean over two agents, one of which stands.
+    # The mean over two agents, one of which does not move.
     assert errors.mean("path_m") == pytest.approx(np.square(WINDOWS_S) / 2, rel=0.05)
     assert errors.order("path_m").value == pytest.approx(2.0, abs=0.03)
 
 
-def test_over_a_whole_run_that_error_grows_and_is_of_the_first_order() -> None:
-    """So it is with solvers of differential equations. It lags by w / 2 in the mean, so by 2 m/s^2 w / 2 in speed."""
+def test_the_position_error_of_a_whole_run_grows_and_is_of_the_first_order() -> None:
+    """As with solvers of differential equations. The mean lag is w / 2, so the speed is too low by 2 m/s^2 w / 2."""
 
     def tracks(policy: SyncPolicy) -> Tracks:
-        tracked = Tracked(Chased(), 50 * MS)
-        chase(policy, tracked).advance(1000 * MS)
-        return tracked.tracks
+        sampled = SampledPhysics(Chased(), 50 * MS)
+        chase(policy, sampled).advance(1000 * MS)
+        return sampled.tracks
 
     exact = tracks(EventDriven())
     assert exact.names == ("lead", "chaser")
     assert exact.times_s == pytest.approx(np.arange(21) * 0.05)
-    coarse, fine = (tracks(Scheduled(window_s)).apart_m(exact)[:, 1] for window_s in (0.1, 0.05))
+    coarse, fine = (tracks(Scheduled(window_s)).distances_m(exact)[:, 1] for window_s in (0.1, 0.05))
     assert fine == pytest.approx(exact.times_s * 0.05, abs=0.05**2)
     assert coarse[-1] / fine[-1] == pytest.approx(2.0, rel=0.03)
 
 
-def test_windows_of_several_runs_count_together() -> None:
-    one, other = (
+def test_windows_of_several_runs_are_pooled() -> None:
+    first, second = (
         local_errors(moving_pair, {"scheduled": Scheduled}, (0.05, 0.1), begins_ns, tail_ns=20 * MS)["scheduled"]
         for begins_ns in (WITHIN[:5], WITHIN[5:12])
     )
-    both = pooled([one, other])
+    both = pooled([first, second])
     assert both.window_s.shape == (2, 12)
-    total = one.sums["delivery_s"].sum(axis=1) + other.sums["delivery_s"].sum(axis=1)
+    total = first.sums["delivery_s"].sum(axis=1) + second.sums["delivery_s"].sum(axis=1)
     assert both.sums["delivery_s"].sum(axis=1) == pytest.approx(total)
 
 
@@ -183,7 +183,7 @@ SHARED: list[int] = []
 
 
 class Disturbed(Disc):
-    """Does what it does by something that all copies share."""
+    """A network whose delay depends on data that all copies share."""
 
     def __init__(self) -> None:
         super().__init__(100.0, DELAY_NS)
@@ -197,7 +197,7 @@ class Disturbed(Disc):
         return super().advance(to_ns, packets, states)
 
 
-def test_what_cannot_be_copied_is_found_out() -> None:
+def test_data_that_is_not_copied_is_detected() -> None:
     def make(policy: SyncPolicy) -> Coordinator:
         agents = Agents(Chased(), {"lead": Periodic("lead", "chaser", period_ns=MS)})
         return Coordinator(agents, Disturbed(), policy, [("lead", "chaser")])
@@ -206,9 +206,9 @@ def test_what_cannot_be_copied_is_found_out() -> None:
         local_errors(make, {"scheduled": Scheduled}, (0.01,), [10 * MS, 20 * MS], tail_ns=5 * MS)
 
 
-def test_begins_lie_anywhere_in_a_period() -> None:
-    times_ns = spread_over(0, 10**9, 1000, 1)
+def test_beginnings_are_distributed_over_all_phases_of_a_period() -> None:
+    times_ns = low_discrepancy_times_ns(0, 10**9, 1000, 1)
     assert times_ns == sorted(times_ns)
     phases = np.sort([at_ns % PERIOD_NS / PERIOD_NS for at_ns in times_ns])
-    # As near to even as random ones are: Kolmogorov's bound for 1000 at one in a million.
+    # As even as random phases: Kolmogorov's bound for 1000 values at a probability of one in a million.
     assert abs(phases - (np.arange(1000) + 0.5) / 1000).max() < 2.7 / math.sqrt(1000)

@@ -1,4 +1,4 @@
-"""The paper's claims: changes worked out by hand, and that systems differ in nothing but what is claimed of them."""
+"""The paper's claims: changes computed by hand, and systems that differ only in the claimed property."""
 
 import math
 
@@ -16,8 +16,8 @@ NAN = math.nan
 SETUPS = claim_setups({"duration": "1s"})
 
 
-def told(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -> dict[tuple[str, str, str], Claim]:
-    """Return all claims by the mean delays and the arrivals of each system with each seed, the same in every row."""
+def claims_of(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -> dict[tuple[str, str, str], Claim]:
+    """Return all claims for the mean delays and the arrivals of each system with each seed, the same in every row."""
     samples = {}
     for name, setup in SETUPS.items():
         system = name.partition(",")[0]
@@ -26,68 +26,68 @@ def told(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -> dic
             {flow: FlowSample(100, count, count * delay_s if count else NAN, {})}
             for delay_s, count in zip(delays_s[system], arrived[system], strict=True)
         ]
-    return {(one.than, one.lines, one.quantity): one for one in claims(SETUPS, samples)}
+    return {(claim.than, claim.lines, claim.quantity): claim for claim in claims(SETUPS, samples)}
 
 
-def test_a_change_is_that_of_means_and_every_row_counts_alike() -> None:
-    own_s = np.array([[1.0, 3.0], [0.02, 0.04]])
-    rival_s = np.array([[2.0, 2.0], [0.01, 0.005]])
-    found, rows = delay_change(own_s, rival_s)
+def test_a_change_compares_means_and_every_row_has_the_same_weight() -> None:
+    ours_s = np.array([[1.0, 3.0], [0.02, 0.04]])
+    theirs_s = np.array([[2.0, 2.0], [0.01, 0.005]])
+    change, rows = delay_change(ours_s, theirs_s)
     # From 2 to 2, and from 0.0075 to 0.03: factors of 1 and 4, whose geometric mean is 2.
-    assert found.value == pytest.approx(1.0)
+    assert change.value == pytest.approx(1.0)
     assert rows == 2
     # Without either seed the factors are 1.5 and 8, or 0.5 and 2, whose mean logarithms are log(12) / 2 and 0.
     error = math.log(12) / 4
-    assert found.low == pytest.approx(math.expm1(math.log(2) - student(1) * error))
-    assert found.high == pytest.approx(math.expm1(math.log(2) + student(1) * error))
+    assert change.low == pytest.approx(math.expm1(math.log(2) - student(1) * error))
+    assert change.high == pytest.approx(math.expm1(math.log(2) + student(1) * error))
 
 
-def test_rows_and_seeds_count_in_which_packets_arrived_in_both() -> None:
-    own_s = np.array([[1.0, 9.0, 3.0], [NAN, 1.0, 1.0], [NAN, NAN, NAN]])
-    rival_s = np.array([[2.0, NAN, 2.0], [1.0, NAN, 1.0], [1.0, 1.0, 1.0]])
-    found, rows = delay_change(own_s, rival_s)
+def test_only_rows_and_seeds_count_in_which_packets_arrived_in_both_systems() -> None:
+    ours_s = np.array([[1.0, 9.0, 3.0], [NAN, 1.0, 1.0], [NAN, NAN, NAN]])
+    theirs_s = np.array([[2.0, NAN, 2.0], [1.0, NAN, 1.0], [1.0, 1.0, 1.0]])
+    change, rows = delay_change(ours_s, theirs_s)
     assert rows == 1
-    assert found.value == pytest.approx(0.0)
-    nothing, rows = delay_change(own_s[2:], rival_s[2:])
+    assert change.value == pytest.approx(0.0)
+    unknown, rows = delay_change(ours_s[2:], theirs_s[2:])
     assert rows == 0
-    assert math.isnan(nothing.value)
+    assert math.isnan(unknown.value)
 
 
 def test_claims_by_hand() -> None:
-    found = told(
+    by_key = claims_of(
         {"adaptive": [0.88, 0.88], "fixed window": [1.0, 1.0], "master-based": [0.44, 0.44]},
         {"adaptive": [100, 80], "fixed window": [90, 70], "master-based": [50, 70]},
     )
-    assert len(found) == 12
-    fixed, loss = found["fixed window", "all", "delay"], found["fixed window", "all", "loss"]
+    assert len(by_key) == 12
+    fixed, loss = by_key["fixed window", "all", "delay"], by_key["fixed window", "all", "loss"]
     assert fixed.ours.value == pytest.approx(-0.12)
     assert fixed.agreement is Agreement.AGREES
     assert loss.ours.value == pytest.approx(-0.10)
     assert loss.agreement is Agreement.AGREES
     assert (fixed.rows, loss.rows) == (10, 10)
     assert math.isnan(fixed.tabled), "no table of the paper has it"
-    master = found["master-based", "nlos", "delay"]
+    master = by_key["master-based", "nlos", "delay"]
     assert master.ours.value == pytest.approx(1.0)
     assert master.agreement is Agreement.ABOVE
-    # Less by 50 and by 10 points with the two seeds.
-    assert found["master-based", "nlos", "loss"].ours.value == pytest.approx(-0.3)
-    assert found["fixed window", "los", "delay"].agreement is None, "of which the paper says nothing"
+    # The arrivals differ by 50 and by 10 points with the two seeds.
+    assert by_key["master-based", "nlos", "loss"].ours.value == pytest.approx(-0.3)
+    assert by_key["fixed window", "los", "delay"].agreement is None, "the paper states none"
 
 
-def test_the_papers_own_tables_say_other_than_its_words() -> None:
+def test_the_papers_own_tables_contradict_its_statements() -> None:
     systems = "adaptive", "fixed window", "master-based"
-    found = told({system: [1.0, 1.0] for system in systems}, {system: [1, 1] for system in systems})
-    los, nlos = (found["master-based", line, "loss"] for line in Sight)
+    by_key = claims_of({system: [1.0, 1.0] for system in systems}, {system: [1, 1] for system in systems})
+    los, nlos = (by_key["master-based", line, "loss"] for line in Sight)
     assert los.tabled == pytest.approx((20 - 40) / 5 / 100), "0 0 0 10 10 instead of 0 0 10 10 20"
     assert nlos.tabled == pytest.approx((70 - 140) / 5 / 100)
-    delay = found["master-based", "los", "delay"]
+    delay = by_key["master-based", "los", "delay"]
     expected = (0.01 * 0.1 * 0.4 * 0.4 * 0.6) / (0.01 * 0.1 * 0.48 * 0.6 * 0.8)
     assert delay.tabled == pytest.approx(expected ** (1 / 5) - 1)
 
 
-def test_adaptive_and_fixed_window_differ_by_their_policy_alone() -> None:
+def test_adaptive_and_fixed_window_differ_only_by_their_policy() -> None:
     for line in Sight:
-        own, fixed = SETUPS[f"adaptive, {line} 60 m"], SETUPS[f"fixed window, {line} 60 m"]
-        assert own.scenario == fixed.scenario
-        assert (own.policy, fixed.policy) == ("velocity_aware", "sliding_window")
-        assert own.scenario.policy.window == 0.001, "the paper's first window"
+        adaptive, fixed = SETUPS[f"adaptive, {line} 60 m"], SETUPS[f"fixed window, {line} 60 m"]
+        assert adaptive.scenario == fixed.scenario
+        assert (adaptive.policy, fixed.policy) == ("velocity_aware", "sliding_window")
+        assert adaptive.scenario.policy.window == 0.001, "the paper's initial window"

@@ -1,4 +1,4 @@
-"""The paper's tables: what is run for them, what becomes of it, and how rows come of that."""
+"""The paper's tables: their setups, the samples of these, and the resulting rows."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,7 @@ from sim_backends.cosim.studies.printed_values import DISTANCES_M
 SHORT = {"duration": "1200ms"}
 
 
-def test_every_row_is_run_at_its_distance_and_line() -> None:
+def test_every_row_has_its_distance_and_line() -> None:
     for table, agents in (("1", ("husky-1", "husky-2")), ("2", ("husky-1", "iris")), ("3", ("husky-1", "husky-2"))):
         study = paper_table(table, {})
         assert len(study.setups) == len(study.sources) == (20 if table == "3" else 10)
@@ -34,8 +34,8 @@ def test_every_row_is_run_at_its_distance_and_line() -> None:
             assert traffic.protocol == {"tcp": "ros1", "udp": "ros1-udp"}.get(str(source.labels["protocol"]), "topic")
 
 
-def test_windows_move_by_what_the_paper_says() -> None:
-    """By 0.1 ms between ground robots, by 0.3 ms to the drone, once they are up to their speeds."""
+def test_windows_change_by_the_amounts_that_the_paper_states() -> None:
+    """By 0.1 ms between ground robots and by 0.3 ms for the drone, when they have reached their speeds."""
     for flying, window_ms in ((False, 1.1), (True, 1.3)):
         run = build(
             masterless(Sight.LOS, 40, {"duration": "2s"}, flying=flying).scenario, policy="velocity_aware"
@@ -43,75 +43,74 @@ def test_windows_move_by_what_the_paper_says() -> None:
         assert np.diff(run.windows_ns)[-100:-1].mean() / 1e6 == pytest.approx(window_ms, abs=0.01)
 
 
-def test_samples_count_what_a_run_has() -> None:
+def test_samples_count_the_packets_of_a_run() -> None:
     setup = masterless(Sight.LOS, 20, SHORT)
     flow = the_flow(setup)
     run = build(setup.scenario, policy=setup.policy, seed=2).run()
     fates = [fate for (name, _), fate in run.fates.items() if name == flow]
     delays_s = [(fate.counted_ns - fate.packet.sent_ns) / 1e9 for fate in fates if fate.counted_ns is not None]
     samples = flow_samples({"here": setup}, [7, 2], workers=1)
-    found = samples["here"][1][flow]
-    assert (found.sent, found.arrived) == (len(fates), len(delays_s))
-    assert found.sent > 30
-    assert found.delay_sum_s == pytest.approx(sum(delays_s))
-    assert found.arrived + sum(found.reasons.values()) == found.sent
-    assert samples["here"][0] != samples["here"][1], "of another seed"
+    sample = samples["here"][1][flow]
+    assert (sample.sent, sample.arrived) == (len(fates), len(delays_s))
+    assert sample.sent > 30
+    assert sample.delay_sum_s == pytest.approx(sum(delays_s))
+    assert sample.arrived + sum(sample.reasons.values()) == sample.sent
+    assert samples["here"][0] != samples["here"][1], "the seeds differ"
 
 
-def test_out_of_range_nothing_arrives_and_nothing_is_fast() -> None:
+def test_out_of_range_no_packet_arrives_and_there_is_no_delay() -> None:
     setups = {"far": master_based(Sight.NLOS, 100, "ros1", SHORT)}
-    (sample,) = flow_samples(setups, [1], workers=1)["far"]
-    (found,) = sample.values()
-    assert found.arrived == 0
-    assert found.loss == 1
-    assert math.isnan(found.delay_sum_s)
-    assert math.isnan(found.delay_mean_s)
-    assert sum(found.reasons.values()) == found.sent > 30
+    (by_flow,) = flow_samples(setups, [1], workers=1)["far"]
+    (sample,) = by_flow.values()
+    assert sample.arrived == 0
+    assert sample.loss == 1
+    assert math.isnan(sample.delay_sum_s)
+    assert math.isnan(sample.delay_mean_s)
+    assert sum(sample.reasons.values()) == sample.sent > 30
 
 
-def test_pings_are_round_trips() -> None:
-    (sample,) = flow_samples({"mesh": mesh({"radio": {"rate": "1Mbit/s"}}, {"duration": "2s"})}, [1], workers=1)[
-        "mesh"
-    ]
-    found = sample["before/node-10"]
-    assert found.arrived == found.sent == 15, "ten a second from 0.5 s on"
-    # Payload, headers of UDP and IP at 1 Mbit/s, and 0.2 ms beside: there and back.
-    assert found.delay_mean_s == pytest.approx(2 * (8 * (56 + 8 + 20) / 1e6 + 0.0002))
+def test_the_delays_of_pings_are_round_trips() -> None:
+    setups = {"mesh": mesh({"radio": {"rate": "1Mbit/s"}}, {"duration": "2s"})}
+    (by_flow,) = flow_samples(setups, [1], workers=1)["mesh"]
+    sample = by_flow["before/node-10"]
+    assert sample.arrived == sample.sent == 15, "ten per second from 0.5 s on"
+    # Payload, headers of UDP and IP at 1 Mbit/s, and 0.2 ms in addition, in both directions.
+    assert sample.delay_mean_s == pytest.approx(2 * (8 * (56 + 8 + 20) / 1e6 + 0.0002))
 
 
-def test_a_row_is_the_mean_over_seeds_beside_the_printed_number() -> None:
+def test_a_row_has_the_mean_over_seeds_and_the_printed_number() -> None:
     study = paper_table("1", SHORT)
     flow = the_flow(study.setups["los 40 m topic"])
     some = FlowSample(500, 490, 0.1, {"pushed out": 6, UNDER_WAY: 4})
     none = FlowSample(500, 0, math.nan, {"not matched yet": 500})
     seeds = [some, replace(some, delay_sum_s=0.3), none]
-    samples = {name: [{the_flow(setup): one} for one in seeds] for name, setup in study.setups.items()}
+    samples = {name: [{the_flow(setup): sample} for sample in seeds] for name, setup in study.setups.items()}
     row = study.rows(samples)[1]
     assert row.labels == {"line": "los", "distance_m": 40, "protocol": "topic"}
     assert row.delay.seeds == 2
-    assert row.delay.ours.value == pytest.approx(0.2), "of those with which something arrived"
-    # Student's t of one degree of freedom is 12.706, and a standard error 0.1 s: no delay is below 0.
+    assert row.delay.ours.value == pytest.approx(0.2), "of the seeds with arrivals"
+    # Student's t with one degree of freedom is 12.706, and the standard error is 0.1 s; a delay is at least 0.
     assert row.delay.ours.low == 0
     assert row.delay.ours.high == pytest.approx(0.2 + 12.706 * 0.1, rel=1e-4)
     assert row.delay.agreement is Agreement.AGREES
     assert not row.delay.agrees_by_mean
     assert row.delay.off == pytest.approx(0.1)
     assert row.loss.ours.value == pytest.approx((0.02 + 0.02 + 1) / 3)
-    assert row.loss.ours.high == 1, "of Student's 1.75"
+    assert row.loss.ours.high == 1, "Student's interval would end at 1.75"
     assert row.reason == "not matched yet"
     assert flow == study.sources[1].flow
 
 
 @pytest.mark.parametrize("table", TABLES)
-def test_what_is_changed_is_changed_in_every_row(table: str) -> None:
+def test_changes_apply_to_every_row(table: str) -> None:
     setups = paper_table(table, {"radio.exponent": 2.5, "duration": "3s"}).setups
     assert {(setup.scenario.radio.exponent, setup.scenario.duration) for setup in setups.values()} == {(2.5, 3.0)}
 
 
-def test_what_is_changed_goes_before_what_a_row_says() -> None:
+def test_changes_have_priority_over_the_values_of_a_row() -> None:
     scenario = masterless(Sight.LOS, 20, {"agents.husky-2.along": "33m"}).scenario
     assert scenario.agents["husky-2"].along == 33
 
 
-def test_the_distances_are_those_of_every_table() -> None:
+def test_all_tables_have_the_same_distances() -> None:
     assert DISTANCES_M == (20, 40, 60, 80, 100)

@@ -1,4 +1,4 @@
-"""Many runs at once: any order, any number of workers, errors that name their run, nothing left behind."""
+"""Many runs in parallel: any order, any number of workers, errors that name their run, no processes left."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ TASKS = [Task(policy, seed) for policy in ("one", "other") for seed in (3, 1, 2)
 
 
 def drawn(task: Task) -> tuple[str, int, float]:
-    """Return what depends on nothing but the task; those that come first take longest."""
+    """Return a result that depends only on the task; tasks that are submitted first take longest."""
     stream = RandomStream(task.seed, task.policy)
     for number in range(0, 3_000 // task.seed, 256):
         stream.draw(number)
@@ -45,7 +45,7 @@ def killed(task: Task) -> int:
     return task.seed
 
 
-def test_results_come_in_the_order_of_the_tasks_whoever_finishes_first() -> None:
+def test_results_are_in_the_order_of_the_tasks() -> None:
     expected = [drawn(task) for task in TASKS]
     counted: list[int] = []
     assert run_many(drawn, TASKS, workers=2, progress=counted.append) == expected
@@ -54,19 +54,19 @@ def test_results_come_in_the_order_of_the_tasks_whoever_finishes_first() -> None
 
 @given(st.permutations(TASKS))
 def test_one_worker_and_any_order_give_the_same(tasks: list[Task]) -> None:
-    found = dict(zip(tasks, run_many(drawn, tasks, workers=1), strict=True))
-    assert [found[task] for task in TASKS] == [drawn(task) for task in TASKS]
+    results = dict(zip(tasks, run_many(drawn, tasks, workers=1), strict=True))
+    assert [results[task] for task in TASKS] == [drawn(task) for task in TASKS]
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_an_error_names_its_policy_and_seed_and_keeps_its_family(workers: int) -> None:
+def test_an_error_names_its_policy_and_seed_and_keeps_its_class(workers: int) -> None:
     with pytest.raises(ConfigurationError, match=r"policy one, seed 2: at 3 s: no window\n  remedy: another"):
         run_many(failing, [Task("one", 1), Task("one", 2)], workers=workers)
     with pytest.raises(FieldkitError, match="policy one, seed 1: ZeroDivisionError"):
         run_many(wrong, [Task("one", 2), Task("one", 1)], workers=workers)
 
 
-def test_a_process_that_dies_is_an_error_not_a_wait() -> None:
+def test_the_death_of_a_process_is_an_error() -> None:
     with pytest.raises(FieldkitError, match="was killed") as raised:
         run_many(killed, TASKS, workers=2)
     assert "fewer workers" in raised.value.remedy
@@ -85,7 +85,7 @@ def work(task):
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_whatever_ends_it_ends_its_workers(how: signal.Signals, tmp_path: Path) -> None:
+def test_the_end_of_the_parent_ends_its_workers(how: signal.Signals, tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(ENDLESS, encoding="utf-8")
     started = tmp_path / "started"
     started.mkdir()
@@ -98,7 +98,7 @@ def test_whatever_ends_it_ends_its_workers(how: signal.Signals, tmp_path: Path) 
     ) as process:
         wait_until(lambda: len(list(started.iterdir())) == 2, Deadline.after(20))
         process.send_signal(how)
-        _, complaint = process.communicate(timeout=20)
+        _, stderr = process.communicate(timeout=20)
     assert process.returncode == -how
-    assert (b"KeyboardInterrupt" in complaint) == (how == signal.SIGINT)
+    assert (b"KeyboardInterrupt" in stderr) == (how == signal.SIGINT)
     wait_until(lambda: not any(alive(int(path.name)) for path in started.iterdir()), Deadline.after(20))

@@ -1,4 +1,4 @@
-"""Studies of a network that contends, fades and adapts its rates: exact policies are exact, forks independent."""
+"""Studies of a network with contention, fading and rate control: exact policies agree, forks are independent."""
 
 import pytest
 
@@ -24,28 +24,28 @@ PERIODS_NS = {("a", "b"): 3_700_001, ("b", "c"): 5_100_003, ("c", "a"): 4_300_00
 
 
 def three(policy: SyncPolicy) -> Coordinator:
-    """Return three robots that pass each other so far apart that many packets are lost."""
-    ways = {
+    """Return three robots that pass each other at distances at which many packets are lost."""
+    motions = {
         "a": WayPoints("a", [(0.0, 0.0, 1.0), (0.0, 200.0, 1.0)], 1.0),
         "b": WayPoints("b", [(120.0, 0.0, 1.0), (0.0, 30.0, 1.0)], 5.0),
         "c": WayPoints("c", [(60.0, 90.0, 1.0), (10.0, 20.0, 1.0)], 2.0),
     }
-    antennas = dict.fromkeys(ways, Antenna("802.11g", 15.0, -90.0))
-    network = RadioNetwork(WifiInWorld(3, RadioOptions(), antennas, None), list(ways))
+    antennas = dict.fromkeys(motions, Antenna("802.11g", 15.0, -90.0))
+    network = RadioNetwork(WifiInWorld(3, RadioOptions(), antennas, None), list(motions))
     programs = {
-        one: Periodic(f"{one} to {other}", other, period_ns=period_ns, size_bytes=400)
-        for (one, other), period_ns in PERIODS_NS.items()
+        source: Periodic(f"{source} to {to}", to, period_ns=period_ns, size_bytes=400)
+        for (source, to), period_ns in PERIODS_NS.items()
     }
-    return Coordinator(Agents(Paths(list(ways.values())), programs), network, policy, list(PERIODS_NS))
+    return Coordinator(Agents(Paths(list(motions.values())), programs), network, policy, list(PERIODS_NS))
 
 
-def test_exact_policies_agree_on_the_radio_and_a_window_does_not() -> None:
+def test_exact_policies_agree_on_the_radio_and_a_fixed_window_does_not() -> None:
     reference = three(EventDriven()).advance(600 * MS)
     assert lost_share(reference) > 0.03, "losses that could differ"
     merged = errors(reference, three(VariableStepped()).advance(600 * MS))
-    assert merged.packets == len(reference.fates) - sum(not fate.is_known for fate in reference.fates.values())
+    assert merged.packets == len(reference.fates) - sum(not fate.is_decided for fate in reference.fates.values())
     assert merged.delivery_error_s == merged.late_s == Spread(0, 0, 0)
-    assert merged.position_error_m == errors(reference, reference).position_error_m, "held for the same steps"
+    assert merged.position_error_m == errors(reference, reference).position_error_m, "states are held for equal steps"
     assert (merged.fate_disagreement, merged.causality_violations) == (0, 0)
     windowed = errors(reference, three(Scheduled(0.02)).advance(600 * MS))
     assert windowed.delivery_error_s.mean > 0.005
@@ -57,13 +57,13 @@ def test_the_rule_as_printed_names_the_pair_whose_time_runs_backwards() -> None:
         three(VelocityAwareRaw(0.001)).advance(MS)
 
 
-def test_one_window_can_be_tried_from_any_state_of_the_radio() -> None:
-    found = local_errors(
+def test_local_errors_can_be_measured_from_any_state_of_the_radio() -> None:
+    by_policy = local_errors(
         three,
         {"scheduled": Scheduled, "exact": lambda _: VariableStepped()},
         (0.02, 0.04),
         [50 * MS, 100 * MS],
         tail_ns=60 * MS,
     )
-    assert not any(found["exact"].sums[measure].any() for measure in found["exact"].sums)
-    assert found["scheduled"].mean("delivery_s") == pytest.approx([0.01, 0.02], rel=0.4)
+    assert not any(by_policy["exact"].sums[measure].any() for measure in by_policy["exact"].sums)
+    assert by_policy["scheduled"].mean("delivery_s") == pytest.approx([0.01, 0.02], rel=0.4)
