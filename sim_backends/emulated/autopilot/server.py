@@ -57,7 +57,7 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
 
     Args:
         drone: What it flies.
-        motion: The file in which the lab says where the robot stands (`own_motion.say`).
+        motion: The file in which the lab says where the robot stands (`own_motion.append_path`).
         steered: The file in which the robot says where it flies (`helm.Helm`).
         ready: Made when it serves.
 

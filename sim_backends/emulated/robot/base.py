@@ -22,7 +22,7 @@ def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
 
     Args:
         base: The robot's base.
-        motion: The file in which the lab says where it has put the robot (`own_motion.say`).
+        motion: The file in which the lab says where it has put the robot (`own_motion.append_path`).
         steered: The file in which the robot says where it drives (`helm.Helm`).
         ready: Made when it serves.
 

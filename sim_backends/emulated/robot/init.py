@@ -24,7 +24,7 @@ from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
 from sim_backends.emulated.robot.supervisor import Supervisor
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.neighbours import Neighbourhood
-from sim_backends.emulated.ros.own_motion import OwnWay
+from sim_backends.emulated.ros.own_motion import AssignedPath
 
 START_S: Final = 30.0
 """How long a robot's programs may take to get up; Debian's ROS on a busy machine takes a few seconds."""
@@ -96,7 +96,7 @@ class Init:
                 switch = network.switch_on if what == "switch on" else network.switch_off
                 switch(request["interface"])
             case "move":
-                own_motion.say(services.MOTION, OwnWay(**request["way"]))
+                own_motion.append_path(services.MOTION, AssignedPath(**request["way"]))
             case "kill":
                 kill_processes(request["process"])
             case "halt":

@@ -193,7 +193,7 @@ def _write(path: Path, content: str, *, mode: int = 0o644) -> None:
     path.write_text(content, encoding="utf-8")
 
 
-def not_to_be_held(paths: Iterable[str]) -> list[str]:
+def unsupported_paths(paths: Iterable[str]) -> list[str]:
     """Return those of `paths` at which no robot can have a file: the kernel's folders, and the root itself."""
     return [path for path in paths if path.startswith(_KERNELS) or path.count("/") == 1]
 

@@ -17,7 +17,7 @@ class Helm:
     """Steers one robot; one process of a robot has it.
 
     Args:
-        ways: The file in which the lab says how it moves the robot (`own_motion.say`).
+        ways: The file in which the lab says how it moves the robot (`own_motion.append_path`).
         record: The file in which the robot says how it moves itself.
         now_ns: When it is made, by the monotonic clock.
 

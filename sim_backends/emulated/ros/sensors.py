@@ -204,7 +204,7 @@ def publish(
         frames: What `/tf_static` joins, published once and latched; empty for a robot without it.
         targets: What is in the robot's world, for its laser.
         moving: Returns what else is there at this moment: other robots.
-        motion: The file in which the lab says how the robot moves (`own_motion.say`).
+        motion: The file in which the lab says how the robot moves (`own_motion.append_path`).
         steered: The file in which the robot says how it steers itself (`helm.Helm`).
         ready: Made when every topic can be subscribed to.
 

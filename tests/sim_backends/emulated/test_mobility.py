@@ -18,7 +18,7 @@ from fieldkit.core.units import parse_distance
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.mobility import STEP_M, Mobility
 from sim_backends.emulated.nodes import EmulatedRobot
-from sim_backends.emulated.ros.own_motion import OwnWay
+from sim_backends.emulated.ros.own_motion import AssignedPath
 from sim_backends.emulated.ros.steered import Steered
 from sim_backends.world.motion import STILL
 from sim_backends.world.world import load_world
@@ -118,11 +118,11 @@ def test_a_medium_that_is_gone_is_told_of_at_the_end(mobility: Mobility, told: T
 def test_who_is_out_of_range_on_its_way_comes_back_where_it_is_by_then(mobility: Mobility, told: Told) -> None:
     place = told.now(Role.SENDER)
     with mobility.moving(FAR):
-        mobility.put_away(Role.SENDER)
+        mobility.set_out_of_range(Role.SENDER)
         calls = len(told.calls)
         wait(lambda: len(told.calls) > calls + 2)
         assert set(told.of(Role.SENDER)[calls - 1 :]) == {None}
-        mobility.put_away(None)
+        mobility.set_out_of_range(None)
         assert told.now(Role.SENDER) not in {None, place}
     since_ns = 0
     absent = [one for one in mobility.track(since_ns) if one.role is Role.SENDER and one.position_m is None]
@@ -187,10 +187,10 @@ class Steering:
     """A robot that steers itself."""
 
     spec: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(steers=True))
-    ways: list[OwnWay] = field(default_factory=list)
+    ways: list[AssignedPath] = field(default_factory=list)
     said: Steered | None = None
 
-    def move(self, way: OwnWay) -> None:
+    def move(self, way: AssignedPath) -> None:
         self.ways.append(way)
 
     def steered(self) -> Steered | None:
@@ -220,12 +220,12 @@ def test_the_medium_follows_who_steers_itself_until_it_is_carried_off(
         robot.say((7.0, 8.0, 12.0))
         wait(lambda: told.now(Role.RELAY) == (7.0, 8.0, 12.0))
         calls = len(told.calls)
-        mobility.put_away(Role.SENDER)  # whoever tells of something else tells of it, too
+        mobility.set_out_of_range(Role.SENDER)  # whoever tells of something else tells of it, too
         assert told.now(Role.RELAY) == (7.0, 8.0, 12.0)
         mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
         assert told.now(Role.RELAY) == place
         robot.said = Steered(time.monotonic_ns(), robot.ways[0].began_ns, (1.0, 2.0, 3.0))
-        mobility.put_away(None)
+        mobility.set_out_of_range(None)
         assert told.now(Role.RELAY) == place, "what it says of where it was before is over"
     assert len(told.calls) > calls
     assert not [thread for thread in threading.enumerate() if thread.name == "watch"]
@@ -252,6 +252,6 @@ def test_lasers_see_who_is_in_place_and_not_who_is_away(told: Told) -> None:
     mobility = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None, show=shown.append)
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
     assert shown[-1] == told.calls[-1][0]
-    mobility.put_away(Role.RELAY)  # no radio reaches another one, but the others are where they were
+    mobility.set_out_of_range(Role.RELAY)  # no radio reaches another one, but the others are where they were
     assert told.calls[-1][0] == {}
     assert shown[-1] == {name: place_m for name, place_m in shown[0].items() if name != CAST[Role.RELAY].name}

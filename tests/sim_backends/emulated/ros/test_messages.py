@@ -256,7 +256,7 @@ def test_the_magnetic_field_points_north_whatever_the_robot_faces(heading_rad: f
 def test_odometry_s_speeds_add_up_to_its_pose_and_to_the_way_through_the_world(one: Sensor, tmp_path: Path) -> None:
     placement = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("10m"))
     world, move = load_world("lawn"), Move(Role.SENDER, (Leg(away_m=2.0), Leg(left_m=1.0), Leg(away_m=1.0)), 0.5)
-    own_motion.say(tmp_path / "motion", places.own_way(placement, move, world, 0))
+    own_motion.append_path(tmp_path / "motion", places.assigned_path(placement, move, world, 0))
     odometer, source = Odometer(tmp_path / "motion", 0), Source(one)
     period_s, long_s = 1 / one.rate_hz, 8.0
     told = [said(one, odometer.at(round(n * period_s * S)), source=source) for n in range(round(10 * one.rate_hz))]

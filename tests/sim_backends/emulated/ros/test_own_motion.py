@@ -15,7 +15,7 @@ from fieldkit.core.units import parse_distance
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.messages import FIX_NOISE_M, Sensor, Source
-from sim_backends.emulated.ros.own_motion import AT_REST, Odometer, OwnMotion, OwnWay
+from sim_backends.emulated.ros.own_motion import AT_REST, Odometer, OwnMotion, AssignedPath
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
 
@@ -27,16 +27,16 @@ POINTS = st.lists(st.tuples(METRES, METRES, st.just(UP_M)), min_size=1, max_size
 ANGLES = st.floats(-math.pi, math.pi)
 
 
-def ways(folder: Path, *told: OwnWay) -> Path:
+def ways(folder: Path, *told: AssignedPath) -> Path:
     path = folder / "motion"
     path.unlink(missing_ok=True)
     for way in told:
-        own_motion.say(path, way)
+        own_motion.append_path(path, way)
     return path
 
 
 def test_it_counts_ahead_turns_to_the_left_and_stands(tmp_path: Path) -> None:
-    odometer = Odometer(ways(tmp_path, OwnWay(10 * S, CORNER, 2.0, 0.0)), 0)
+    odometer = Odometer(ways(tmp_path, AssignedPath(10 * S, CORNER, 2.0, 0.0)), 0)
     assert odometer.at(10 * S) == OwnMotion(speed_m_s=2.0, place_m=CORNER[0])
     assert odometer.at(11 * S) == OwnMotion(2.0, 0.0, 0.0, 2.0, (5.0, 6.0, UP_M))
     half = odometer.at(round(12.5 * S))
@@ -48,14 +48,14 @@ def test_it_counts_ahead_turns_to_the_left_and_stands(tmp_path: Path) -> None:
 
 
 def test_who_is_carried_back_turns_no_wheel(tmp_path: Path) -> None:
-    path = ways(tmp_path, OwnWay(0, CORNER, 2.0, 0.0))
+    path = ways(tmp_path, AssignedPath(0, CORNER, 2.0, 0.0))
     odometer = Odometer(path, 0)
     odometer.at(2 * S)
-    own_motion.say(path, OwnWay(4 * S, CORNER[:1], 2.0, 0.0))
+    own_motion.append_path(path, AssignedPath(4 * S, CORNER[:1], 2.0, 0.0))
     back = odometer.at(5 * S)
     assert (back.x_m, back.y_m) == pytest.approx((4.0, 2.0))
     assert back.place_m == CORNER[0]
-    own_motion.say(path, OwnWay(6 * S, CORNER, 2.0, 0.0))
+    own_motion.append_path(path, AssignedPath(6 * S, CORNER, 2.0, 0.0))
     again = odometer.at(7 * S)
     # It faces as it did at first, which its wheels have not seen: ahead is to the left of where they began.
     assert (again.x_m, again.y_m, again.yaw_rad) == pytest.approx((4.0, 4.0, math.pi / 2))
@@ -79,7 +79,7 @@ def test_switched_on_anywhere_it_counts_from_there(
     speed_m_s: float,
     on_ns: int,
 ) -> None:
-    path = ways(tmp_path_factory.getbasetemp(), OwnWay(0, points_m, speed_m_s, facing_rad))
+    path = ways(tmp_path_factory.getbasetemp(), AssignedPath(0, points_m, speed_m_s, facing_rad))
     found = Odometer(path, on_ns).at(on_ns)
     assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((0, 0, 0), abs=1e-6)
 
@@ -91,7 +91,7 @@ def test_its_place_is_the_integral_of_its_speed_and_as_far_as_the_world_has_it(
     facing_rad: float,
     speed_m_s: float,
 ) -> None:
-    path = ways(tmp_path_factory.getbasetemp(), OwnWay(0, points_m, speed_m_s, facing_rad))
+    path = ways(tmp_path_factory.getbasetemp(), AssignedPath(0, points_m, speed_m_s, facing_rad))
     odometer = Odometer(path, 0)
     long_s = sum(math.dist(*pair) for pair in pairwise(points_m)) / speed_m_s
     steps = 400
@@ -109,7 +109,7 @@ def test_its_place_is_the_integral_of_its_speed_and_as_far_as_the_world_has_it(
 def test_away_is_ahead_and_left_is_left(tmp_path: Path, role: Role) -> None:
     placement = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("10m"))
     world, move = load_world("lawn"), Move(role, (Leg(away_m=2.0), Leg(left_m=1.0)), 1.0)
-    odometer = Odometer(ways(tmp_path, places.own_way(placement, move, world, 0)), 0)
+    odometer = Odometer(ways(tmp_path, places.assigned_path(placement, move, world, 0)), 0)
     end = odometer.at(4 * S)
     assert (end.x_m, end.y_m) == pytest.approx((2.0, 1.0))
     motion = places.motion(CAST, placement, move, world)

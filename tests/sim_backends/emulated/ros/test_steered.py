@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.helm import Helm
-from sim_backends.emulated.ros.own_motion import Odometer, OwnWay
+from sim_backends.emulated.ros.own_motion import Odometer, AssignedPath
 from sim_backends.emulated.ros.steered import SILENT_NS, Steered, SteeredRecord
 
 S = 10**9
@@ -86,7 +86,7 @@ def test_it_is_reckoned_on_as_long_as_it_is_not_silent(one: Steered, late_ns: in
 
 def test_the_helm_knows_where_it_was_put_and_sensors_follow_it(tmp_path: Path) -> None:
     ways, record = tmp_path / "motion", tmp_path / "steered"
-    own_motion.say(ways, OwnWay(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    own_motion.append_path(ways, AssignedPath(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
     helm, odometer = Helm(ways, record, 6 * S), Odometer(ways, 6 * S, record)
     put = helm.put(6 * S)
     assert put is not None
@@ -96,7 +96,7 @@ def test_the_helm_knows_where_it_was_put_and_sensors_follow_it(tmp_path: Path) -
     now = odometer.at(7 * S + S // 10)
     assert now.place_m == pytest.approx((3.0, 7.05, 0.2))
     assert (now.x_m, now.speed_m_s, now.turn_rad_s) == pytest.approx((1.05, 0.5, 0.1))
-    own_motion.say(ways, OwnWay(8 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    own_motion.append_path(ways, AssignedPath(8 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
     back = odometer.at(9 * S)
     assert back.place_m == (3.0, 6.0, 0.2)
     assert back.x_m > 1.0, "who is carried turns no wheel"
@@ -110,7 +110,7 @@ def test_the_helm_knows_where_it_was_put_and_sensors_follow_it(tmp_path: Path) -
 
 def test_a_helm_that_was_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     ways, record = tmp_path / "motion", tmp_path / "steered"
-    own_motion.say(ways, OwnWay(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
+    own_motion.append_path(ways, AssignedPath(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
     helm = Helm(ways, record, 2 * S)
     helm.put(2 * S)
     helm.say(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), wheels=(4.0, 0.0, 0.0))
