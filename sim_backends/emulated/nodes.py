@@ -69,7 +69,7 @@ class Node:
         """
         link = {"interface": self.interface, "address": self.address}
         request = {"do": "open radio", **link, "mesh": mesh, "guest_hello_s": guest_hello_s}
-        _, (self._radio_fd,) = self._worker.ask(request)
+        _, (self._radio_fd,) = self._worker.request(request)
 
     @property
     def radio_fd(self) -> int:
@@ -91,7 +91,7 @@ class Node:
         """
         try:
             # The socket is made in the node and connected here, so that a slow peer blocks this thread, not the node.
-            _, (fd,) = self._worker.ask({"do": "socket"})
+            _, (fd,) = self._worker.request({"do": "socket"})
         except TestbedLostError:
             raise
         except (LinkError, RobotError) as error:
@@ -142,7 +142,7 @@ class EmulatedRobot(Node):
     def build(self) -> None:
         """Give the robot its host name and its file system. Errors as `open_radio`."""
         shared = () if self._places_fd is None else (self._places_fd,)
-        _, (fd,) = self._worker.ask({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
+        _, (fd,) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
         self._record = SteeredRecord(fd)
 
     def steered(self) -> Steered | None:
@@ -151,31 +151,31 @@ class EmulatedRobot(Node):
 
     def start(self) -> None:
         """Start the robot's programs and return when they serve. Errors as `open_radio`."""
-        self._worker.ask({"do": "start", "robot": asdict(self.spec)}, timeout_s=START_S + REPLY_S)
+        self._worker.request({"do": "start", "robot": asdict(self.spec)}, timeout_s=START_S + REPLY_S)
 
     def switch_off(self) -> None:
         """Take the radio interface down. Errors as `open_radio`."""
-        self._worker.ask({"do": "switch off", "interface": self.spec.interface})
+        self._worker.request({"do": "switch off", "interface": self.spec.interface})
 
     def switch_on(self) -> None:
         """Bring the radio interface up again. Errors as `open_radio`."""
-        self._worker.ask({"do": "switch on", "interface": self.spec.interface})
+        self._worker.request({"do": "switch on", "interface": self.spec.interface})
 
     def kill(self, process: str) -> None:
         """Kill every process of this name. Errors as `open_radio`, also if there is none."""
-        self._worker.ask({"do": "kill", "process": process})
+        self._worker.request({"do": "kill", "process": process})
 
     def move(self, path: AssignedPath) -> None:
         """Send the robot's sensors the path on which the lab moves it. Errors as `open_radio`."""
-        self._worker.ask({"do": "move", "way": asdict(path)})
+        self._worker.request({"do": "move", "way": asdict(path)})
 
     def halt(self) -> None:
         """Cut the power: all processes except init are killed, and memory is lost. Errors as `open_radio`."""
-        self._worker.ask({"do": "halt", "interface": self.spec.interface})
+        self._worker.request({"do": "halt", "interface": self.spec.interface})
 
     def boot(self) -> None:
         """Boot after `halt`: the interface is up and the programs are starting. Errors as `open_radio`."""
-        self._worker.ask({"do": "boot", "interface": self.spec.interface, "robot": asdict(self.spec)})
+        self._worker.request({"do": "boot", "interface": self.spec.interface, "robot": asdict(self.spec)})
 
     @override
     def close(self) -> None:

@@ -164,7 +164,7 @@ def test_a_process_that_does_not_run_cannot_be_killed(up: EmulatedTestbed) -> No
 
 
 def test_who_is_in_a_hurry_does_not_break_a_robot_for_the_others(up: EmulatedTestbed) -> None:
-    _, descriptors = up.robots[Role.SENDER]._worker.ask({"do": "socket"}, timeout_s=1e-6)
+    _, descriptors = up.robots[Role.SENDER]._worker.request({"do": "socket"}, timeout_s=1e-6)
     for fd in descriptors:
         os.close(fd)
     said(up.shells[Role.SENDER], "true")

@@ -83,7 +83,7 @@ def test_a_robot_moves_over_the_ground(to: Destination, expected_m: Vector) -> N
         (Destination(20.1, 5, None, relative=False), "20.1 m east, 5 m north is outside of the world hill"),
         (Destination(0, 5.1, None, relative=True), "5 m east, 10.1 m north is outside"),
         (Destination(math.inf, 0, None, relative=False), "inf m east"),
-        (Destination(15, 5, 0.9, relative=False), "0.9 m up is no place: the ground is at 1 m"),
+        (Destination(15, 5, 0.9, relative=False), "0.9 m up is not a valid height: the ground is at 1 m"),
         (Destination(0, 0, -0.6, relative=True), "-0.1 m up is no place"),
         (Destination(5, 5, math.inf, relative=False), "inf m up is no place"),
     ],

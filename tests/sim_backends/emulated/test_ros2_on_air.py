@@ -304,7 +304,7 @@ def test_the_built_in_ros_stays_off_the_air() -> None:
 
 def test_a_router_that_takes_no_part_is_refused() -> None:
     robots = {role: one for role, one in cast(sender="zenoh").items() if role is not Role.RELAY}
-    with pytest.raises(ConfigurationError, match="has the router run on duckiedrone-1, which does not take part"):
+    with pytest.raises(ConfigurationError, match="emulated.ros2.router is duckiedrone-1, which does not take part"):
         specs(robots, ROUTER)
 
 
@@ -327,7 +327,7 @@ def test_wrong_options_are_told(ros2: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("ros2", "profile", "said"),
     [
-        (ROUTER, speaking("cyclonedds"), "speaks over DDS, which has none"),
+        (ROUTER, speaking("cyclonedds"), "uses DDS, which has no router"),
         ("{}", speaking("zenoh", ROS_DOMAIN_ID="150"), "the ports of ROS_DOMAIN_ID 150 of the profile"),
     ],
 )

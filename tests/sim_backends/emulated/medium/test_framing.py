@@ -14,7 +14,7 @@ from scapy.layers.l2 import ARP, Ether
 
 from fieldkit.config.profiles import Radio
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.medium.framing import ETHERNET, NOBODY, mac_of
+from sim_backends.emulated.medium.framing import ETHERNET, NO_ROBOT, mac_of
 from sim_backends.emulated.medium.framing import IP as BARE
 from sim_backends.radio.options import RadioOptions
 
@@ -36,15 +36,15 @@ def test_a_mac_address_is_of_one_station_and_locally_administered() -> None:
         ("10.42.0.255", None),
         ("255.255.255.255", None),
         ("239.1.2.3", None),
-        ("10.42.0.9", NOBODY),
-        ("192.168.0.1", NOBODY),
+        ("10.42.0.9", NO_ROBOT),
+        ("192.168.0.1", NO_ROBOT),
     ],
 )
 def test_a_bare_packet_goes_where_its_address_says(to: str, expected: str | None) -> None:
     packet = bytes(IP(src="10.42.0.1", dst=to) / UDP())
     assert BARE.carries(packet)
     assert BARE.destination(packet, BARE.routes(OWN, OTHERS)) == expected
-    assert BARE.destination(packet, BARE.routes(OWN, {})) == NOBODY
+    assert BARE.destination(packet, BARE.routes(OWN, {})) == NO_ROBOT
     assert not BARE.carries(bytes(IPv6()))
 
 
@@ -55,7 +55,7 @@ def test_a_bare_packet_goes_where_its_address_says(to: str, expected: str | None
         ("ff:ff:ff:ff:ff:ff", None),
         ("01:00:5e:01:02:03", None),
         ("33:33:00:01:00:06", None),
-        ("02:00:0a:2a:00:09", NOBODY),
+        ("02:00:0a:2a:00:09", NO_ROBOT),
     ],
 )
 def test_a_frame_goes_to_the_next_hop_whatever_is_in_it(to: str, expected: str | None) -> None:
@@ -63,7 +63,7 @@ def test_a_frame_goes_to_the_next_hop_whatever_is_in_it(to: str, expected: str |
         frame = bytes(Ether(dst=to, src=MACS["a"]) / inner)
         assert ETHERNET.carries(frame)
         assert ETHERNET.destination(frame, ETHERNET.routes(OWN, OTHERS)) == expected
-        assert ETHERNET.destination(frame, ETHERNET.routes(OWN, {})) == NOBODY
+        assert ETHERNET.destination(frame, ETHERNET.routes(OWN, {})) == NO_ROBOT
 
 
 def test_the_packet_in_a_frame_is_found_by_its_type() -> None:
@@ -79,7 +79,7 @@ def test_the_packet_in_a_frame_is_found_by_its_type() -> None:
 def test_no_bytes_are_too_strange(frame: bytes, address: IPv4Address) -> None:
     routes = ETHERNET.routes(OWN, {"x": IPv4Interface(address)})
     assert not ETHERNET.carries(frame) or len(frame) >= 14
-    assert ETHERNET.destination(frame, routes) in {None, NOBODY, "x"}
+    assert ETHERNET.destination(frame, routes) in {None, NO_ROBOT, "x"}
 
 
 @pytest.fixture

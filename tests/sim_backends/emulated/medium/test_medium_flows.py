@@ -16,7 +16,7 @@ HERE, THERE = IPv4Address(SENDER), IPv4Address(RECEIVER)
 
 
 def count_of(flows: FlowDelays, port: int, protocol: int = UDP) -> int:
-    return flows.told(HERE, THERE, protocol, port).packets
+    return flows.delay_parts(HERE, THERE, protocol, port).packets
 
 
 @given(
@@ -32,7 +32,7 @@ def test_every_fragment_that_arrives_is_its_flows(sent: list[tuple[int, int, int
     for ip_id, port, size in sent:
         packets = datagram(ip_id, size, port=port)
         for packet in packets:
-            flows.see_leave(packet)
+            flows.note_first_fragment(packet)
         for packet in packets:
             number += 1
             if number not in lost:
@@ -51,7 +51,7 @@ def test_protocol_direction_and_options_of_the_header_matter() -> None:
     # A header of 24 bytes, its option what looks like another port.
     optional = bytes((0x46,)) + plain[1:20] + struct.pack(">HH", 7, 7) + plain[20:]
     for packet in (plain, optional, ipv4(head, protocol=TCP, src=RECEIVER, dst=SENDER), ipv4(head, protocol=1)):
-        flows.see_leave(packet)
+        flows.note_first_fragment(packet)
         flows.count(packet, PACKET, packet[16:20])
     assert (count_of(flows, 1234, TCP), count_of(flows, 1234)) == (2, 0)
 
@@ -63,7 +63,7 @@ def test_a_packet_that_is_forwarded_counts_once_with_the_time_of_all_its_hops() 
     # Another time to live on each hop, as forwarding has it.
     hops = [packet[:8] + bytes((64 - number,)) + packet[9:] for number in range(3)]
     for hop, receiver in zip(hops, (b"\x0a\x2a\x00\x07", b"\x0a\x2a\x00\x08", THERE.packed), strict=True):
-        flows.see_leave(hop)
+        flows.note_first_fragment(hop)
         flows.count(hop, PACKET + QUEUING_NS * 1000, receiver)
-    told = flows.told(HERE, THERE, UDP, 1234)
+    told = flows.delay_parts(HERE, THERE, UDP, 1234)
     assert (told.packets, told.queuing_ns) == (1, 3000)

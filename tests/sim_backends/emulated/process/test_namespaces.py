@@ -39,6 +39,6 @@ def test_a_setting_that_forbids_is_named_with_its_remedy(
     path = tmp_path / name.replace(".", "/")
     path.parent.mkdir()
     path.write_text(f"{allows}\n", encoding="ascii")
-    assert namespaces.forbidding(tmp_path) == {}
+    assert namespaces.forbidding_settings(tmp_path) == {}
     path.write_text(f"{forbids}\n", encoding="ascii")
-    assert namespaces.forbidding(tmp_path) == {f"{name} = {forbids}": f"sudo sysctl {name}={allows}"}
+    assert namespaces.forbidding_settings(tmp_path) == {f"{name} = {forbids}": f"sudo sysctl {name}={allows}"}

@@ -240,7 +240,7 @@ def test_debian_s_ros_is_not_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
         document = parse(f"{text}\nemulated: {{ros: {choice}}}\n", source="fieldkit.yaml")
         backend = EmulatedBackend(validate(document, Site), document)
         if choice == "debian":
-            with pytest.raises(ConfigurationError, match="asks for Debian's ROS, which is ROS 1"):
+            with pytest.raises(ConfigurationError, match="requests Debian's ROS, which is ROS 1"):
                 backend.cast(Topology.MASTER)
         else:
             assert backend.cast(Topology.MASTER)
