@@ -288,7 +288,7 @@ def test_a_server_that_does_not_start_is_named_with_its_own_words() -> None:
         robot = lone_robot(stack, host_key="no key")
         robot.build()
         robot.open_radio()
-        with pytest.raises(RobotError, match=r"turtlebot-1: sshd ended with status 1: .*no hostkeys available"):
+        with pytest.raises(RobotError, match=r"turtlebot-1: sshd exited with status 1: .*no hostkeys available"):
             robot.start()
 
 
@@ -307,7 +307,7 @@ def test_a_refused_address_is_named() -> None:
     with ExitStack() as stack:
         robot = lone_robot(stack, address="10.42.0.1/99")
         robot.build()
-        with pytest.raises(RobotError, match="turtlebot-1: ip refused a setting"):
+        with pytest.raises(RobotError, match="turtlebot-1: ip rejected a setting"):
             robot.open_radio()
 
 

@@ -22,12 +22,12 @@ def test_whatever_it_is_told_it_stays_within_limits_and_its_wheels_count_it(
     told: list[tuple[int, float, float]],
 ) -> None:
     controller, now_ns = BaseController(BASE, 0), 0
-    controller.put(PUT)
+    controller.reset(PUT)
     x_m, y_m, yaw_rad = PUT.x_m, PUT.y_m, PUT.yaw_rad
     for later_ns, ahead_m_s, turn_rad_s in told:
         now_ns += later_ns
         controller.advance(now_ns)
-        controller.hear(now_ns, ahead_m_s, turn_rad_s)
+        controller.set_velocity(now_ns, ahead_m_s, turn_rad_s)
         for _ in range(20):
             before, (x0, y0, yaw0) = controller.pose, controller.wheels
             now_ns += STEP_NS
@@ -45,17 +45,17 @@ def test_whatever_it_is_told_it_stays_within_limits_and_its_wheels_count_it(
 
 def test_it_drives_while_it_is_told_and_stands_where_it_was_when_words_end() -> None:
     controller = BaseController(BASE, 0)
-    controller.put(PUT)
-    assert controller.stands
+    controller.reset(PUT)
+    assert controller.is_idle
     for now_ns in range(10 * S, 12 * S, S // 10):
-        controller.hear(now_ns, 0.4, 0.0)
+        controller.set_velocity(now_ns, 0.4, 0.0)
         controller.advance(now_ns)
     assert controller.pose.speed_m_s == pytest.approx(0.4)
     last_ns = 12 * S - S // 10
     controller.advance(last_ns + TIMEOUT_NS)
     assert controller.pose.speed_m_s == pytest.approx(0.4), "patience"
     controller.advance(last_ns + TIMEOUT_NS + S // 2)
-    assert controller.stands
+    assert controller.is_idle
     stood = controller.pose.place_m
     controller.advance(100 * S)
     assert controller.pose.place_m == stood
@@ -70,11 +70,11 @@ def test_it_drives_while_it_is_told_and_stands_where_it_was_when_words_end() -> 
 
 def test_who_is_carried_off_stands_there() -> None:
     controller = BaseController(BASE, 0)
-    controller.hear(0, 0.5, 0.0)
+    controller.set_velocity(0, 0.5, 0.0)
     controller.advance(S // 2)
-    assert not controller.stands
-    controller.put(PUT)
-    assert controller.stands
+    assert not controller.is_idle
+    controller.reset(PUT)
+    assert controller.is_idle
     assert (controller.pose.place_m, controller.wheels) == (PUT.place_m, (PUT.x_m, PUT.y_m, PUT.yaw_rad))
 
 
