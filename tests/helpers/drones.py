@@ -91,8 +91,8 @@ def flying(
         firmware=firmware,
         system=SYSTEM,
         limits=LIMITS,
-        can=DUCKIEDRONE,
-        around=Ground(None, None).around,
+        airframe_limits=DUCKIEDRONE,
+        obstacles=Ground(None, None).around,
         now_ns=time.monotonic_ns(),
         boot_s=boot_s,
     )

@@ -43,7 +43,13 @@ class GroundStation:
     ) -> None:
         around = Ground(world, None).around
         self.autopilot = Autopilot(
-            firmware=firmware, system=SYSTEM, limits=limits, can=DUCKIEDRONE, around=around, now_ns=0, boot_s=boot_s
+            firmware=firmware,
+            system=SYSTEM,
+            limits=limits,
+            airframe_limits=DUCKIEDRONE,
+            obstacles=around,
+            now_ns=0,
+            boot_s=boot_s,
         )
         self.autopilot.vehicle.place(HOME_M, math.pi / 2, 0)
         self._ardupilot = firmware.is_ardupilot

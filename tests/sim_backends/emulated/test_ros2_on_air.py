@@ -304,7 +304,9 @@ def test_the_built_in_ros_stays_off_the_air() -> None:
 
 def test_a_router_that_takes_no_part_is_refused() -> None:
     robots = {role: one for role, one in cast(sender="zenoh").items() if role is not Role.RELAY}
-    with pytest.raises(ConfigurationError, match="emulated.ros2.router is duckiedrone-1, which does not take part"):
+    with pytest.raises(
+        ConfigurationError, match=r"emulated\.ros2\.router is duckiedrone-1, which does not take part"
+    ):
         specs(robots, ROUTER)
 
 

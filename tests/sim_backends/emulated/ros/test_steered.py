@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.helm import Helm
-from sim_backends.emulated.ros.own_motion import Odometer, AssignedPath
+from sim_backends.emulated.ros.own_motion import AssignedPath, Odometer
 from sim_backends.emulated.ros.steered import SILENT_NS, Steered, SteeredRecord
 
 S = 10**9
@@ -88,11 +88,13 @@ def test_the_helm_knows_where_it_was_put_and_sensors_follow_it(tmp_path: Path) -
     ways, record = tmp_path / "motion", tmp_path / "steered"
     own_motion.append_path(ways, AssignedPath(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
     helm, odometer = Helm(ways, record, 6 * S), Odometer(ways, 6 * S, record)
-    put = helm.put(6 * S)
+    put = helm.poll_placement(6 * S)
     assert put is not None
     assert (put.place_m, put.heading_rad, put.x_m) == ((3.0, 6.0, 0.2), math.pi / 2, 0.0)
-    assert helm.put(7 * S) is None
-    helm.say(7 * S, (3.0, 7.0, 0.2), (0.0, 0.5, 0.0), heading_rad=math.pi / 2, turn_rad_s=0.1, wheels=(1.0, 0.0, 0.0))
+    assert helm.poll_placement(7 * S) is None
+    helm.write(
+        7 * S, (3.0, 7.0, 0.2), (0.0, 0.5, 0.0), heading_rad=math.pi / 2, turn_rad_s=0.1, wheels=(1.0, 0.0, 0.0)
+    )
     now = odometer.at(7 * S + S // 10)
     assert now.place_m == pytest.approx((3.0, 7.05, 0.2))
     assert (now.x_m, now.speed_m_s, now.turn_rad_s) == pytest.approx((1.05, 0.5, 0.1))
@@ -100,9 +102,9 @@ def test_the_helm_knows_where_it_was_put_and_sensors_follow_it(tmp_path: Path) -
     back = odometer.at(9 * S)
     assert back.place_m == (3.0, 6.0, 0.2)
     assert back.x_m > 1.0, "who is carried turns no wheel"
-    helm.say(9 * S, (3.0, 9.0, 0.2), wheels=(1.25, 0.0, 0.05))
+    helm.write(9 * S, (3.0, 9.0, 0.2), wheels=(1.25, 0.0, 0.05))
     assert odometer.at(9 * S).place_m == (3.0, 6.0, 0.2), "it was carried off since"
-    again = helm.put(9 * S)
+    again = helm.poll_placement(9 * S)
     assert again is not None
     assert again.place_m == back.place_m
     assert again.x_m == pytest.approx(back.x_m, abs=0.01)
@@ -112,8 +114,8 @@ def test_a_helm_that_was_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     ways, record = tmp_path / "motion", tmp_path / "steered"
     own_motion.append_path(ways, AssignedPath(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
     helm = Helm(ways, record, 2 * S)
-    helm.put(2 * S)
-    helm.say(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), wheels=(4.0, 0.0, 0.0))
+    helm.poll_placement(2 * S)
+    helm.write(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), wheels=(4.0, 0.0, 0.0))
     late_ns = 60 * S
     found = Helm(ways, record, late_ns).put(late_ns)
     assert found is not None

@@ -115,8 +115,8 @@ def test_the_sum_of_a_definition_is_that_of_ros() -> None:
         (topic("type: my_msgs/Scan"), "cannot publish my_msgs/Scan"),
         (custom("other_msgs/Thing thing\n", ""), "cannot publish my_msgs/Scan"),
         (custom("float32 3x = [\n", ""), "definition of my_msgs/Scan cannot be read"),
-        (topic("type: std_msgs/String, size: 10B"), "no list of numbers that could have 10 bytes"),
-        (custom(PLAIN, "size: 401B"), "no list of numbers that could have 401 bytes"),
+        (topic("type: std_msgs/String, size: 10B"), "no list of numbers whose size can be 10 bytes"),
+        (custom(PLAIN, "size: 401B"), "no list of numbers whose size can be 401 bytes"),
     ],
 )
 def test_what_cannot_be_made_is_refused_with_a_remedy(one: PublishedTopic, said: str) -> None:
