@@ -64,11 +64,11 @@ class Failsafes(Protocol):
 
     @property
     def active(self) -> bool:
-        """See the class."""
+        """Whether a fail-safe is triggered."""
 
     @property
     def arming_errors(self) -> list[str]:
-        """See the class."""
+        """Reasons for which they prevent arming."""
 
     def heartbeat(self, system: int, kind: int, now_ns: int) -> None:
         """Process a heartbeat: system id and MAV_TYPE of its sender."""

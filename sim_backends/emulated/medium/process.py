@@ -239,8 +239,8 @@ class Medium:
                 return {}
             case "links":
                 return self._links(go_on=request["go_on"])
-            case "delays" | "stats" as what:
-                return self._delays(request) if what == "delays" else pack_stats(self._stats())
+            case "delays" | "stats" as topic:
+                return self._delays(request) if topic == "delays" else pack_stats(self._stats())
             case other:
                 raise ValueError(f"unknown request {other!r}")
 

@@ -93,8 +93,8 @@ class Init:
                 return [_open_radio(request)]
             case "start":
                 self._start(RobotSpec.from_json(request["robot"]))
-            case "switch off" | "switch on" as what:
-                switch = network.switch_on if what == "switch on" else network.switch_off
+            case "switch off" | "switch on" as action:
+                switch = network.switch_on if action == "switch on" else network.switch_off
                 switch(request["interface"])
             case "move":
                 own_motion.append_path(services.MOTION, AssignedPath(**request["way"]))

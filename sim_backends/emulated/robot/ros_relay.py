@@ -156,11 +156,11 @@ def _message_class(header: dict[str, str]) -> Any:  # noqa: ANN401 (rospy has no
     return type("Relayed", (rospy.AnyMsg,), attributes)
 
 
-def _wait(what: str, condition: Callable[[], bool]) -> None:
+def _wait(error_text: str, condition: Callable[[], bool]) -> None:
     deadline = Deadline.after(_MASTER_S)
     while not condition():
         if deadline.expired:
-            raise TimeoutError(what)
+            raise TimeoutError(error_text)
         time.sleep(0.01)
 
 

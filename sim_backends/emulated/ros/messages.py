@@ -120,7 +120,7 @@ class Source:
         moving: Returns the laser targets that move: other robots, where they are now.
 
     Raises:
-        ConfigurationError: There is no generator for its type, or it lacks what its type needs.
+        ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ def check(sensor: Sensor) -> None:
     """Check that an emulated robot can publish `sensor`.
 
     Raises:
-        ConfigurationError: There is no generator for its type, or it lacks what its type needs.
+        ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
     """
     if sensor.type not in GENERATORS and sensor.template is None:
         hint = nearest(sensor.type, GENERATORS, f"known types: {', '.join(GENERATORS)}")

@@ -37,7 +37,7 @@ class AssignedPath:
 
 @dataclass(frozen=True)
 class OwnMotion:
-    """State of motion of a robot at one moment.
+    """State of motion of a robot at one time.
 
     Attributes:
         x_m: Odometry: distance ahead from where the robot was switched on, along its heading at that time.

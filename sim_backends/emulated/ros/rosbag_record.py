@@ -52,12 +52,12 @@ class RecorderError(Exception):
     """The recorder cannot continue.
 
     Args:
-        what: The error message of the original.
+        text: The error message of the original.
     """
 
-    def __init__(self, what: str) -> None:
-        super().__init__(what)
-        self.line = _console("\x1b[31m[ERROR]", what)
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.line = _console("\x1b[31m[ERROR]", text)
 
 
 class Rosbag1Recorder:

@@ -33,12 +33,12 @@ class Subscriber:
         selector: Selector of the process; the key's data is the function to call with the events, `serve`.
 
     Attributes:
-        hears: Whether it has requested the topic.
+        is_subscribed: Whether it has requested the topic.
         gone: Whether it has disconnected, or was disconnected because it violates the protocol.
     """
 
     def __init__(self, stream: socket.socket, greeting: bytes, selector: selectors.BaseSelector) -> None:
-        self.hears = False
+        self.is_subscribed = False
         self.gone = False
         self._stream = stream
         self._greeting = greeting
@@ -75,7 +75,7 @@ class Subscriber:
     def _read(self) -> None:
         try:
             data = self._stream.recv(_CHUNK_BYTES)
-            if not self.hears:
+            if not self.is_subscribed:
                 self._packets.feed(data)
                 self._answer()
         except BlockingIOError:
@@ -89,7 +89,7 @@ class Subscriber:
         """Answer the connection header once it is complete; anything after it is ignored."""
         for packet in self._packets:
             tcpros.unpack_header(packet)
-            self.hears = True
+            self.is_subscribed = True
             self.send(self._greeting)
             return
 
@@ -128,7 +128,7 @@ class TopicSocket:
     def subscribers(self) -> list[Subscriber]:
         """Return the subscribers that have requested the topic and are still connected."""
         self._subscribers = [subscriber for subscriber in self._subscribers if not subscriber.gone]
-        return [subscriber for subscriber in self._subscribers if subscriber.hears]
+        return [subscriber for subscriber in self._subscribers if subscriber.is_subscribed]
 
     def _accept(self, _events: int) -> None:
         stream, _ = self._socket.accept()

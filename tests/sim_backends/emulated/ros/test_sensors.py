@@ -94,10 +94,10 @@ def test_a_subscriber_is_answered_once_its_request_is_whole(peer: Peer) -> None:
     for byte in REQUEST[:-1]:
         peer.stream.send(bytes([byte]))
         peer.served()
-    assert not peer.subscriber.hears
+    assert not peer.subscriber.is_subscribed
     peer.stream.send(REQUEST[-1:])
     peer.served()
-    assert peer.subscriber.hears
+    assert peer.subscriber.is_subscribed
     peer.stream.send(b"what it says now means nothing")
     peer.served()
     assert peer.said() == [b"the header"]
