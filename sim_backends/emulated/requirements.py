@@ -67,7 +67,7 @@ def check(programs: Iterable[str] = ()) -> None:
 
 
 def _check_files() -> None:
-    """Raise ConfigurationError if a file is missing that robots mount their own file over; only root can create it."""
+    """Raise ConfigurationError if a file that robots mount their own over is missing; only root can create it."""
     lacking = [path for path in rootfs.OWN_FILES if not Path(path).exists()]
     if lacking:
         raise ConfigurationError(

@@ -165,7 +165,7 @@ def test_the_first_of_equal_robots_publishes_and_who_runs_the_master_runs_roscor
 
 
 def test_the_built_in_ros_has_no_master_to_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigurationError, match="with Debian's ROS alone") as caught:
+    with pytest.raises(ConfigurationError, match="which for emulated robots needs Debian's ROS") as caught:
         requirements.check_shared_master(RosChoice.BUILTIN)
     assert "python3-rosmaster" in caught.value.remedy
     requirements.check_shared_master(RosChoice.DEBIAN)

@@ -402,7 +402,7 @@ except FieldkitError as error:
 
 
 def test_a_tun_that_cannot_be_made_says_why() -> None:
-    with pytest.raises(ConfigurationError, match="no name for an interface"):
+    with pytest.raises(ConfigurationError, match="is not a valid interface name"):
         open_tun("a-name-that-is-too-long")
     with Namespace() as space:
         first = space.tun("wlan0", "10.9.0.1/24")

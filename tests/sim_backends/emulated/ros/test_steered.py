@@ -117,7 +117,7 @@ def test_a_helm_that_was_killed_goes_on_where_it_was(tmp_path: Path) -> None:
     helm.poll_placement(2 * S)
     helm.write(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), wheels=(4.0, 0.0, 0.0))
     late_ns = 60 * S
-    found = Helm(ways, record, late_ns).put(late_ns)
+    found = Helm(ways, record, late_ns).poll_placement(late_ns)
     assert found is not None
     assert found.place_m == pytest.approx((4.0 + SILENT_NS / 1e9, 0.0, 0.2))
     assert found.speed_m_s == 0.0
