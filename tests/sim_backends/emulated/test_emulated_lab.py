@@ -262,7 +262,7 @@ def test_sigkill_of_the_owner_leaves_no_processes(untouched: Untouched) -> None:
     process.send_signal(signal.SIGKILL)
     process.wait()
     wait_for_end(lab_pids, within_s=60.0)
-    # A namespace exists as long as a process or a mount uses it. Its number proves nothing, because the kernel reuses it.
+    # A namespace exists as long as a process or a mount uses it. The kernel reuses its number, so `untouched` checks.
     untouched()
 
 
