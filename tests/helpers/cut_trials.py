@@ -63,12 +63,12 @@ def run(out: Path, witness: Witness) -> None:
     """Start the trial in `out`, or resume it if a power cut left its plan; the witness receives the messages."""
     plans = list(out.glob(f"*/{PLAN_FILE}"))
     if plans:
-        resume_trial(plans[0].parent, IdleTestbed(), witness.hear)
+        resume_trial(plans[0].parent, IdleTestbed(), witness.on_event)
     else:
         out.mkdir(exist_ok=True)
         for leftover in out.iterdir():  # a trial that was not reported to the user; the next one has a different name
             shutil.rmtree(leftover)
-        run_trial(plan(), IdleTestbed(), out, witness.hear)
+        run_trial(plan(), IdleTestbed(), out, witness.on_event)
 
 
 @contextmanager
