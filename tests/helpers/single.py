@@ -29,8 +29,8 @@ def mean(values: ArrayLike) -> Interval | None:
     return _single(statistics.means(np.atleast_2d(values)))
 
 
-def median(values: ArrayLike, minimum: float = -math.inf) -> Interval | None:
-    return _single(statistics.medians(np.atleast_2d(values), minimum))
+def median(values: ArrayLike, least: float = -math.inf) -> Interval | None:
+    return _single(statistics.medians(np.atleast_2d(values), least))
 
 
 def more_wanted(interval: Interval, n: int, half_width: float, kind: Kind) -> int:

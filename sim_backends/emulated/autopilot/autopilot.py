@@ -116,7 +116,7 @@ class Autopilot:
         for group in self._firmware.groups:
             if group.parameter == name:
                 for kind in group.messages:
-                    self._streams.set_usual(kind, self._parameters[name], self._now_ns)
+                    self._streams.set_default(kind, self._parameters[name], self._now_ns)
 
     def _is_for_us(self, message: Message) -> bool:
         system, component = mavlink.addressee(message)
