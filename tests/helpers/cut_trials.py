@@ -204,7 +204,7 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
             states.append((dict(witness.told), witness.is_over))
             cut_requested.set()
 
-        def look(_sync_location: str) -> bool:
+        def look(_location: str) -> bool:
             witness.look()
             return True
 

@@ -123,9 +123,8 @@ def _write_state(mounted: Path) -> tuple[str, ...]:
     """
     for line in Path("/proc/thread-self/mountinfo").read_text(encoding="utf-8").splitlines():
         mount_fields = line.split()
-        if mount_fields[4] == str(
-            mounted
-        ):  # btrfs has a device number of its own, so the name tells which loop device it is
+        if mount_fields[4] == str(mounted):
+            # btrfs has a separate device number, so the loop device is identified by its name.
             name = Path(mount_fields[mount_fields.index("-") + 2]).name
             fields = Path(f"/sys/block/{name}/stat").read_text(encoding="ascii").split()
             return fields[4], fields[6], fields[8]

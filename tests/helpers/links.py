@@ -178,7 +178,7 @@ def tcp(
         arrivals, unneeded = arrivals + new_arrivals, []
         missing = sorted(set(missing) - {segment.start for _, _, segment in new_arrivals})
         again_ns += 30 * MS
-    arrivals.sort(key=lambda segment: segment[0])
+    arrivals.sort(key=lambda arrival: arrival[0])
 
     def packet(start: int, size: int, stamp: int | None, ip_id: int | None, flags: int = 0x10) -> bytes:
         options = b"" if stamp is None else struct.pack(">BBBBII", 1, 1, 8, 10, stamp, 1)
@@ -200,10 +200,10 @@ def tcp(
     arrived = {(number, segment.start) for _, number, segment in arrivals}
     sent = [segment for group in frames for segment in group]
     return TcpTruth(
-        sender=[Frame(clock, syn), *(frame(index, group) for index, group in zip(times_ns, frames, strict=True))],
+        sender=[Frame(clock, syn), *(frame(at_ns, group) for at_ns, group in zip(times_ns, frames, strict=True))],
         receiver=[
             Frame(clock + link.clock_ns + link.delay_ns, syn),
-            *(frame(index, [segment for _, segment in group]) for index, group in joined),
+            *(frame(at_ns, [segment for _, segment in group]) for at_ns, group in joined),
         ],
         sent_bytes=len(sent) * MSS,
         received_bytes=len(arrived) * MSS,

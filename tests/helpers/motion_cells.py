@@ -168,9 +168,9 @@ class MotionCell:
     @property
     def cuts_link(self) -> bool:
         """True if the programs must lose their link to the autopilot and the flight log can show it."""
-        killed_parties = {*self.parties} & {Party.ROUTER, Party.SERVER}
-        is_logged = Party.SERVER in killed_parties or Party.PILOT not in self.parties
-        return bool(killed_parties) and is_logged and self.blow is not Blow.SLOW and self.moment not in AT_REST
+        link_parties = {*self.parties} & {Party.ROUTER, Party.SERVER}
+        is_logged = Party.SERVER in link_parties or Party.PILOT not in self.parties
+        return bool(link_parties) and is_logged and self.blow is not Blow.SLOW and self.moment not in AT_REST
 
 
 _CONTROL: Final = {Party.LAPTOP, Party.FIELDKIT, Party.LINK}

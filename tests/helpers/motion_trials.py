@@ -113,7 +113,7 @@ class MotionTrial:
                 self._end()
         leftovers = self.lab.tidy(craft, self.folder)
         duration_s = round(time.monotonic() - began_s, 1)
-        return replace(outcome, problems=(*outcome.problems, *leftovers), duration_s=duration_s)
+        return replace(outcome, problems=(*outcome.problems, *leftovers), took_s=duration_s)
 
     @property
     def _max_delay_s(self) -> float:
@@ -135,7 +135,7 @@ class MotionTrial:
 
     def _in_phase(self, sampler: MotionSampler) -> bool:
         """Return True if the robot is in the phase, by its log and by its ground-truth motion."""
-        sample, moment = sampler.sample, self.cell.moment
+        sample, moment = sampler.now, self.cell.moment
         if sample is None:
             return False
         if moment is Moment.WAITING:

@@ -79,9 +79,9 @@ class LocalShell:
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
         return self.begin(argv, deadline=deadline).end(deadline=deadline, check=check, stdin=stdin)
 
-    def fetch(self, argv: Sequence[str], path: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
+    def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         completed = self.run(argv, deadline=deadline, check=False)
-        path.write_bytes(completed.stdout[:limit_bytes])
+        to.write_bytes(completed.stdout[:limit_bytes])
         if completed.exit_code:
             raise RobotError(f"exit code {completed.exit_code}: {printable(completed.stderr)}", where=self.robot)
         return completed
