@@ -73,7 +73,7 @@ def said(shell: Shell, *argv: str) -> str:
 
 
 @contextmanager
-def endless(shell: Shell, *, first: str = ":") -> Iterator[tuple[str, ...]]:
+def endless_command(shell: Shell, *, first: str = ":") -> Iterator[tuple[str, ...]]:
     """Yield a command that does `first` and then sleeps for a long time; it is killed at the end of the context.
 
     Not all SSH servers kill the commands of a disconnected client: OpenSSH does not.
@@ -85,19 +85,19 @@ def endless(shell: Shell, *, first: str = ":") -> Iterator[tuple[str, ...]]:
 
 
 @contextmanager
-def waiting(shell: Shell) -> Iterator[Callable[[float], BaseException | None]]:
+def waiting_thread(shell: Shell) -> Iterator[Callable[[float], BaseException | None]]:
     """Let a thread wait for an endless command while neither side sends data.
 
     Yields a function that returns the thread's error, within a number of seconds.
     """
-    with endless(shell, first="cat") as argv, ThreadPoolExecutor(1) as pool:
+    with endless_command(shell, first="cat") as argv, ThreadPoolExecutor(1) as pool:
         session = shell.begin(argv, deadline=soon())
         ended = pool.submit(session.end, deadline=Deadline.after(2 * SOON_S))
         said(shell, "sh", "-c", "until [ -s endless ]; do sleep 0.05; done")
         yield ended.exception
 
 
-def answers(shell: Shell) -> bool:
+def is_responsive(shell: Shell) -> bool:
     try:
         return said(shell, "echo", "back") == "back\n"
     except LinkError:
@@ -170,7 +170,7 @@ class ShellConformance:
         assert said(subject.shell, "echo", "on") == "on\n"
 
     def test_an_endless_command_raises_a_link_error_at_the_deadline(self, subject: Subject) -> None:
-        with endless(subject.shell) as argv:
+        with endless_command(subject.shell) as argv:
             began_s = time.monotonic()
             with pytest.raises(LinkError):
                 subject.shell.run(argv, deadline=Deadline.after(1.0))
@@ -183,7 +183,7 @@ class ShellConformance:
         assert said(subject.shell, "echo", "on") == "on\n"
 
     def test_close_ends_the_wait_of_another_thread(self, subject: Subject) -> None:
-        with waiting(subject.shell) as error:
+        with waiting_thread(subject.shell) as error:
             subject.shell.close()
             assert isinstance(error(NOTICED_S), LinkError)
         assert said(subject.shell, "echo", "made again") == "made again\n"
@@ -213,10 +213,10 @@ class ShellConformance:
             timer.join()
 
     def test_a_waiting_thread_detects_a_dead_link(self, subject: Subject) -> None:
-        with waiting(subject.shell) as error, subject.dead_link():
+        with waiting_thread(subject.shell) as error, subject.dead_link():
             assert isinstance(error(NOTICED_S + subject.give_up_s), LinkError)
         # The Shell gives up early to save time; on a busy machine, a new connection may take longer.
-        wait_until(lambda: answers(subject.shell), soon())
+        wait_until(lambda: is_responsive(subject.shell), soon())
 
 
 class RebootConformance:

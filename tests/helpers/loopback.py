@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldkit.core.deadline import Deadline
-from tests.helpers.sshd import UP_S, Server, answers, free_port, make_key, wait_until
+from tests.helpers.sshd import UP_S, Server, is_ssh_server, free_port, make_key, wait_until
 
 Command = Callable[[Path, int], Sequence[str]]
 """Command line of a server, from the file of its host key in OpenSSH format and its port."""
@@ -51,7 +51,7 @@ def serve(folder: Path, command: Command) -> Iterator[Server]:
     )
     with (folder / "log").open("wb") as log, subprocess.Popen(argv, stderr=log) as process:
         try:
-            wait_until(lambda: answers(port), Deadline.after(UP_S))
+            wait_until(lambda: is_ssh_server(port), Deadline.after(UP_S))
             yield Server(port, host_key, (folder / "client").read_text(encoding="ascii"), folder, process.pid)
         finally:
             process.kill()  # unshare ignores SIGTERM

@@ -102,13 +102,13 @@ def sshd(folder: Path, *, within: Sequence[str] = (), **options: str) -> Iterato
     argv += [f"-o{name}={value}" for name, value in options.items()]
     with (folder / "log").open("wb") as log, subprocess.Popen(argv, stderr=log) as process:
         try:
-            wait_until(lambda: answers(port), Deadline.after(UP_S))
+            wait_until(lambda: is_ssh_server(port), Deadline.after(UP_S))
             yield Server(port, host_key, (folder / "client").read_text(encoding="ascii"), folder, process.pid)
         finally:
             process.terminate()
 
 
-def answers(port: int) -> bool:
+def is_ssh_server(port: int) -> bool:
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=1) as connection:
             return connection.recv(4) == b"SSH-"
