@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldkit.core.deadline import Deadline
-from tests.helpers.sshd import UP_S, Server, is_ssh_server, free_port, make_key, wait_until
+from tests.helpers.sshd import UP_S, Server, free_port, is_ssh_server, make_key, wait_until
 
 Command = Callable[[Path, int], Sequence[str]]
 """Command line of a server, from the file of its host key in OpenSSH format and its port."""
