@@ -59,7 +59,7 @@ class Node:
         """Bring up the radio interface.
 
         Args:
-            mesh: Whether robots forward packets for each other.
+            mesh: True if robots forward packets for each other.
             guest_hello_s: Hello interval of a node that uses the robots' routes and forwards nothing itself; None if
                 the node starts a routing daemon of its own, or needs none.
 

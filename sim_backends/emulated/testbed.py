@@ -196,7 +196,7 @@ def bring_up(
         world: The world around the robots.
         ros: Source of ROS for robots with ROS 1, `debian` or `builtin`.
         seed: Seed of all random numbers of the medium.
-        control: Whether SSH uses the radio; if so, a robot out of the laptop's range cannot be reached.
+        control: True if SSH uses the radio; if so, a robot out of the laptop's range cannot be reached.
         patience_s: How long to wait for a lost control connection.
         notice: Called with a message when a control connection is lost, and when it is back.
         operator: The person who answers the questions of steps.

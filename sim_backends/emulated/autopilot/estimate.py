@@ -47,7 +47,7 @@ class PositionEstimate:
 
     @property
     def is_instant(self) -> bool:
-        """Whether it has an origin immediately after power-on."""
+        """True if it has an origin immediately after power-on."""
         return not self._boot_ns
 
     @property

@@ -24,8 +24,8 @@ class VehicleState:
 
     Attributes:
         now_ns: Time.
-        armed: Whether it is armed.
-        landed: Whether it is on the ground.
+        armed: True if it is armed.
+        landed: True if it is on the ground.
         mode: Its mode.
         battery: Its battery.
     """
@@ -45,7 +45,7 @@ class Reaction:
         text: Text for people, or empty.
         severity: MAV_SEVERITY of the text.
         mode: Mode to change to; None to keep the mode.
-        disarm: Whether to stop the motors.
+        disarm: True to stop the motors.
     """
 
     text: str = ""
@@ -58,13 +58,13 @@ class Failsafes(Protocol):
     """The fail-safes of a vehicle.
 
     Attributes:
-        active: Whether a fail-safe is triggered; HEARTBEAT then has MAV_STATE_CRITICAL.
+        active: True if a fail-safe is triggered; HEARTBEAT then has MAV_STATE_CRITICAL.
         arming_errors: Reasons for which they prevent arming.
     """
 
     @property
     def active(self) -> bool:
-        """Whether a fail-safe is triggered."""
+        """True if a fail-safe is triggered."""
 
     @property
     def arming_errors(self) -> list[str]:

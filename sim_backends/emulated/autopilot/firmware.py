@@ -50,9 +50,9 @@ class Firmware:
         spool_s: Time from arming to the earliest lift-off.
         landed_s: Time on the ground after which it has detected its landing.
         fix_type: GPS_FIX_TYPE with a good receiver.
-        guided_holds: Whether it holds its position in the mode of set-points when set-points are missing.
-        lifts_off: Whether set-points make it lift off.
-        lands_anywhere: Whether it accepts LAND and RTL on the ground.
+        guided_holds: True if it holds its position in the mode of set-points when set-points are missing.
+        lifts_off: True if set-points make it lift off.
+        lands_anywhere: True if it accepts LAND and RTL on the ground.
         first_item: Number of the first item of a mission that is flown; ArduPilot's item 0 is home.
     """
 
@@ -84,7 +84,7 @@ class Firmware:
 
     @property
     def is_ardupilot(self) -> bool:
-        """Whether it is ArduPilot."""
+        """True if it is ArduPilot."""
         return self.guided_holds
 
     def mode_of(self, custom_mode: int) -> Mode | None:

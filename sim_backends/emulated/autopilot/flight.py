@@ -42,8 +42,8 @@ class Airframe:
     Attributes:
         home_m: Position of home in the world; `position_m` is relative to it.
         now_ns: Time of the current state.
-        driven: Whether its motors turn; without them it rests or falls.
-        on_ground: Whether it is on the ground or on an obstacle.
+        driven: True if its motors turn; without them it rests or falls.
+        on_ground: True if it is on the ground or on an obstacle.
         turn_rad_s: Turn rate to the left.
     """
 

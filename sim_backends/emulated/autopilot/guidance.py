@@ -21,7 +21,7 @@ class SetPoint(NamedTuple):
 
     Attributes:
         vector: Position relative to home in m, or velocity in m/s: east, north, up.
-        is_place: Whether it is a position.
+        is_place: True if it is a position.
         yaw_rad: Heading from east towards north; None if it has none.
     """
 

@@ -18,7 +18,7 @@ class Parameter:
         most: Maximum.
         key: PX4's name, by which the vehicle reads it; empty if it equals `name`.
         scale: Number of its units per SI unit.
-        integer: Whether it is an integer (MAV_PARAM_TYPE_INT32); otherwise a float (REAL32).
+        integer: True if it is an integer (MAV_PARAM_TYPE_INT32); otherwise a float (REAL32).
     """
 
     name: str

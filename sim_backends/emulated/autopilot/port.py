@@ -56,7 +56,7 @@ class MavlinkPort:
 
     @property
     def is_used(self) -> bool:
-        """Whether there is a client."""
+        """True if there is a client."""
         return bool(self._clients)
 
     def register(self, sender: Address, message: Message, now_ns: int) -> bool:

@@ -60,8 +60,8 @@ class Vehicle:
 
     Attributes:
         body: Position and motion, relative to home.
-        armed: Whether its motors turn.
-        landed: Whether it has detected that it is on the ground.
+        armed: True if its motors turn.
+        landed: True if it has detected that it is on the ground.
         mode: Its flight mode.
         mission: The mission of mode MISSION.
         battery: Its battery.

@@ -148,7 +148,7 @@ class MediumClient:
         """Return the link samples of each robot since the last call, including one taken now.
 
         Args:
-            go_on: Whether to continue to sample.
+            go_on: True to continue sampling.
 
         Raises:
             LinkError: The medium ended or did not answer.

@@ -110,7 +110,7 @@ def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
     Args:
         interface: Name of the interface.
         address: Its address with the prefix length.
-        mesh: Whether robots forward for each other: the interface then has a MAC address, by which frames name the
+        mesh: True if robots forward for each other; the interface then has a MAC address, by which frames name the
             next hop, and IPv6, whose link-local addresses the routing daemon uses (RFC 8966, section 4).
 
         The device's descriptor, for the medium.

@@ -102,13 +102,13 @@ class RobotSpec:
         neighbours: The bodies of the other robots, which reflect its laser; empty without a laser.
         base: Its base controller; None if no program in it drives it.
         ssh: Its SSH server.
-        sftp: Whether that server offers SFTP.
+        sftp: True if that server offers SFTP.
         userland: Source of `sh`, `tar`, `ip` and similar tools.
         netcat: Its only netcat, as `nc` and by its full name; None for those of this machine or of the userland.
         ping: Its `ping`; None as for `netcat`.
         mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward.
         ros2: Its ROS 2 over the radio; None for a robot without.
-        routes_zenoh: Whether it runs the Zenoh router.
+        routes_zenoh: True if it runs the Zenoh router.
         bridge: Command that bridges its topics from ROS 1 to another middleware; empty if none runs automatically.
     """
 
@@ -155,22 +155,22 @@ class RobotSpec:
 
     @property
     def shares_master(self) -> bool:
-        """Whether its ROS master also serves other robots."""
+        """True if its ROS master also serves other robots."""
         return self.ros_master != LOOPBACK
 
     @property
     def runs_master(self) -> bool:
-        """Whether its ROS master runs on the robot itself."""
+        """True if its ROS master runs on the robot itself."""
         return self.ros_master in {LOOPBACK, self.ip}
 
     @property
     def steers(self) -> bool:
-        """Whether a program in it may steer it."""
+        """True if a program in it may steer it."""
         return self.mavlink_port is not None or self.base is not None
 
     @property
     def waits_for_another(self) -> bool:
-        """Whether its startup waits for another robot, which runs its ROS master or its Zenoh router."""
+        """True if its startup waits for another robot, which runs its ROS master or its Zenoh router."""
         return self.shares_master or bool(self.ros2 and self.ros2.router)
 
     @property

@@ -57,11 +57,11 @@ class Template:
     """Serialized parts of messages of a type without a generator.
 
     Attributes:
-        stamped: Whether the message starts with a header.
+        stamped: True if the message starts with a header.
         head: Content between the header and the list that is filled, serialized, in hexadecimal digits.
         tail: Content after the list, in the same form.
         size_bytes: Size of the list.
-        floats: Whether the list holds 4-byte floats; otherwise any bytes.
+        floats: True if the list holds 4-byte floats; otherwise any bytes.
     """
 
     stamped: bool

@@ -33,8 +33,8 @@ class Subscriber:
         selector: Selector of the process; the key's data is the function to call with the events, `serve`.
 
     Attributes:
-        is_subscribed: Whether it has requested the topic.
-        gone: Whether it has disconnected, or was disconnected because it violates the protocol.
+        is_subscribed: True if it has requested the topic.
+        gone: True if it has disconnected, or was disconnected because it violates the protocol.
     """
 
     def __init__(self, stream: socket.socket, greeting: bytes, selector: selectors.BaseSelector) -> None:
