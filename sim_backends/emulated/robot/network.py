@@ -113,6 +113,7 @@ def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
         mesh: True if robots forward for each other; the interface then has a MAC address, by which frames name the
             next hop, and IPv6, whose link-local addresses the routing daemon uses (RFC 8966, section 4).
 
+    Returns:
         The device's descriptor, for the medium.
 
     Raises:
