@@ -26,8 +26,6 @@ def transfer(protocol: Protocol) -> Transfer:
 class Frame:
     """A frame with its time."""
 
-    """One frame with its moment."""
-
     time_ns: int
     data: bytes
     wire_bytes: int | None = None

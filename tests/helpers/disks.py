@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-SIZE_BYTES: Final = 512 << 20  # the files are sparse; xfs wants 300 MiB
+SIZE_BYTES: Final = 512 << 20  # the files are sparse; xfs needs 300 MiB
 _MAX_COPIES: Final = 200
 
 

@@ -27,8 +27,6 @@ class LeakError(AssertionError):
 class HostState:
     """Interfaces, addresses, routes and mounts of a namespace; a named network namespace is a mount."""
 
-    """Interfaces, addresses, routes and mounts of a namespace; a named network namespace is a mount."""
-
     links: str
     addresses: str
     routes: str

@@ -296,7 +296,7 @@ class Attempt:
             self._path(planned.job.stdout).write_text(json.dumps(output), encoding="ascii")
 
     def _fault(self, job: Job) -> None:
-        """The observer saw the robot go for 3 s, and the cause lasted 1 s."""
+        """The observer lost the robot for 3 s, and the cause of the fault lasted 1 s."""
         if job.name.endswith("-heals"):
             self._path(job.stdout).write_text("lasted_s 1.000\ninterval_s 0.1\n", encoding="ascii")
         elif job.log.endswith("-watch.txt"):
