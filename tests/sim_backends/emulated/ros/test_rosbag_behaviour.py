@@ -1,7 +1,7 @@
 """The robot's `rosbag` behaves like ROS's own: outputs, exit codes, files, signals.
 
 `tests/data/rosbag/1.15.15/outputs.json` has the output and behaviour of ROS's own, verbatim. Run this file as a
-program to record them again: `python -m tests.sim_backends.test_rosbag_behaviour`.
+program to record them again: `python -m tests.sim_backends.emulated.ros.test_rosbag_behaviour`.
 """
 
 import json
