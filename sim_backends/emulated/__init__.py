@@ -1,1 +1,1 @@
-"""Emulated robots: namespaces with real tools, and the process that carries their packets."""
+"""Emulated robots: namespaces with real tools, and a process that carries their packets."""

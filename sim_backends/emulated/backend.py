@@ -1,4 +1,4 @@
-"""The emulated backend: the lab of a site file, or the paper's, in namespaces on this machine."""
+"""The emulated backend: the robots of a site file, or the robots of the paper, in namespaces on this machine."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -31,29 +31,29 @@ from sim_backends.emulated.ros import messages
 from sim_backends.world.world import load_world
 
 if TYPE_CHECKING:
-    from fieldkit.lab.protocol import Lab, LabRobot, Overview  # which no trial needs
+    from fieldkit.lab.protocol import Lab, LabRobot, Overview  # a trial needs none of them
 
 DEFAULT_SITE: Final = Path(__file__).with_name("default.yaml")
 
-# Measured on 2 cores: three robots, from nothing to published topics.
+# Measured on 2 cores: from the start of three robots until they publish topics.
 _START_S: Final = {RosChoice.BUILTIN: 0.5, RosChoice.DEBIAN: 1.0}
 
 
 class EmulatedBackend:
-    """Emulated robots.
+    """Backend that runs each robot in namespaces of this machine.
 
     Args:
         site: The site file; None for the paper's lab.
-        document: Its document, for messages with lines.
+        document: The document of the site file, for error messages with line numbers.
 
     Raises:
         ConfigurationError: The `emulated:` section is wrong or names a robot that the lab does not have, the lab has
-            more robots than addresses, or one has the laptop's name.
+            more robots than addresses, or a robot has the name of the laptop.
     """
 
     by_hand: Final = False
     allow_motion = False
-    """Of no matter: nobody is hurt by an emulated robot."""
+    """Without effect: emulated robots endanger no person."""
 
     def __init__(self, site: Site | None, document: Document | None) -> None:
         if site is None:
@@ -66,7 +66,7 @@ class EmulatedBackend:
         hosts = [str(host) for host in NETWORK.hosts() if host != LAPTOP_ADDRESS]
         if len(site.robots) > len(hosts):
             raise ConfigurationError(
-                f"the lab has {len(site.robots)} robots, an emulated one holds {len(hosts)}",
+                f"the lab has {len(site.robots)} robots, but an emulated lab has addresses for {len(hosts)}",
                 where=document.where(("robots",)) if document else "",
                 remedy="split the site file",
             )
@@ -86,7 +86,7 @@ class EmulatedBackend:
             )
         if site.control is Control.RADIO and LAPTOP_NAME in site.robots:
             raise ConfigurationError(
-                f"with control: radio the name {LAPTOP_NAME!r} is the operator's",
+                f"with control: radio, the name {LAPTOP_NAME!r} is reserved for the operator's laptop",
                 where=document.where(("robots", LAPTOP_NAME)) if document else "",
                 remedy="give the robot another name",
             )
@@ -94,7 +94,7 @@ class EmulatedBackend:
 
     @property
     def lab_bytes(self) -> int:
-        """See `Backend.lab_bytes`; fixed links make no attempts to record."""
+        """Implement `Backend.lab_bytes`: fixed links have no transmission attempts to record."""
         if not self._options.record_air or self._options.radio.fixed:
             return 0
         from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (random streams of numpy: 20 ms)
@@ -102,7 +102,7 @@ class EmulatedBackend:
         return LIMIT_BYTES
 
     def cast(self, topology: Topology) -> Cast:
-        """See `Backend.cast`; addresses follow the order of the robots in the site file."""
+        """Implement `Backend.cast`; robots get addresses in their order in the site file."""
         cast = cast_of(self._site, self._document, topology, self._addresses)
         self._check_profiles(cast)
         return {
@@ -113,7 +113,10 @@ class EmulatedBackend:
         }
 
     def _drives(self, robot: Robot, cast: Cast) -> bool:
-        """Return whether a robot drives by its topic; where others would obey it, too, the lab moves it."""
+        """Return True if the robot drives by its topic.
+
+        If other robots of the cast would receive its velocities too, the lab moves the robot instead.
+        """
         return drives_by_topic(robot.profile, self._options) and disturbed(robot, cast.values()) is None
 
     @contextmanager
@@ -125,8 +128,8 @@ class EmulatedBackend:
         sink: Sink,
         operator: Operator,
     ) -> Iterator[Testbed]:
-        """See `Backend.open`."""
-        # A dry run asks for the cast alone, and needs neither SSH nor keys.
+        """Implement `Backend.open`."""
+        # A dry run needs only `cast`, and imports neither SSH nor keys.
         from sim_backends.emulated import requirements, testbed  # noqa: PLC0415
 
         ros = self._checked_ros(robot.name for robot in cast.values())
@@ -148,20 +151,16 @@ class EmulatedBackend:
             yield up
 
     def standing(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:  # noqa: ARG002 (none)
-        """See `Backend.standing`; these robots end with their lab."""
+        """Implement `Backend.standing`: emulated robots stop with their lab, so there are none."""
         return nullcontext({})
 
     @contextmanager
     def open_lab(self, *, seed: int, sink: Sink) -> "Iterator[Lab]":
-        """See `LabBackend.open_lab`."""
+        """Implement `LabBackend.open_lab`."""
         from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
 
         if self._site.control is Control.RADIO:
-            sink(
-                Note(
-                    "control: radio is for trials; in a lab SSH reaches every robot, wherever it is, beside its radio"
-                )
-            )
+            sink(Note("control: radio applies to trials; in a lab SSH bypasses the radio and reaches every robot"))
         members = self._members()
         ros = self._checked_ros(members)
         _check_bridges(members, ros)
@@ -170,7 +169,7 @@ class EmulatedBackend:
             yield up
 
     def overview(self) -> "Overview":
-        """See `LabBackend.overview`; without shadowing, which a seed draws."""
+        """Implement `LabBackend.overview`, without shadowing, which depends on the seed."""
         from sim_backends.emulated import lab, placement  # noqa: PLC0415 (as in `open`)
 
         members = self._members()
@@ -190,7 +189,7 @@ class EmulatedBackend:
                 messages.check(sensor)
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
-        """Check this machine for what the robots of these names need; return where their ROS comes from."""
+        """Check that this machine has the programs that these robots need, and return the source of their ROS."""
         from sim_backends.emulated import requirements  # noqa: PLC0415 (as in `open`)
 
         variants = self._options.robots
@@ -208,47 +207,48 @@ def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
         _check_ros2(robot.name, ros, options.ros2)
     if ros.variant == "ros2" and options.ros is RosChoice.DEBIAN:
         raise ConfigurationError(
-            f"profile {robot.profile.name} runs ros2, and the site file asks for Debian's ROS, which is ROS 1",
+            f"profile {robot.profile.name} runs ros2, but the site file requests Debian's ROS, which is ROS 1",
             where=robot.name,
             remedy="write ros: auto, or set variant: ros1 in a copy of the profile",
         )
     if ros.variant == "ros2" and any(topic.definition for topic in ros.topics):
         raise ConfigurationError(
-            f"profile {robot.profile.name} runs ros2, whose emulated recorder knows ROS's own types alone",
+            f"profile {robot.profile.name} runs ros2, whose emulated recorder supports only ROS's own types",
             where=robot.name,
-            remedy="leave topics with a definition out of a copy of the profile",
+            remedy="remove the topics that have a definition from a copy of the profile",
         )
-    if impossible := rootfs.not_to_be_held(ros.command.setup):
+    if unsupported := rootfs.unsupported_paths(ros.command.setup):
         raise ConfigurationError(
-            f"a robot cannot have a setup file {impossible[0]}: it lies at the top, or in a folder of the kernel's",
+            f"a robot cannot have the setup file {unsupported[0]}: it is in the root directory or in a kernel folder",
             where=robot.name,
-            remedy="name one in another folder",
+            remedy="move it to another folder",
         )
 
 
 def _check_bridges(robots: "Mapping[RobotKey, Robot | LabRobot]", ros: RosChoice) -> None:
-    """Stop where a profile asks for a bridge from ROS 1, and there is no ROS master."""
+    """Raise ConfigurationError if a profile has a bridge from ROS 1 but the lab has no ROS master."""
     for robot in robots.values():
         if ros is RosChoice.BUILTIN and robot.profile.ros is not None and robot.profile.ros.bridge is not None:
             raise ConfigurationError(
-                f"profile {robot.profile.name} asks for a bridge, which needs Debian's ROS",
+                f"profile {robot.profile.name} has a bridge, which needs Debian's ROS",
                 where=robot.name,
                 remedy="apt-get install --no-install-recommends python3-rosmaster python3-rospy python3-rosbag "
-                "python3-sensor-msgs; or leave bridge out of a copy of the profile",
+                "python3-sensor-msgs; or remove bridge from a copy of the profile",
             )
 
 
 def _check_ros2(name: str, ros: Ros, options: Ros2Options) -> None:
-    """See that a robot can speak ROS 2 as its profile and the lab say."""
+    """Raise ConfigurationError if the lab does not support the ROS 2 settings of a profile."""
     if options.discovery == "router" and ros.middleware != "zenoh":
         raise ConfigurationError(
-            "emulated.ros2 has a router, and the profile speaks over DDS, which has none",
+            "emulated.ros2 has a router, but the profile uses DDS, which has no router",
             where=name,
             remedy="write rmw: zenoh in a copy of the profile, or discovery: peers in the site file",
         )
     if ros.domain > MOST_DOMAIN:
         raise ConfigurationError(
-            f"the ports of ROS_DOMAIN_ID {ros.domain} of the profile are those that Linux gives to anybody",
+            f"the ports of ROS_DOMAIN_ID {ros.domain} of the profile are ephemeral ports of Linux, which any program "
+            "may use",
             where=name,
-            remedy=f"0 to {MOST_DOMAIN}",
+            remedy=f"use a domain from 0 to {MOST_DOMAIN}",
         )

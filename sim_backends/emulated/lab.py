@@ -1,4 +1,4 @@
-"""All robots of a site file, up to play with: nobody has a role, everybody talks directly to everybody."""
+"""Interactive lab: all robots of a site file are up, none has a role, and all of them communicate directly."""
 
 import socket
 import threading
@@ -19,7 +19,7 @@ from sim_backends.emulated import placement
 from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.robot.spec import USER
-from sim_backends.emulated.ros.own_motion import OwnWay
+from sim_backends.emulated.ros.own_motion import AssignedPath
 from sim_backends.emulated.startup import RunningRobots, running_robots
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from sim_backends.world.motion import State
@@ -27,13 +27,13 @@ from sim_backends.world.world import World
 
 
 class EmulatedLab:
-    """Robots that are up, in the middle of their world until they are moved.
+    """Running robots, in the middle of their world until they are moved.
 
     Args:
-        members: The robots.
-        up: What runs.
+        members: The robots by name.
+        up: The running robots and their medium.
         options: The lab's options.
-        world: What they stand in.
+        world: The world around the robots.
 
     Raises:
         LinkError: The medium ended or did not answer.
@@ -46,10 +46,10 @@ class EmulatedLab:
         self._options = options
         self._world = world
         self._places_m = placement.square_m(members, world)
-        self._ways_ns: dict[str, int] = {}
+        self._path_starts_ns: dict[str, int] = {}
         self._states: dict[str, State] = {}
-        # A robot that steers itself is followed in a thread of its own.
-        self._turn = threading.RLock()
+        # A separate thread follows robots that steer themselves.
+        self._lock = threading.RLock()
         up.medium.place(self._places_m)
         up.places.write(self._places_m)
         for name in members:
@@ -58,21 +58,21 @@ class EmulatedLab:
         self.login = Login(USER, up.private_key, up.host_keys)
 
     def connect(self, name: str, timeout_s: float) -> socket.socket:
-        """See `Lab.connect`."""
+        """Implement `Lab.connect`."""
         return self._up.robots[name].connect(timeout_s)
 
     def programs(self, name: str) -> tuple[str, ...]:
-        """See `Lab.programs`; the kernel knows them, so that a robot that hangs is told about as well."""
+        """Implement `Lab.programs` from `/proc`, which also works for a robot that does not respond."""
         return tuple(dict.fromkeys(_programs(self._up.robots[name].pid)))
 
     def place_m(self, name: str) -> Vector:
-        """See `Lab.place_m`."""
-        with self._turn:
+        """Implement `Lab.place_m`."""
+        with self._lock:
             return self._places_m[name]
 
     def move(self, name: str, to: Destination) -> Vector:
-        """See `Lab.move`."""
-        with self._turn:
+        """Implement `Lab.move`."""
+        with self._lock:
             place_m = placement.moved_m(self._places_m[name], to, self._world)
             places_m = self._places_m | {name: place_m}
             self._up.medium.place(places_m)
@@ -82,24 +82,24 @@ class EmulatedLab:
             return place_m
 
     def _put(self, name: str) -> None:
-        """Tell a robot where it is; it faces east."""
-        self._ways_ns[name] = began_ns = time.monotonic_ns()
-        self._up.robots[name].move(OwnWay(began_ns, [self._places_m[name]], speed_m_s=1.0, facing_rad=0.0))
+        """Send a robot its new place; it faces east there."""
+        self._path_starts_ns[name] = start_ns = time.monotonic_ns()
+        self._up.robots[name].move(AssignedPath(start_ns, [self._places_m[name]], speed_m_s=1.0, facing_rad=0.0))
 
     def watching(self) -> AbstractContextManager[object]:
-        """Return a context in which the medium is told of robots that steer themselves."""
+        """Return a context that keeps the medium up to date with robots that steer themselves."""
         if not any(robot.spec.steers for robot in self._up.robots.values()):
             return nullcontext()
         return MotionThread(self._follow, "watch")
 
     def _follow(self) -> float:
-        """Take in where robots have gone by their own power; return when to do it again."""
-        with self._turn:
+        """Update the places of robots that steer themselves; return the seconds until the next update."""
+        with self._lock:
             states = {
-                name: said.state
+                name: motion.state
                 if self.members[name].profile.mavlink is not None
-                else placement.on_ground(said.state, self._world)
-                for name, said in self_steered(self._up.robots, self._ways_ns).items()
+                else placement.on_ground(motion.state, self._world)
+                for name, motion in self_steered(self._up.robots, self._path_starts_ns).items()
             }
             if states != self._states:
                 self._states = states
@@ -110,7 +110,7 @@ class EmulatedLab:
         return WATCH_S
 
     def overview(self) -> Overview:
-        """See `Lab.overview`."""
+        """Implement `Lab.overview`."""
         return overview(self.members, self._places_m, self._options, self._world)
 
 
@@ -118,10 +118,10 @@ class EmulatedLab:
 def bring_up(
     members: Mapping[str, LabRobot], *, options: EmulatedOptions, world: World, ros: RosChoice, seed: int
 ) -> Iterator[EmulatedLab]:
-    """Yield robots that stand in the middle of their world.
+    """Yield running robots in the middle of their world.
 
     Raises:
-        FieldkitError: A robot or the medium did not come up.
+        FieldkitError: A robot or the medium did not start.
     """
     with running_robots(members, options=options, world=world, ros=ros, seed=seed) as up:
         lab = EmulatedLab(members, up, options, world)
@@ -134,8 +134,8 @@ def members_of(site: Site, document: Document | None, addresses: Mapping[str, st
 
     Args:
         site: The site file.
-        document: Its document, for messages with lines.
-        addresses: Address on the radio per robot.
+        document: The document of the site file, for error messages with line numbers.
+        addresses: Radio address of each robot.
 
     Raises:
         ConfigurationError: A profile is missing or wrong.
@@ -151,7 +151,7 @@ def members_of(site: Site, document: Document | None, addresses: Mapping[str, st
 def overview(
     members: Mapping[str, LabRobot], places_m: Mapping[str, Vector], options: EmulatedOptions, world: World
 ) -> Overview:
-    """Return robots from above, without shadowing, which a seed draws."""
+    """Return the map of the lab, computed without shadowing, which depends on the seed."""
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
     channel = WorldChannel(
         0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world
@@ -162,12 +162,12 @@ def overview(
     first, second = (np.array([places_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
     links = [
         LabLink(
-            (names[one], names[two]),
-            min(channel.snr_db(one, two), channel.snr_db(two, one)),
-            channel.linked(one, two),
+            (names[first_index], names[second_index]),
+            min(channel.snr_db(first_index, second_index), channel.snr_db(second_index, first_index)),
+            channel.linked(first_index, second_index),
             tuple(dict.fromkeys(crossing.obstacle for crossing in crossed)),
         )
-        for (one, two), crossed in zip(pairs, world.crossings(first, second), strict=True)
+        for (first_index, second_index), crossed in zip(pairs, world.crossings(first, second), strict=True)
     ]
     parts = sorted(world.parts, key=lambda part: part.shape.top_m)
     outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]
@@ -176,18 +176,18 @@ def overview(
 
 
 def _programs(robot_pid: int) -> Iterator[str]:
-    """Yield the name of each process of a robot but its first one, which holds it."""
-    waiting = [pid for first in _children(robot_pid) for pid in _children(first)]
-    while waiting:
-        yield from filter(None, map(_name, waiting))
-        waiting = [child for pid in waiting for child in _children(pid)]
+    """Yield the name of each process of a robot except its init process."""
+    pending = [pid for first in _children(robot_pid) for pid in _children(first)]
+    while pending:
+        yield from filter(None, map(_name, pending))
+        pending = [child for pid in pending for child in _children(pid)]
 
 
 def _children(pid: int) -> list[int]:
     try:
         return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()]
     except OSError:
-        return []  # it ended meanwhile
+        return []  # the process has exited
 
 
 def _name(pid: int) -> str:

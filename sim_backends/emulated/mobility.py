@@ -1,4 +1,4 @@
-"""Mobility of robots in an emulated lab: where everybody is, as the medium is told, and since when."""
+"""Mobility of robots in an emulated lab: places and velocities over time, as the medium receives them."""
 
 import math
 import threading
@@ -21,33 +21,33 @@ from sim_backends.world.motion import STILL, Motion, State
 from sim_backends.world.world import World
 
 STEP_M: Final = 0.1
-"""How far a robot may go until the medium is told again.
+"""Distance that a robot may move between two updates of the medium.
 
 Loss grows by 10 n / (ln 10 d) dB per metre, with n = 3 by 1.3 dB/m at 10 m: a step is 0.13 dB there. Fading, which
-turns within a wavelength of 0.12 m, goes on between the steps.
+changes within a wavelength of 0.12 m, continues between the updates.
 """
 
-_SHORTEST_S: Final = 0.02
-_LONGEST_S: Final = 0.1
+_MIN_PERIOD_S: Final = 0.02
+_MAX_PERIOD_S: Final = 0.1
 
 WATCH_S: Final = 0.05
-"""How often robots that may steer themselves are looked at while they stand: 1 cm late at 0.2 m/s."""
+"""Polling interval for robots that steer themselves, while they are at rest: at 0.2 m/s an error of 1 cm."""
 
 
 class MotionThread:
-    """Tells of a motion, step by step; use as a context manager, whose end is the end of the thread.
+    """Thread that reports a motion step by step; use it as a context manager, which stops the thread on leaving.
 
     Args:
-        step: Tells where robots are now; returns after how many seconds to call it again, None when they stand.
+        step: Reports where the robots are now; returns the seconds until its next call, or None at the end.
         name: Name of the thread.
 
     Raises:
-        FieldkitError: `step` did; raised when the context is left, unless its body raised.
+        FieldkitError: The error of `step`, raised when the context is left, unless its body raised.
     """
 
     def __init__(self, step: Callable[[], float | None], name: str = "motion") -> None:
         self._step = step
-        self._left = threading.Event()
+        self._stop = threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
@@ -58,47 +58,47 @@ class MotionThread:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._left.set()
+        self._stop.set()
         self._thread.join()
         if self._error is not None and error is None:
             raise self._error
 
     def _run(self) -> None:
         try:
-            while (wait_s := self._step()) is not None and not self._left.wait(wait_s):
+            while (wait_s := self._step()) is not None and not self._stop.wait(wait_s):
                 continue
-        except BaseException as error:  # noqa: BLE001 (whoever leaves the context gets it)
+        except BaseException as error:  # noqa: BLE001 (raised in the thread that leaves the context)
             self._error = error
 
 
 def self_steered(
-    robots: Mapping[RobotKey, EmulatedRobot], ways_ns: Mapping[RobotKey, int]
+    robots: Mapping[RobotKey, EmulatedRobot], path_starts_ns: Mapping[RobotKey, int]
 ) -> dict[RobotKey, Steered]:
-    """Return how robots move now by their own power that have used it since the lab put them where they were.
+    """Return the current motion of each robot that has steered itself since the lab assigned its last path.
 
     Args:
         robots: The robots.
-        ways_ns: When each was last told a way; what one says of an older one is over.
+        path_starts_ns: Start of each robot's last assigned path; motion that refers to an earlier path is ignored.
     """
     now_ns = time.monotonic_ns()
-    said = {key: robot.steered() for key, robot in robots.items()}
+    recorded = {key: robot.steered() for key, robot in robots.items()}
     return {
         key: steered.at(now_ns) if steered.moves else steered
-        for key, steered in said.items()
-        if steered is not None and steered.way_ns == ways_ns.get(key)
+        for key, steered in recorded.items()
+        if steered is not None and steered.path_start_ns == path_starts_ns.get(key)
     }
 
 
 class Mobility:
-    """Puts robots in their places, lets them move, takes one away and brings it back.
+    """Places robots, moves them, and takes one out of range.
 
     Args:
-        cast: Who plays which role.
-        medium: Carries their packets.
-        world: What they stand in.
-        laptop: Stands among them; None where it is not on the air.
-        robots: Told how they move, for their sensors; those that steer themselves say where they are.
-        show: Takes where each robot is, metres east, north, up, for the lasers of the others.
+        cast: The robot of each role.
+        medium: The medium that carries the robots' packets.
+        world: The world around the robots.
+        laptop: The operator's laptop, placed beside the robots; None if it is not on the air.
+        robots: Handles of the robots, which get their paths and report motion of their own.
+        show: Called with each robot's position, metres east, north, up, for the lasers of the other robots.
     """
 
     def __init__(
@@ -119,94 +119,93 @@ class Mobility:
         self._laptop = laptop
         self._placement: Placement | None = None
         self._away: Role | None = None
-        # Each with when it began, by the monotonic clock.
+        # Each with its start, by the monotonic clock.
         self._motions: list[tuple[int, Motion]] = []
-        # When each robot was last told a way: what it says of an older one is over.
-        self._ways_ns: dict[Role, int] = {}
-        self._seen: dict[Role, Steered] = {}
+        # Start of each robot's last assigned path; motion that refers to an earlier path is ignored.
+        self._path_starts_ns: dict[Role, int] = {}
+        self._last_steered: dict[Role, Steered] = {}
         self._track: list[Whereabouts] = []
-        # A robot that moves does so in a thread of its own.
-        self._turn = threading.RLock()
+        # Each motion runs in a separate thread.
+        self._lock = threading.RLock()
 
     def place(self, placement: Placement) -> None:
-        """Put everybody in place, at once.
+        """Put all robots in place, immediately.
 
         Raises:
             LinkError: The medium ended or did not answer.
         """
-        with self._turn:
+        with self._lock:
             self._placement = placement
-            # Robots first: what one says of its own way is over with the new one.
+            # Robots before the medium: the new path invalidates motion that refers to the old one.
             for role in self._robots:
-                self._tell_robot(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
-            self._tell()
+                self._send_path(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
+            self._update_medium()
 
-    def put_back(self, role: Role) -> None:
-        """Put one robot back in its place, at once; errors as `put_away`."""
-        with self._turn:
-            self._tell_robot(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
-            self._tell()
+    def return_to_place(self, role: Role) -> None:
+        """Put one robot back in its place, immediately; errors as `set_out_of_range`."""
+        with self._lock:
+            self._send_path(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
+            self._update_medium()
 
-    def put_away(self, role: Role | None) -> None:
-        """Take one robot out of everybody's range, or bring it back with None.
+    def set_out_of_range(self, role: Role | None) -> None:
+        """Take one robot out of the range of all others, or bring it back with None.
 
-        Without the relay nobody hears anybody.
+        Without the relay no robot receives another.
 
         Raises:
             LinkError: The medium ended or did not answer.
-            RobotError: Nobody has a place yet.
+            RobotError: The robots have no places yet.
         """
-        with self._turn:
-            self._placed()
+        with self._lock:
+            self._require_placement()
             self._away = role
-            self._tell()
+            self._update_medium()
 
     @contextmanager
     def moving(self, move: Move) -> Iterator[None]:
-        """Let a robot move while the body runs; it is back at its place afterwards, at once, whatever ended the body.
+        """Let a robot move while the body runs; afterwards, also after an error, it is back at its place immediately.
 
         Raises:
             LinkError: The medium ended or did not answer.
-            RobotError: Nobody has a place yet.
+            RobotError: The robots have no places yet.
         """
-        motion = places.motion(self._cast, self._placed(), move, self._world)
+        motion = places.motion(self._cast, self._require_placement(), move, self._world)
         entry = time.monotonic_ns(), motion
-        with self._turn:
+        with self._lock:
             self._motions.append(entry)
         try:
-            self._tell_robot(move, entry[0])
-            with MotionThread(self._tell):
+            self._send_path(move, entry[0])
+            with MotionThread(self._update_medium):
                 yield
         finally:
-            with self._turn:
+            with self._lock:
                 self._motions.remove(entry)
-                self._tell()
-            self._tell_robot(Move(move.role, (), move.speed_m_s), time.monotonic_ns())
+                self._update_medium()
+            self._send_path(Move(move.role, (), move.speed_m_s), time.monotonic_ns())
 
     def watching(self) -> AbstractContextManager[object]:
-        """Return a context in which the medium is told of robots that steer themselves."""
+        """Return a context that keeps the medium up to date with robots that steer themselves."""
         if not any(robot.spec.steers for robot in self._robots.values()):
             return nullcontext()
         return MotionThread(self._watch, "watch")
 
     def _watch(self) -> float:
-        """Tell of robots that moved themselves since they were looked at last; return when to look again."""
-        with self._turn:
-            said = self._steered()
-            if said == self._seen and not any(steered.moves for steered in said.values()):
+        """Update the medium if a robot has moved itself; return the seconds until the next call."""
+        with self._lock:
+            steered = self._steered()
+            if steered == self._last_steered and not any(motion.moves for motion in steered.values()):
                 return WATCH_S
-            self._seen = said
-            self._tell()
-            fastest_m_s = max((math.hypot(*steered.velocity_m_s) for steered in said.values()), default=0.0)
-            return min(max(STEP_M / fastest_m_s, _SHORTEST_S), WATCH_S) if fastest_m_s else WATCH_S
+            self._last_steered = steered
+            self._update_medium()
+            fastest_m_s = max((math.hypot(*motion.velocity_m_s) for motion in steered.values()), default=0.0)
+            return min(max(STEP_M / fastest_m_s, _MIN_PERIOD_S), WATCH_S) if fastest_m_s else WATCH_S
 
     def _steered(self) -> dict[Role, Steered]:
-        """Return how robots move by their own power that have used it since they were put in their places."""
-        return self_steered(self._robots, self._ways_ns)
+        return self_steered(self._robots, self._path_starts_ns)
 
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
-        """Return where each robot was from a moment on; what was before it is forgotten."""
-        with self._turn:
+        """Return the positions of all robots from a time on; earlier ones are discarded."""
+        with self._lock:
             last = {
                 whereabouts.role: number
                 for number, whereabouts in enumerate(self._track)
@@ -219,46 +218,46 @@ class Mobility:
             ]
             return tuple(self._track)
 
-    def _tell_robot(self, move: Move, began_ns: int) -> None:
-        """Tell a robot how it moves."""
-        placement = self._placed()
+    def _send_path(self, move: Move, start_ns: int) -> None:
+        """Send a robot the path of a move, if the placement has a place for it."""
+        placement = self._require_placement()
         if move.role in self._robots and move.role in geometry.positions_m(placement):
-            self._ways_ns[move.role] = began_ns
-            self._robots[move.role].move(places.own_way(placement, move, self._world, began_ns))
+            self._path_starts_ns[move.role] = start_ns
+            self._robots[move.role].move(places.assigned_path(placement, move, self._world, start_ns))
 
-    def _placed(self) -> Placement:
+    def _require_placement(self) -> Placement:
         if self._placement is None:
             raise RobotError("the robots have no places yet", remedy="place them first")
         return self._placement
 
-    def _tell(self) -> float | None:
-        """Tell the medium where everybody is now; return when to do it again, in seconds, None while all stand."""
-        with self._turn:
-            placement, now_ns = self._placed(), time.monotonic_ns()
+    def _update_medium(self) -> float | None:
+        """Send the medium all positions; return the seconds until the next update, or None without motion."""
+        with self._lock:
+            placement, now_ns = self._require_placement(), time.monotonic_ns()
             positions_m = places.positions_m(self._cast, placement, self._world)
             states = {name: State(place_m) for name, place_m in positions_m.items()}
-            for began_ns, motion in self._motions:
-                states |= motion.at(now_ns - began_ns)
+            for start_ns, motion in self._motions:
+                states |= motion.at(now_ns - start_ns)
             states |= {
-                self._cast[role].name: self._on_its_own(role, steered) for role, steered in self._steered().items()
+                self._cast[role].name: self._steered_state(role, steered) for role, steered in self._steered().items()
             }
             relay = places.relay(self._cast, placement)
             if self._laptop is not None:
                 states[self._laptop.name] = State(places.laptop_m(self._cast, placement, self._world))
-            gone = None if self._away is None else self._cast[self._away].name
-            self._show({name: state.position_m for name, state in states.items() if name != gone})
-            if gone is not None:
-                states = {} if gone == relay else {name: state for name, state in states.items() if name != gone}
+            away = None if self._away is None else self._cast[self._away].name
+            self._show({name: state.position_m for name, state in states.items() if name != away})
+            if away is not None:
+                states = {} if away == relay else {name: state for name, state in states.items() if name != away}
             self._medium.place(
                 {name: state.position_m for name, state in states.items()},
                 relay=relay if relay in states else None,
                 velocities_m_s={name: state.velocity_m_s for name, state in states.items()},
             )
-            self._note(states)
-            return self._due_s(now_ns, states)
+            self._extend_track(states)
+            return self._next_update_s(now_ns, states)
 
-    def _note(self, states: Mapping[str, State]) -> None:
-        """Write down who is elsewhere than before, or moves otherwise."""
+    def _extend_track(self, states: Mapping[str, State]) -> None:
+        """Append robots whose position or velocity has changed to the track."""
         utc_ns = time.time_ns()
         last = {whereabouts.role: whereabouts for whereabouts in self._track}
         for role, robot in self._cast.items():
@@ -268,20 +267,19 @@ class Mobility:
             if before is None or (before.position_m, before.velocity_m_s) != now:
                 self._track.append(Whereabouts(utc_ns, role, *now))
 
-    def _on_its_own(self, role: Role, said: Steered) -> State:
-        """Return the state of a robot that steers itself; one that does not fly is on the ground of the world."""
-        state = said.state
+    def _steered_state(self, role: Role, steered: Steered) -> State:
+        """Return the state of a robot that steers itself; a ground robot is at the height of the ground."""
         flies = self._cast[role].profile.mavlink is not None
-        return state if flies else places.on_ground(state, self._world)
+        return steered.state if flies else places.on_ground(steered.state, self._world)
 
-    def _due_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:
+    def _next_update_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:
         left_ns = [
-            math.inf if motion.end_ns is None else began_ns + motion.end_ns - now_ns
-            for began_ns, motion in self._motions
+            math.inf if motion.end_ns is None else start_ns + motion.end_ns - now_ns
+            for start_ns, motion in self._motions
         ]
         if all(left <= 0 for left in left_ns):
             return None
         fastest_m_s = max((math.hypot(*state.velocity_m_s) for state in states.values()), default=0.0)
-        step_s = STEP_M / fastest_m_s if fastest_m_s else _LONGEST_S
+        step_s = STEP_M / fastest_m_s if fastest_m_s else _MAX_PERIOD_S
         next_end_s = min(left for left in left_ns if left > 0) / 1e9
-        return min(max(step_s, _SHORTEST_S), _LONGEST_S, next_end_s)
+        return min(max(step_s, _MIN_PERIOD_S), _MAX_PERIOD_S, next_end_s)

@@ -1,4 +1,4 @@
-"""Handles on the nodes of an emulated lab: emulated robots, and the operator's laptop where SSH crosses the radio."""
+"""Handles of the nodes of an emulated lab: robots, and the operator's laptop if SSH uses the radio."""
 
 import os
 import socket
@@ -15,23 +15,23 @@ from sim_backends.emulated.provisioning import LAPTOP_NAME
 from sim_backends.emulated.robot.init import START_S
 from sim_backends.emulated.robot.spec import HOME, RobotSpec
 from sim_backends.emulated.robot.ssh_server import SSH_PORT
-from sim_backends.emulated.ros.own_motion import OwnWay
+from sim_backends.emulated.ros.own_motion import AssignedPath
 from sim_backends.emulated.ros.steered import Steered, SteeredRecord
 
-# Like the robots' own radios, so that a link is as good in both directions.
+# Equal to the robots' own radios, so that a link has the same quality in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
 
 
 class Node:
     """A process tree in its own network, mount, PID, UTS and IPC namespaces; use as a context manager.
 
-    It ends as a `Worker` does, and is made in a thread as that wants it. It is made at once; the first request waits
-    until it is up.
+    The process starts when the object is made, and the first request waits until it is up. It stops as a `Worker`
+    does, so make the object in a thread that lives as long as the lab.
 
     Args:
         name: Its name in the lab.
         interface: Name of its radio interface.
-        address: Its IPv4 address on the radio with the length of the network, `10.42.0.1/24`.
+        address: Its IPv4 address on the radio with the prefix length, `10.42.0.1/24`.
 
     Raises:
         ConfigurationError: A program of util-linux is missing.
@@ -52,24 +52,24 @@ class Node:
 
     @property
     def pid(self) -> int:
-        """Process id of the outermost process, whose end is the node's."""
+        """Process id of the outermost process; when it exits, all processes of the node exit."""
         return self._worker.pid
 
     def open_radio(self, *, mesh: bool = False, guest_hello_s: float | None = None) -> None:
-        """Bring up its radio interface.
+        """Bring up the radio interface.
 
         Args:
-            mesh: Whether robots forward for each other.
-            guest_hello_s: How often it says hello to robots that forward to it, and for which it forwards nothing;
-                None for who starts a routing daemon of its own, or needs none.
+            mesh: True if robots forward packets for each other.
+            guest_hello_s: Hello interval of a node that uses the robots' routes and forwards nothing itself; None if
+                the node starts a routing daemon of its own, or needs none.
 
         Raises:
-            LinkError: It ended or did not answer.
-            RobotError: Its kernel or its tools refused.
+            LinkError: The node has exited or did not answer.
+            RobotError: A kernel call or a tool failed.
         """
-        own = {"interface": self.interface, "address": self.address}
-        request = {"do": "open radio", **own, "mesh": mesh, "guest_hello_s": guest_hello_s}
-        _, (self._radio_fd,) = self._worker.ask(request)
+        link = {"interface": self.interface, "address": self.address}
+        request = {"do": "open radio", **link, "mesh": mesh, "guest_hello_s": guest_hello_s}
+        _, (self._radio_fd,) = self._worker.request(request)
 
     @property
     def radio_fd(self) -> int:
@@ -83,15 +83,15 @@ class Node:
         return self._radio_fd
 
     def stream_to(self, host: str, port: int, timeout_s: float) -> socket.socket:
-        """Return a TCP connection from inside its network namespace.
+        """Return a TCP connection from inside the node's network namespace.
 
         Raises:
-            OSError: There was none in time, or the node is busy.
-            TestbedLostError: The node ended.
+            OSError: The connection was not made in time, or the node is busy.
+            TestbedLostError: The node has exited.
         """
         try:
-            # Made there, connected here: whoever does not answer keeps this thread waiting, and not the node.
-            _, (fd,) = self._worker.ask({"do": "socket"})
+            # The socket is made in the node and connected here, so that a slow peer blocks this thread, not the node.
+            _, (fd,) = self._worker.request({"do": "socket"})
         except TestbedLostError:
             raise
         except (LinkError, RobotError) as error:
@@ -106,15 +106,15 @@ class Node:
         return stream
 
     def demand_up(self) -> None:
-        """Return if the node runs; raises as `Worker.demand_up`."""
+        """Raise the errors of `Worker.demand_up` if the node does not run."""
         self._worker.demand_up()
 
     def hang_up(self) -> None:
-        """Let the node end, without waiting for it; requests under way fail at once."""
+        """Request that the node stops, without waiting for it; requests under way fail immediately."""
         self._worker.hang_up()
 
     def close(self) -> None:
-        """End the node and wait until it is gone; does nothing the second time."""
+        """Stop the node and wait until its processes have exited; a second call does nothing."""
         self._worker.close()
         if self._radio_fd is not None:
             os.close(self._radio_fd)
@@ -122,12 +122,12 @@ class Node:
 
 
 class EmulatedRobot(Node):
-    """A node with a file system of its own and a robot's programs.
+    """A node with a separate file system and a robot's programs.
 
     Args:
-        spec: What it is told about itself.
-        places_fd: Descriptor of the memory with the places of all robots (`neighbours.PlacesWriter`), open until it
-            is built; None for a robot that is alone.
+        spec: Specification of the robot.
+        places_fd: Descriptor of the memory with the places of all robots (`neighbours.PlacesWriter`), which must stay
+            open until `build` has returned; None for a robot without neighbours.
 
     Raises:
         ConfigurationError: As `Node`.
@@ -140,42 +140,42 @@ class EmulatedRobot(Node):
         self._record: SteeredRecord | None = None
 
     def build(self) -> None:
-        """Give the robot its name and its own file system. Errors as `open_radio`."""
+        """Give the robot its host name and its file system. Errors as `open_radio`."""
         shared = () if self._places_fd is None else (self._places_fd,)
-        _, (fd,) = self._worker.ask({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
+        _, (fd,) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
         self._record = SteeredRecord(fd)
 
     def steered(self) -> Steered | None:
-        """Return how it moved by its own power, when it said so last; None if it never did. It is not asked."""
+        """Return the motion that the robot recorded last, or None if it never steered itself. Sends no request."""
         return None if self._record is None else self._record.read()
 
     def start(self) -> None:
-        """Start its programs and return when they serve. Errors as `open_radio`."""
-        self._worker.ask({"do": "start", "robot": asdict(self.spec)}, timeout_s=START_S + REPLY_S)
+        """Start the robot's programs and return when they serve. Errors as `open_radio`."""
+        self._worker.request({"do": "start", "robot": asdict(self.spec)}, timeout_s=START_S + REPLY_S)
 
     def switch_off(self) -> None:
-        """Take its radio interface down. Errors as `open_radio`."""
-        self._worker.ask({"do": "switch off", "interface": self.spec.interface})
+        """Take the radio interface down. Errors as `open_radio`."""
+        self._worker.request({"do": "switch off", "interface": self.spec.interface})
 
     def switch_on(self) -> None:
-        """Bring its radio interface up again. Errors as `open_radio`."""
-        self._worker.ask({"do": "switch on", "interface": self.spec.interface})
+        """Bring the radio interface up again. Errors as `open_radio`."""
+        self._worker.request({"do": "switch on", "interface": self.spec.interface})
 
     def kill(self, process: str) -> None:
-        """End every process of this name. Errors as `open_radio`; there may be none."""
-        self._worker.ask({"do": "kill", "process": process})
+        """Kill every process of this name. Errors as `open_radio`, also if there is none."""
+        self._worker.request({"do": "kill", "process": process})
 
-    def move(self, way: OwnWay) -> None:
-        """Let its sensors know how it moves. Errors as `open_radio`."""
-        self._worker.ask({"do": "move", "way": asdict(way)})
+    def move(self, path: AssignedPath) -> None:
+        """Send the robot's sensors the path on which the lab moves it. Errors as `open_radio`."""
+        self._worker.request({"do": "move", "way": asdict(path)})
 
     def halt(self) -> None:
-        """Take its power: all processes but its first end, what lies in memory is gone. Errors as `open_radio`."""
-        self._worker.ask({"do": "halt", "interface": self.spec.interface})
+        """Cut the power: all processes except init are killed, and memory is lost. Errors as `open_radio`."""
+        self._worker.request({"do": "halt", "interface": self.spec.interface})
 
     def boot(self) -> None:
-        """Start it after `halt`: interface up, programs starting. Errors as `open_radio`."""
-        self._worker.ask({"do": "boot", "interface": self.spec.interface, "robot": asdict(self.spec)})
+        """Boot after `halt`: the interface is up and the programs are starting. Errors as `open_radio`."""
+        self._worker.request({"do": "boot", "interface": self.spec.interface, "robot": asdict(self.spec)})
 
     @override
     def close(self) -> None:
@@ -185,15 +185,18 @@ class EmulatedRobot(Node):
             self._record = None
 
     def connect(self, timeout_s: float) -> socket.socket:
-        """Return a stream to its SSH server over its own loopback, past every radio. Errors as `stream_to`."""
+        """Return a TCP connection to the robot's SSH server over its loopback, which bypasses the radio.
+
+        Errors as `stream_to`.
+        """
         return self.stream_to("127.0.0.1", SSH_PORT, timeout_s)
 
 
 class Laptop(Node):
-    """A node that reaches robots over the medium.
+    """A node from which SSH reaches the robots over the medium.
 
     Args:
-        address: Its address with the length of the network.
+        address: Its address with the prefix length.
 
     Raises:
         ConfigurationError: As `Node`.
@@ -203,5 +206,5 @@ class Laptop(Node):
         super().__init__(LAPTOP_NAME, interface=LAPTOP_RADIO.interface, address=address)
 
     def reach(self, address: str, timeout_s: float) -> socket.socket:
-        """Return a stream to the SSH server of the robot at `address`. Errors as `stream_to`."""
+        """Return a TCP connection to the SSH server of the robot at `address`. Errors as `stream_to`."""
         return self.stream_to(address, SSH_PORT, timeout_s)

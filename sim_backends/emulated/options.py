@@ -23,18 +23,18 @@ class RosChoice(StrEnum):
 
 
 ROS_FILES: Final = ("/usr/bin/rosbag", "/usr/bin/rosmaster", "/usr/lib/python3/dist-packages/rospy")
-"""By which Debian's ROS is known to be installed."""
+"""Files whose presence shows that Debian's ROS is installed."""
 
 
 def uses_debian_ros(choice: RosChoice) -> bool:
-    """Return whether robots with ROS 1 have Debian's, by choice or because it is installed."""
+    """Return True if robots with ROS 1 use Debian's ROS, by choice or because it is installed."""
     if choice is RosChoice.AUTO:
         return all(Path(path).exists() for path in ROS_FILES)
     return choice is RosChoice.DEBIAN
 
 
 class RobotOptions(Strict):
-    """Which variant of each tool one robot has; what is not said is as on this machine.
+    """Tool variants of one robot; a tool that is not named is that of this machine.
 
     Attributes:
         ssh: Its SSH server: `openssh` or `dropbear`.
@@ -53,22 +53,22 @@ class RobotOptions(Strict):
     ping: Ping | None = None
 
     def programs(self) -> set[str]:
-        """Return what this machine must have for it beside what every emulated lab needs."""
-        found = {"dropbear", "dropbearconvert"} if self.ssh == "dropbear" else set()
+        """Return the programs that this machine must have for these variants, beyond those of every emulated lab."""
+        programs = {"dropbear", "dropbearconvert"} if self.ssh == "dropbear" else set()
         if self.netcat is not None:
-            found.add(NETCATS[self.netcat])
-        return found | ({"busybox"} if "busybox" in {self.userland, self.ping} else set())
+            programs.add(NETCATS[self.netcat])
+        return programs | ({"busybox"} if "busybox" in {self.userland, self.ping} else set())
 
 
 AS_THIS_MACHINE: Final = RobotOptions.defaults()
 
 
 class MeshOptions(Strict):
-    """A mesh: robots forward for each other, and a routing daemon on each finds the ways.
+    """A mesh: robots forward packets for each other, and a routing daemon on each robot finds the routes.
 
     Attributes:
         daemon: `babeld`, which speaks Babel (RFC 8966).
-        hello: Hello interval; 4 s is the daemon's own default. A lost route is replaced within a multiple of it.
+        hello: Hello interval; the daemon's default is 4 s. A lost route is replaced within a multiple of it.
     """
 
     daemon: Literal["babeld"]
@@ -76,7 +76,7 @@ class MeshOptions(Strict):
 
 
 class Ros2Options(Strict):
-    """How the nodes of robots with ROS 2 find each other over the radio.
+    """Discovery between the ROS 2 nodes of different robots over the radio.
 
     Attributes:
         discovery: `multicast`: by multicast (DDS) or scouting (Zenoh). `peers`: each robot has a list of the
@@ -88,7 +88,7 @@ class Ros2Options(Strict):
     router: str | None = None
 
     @schema.model_validator(mode="after")
-    def _a_router_runs_somewhere(self) -> "Ros2Options":
+    def _check_router(self) -> "Ros2Options":
         if (self.discovery == "router") != (self.router is not None):
             raise schema.complaint("`discovery: router` and `router: ROBOT`, which runs it, go together", "router")
         return self

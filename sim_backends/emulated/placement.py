@@ -10,22 +10,22 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Move, Placement, Role, Topology, Vector
 from fieldkit.lab.protocol import Destination
 from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.own_motion import OwnWay
+from sim_backends.emulated.ros.own_motion import AssignedPath
 from sim_backends.world.motion import Motion, OnGround, State, WayPoints
 from sim_backends.world.world import Line, World
 
 _OPERATOR_M: Final = 2.0
-_APART_M: Final = 5.0
+_SPACING_M: Final = 5.0
 
 _CEILING_M: Final = 100_000.0
-"""Nothing flies higher: space begins there (FAI)."""
+"""Maximum height of a flying robot: space begins there (FAI)."""
 
 
 def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vector]:
-    """Return each antenna's place in metres east, north, up, along the line that the world has for the scenario.
+    """Return the position of each antenna, metres east, north, up, on the world's line for the scenario.
 
-    The sender stands at its end, without line of sight behind what is in the way (paper, section VI-A), the others as
-    far from it as `geometry.positions_m` says.
+    The sender is at the end of the line, where an obstacle blocks the line of sight if the scenario has one (paper,
+    section VI-A); the distances of the others from it are those of `geometry.positions_m`.
 
     Raises:
         ConfigurationError: The world has no line for the scenario.
@@ -33,95 +33,95 @@ def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vec
     line = _line(placement, world)
     return {
         cast[role].name: antenna_m(world, line.at(from_sender_m, left_m))
-        for role, (from_sender_m, left_m) in _along_m(placement).items()
+        for role, (from_sender_m, left_m) in _along_line_m(placement).items()
         if role in cast
     }
 
 
 def motion(cast: Cast, placement: Placement, move: Move, world: World) -> Motion:
-    """Return how a robot of a trial moves on the ground; errors as `positions_m`."""
+    """Return the motion of a ground robot of a trial; errors as `positions_m`."""
     corners = [(*corner, 0.0) for corner in _corners_m(placement, move, world)]
-    way = WayPoints(cast[move.role].name, corners, move.speed_m_s)
-    return OnGround(way, lambda place_m: antenna_m(world, place_m)[2])
+    path = WayPoints(cast[move.role].name, corners, move.speed_m_s)
+    return OnGround(path, lambda place_m: antenna_m(world, place_m)[2])
 
 
-def own_way(placement: Placement, move: Move, world: World, began_ns: int) -> OwnWay:
-    """Return a move as the robot itself is told it; errors as `positions_m`.
+def assigned_path(placement: Placement, move: Move, world: World, start_ns: int) -> AssignedPath:
+    """Return the path of a move in the form that the robot receives; errors as `positions_m`.
 
-    At its place it faces away from the other end of its link.
+    At its place the robot faces away from the other end of its link.
 
     Args:
-        placement: Where robots stand.
-        move: Who goes where; without a leg it stays in its place.
-        world: What they stand in.
-        began_ns: When it begins, by the monotonic clock.
+        placement: Places of the robots.
+        move: The move; without legs the robot stays at its place.
+        world: The world around the robots.
+        start_ns: Start of the move, by the monotonic clock.
     """
-    line, (from_m, off_m) = _line(placement, world), _along_m(placement)[move.role]
+    line, (along_m, left_m) = _line(placement, world), _along_line_m(placement)[move.role]
     ahead_m = math.cos(geometry.heading_rad(move.role, "away"))
-    here, ahead = line.at(from_m, off_m), line.at(from_m + ahead_m, off_m)
+    here, ahead = line.at(along_m, left_m), line.at(along_m + ahead_m, left_m)
     facing_rad = math.atan2(ahead[1] - here[1], ahead[0] - here[0])
     points_m = [antenna_m(world, corner) for corner in _corners_m(placement, move, world)]
-    return OwnWay(began_ns, points_m, move.speed_m_s, facing_rad)
+    return AssignedPath(start_ns, points_m, move.speed_m_s, facing_rad)
 
 
 def _corners_m(placement: Placement, move: Move, world: World) -> list[tuple[float, float]]:
-    line, (from_m, off_m) = _line(placement, world), _along_m(placement)[move.role]
-    return [line.at(from_m + along_m, off_m + left_m) for along_m, left_m in geometry.way_m(move)]
+    line, (start_along_m, start_left_m) = _line(placement, world), _along_line_m(placement)[move.role]
+    return [line.at(start_along_m + along_m, start_left_m + left_m) for along_m, left_m in geometry.way_m(move)]
 
 
 def _line(placement: Placement, world: World) -> Line:
     line = world.lines.get(placement.scenario)
     if line is None:
         raise ConfigurationError(
-            f"the world {world.name} says not where robots stand for the scenario {placement.scenario}",
+            f"the world {world.name} has no line for the places of robots in the scenario {placement.scenario}",
             remedy=f"add lines: {{{placement.scenario}: {{from_m: [0, 0], bearing_deg: 90}}}} to it",
         )
     return line
 
 
-def _along_m(placement: Placement) -> dict[Role, tuple[float, float]]:
-    """Return how far from the sender each role stands along the line, and how far to the left of it."""
+def _along_line_m(placement: Placement) -> dict[Role, tuple[float, float]]:
+    """Return the place of each role: metres from the sender along the line, and metres to the left of the line."""
     places_m = geometry.positions_m(placement)
     sender_m = places_m[Role.SENDER][0]
     return {role: (east_m - sender_m, north_m) for role, (east_m, north_m, _) in places_m.items()}
 
 
 def antenna_m(world: World, place_m: tuple[float, float]) -> Vector:
-    """Return the place of a ground robot's antenna over a place on the ground, metres east and north."""
+    """Return the position of a ground robot's antenna above a point on the ground, metres east and north."""
     return (*place_m, world.ground_m(place_m) + ANTENNA_M)
 
 
 def on_ground(state: State, world: World) -> State:
-    """Return the state of a robot that drives, whose antenna is over the ground of the world."""
+    """Return the state of a ground robot with its antenna at the right height above the ground of the world."""
     return state._replace(position_m=antenna_m(world, state.position_m[:2]))
 
 
-def together_m(names: Iterable[str]) -> dict[str, Vector]:
-    """Return places 1 m apart: where everything is switched on, before anybody carries it away."""
+def side_by_side_m(names: Iterable[str]) -> dict[str, Vector]:
+    """Return positions 1 m apart, which robots have from startup until they are placed."""
     return {name: (float(number), 0.0, 0.0) for number, name in enumerate(names)}
 
 
 def square_m(names: Collection[str], world: World) -> dict[str, Vector]:
-    """Return antennas' places in a square in the middle of a world, 5 m apart or less, the first in the southwest."""
+    """Return antenna positions on a square grid in the middle of a world, at most 5 m apart, southwest first."""
     side = math.ceil(math.sqrt(len(names)))
-    apart_m = min(_APART_M, min(world.area_m) / side)
-    west_m, south_m = (extent_m / 2 - (side - 1) * apart_m / 2 for extent_m in world.area_m)
+    spacing_m = min(_SPACING_M, min(world.area_m) / side)
+    west_m, south_m = (extent_m / 2 - (side - 1) * spacing_m / 2 for extent_m in world.area_m)
     return {
-        name: antenna_m(world, (west_m + number % side * apart_m, south_m + number // side * apart_m))
+        name: antenna_m(world, (west_m + number % side * spacing_m, south_m + number // side * spacing_m))
         for number, name in enumerate(names)
     }
 
 
 def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
-    """Return where an antenna is after a move.
+    """Return the position of an antenna after a move.
 
     Args:
-        place_m: Where it was.
-        to: Where it goes.
-        world: What it is in.
+        place_m: Its position before.
+        to: The destination.
+        world: The world around the robot.
 
     Raises:
-        ConfigurationError: That is outside of the world, under its ground, or higher than anything flies.
+        ConfigurationError: The destination is outside the world, below its ground, or above 100 km.
     """
     start_m = place_m[:2] if to.relative else (0.0, 0.0)
     end_m = start_m[0] + to.east_m, start_m[1] + to.north_m
@@ -130,8 +130,8 @@ def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
         raise ConfigurationError(
             f"{end_m[0]:g} m east, {end_m[1]:g} m north is outside of the world {world.name}, which is "
             f"{width_m:g} m by {depth_m:g} m",
-            remedy="choose a place in it, or a larger one by emulated.world in the site file; see: fieldkit docs "
-            "world-file",
+            remedy="choose a place inside it, or select a larger world by emulated.world in the site file; see: "
+            "fieldkit docs world-file",
         )
     ground_m = world.ground_m(end_m)
     if to.relative:
@@ -141,7 +141,7 @@ def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
     up_m = ground_m + over_ground_m
     if not 0 <= over_ground_m <= _CEILING_M:
         raise ConfigurationError(
-            f"{up_m:g} m up is no place: the ground is at {ground_m:g} m there, and nothing flies above "
+            f"{up_m:g} m up is not a valid height: the ground is at {ground_m:g} m there, and nothing flies above "
             f"{_CEILING_M / 1000:g} km",
             remedy=f"leave UP out for a robot on the ground, whose antenna is {ANTENNA_M:g} m above it",
         )
@@ -149,16 +149,16 @@ def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
 
 
 def laptop_m(cast: Cast, placement: Placement, world: World) -> Vector:
-    """Return where the operator holds the laptop: 2 m beside the robot that stays in its place.
+    """Return the position of the laptop: 2 m beside the robot that stays in its place.
 
-    That is the relay in master, as near to the access point as people sit, and the receiver in masterless, because a
-    person carries the sender (behind the wall, too, where the laptop never is).
+    In master this is the relay, since people sit near the access point. In masterless it is the receiver, because a
+    person carries the sender, also behind the wall, where the laptop never is.
     """
-    stays = Role.RELAY if placement.topology is Topology.MASTER else Role.RECEIVER
-    east_m, north_m, up_m = positions_m(cast, placement, world)[cast[stays].name]
+    staying = Role.RELAY if placement.topology is Topology.MASTER else Role.RECEIVER
+    east_m, north_m, up_m = positions_m(cast, placement, world)[cast[staying].name]
     return east_m, north_m + _OPERATOR_M, up_m
 
 
 def relay(cast: Cast, placement: Placement) -> str | None:
-    """Return the robot whose access point carries the traffic, None where robots talk directly."""
+    """Return the robot whose access point carries the traffic, or None if robots communicate directly."""
     return cast[Role.RELAY].name if placement.topology is Topology.MASTER else None

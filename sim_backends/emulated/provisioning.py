@@ -1,6 +1,6 @@
-"""Provisioning of emulated robots: addresses, SSH keys, message definitions, and the specification with all of them.
+"""Provisioning of emulated robots: addresses, SSH keys, message definitions, and the specification of each robot.
 
-Keys are made per lab and never lie on the host's disk. The only user of `cryptography`.
+Keys are made per lab and never written to the host's disk. This is the only module that imports `cryptography`.
 """
 
 from collections.abc import Mapping
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
 
 NETWORK: Final = IPv4Network("10.42.0.0/24")
 LAPTOP_ADDRESS: Final = NETWORK[-2]
-"""Address of the laptop; the robots have those before it."""
+"""Address of the laptop; robots have lower addresses."""
 LAPTOP_NAME: Final = "laptop"
 
 _DEFAULTS: Final = EmulatedOptions.defaults()
 
 BRIDGE_PATIENCE_S: Final = 20
-"""How long a bridge waits for the ROS master, which starts beside it."""
+"""Time that a bridge waits for the ROS master, which starts at the same time."""
 
 RobotKey = TypeVar("RobotKey")
-"""What tells robots apart: a role in a trial, a name in a lab to play with."""
+"""Type of the keys that identify robots: a role in a trial, a name in an interactive lab."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class KeyPair:
     @classmethod
     def make(cls) -> Self:
         """Return a new key."""
-        # A dry run asks this module for addresses, and makes no key: loading this takes 50 ms.
+        # Importing cryptography takes 50 ms, and a dry run uses this module without making a key.
         from cryptography.hazmat.primitives import serialization as form  # noqa: PLC0415
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey  # noqa: PLC0415
 
@@ -66,7 +66,7 @@ class KeyPair:
 
 @cache
 def definition(kind: str, text: str = "") -> Definition:
-    """Return the definition of the ROS 1 message type `package/Name`, with `text` where ROS has none of that name.
+    """Return the definition of the ROS 1 message type `package/Name`; `text` is used if ROS has no such type.
 
     Errors as `template_of`.
     """
@@ -76,12 +76,12 @@ def definition(kind: str, text: str = "") -> Definition:
 
 
 def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
-    """Return what a robot publishes. Errors as `template_of`."""
+    """Return the sensors of a robot, one per published topic. Errors as `template_of`."""
     return tuple(_sensor(topic) for topic in _topics(robot))
 
 
 def _definitions(robot: "Robot | LabRobot") -> dict[str, Definition]:
-    """Return the definitions of the types that a robot publishes; errors as `template_of`."""
+    """Return the definitions of the message types that a robot publishes; errors as `template_of`."""
     definitions = {topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)}
     if static_frames.links(sensors_of(robot)):
         definitions[static_frames.TYPE] = definition(static_frames.TYPE)
@@ -93,16 +93,16 @@ def _topics(robot: "Robot | LabRobot") -> tuple[PublishedTopic, ...]:
 
 
 def _sensor(topic: PublishedTopic) -> Sensor:
-    own = Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points, child_frame=topic.child_frame)
+    sensor = Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points, child_frame=topic.child_frame)
     if topic.type in GENERATORS:
-        return own
+        return sensor
     from sim_backends.emulated.ros import templates  # noqa: PLC0415 (as above)
 
-    return replace(own, template=templates.template_of(topic))
+    return replace(sensor, template=templates.template_of(topic))
 
 
 def laser_targets(world: World) -> tuple[LaserTarget, ...]:
-    """Return what a laser sees of a world."""
+    """Return the laser targets of a world."""
     return tuple(_laser_target(part.shape) for part in world.parts)
 
 
@@ -114,63 +114,63 @@ def _laser_target(shape: Shape) -> LaserTarget:
 
 
 def _neighbours(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[Neighbour, ...]:
-    """Return the bodies of the other robots, with their positions among `robots`."""
+    """Return the bodies of the other robots, numbered by their positions in `robots`."""
     return tuple(
         neighbour(number, robot.profile) for number, (other, robot) in enumerate(robots.items()) if other != key
     )
 
 
 def neighbour(number: int, profile: RobotProfile) -> Neighbour:
-    """Return the body of a robot from the ground under it up to its antenna, or to its top where that is higher.
+    """Return the body of a robot from the ground up to its antenna, or to its top if that is higher.
 
-    A profile without a known body has that of the paper's robot of its kind.
+    A profile whose body is not in the table has the body of the paper's robot of its kind.
     """
     from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER  # noqa: PLC0415 (numpy takes 60 ms)
     from sim_backends.physics.known import BODIES, quadrotor  # noqa: PLC0415
 
-    like = quadrotor(profile.name) if profile.kind == "uav" else TURTLEBOT3_BURGER
-    body = BODIES.get(profile.name, like)
+    default = quadrotor(profile.name) if profile.kind == "uav" else TURTLEBOT3_BURGER
+    body = BODIES.get(profile.name, default)
     return Neighbour(number, body.radius_m, ANTENNA_M, max(body.height_m - ANTENNA_M, 0.0))
 
 
 def ros_master_of(robot: "Robot | LabRobot") -> str:
-    """Return the address of the ROS master that a robot uses; in a lab to play with each has its own."""
+    """Return the address of the ROS master that a robot uses; in an interactive lab each robot has its own."""
     return (robot.ros_master if isinstance(robot, Robot) else "") or LOOPBACK
 
 
 def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[str, ...]:
-    """Return the topics that a robot publishes to its master.
+    """Return the topics that a robot registers at its ROS master.
 
-    Of robots that share one, the first publishes what several have: drivers that are started on a second robot, too,
-    are nodes of the same names, and the master ends those of the first.
+    If robots share a master, a topic that several of them have is registered by the first one: nodes of a second
+    robot have the same names, and the master shuts down the earlier nodes of these names.
     """
-    taken: set[str] = set()
+    registered: set[str] = set()
     for other in robots:
-        own = [topic.name for topic in _topics(robots[other])]
+        topics = [topic.name for topic in _topics(robots[other])]
         if other == key:
-            return tuple(topic for topic in own if topic not in taken)
+            return tuple(topic for topic in topics if topic not in registered)
         if ros_master_of(robots[other]) == ros_master_of(robots[key]) != LOOPBACK:
-            taken.update(own)
+            registered.update(topics)
     raise KeyError(key)
 
 
 def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
-    """Return whether robots of a profile are driven by a topic: of real ROS 1, or of ROS 2 where its ends meet.
+    """Return True if robots of a profile can be driven by a topic of Debian's ROS 1, or of ROS 2 over the radio.
 
-    By a router of Zenoh on another robot they do not, for the driver looks on its own alone.
+    Not with a Zenoh router on another robot, because the driver discovers only the base on its own robot.
     """
     ros = profile.ros
     if profile.drive is None or ros is None:
         return False
     if ros.variant == "ros1":
         return uses_debian_ros(options.ros)
-    return over_ros2(profile, options) != "" and options.ros2.router is None
+    return ros2_middleware(profile, options) != "" and options.ros2.router is None
 
 
-def over_ros2(profile: RobotProfile, options: EmulatedOptions) -> str:
-    """Return by what robots of a profile speak ROS 2 over the radio, `dds` or `zenoh`; empty where they do not.
+def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
+    """Return the middleware of a profile's ROS 2 over the radio, `dds` or `zenoh`, or "" without one.
 
-    They do not either where their middleware is not installed here.
+    The result is "" too if the middleware is not installed on this machine.
     """
     ros = profile.ros
     if ros is None or ros.variant != "ros2" or options.ros is RosChoice.BUILTIN:
@@ -189,39 +189,39 @@ def _base(profile: RobotProfile) -> Base | None:
 def _ros2_spec(
     robots: "Mapping[RobotKey, Robot | LabRobot]", robot: "Robot | LabRobot", options: EmulatedOptions
 ) -> Ros2Spec | None:
-    """Return how a robot speaks ROS 2 over the radio; None if it does not, or its middleware is not installed here.
+    """Return the ROS 2 of a robot over the radio, or None if it has none or its middleware is not installed here.
 
     Raises:
-        ConfigurationError: The robot that is to run the router is not among them.
+        ConfigurationError: The robot with the router is not among `robots`.
     """
-    own, over = robot.profile.ros, over_ros2(robot.profile, options)
-    if own is None or not over:
+    ros, middleware = robot.profile.ros, ros2_middleware(robot.profile, options)
+    if ros is None or not middleware:
         return None
-    others = {other.name: other.address for other in robots.values()}
-    how = options.ros2
-    if how.router is not None and how.router not in others:
+    addresses = {other.name: other.address for other in robots.values()}
+    settings = options.ros2
+    if settings.router is not None and settings.router not in addresses:
         raise ConfigurationError(
-            f"emulated.ros2 has the router run on {how.router}, which does not take part",
+            f"emulated.ros2.router is {settings.router}, which does not take part in this trial",
             where=robot.name,
-            remedy=f"name one of: {', '.join(others)}; or write discovery: multicast",
+            remedy=f"name one of: {', '.join(addresses)}; or write discovery: multicast",
         )
-    peers = tuple(address for address in others.values() if address != robot.address)
+    peers = tuple(address for address in addresses.values() if address != robot.address)
     return Ros2Spec(
-        over=over,
-        distribution=own.command.distribution,
-        discovery=how.discovery,
-        peers=peers if how.discovery == "peers" else (),
-        router=others[how.router] if how.router else "",
-        domain=own.domain,
+        over=middleware,
+        distribution=ros.command.distribution,
+        discovery=settings.discovery,
+        peers=peers if settings.discovery == "peers" else (),
+        router=addresses[settings.router] if settings.router else "",
+        domain=ros.domain,
     )
 
 
 def _bridge(robot: "Robot | LabRobot") -> tuple[str, ...]:
-    """Return the command of the bridge that runs by itself: in a lab to play with, since a trial starts its own."""
-    own = robot.profile.ros
-    if own is None or own.bridge is None or isinstance(robot, Robot):
+    """Return the command of the bridge that starts with the robot, in an interactive lab; a trial starts its own."""
+    ros = robot.profile.ros
+    if ros is None or ros.bridge is None or isinstance(robot, Robot):
         return ()
-    return own.bridge.command(robot.address, "", BRIDGE_PATIENCE_S)
+    return ros.bridge.command(robot.address, "", BRIDGE_PATIENCE_S)
 
 
 def robot_spec(
@@ -234,13 +234,13 @@ def robot_spec(
     options: EmulatedOptions = _DEFAULTS,
     world: World | None = None,
 ) -> RobotSpec:
-    """Return what a robot is told about itself; one that flies, or has a laser, needs to know its world."""
+    """Return the specification of a robot; `world` is needed for a robot that flies or has a laser."""
     robot = robots[key]
     tools = options.robots.get(robot.name, AS_THIS_MACHINE)
-    own = robot.profile.ros
-    ros2 = own is not None and own.variant == "ros2"
-    speaks_ros2 = _ros2_spec(robots, robot, options)
-    hears_ros1 = ros is RosChoice.DEBIAN and own is not None and not ros2
+    profile_ros = robot.profile.ros
+    is_ros2 = profile_ros is not None and profile_ros.variant == "ros2"
+    ros2_over_radio = _ros2_spec(robots, robot, options)
+    has_debian_ros1 = ros is RosChoice.DEBIAN and profile_ros is not None and not is_ros2
     mavlink, limits = robot.profile.mavlink, robot.profile.limits
     has_laser = any(topic.type == LASER_SCAN for topic in _topics(robot))
     return RobotSpec(
@@ -251,10 +251,10 @@ def robot_spec(
         host_key=host_key.private,
         authorized_key=login.public,
         # Debian has no ROS 2, and a robot without ROS runs no master.
-        ros=(RosChoice.BUILTIN if ros2 or own is None else ros).value,
-        ros_version=2 if ros2 else 1,
-        distribution=own.command.distribution if own else "",
-        setup=own.command.setup if own else (),
+        ros=(RosChoice.BUILTIN if is_ros2 or profile_ros is None else ros).value,
+        ros_version=2 if is_ros2 else 1,
+        distribution=profile_ros.command.distribution if profile_ros else "",
+        setup=profile_ros.command.setup if profile_ros else (),
         ros_master=ros_master_of(robot),
         sensors=sensors_of(robot),
         registered=_registered(robots, key),
@@ -270,9 +270,9 @@ def robot_spec(
         autopilot=mavlink.autopilot if mavlink else "px4",
         system=mavlink.system if mavlink else 1,
         boot_s=float(mavlink.boot_s) if mavlink else 0.0,
-        base=_base(robot.profile) if hears_ros1 or speaks_ros2 is not None else None,
+        base=_base(robot.profile) if has_debian_ros1 or ros2_over_radio is not None else None,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
-        ros2=speaks_ros2,
+        ros2=ros2_over_radio,
         bridge=_bridge(robot),
         routes_zenoh=options.ros2.router == robot.name,
         **tools.model_dump(),

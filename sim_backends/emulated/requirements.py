@@ -1,4 +1,4 @@
-"""Requirements of an emulated lab on this machine; each lack is named with its remedy."""
+"""Checks that this machine can run an emulated lab; each error has a remedy."""
 
 import os
 import shutil
@@ -38,17 +38,17 @@ VARIANT_PACKAGE_OF: Final = {
 
 ROS_PACKAGES: Final = ("python3-rosmaster", "python3-rosbag", "python3-rospy", "python3-sensor-msgs")
 _MASTER_FILES: Final = {services.ROSCORE: "python3-roslaunch", "/usr/lib/rosout/rosout": "rosout"}
-"""What one master of several robots needs beside them, and Debian's package of it."""
+"""Files that a ROS master for several robots needs in addition, and the Debian packages that contain them."""
 
 
 def check(programs: Iterable[str] = ()) -> None:
-    """Check rights and programs.
+    """Check permissions and programs.
 
     Args:
-        programs: What this lab's options need: tool variants of its robots, a routing daemon.
+        programs: Programs that the options of this lab need: tool variants of its robots, a routing daemon.
 
     Raises:
-        ConfigurationError: Something is missing.
+        ConfigurationError: A permission or a program is missing.
     """
     package_of = PACKAGE_OF if namespaces.is_root() else PACKAGE_OF | ORDINARY_PACKAGE_OF
     needed = dict.fromkeys((*package_of, *sorted(programs)))
@@ -67,44 +67,44 @@ def check(programs: Iterable[str] = ()) -> None:
 
 
 def _check_files() -> None:
-    """Stop where this machine lacks a file that a robot has its own of: only root may lay one where there is none."""
+    """Raise ConfigurationError if a file that robots mount their own over is missing; only root can create it."""
     lacking = [path for path in rootfs.OWN_FILES if not Path(path).exists()]
     if lacking:
         raise ConfigurationError(
-            f"this machine has no {', '.join(lacking)}, over which a robot's own could stand",
+            f"this machine has no {', '.join(lacking)}, which a robot's own file is mounted over",
             remedy=f"sudo touch {' '.join(lacking)}",
         )
 
 
 def ros_in_use(choice: RosChoice) -> RosChoice:
-    """Return `debian` or `builtin` for a choice.
+    """Return the source of ROS, `debian` or `builtin`, for a choice.
 
     Raises:
         ConfigurationError: Debian's ROS is chosen and not installed.
     """
     if choice is RosChoice.DEBIAN and not uses_debian_ros(RosChoice.AUTO):
         raise ConfigurationError(
-            "the site file asks for Debian's ROS, which is not installed",
+            "the site file requests Debian's ROS, which is not installed",
             remedy=f"apt-get install --no-install-recommends {' '.join(ROS_PACKAGES)}, or write ros: builtin",
         )
     return RosChoice.DEBIAN if uses_debian_ros(choice) else RosChoice.BUILTIN
 
 
 def check_shared_master(ros: RosChoice) -> None:
-    """Stop where this machine cannot run one ROS master for several robots.
+    """Check that this machine can run one ROS master for several robots.
 
     Args:
-        ros: Where the robots' ROS comes from.
+        ros: Source of the robots' ROS.
 
     Raises:
-        ConfigurationError: It has no ROS of its own, or not all that roscore starts.
+        ConfigurationError: Debian's ROS, or a program that roscore starts, is not installed.
     """
     packages = [package for path, package in _MASTER_FILES.items() if not Path(path).exists()]
     if ros is RosChoice.BUILTIN:
         packages = [*ROS_PACKAGES, *packages]
     if packages:
         raise ConfigurationError(
-            "the site file gives robots one ROS master (ros_master): emulated ones have it with Debian's ROS alone",
+            "the site file gives robots one ROS master (ros_master), which for emulated robots needs Debian's ROS",
             remedy=f"apt-get install --no-install-recommends {' '.join(packages)}, and ros: debian or auto under "
-            "emulated; or take ros_master out",
+            "emulated; or remove ros_master",
         )

@@ -1,4 +1,4 @@
-"""Startup of robots: built, on the air, their programs serving; for a trial or to play with."""
+"""Startup of emulated robots for a trial or an interactive lab: file systems, radios, programs."""
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -18,20 +18,20 @@ from sim_backends.emulated.ros.neighbours import PlacesWriter
 from sim_backends.radio.modes import fixed_mode, standard_of
 from sim_backends.world.world import World
 
-_AT_ONCE: Final = 16
-"""How many robots are built and started at a time: each takes a thread here, and a turn on the machine there."""
+_MAX_PARALLEL_STARTS: Final = 16
+"""Number of robots that are built and started at the same time; each needs a thread here and processor time."""
 
 
 @dataclass(frozen=True)
 class RunningRobots(Generic[RobotKey]):
-    """Robots on one medium, without places yet.
+    """Running robots on one medium, without places yet.
 
     Attributes:
         robots: The robots.
-        medium: Carries their packets.
-        places: Takes where each of them is, for the lasers of the others.
-        host_keys: Public host key of each.
-        private_key: Logs in on all of them, OpenSSH PEM.
+        medium: The medium that carries their packets.
+        places: Writer of the robots' places, for the lasers of the other robots.
+        host_keys: Public host key of each robot.
+        private_key: Private key that logs in on all robots, OpenSSH PEM.
     """
 
     robots: Mapping[RobotKey, EmulatedRobot]
@@ -50,13 +50,14 @@ def running_robots(
     ros: RosChoice,
     seed: int,
 ) -> Iterator[RunningRobots[RobotKey]]:
-    """Yield robots that serve; leaving the context ends every process of them. Arguments as `testbed.bring_up`.
+    """Yield robots whose programs serve; leaving the context stops all their processes.
 
-    Those that share a ROS master, or a router of Zenoh, start side by side, as people do, and find it over the radio.
+    The arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
+    and connect to it over the radio.
 
     Raises:
-        ConfigurationError: They are to send in a mode that one of them does not have.
-        FieldkitError: A robot or the medium did not come up.
+        ConfigurationError: The site file fixes a radio mode that one of the robots does not have.
+        FieldkitError: A robot or the medium did not start.
     """
     fixed_mode(options.radio.mode, {robot.name: standard_of(robot.profile.radio) for robot in robots.values()})
     login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
@@ -64,8 +65,8 @@ def running_robots(
         framing = IP if options.mesh is None else ETHERNET
         medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
         places = stack.enter_context(closing(PlacesWriter([robot.name for robot in robots.values()])))
-        # Entered before the robots and left after them: a robot that ends ends the request that waits for it.
-        pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _AT_ONCE)))
+        # Entered before the robots and left after them: when a robot exits, the request that waits for it fails.
+        pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _MAX_PARALLEL_STARTS)))
         up: dict[RobotKey, EmulatedRobot] = {}
         for key in robots:
             spec = robot_spec(
@@ -73,16 +74,16 @@ def running_robots(
             )
             up[key] = stack.enter_context(EmulatedRobot(spec, places.fd))
         list(pool.map(_build, up.values()))
-        # Who waits for a master of others waits for one that is being started.
-        started = pool.map(EmulatedRobot.start, sorted(up.values(), key=lambda one: not one.spec.runs_master))
-        for key, one in up.items():
-            medium.attach(one.name, one.address, robots[key].profile.radio, one.radio_fd)
+        # Robots with a ROS master start first, because the other robots wait for it.
+        started = pool.map(EmulatedRobot.start, sorted(up.values(), key=lambda robot: not robot.spec.runs_master))
+        for key, robot in up.items():
+            medium.attach(robot.name, robot.address, robots[key].profile.radio, robot.radio_fd)
         if any(robot.spec.waits_for_another for robot in up.values()):
-            medium.place(placement.together_m(robot.name for robot in up.values()))
+            medium.place(placement.side_by_side_m(robot.name for robot in up.values()))
         list(started)
         yield RunningRobots(up, medium, places, {key: pair.public for key, pair in host_keys.items()}, login.private)
-        for one in up.values():
-            one.hang_up()
+        for robot in up.values():
+            robot.hang_up()
 
 
 def _build(robot: EmulatedRobot) -> None:

@@ -1,4 +1,4 @@
-"""Emulated robots of one cast, up and on the air."""
+"""Testbed of the emulated robots of one cast."""
 
 import socket
 import time
@@ -39,13 +39,13 @@ _IP_PROTOCOL: Final = {Protocol.TCP: socket.IPPROTO_TCP, Protocol.UDP: socket.IP
 
 
 class EmulatedOracle:
-    """What the medium knows of the packets that it carries, and where it was told that robots are.
+    """Ground truth of the medium: delays and lateness of packets, places of robots, link samples.
 
     Args:
         names: Name of each robot.
-        medium: Carries their packets.
-        mobility: Tells the medium where they are.
-        options: The lab's options: whether to record the air, and from which lateness on a repeat is void.
+        medium: The medium that carries the robots' packets.
+        mobility: The object that places the robots in the medium.
+        options: The lab's options, with the limit of lateness and whether transmissions are recorded.
     """
 
     def __init__(
@@ -55,42 +55,42 @@ class EmulatedOracle:
         self._medium = medium
         self._mobility = mobility
         self._late_bound_s = options.late_bound
-        self._recorded = options.record_air
+        self._records_air = options.record_air
 
     def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
-        """See `Oracle.track`; robots are where the medium was told."""
+        """Implement `Oracle.track` from the places that the medium received."""
         return self._mobility.track(since_utc_ns)
 
     def delays(self, source: Role, destination: Role, protocol: Protocol, port: int) -> DelayParts:
-        """See `Oracle.delays`."""
+        """Implement `Oracle.delays`."""
         return self._medium.delays(self._names[source], self._names[destination], _IP_PROTOCOL[protocol], port)
 
     def lateness(self) -> Lateness:
-        """See `Oracle.lateness`."""
+        """Implement `Oracle.lateness`."""
         return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self._medium.stats().late)
 
     def links(self, *, go_on: bool) -> dict[Role, list[LinkSample]]:
-        """See `Oracle.links`."""
+        """Implement `Oracle.links`."""
         links = self._medium.links(go_on=go_on)
         return {role: links.get(name, []) for role, name in self._names.items()}
 
     def record_air(self, folder: Path | None) -> None:
-        """See `Oracle.record_air`."""
-        if self._recorded:
+        """Implement `Oracle.record_air`."""
+        if self._records_air:
             self._medium.record(folder)
 
 
 class EmulatedTestbed:
-    """Robots on one medium.
+    """Running robots on one medium, in the roles of a cast.
 
     Args:
-        cast: Who plays which role.
-        up: What runs.
-        shells: The robots' control connections.
+        cast: The robot of each role.
+        up: The running robots and their medium.
+        shells: Control connection of each robot.
         options: The lab's options.
-        world: What they stand in.
-        laptop: From where the shells reach them over the medium; None where they have a way of their own.
-        operator: Who is asked what steps want to know.
+        world: The world around the robots.
+        laptop: The node from which SSH reaches the robots over the medium; None if SSH bypasses the medium.
+        operator: The person who answers the questions of steps.
     """
 
     def __init__(
@@ -116,63 +116,63 @@ class EmulatedTestbed:
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
-        """See `Testbed.shells`."""
+        """Implement `Testbed.shells`."""
         return self._shells
 
     @property
     def oracle(self) -> EmulatedOracle:
-        """See `Testbed.oracle`."""
+        """Implement `Testbed.oracle`."""
         return self._oracle
 
     def demand_up(self) -> None:
-        """See `Transient.demand_up`."""
+        """Implement `Transient.demand_up`."""
         self.medium.demand_up()
         nodes: list[Node] = [*self.robots.values()]
         for node in nodes if self._laptop is None else [*nodes, self._laptop]:
             node.demand_up()
 
     def place(self, placement: Placement) -> Answer:
-        """See `Testbed.place`; robots arrive at once."""
+        """Implement `Testbed.place`; robots arrive immediately."""
         self._mobility.place(placement)
         return DONE
 
     def inject(self, fault: Fault) -> float | None:
-        """See `Testbed.inject`; what was begun is undone also when this is interrupted."""
+        """Implement `Testbed.inject`; the fault is also removed if the call is interrupted."""
         robot = self.robots[fault.role]
         match fault.kind:
             case FaultKind.LINK_DOWN:
-                return _lasting(fault.duration_s, robot.switch_off, robot.switch_on)
+                return _apply_for(fault.duration_s, robot.switch_off, robot.switch_on)
             case FaultKind.OUT_OF_RANGE:
-                away = partial(self._mobility.put_away, fault.role)
-                return _lasting(fault.duration_s, away, partial(self._mobility.put_away, None))
+                remove = partial(self._mobility.set_out_of_range, fault.role)
+                return _apply_for(fault.duration_s, remove, partial(self._mobility.set_out_of_range, None))
             case FaultKind.REBOOT:
-                _lasting(self._boot_s, robot.halt, robot.boot)
+                _apply_for(self._boot_s, robot.halt, robot.boot)
             case FaultKind.KILL:
                 robot.kill(fault.process)
         return 0.0
 
-    def bring_back(self, role: Role, *, by_itself: bool) -> None:  # noqa: ARG002 (each repeat is to begin alike)
-        """See `Testbed.bring_back`; the robot is at its place at once, exactly, whatever its odometry says."""
-        self._mobility.put_back(role)
+    def bring_back(self, role: Role, *, by_itself: bool) -> None:  # noqa: ARG002 (all repeats must start alike)
+        """Implement `Testbed.bring_back`; the robot is exactly at its place, whatever its odometry reports."""
+        self._mobility.return_to_place(role)
 
     def watching(self) -> AbstractContextManager[object]:
-        """Return a context in which the medium is told of robots that steer themselves."""
+        """Return a context that keeps the medium up to date with robots that steer themselves."""
         return self._mobility.watching()
 
     def moving(self, move: Move) -> AbstractContextManager[None]:
-        """See `Testbed.moving`; the robot is back at its place at once."""
+        """Implement `Testbed.moving`; the robot returns to its place immediately."""
         return self._mobility.moving(move)
 
 
-def _lasting(duration_s: float, begin: Callable[[], None], end: Callable[[], None]) -> float:
-    """Begin something, end it after `duration_s` whatever happens, and return how long it lasted."""
-    begin()
-    began_s = time.monotonic()
+def _apply_for(duration_s: float, apply: Callable[[], None], revert: Callable[[], None]) -> float:
+    """Call `apply`, call `revert` after `duration_s` or on an interrupt, and return the seconds between both."""
+    apply()
+    start_s = time.monotonic()
     try:
         time.sleep(duration_s)
     finally:
-        end()
-    return time.monotonic() - began_s
+        revert()
+    return time.monotonic() - start_s
 
 
 @contextmanager
@@ -188,27 +188,27 @@ def bring_up(
     notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
     operator: Operator = NOBODY,
 ) -> Iterator[EmulatedTestbed]:
-    """Yield the testbed of a cast; leaving the context ends every process of it.
+    """Yield the testbed of a cast; leaving the context stops all its processes.
 
     Args:
-        cast: Who plays which role.
-        options: The lab's options; `world` and `ros` are what became of those.
-        world: What the robots stand in.
-        ros: `debian` or `builtin`, for robots with ROS 1.
-        seed: Seed of everything random in the medium.
-        control: Whether SSH crosses the radio; if so, a robot out of the laptop's range is out of reach.
-        patience_s: How long a lost control connection is awaited.
-        notice: Told when it is lost, and when it is back.
-        operator: Who is asked what steps want to know.
+        cast: The robot of each role.
+        options: The lab's options; `world` and `ros` override the options of these names.
+        world: The world around the robots.
+        ros: Source of ROS for robots with ROS 1, `debian` or `builtin`.
+        seed: Seed of all random numbers of the medium.
+        control: True if SSH uses the radio; if so, a robot out of the laptop's range cannot be reached.
+        patience_s: How long to wait for a lost control connection.
+        notice: Called with a message when a control connection is lost, and when it is back.
+        operator: The person who answers the questions of steps.
 
     Raises:
-        FieldkitError: A robot or the medium did not come up.
+        FieldkitError: A robot or the medium did not start.
     """
     with ExitStack() as stack:
         up = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
         laptop = stack.enter_context(laptop_on_air(up, options.mesh)) if control is Control.RADIO else None
-        if laptop is not None:  # it reaches them before they have places of their own
-            up.medium.place(places.together_m([*(robot.name for robot in up.robots.values()), laptop.name]))
+        if laptop is not None:  # it connects to the robots before they have places
+            up.medium.place(places.side_by_side_m([*(robot.name for robot in up.robots.values()), laptop.name]))
         shells: dict[Role, Shell] = {}
         for role in up.robots:
             shell = _shell(up, role, laptop, patience_s, notice)
@@ -220,9 +220,9 @@ def bring_up(
 
 @contextmanager
 def laptop_on_air(up: RunningRobots[RobotKey], mesh: MeshOptions | None) -> Iterator[Laptop]:
-    """Yield the laptop, which has no place yet.
+    """Yield the laptop, attached to the medium without a place.
 
-    In a mesh it finds its way over the robots, and forwards for nobody.
+    In a mesh it uses the routes of the robots, and forwards no packets.
     """
     with Laptop(f"{LAPTOP_ADDRESS}/{NETWORK.prefixlen}") as laptop:
         laptop.open_radio(mesh=mesh is not None, guest_hello_s=None if mesh is None else mesh.hello)
@@ -233,13 +233,14 @@ def laptop_on_air(up: RunningRobots[RobotKey], mesh: MeshOptions | None) -> Iter
 def _shell(
     up: RunningRobots[Role], role: Role, laptop: Laptop | None, patience_s: float, notice: Callable[[str], None]
 ) -> SshShell:
-    """Return the control connection of a robot, over the radio where there is a laptop on it."""
+    """Return the control connection of a robot, over the radio if the laptop is on the air."""
     robot = up.robots[role]
 
     def connect(timeout_s: float) -> socket.socket:
         if laptop is None:
             return robot.connect(timeout_s)
-        up.medium.demand_up()  # nobody waits for an answer that nothing carries
+        up.medium.demand_up()  # fail now instead of waiting for an answer that no process carries
+
         robot.demand_up()
         return laptop.reach(robot.spec.ip, timeout_s)
 

@@ -107,7 +107,7 @@ def test_a_text_in_pieces_is_one() -> None:
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])
 def test_an_emulated_autopilot_is_asked(firmware: Firmware, capsys: pytest.CaptureFixture[str]) -> None:
     unfit: list[str] = []
-    with drones.at_udp(firmware=replace(firmware, unfit=lambda _parameters, _battery: unfit)) as port:
+    with drones.at_udp(firmware=replace(firmware, arming_errors=lambda _parameters, _battery: unfit)) as port:
         for reasons in ([], ["Gyros inconsistent"]):
             unfit[:] = reasons
             assert arming.look(f"udpout:127.0.0.1:{port}", replace(NEEDS, ceiling_m=30.0), threading.Event()) == 0

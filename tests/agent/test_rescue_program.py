@@ -71,9 +71,9 @@ def entries(path: Path) -> tuple[liveness.LifeEntry, ...]:
 def fly_up(autopilot: Autopilot, firmware: Firmware) -> None:
     """Let it hover in the guided mode; a PX4 follows one set-point and then misses the next."""
     vehicle = autopilot.vehicle
-    wait_until(lambda: not vehicle.unfit, Deadline.after(60))
+    wait_until(lambda: not vehicle.arming_errors, Deadline.after(60))
     if firmware is PX4:
-        vehicle.lead(SetPoint((0.0, 0.0, HEIGHT_M), is_place=True))
+        vehicle.accept_set_point(SetPoint((0.0, 0.0, HEIGHT_M), is_place=True))
     vehicle.change_mode(Mode.OFFBOARD)
     vehicle.arm()
     if firmware is PX4:
@@ -84,7 +84,7 @@ def fly_up(autopilot: Autopilot, firmware: Firmware) -> None:
 
 
 def lead(autopilot: Autopilot) -> float:
-    autopilot.vehicle.lead(SetPoint((0.0, 0.0, HEIGHT_M), is_place=True))
+    autopilot.vehicle.accept_set_point(SetPoint((0.0, 0.0, HEIGHT_M), is_place=True))
     return up_m(autopilot)
 
 

@@ -42,7 +42,7 @@ def test_no_robot_may_be_the_laptop(tmp_path: Path) -> None:
     path = tmp_path / "fieldkit.yaml"
     text = DEFAULT_SITE.read_text(encoding="utf-8").replace("turtlebot-2", "laptop")
     path.write_text(f"{text}control: radio\n", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="'laptop' is the operator's") as caught:
+    with pytest.raises(ConfigurationError, match="'laptop' is reserved for the operator's laptop") as caught:
         EmulatedBackend(*load_site(path))
     assert caught.value.where.endswith("fieldkit.yaml:7")
 

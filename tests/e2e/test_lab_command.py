@@ -202,8 +202,8 @@ def test_another_robot_reflects_the_laser_and_the_range_follows_it(lab: Path) ->
             "401 m east, 1 m north is outside of the world open, which is 400 m by 400 m\n  remedy",
         ),
         ("air-1 --by 0m -200m", "-2.5 m north is outside of the world open"),
-        ("air-1 --to 1m 1m -1m", "-1 m up is no place: the ground is at 0 m there"),
-        ("air-1 --to 1m 1m 101km", "101000 m up is no place"),
+        ("air-1 --to 1m 1m -1m", "-1 m up is not a valid height: the ground is at 0 m there"),
+        ("air-1 --to 1m 1m 101km", "101000 m up is not a valid height"),
         ("air-1 --to 1 1", "length '1' has no unit\n  remedy"),
         ("air-1 --to here there", "'here' is not a length\n  remedy"),
         ("air-1 --by 1m", "--by takes EAST NORTH [UP], not '1m'\n  remedy"),
@@ -330,7 +330,7 @@ def test_control_over_the_radio_is_for_trials_and_a_lab_says_so(tmp_path: Path, 
     up = fieldkit(tmp_path, "lab", "up", *robots)
     assert up.code == 0, up.err
     try:
-        assert "note: control: radio is for trials; in a lab SSH reaches every robot, wherever it is" in up.err
+        assert "note: control: radio applies to trials; in a lab SSH bypasses the radio" in up.err
         name = client.state(folder.of_directory(tmp_path)).robots[0].name
         assert fieldkit(tmp_path, "lab", "move", name, "--to", "0m", "0m").code == 0
         assert fieldkit(tmp_path, "lab", "shell", name, "hostname").out == f"{name}\n"

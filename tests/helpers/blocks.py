@@ -1,4 +1,4 @@
-"""pcapng files for tests, block by block: nothing here uses the code under test."""
+"""pcapng files for tests, built from blocks without the code under test."""
 
 import struct
 from collections.abc import Iterable
@@ -39,26 +39,26 @@ def interface(
     return block(1, struct.pack(f"{order}HHI", link_type, 0, snap) + options, order=order)
 
 
-def _wire(frame: Frame) -> int:
+def _wire_bytes(frame: Frame) -> int:
     return len(frame.data) if frame.wire_bytes is None else frame.wire_bytes
 
 
 def enhanced(frame: Frame, *, ticks: int, number: int = 0, order: str = "<", comment: bytes = b"") -> bytes:
-    head = struct.pack(f"{order}5I", number, ticks >> 32, ticks & 0xFFFFFFFF, len(frame.data), _wire(frame))
+    header = struct.pack(f"{order}5I", number, ticks >> 32, ticks & 0xFFFFFFFF, len(frame.data), _wire_bytes(frame))
     options = option(1, comment, order=order) + option(0, b"", order=order) if comment else b""
-    return block(6, head + frame.data + PADDING[: -len(frame.data) % 4] + options, order=order)
+    return block(6, header + frame.data + PADDING[: -len(frame.data) % 4] + options, order=order)
 
 
 def obsolete(frame: Frame, *, ticks: int, number: int = 0, order: str = "<", drops: int = 0) -> bytes:
-    times = (ticks >> 32, ticks & 0xFFFFFFFF, len(frame.data), _wire(frame))
+    times = (ticks >> 32, ticks & 0xFFFFFFFF, len(frame.data), _wire_bytes(frame))
     return block(2, struct.pack(f"{order}HH4I", number, drops, *times) + frame.data, order=order)
 
 
 def simple(frame: Frame, *, order: str = "<") -> bytes:
-    return block(3, struct.pack(f"{order}I", _wire(frame)) + frame.data, order=order)
+    return block(3, struct.pack(f"{order}I", _wire_bytes(frame)) + frame.data, order=order)
 
 
 def file_of(frames: Iterable[Frame], *, order: str = "<", link_type: int = 101) -> bytes:
-    """One section with one interface of nanoseconds, an enhanced packet block per frame."""
+    """A section with one interface with nanosecond timestamps, and an enhanced packet block per frame."""
     blocks = [enhanced(frame, ticks=frame.time_ns, order=order) for frame in frames]
     return b"".join([section(order=order), interface(link_type, order=order, resolution=9), *blocks])

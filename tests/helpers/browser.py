@@ -1,4 +1,4 @@
-"""A report opened in Chromium, with everything noted that it says and asks for."""
+"""A report opened in Chromium, with a record of its console messages and requests."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,12 +10,12 @@ from playwright.sync_api import Browser, Page, Route, sync_playwright
 
 PHONE = 390
 LAPTOP = 1280
-_LONG_MS = 120_000
+_TIMEOUT_MS = 120_000
 
 
 @dataclass
 class Opened:
-    """An open page, what its console said, and what it asked for beside its own file."""
+    """An open page, its console messages, and its requests other than for its own file."""
 
     page: Page
     said: list[str] = field(default_factory=list)
@@ -24,9 +24,11 @@ class Opened:
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """Yield Debian's Chromium, without a window."""
+    """Yield a headless Chromium of the Debian package."""
     with sync_playwright() as tools:
-        browser = tools.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"], timeout=_LONG_MS)
+        browser = tools.chromium.launch(
+            executable_path="/usr/bin/chromium", args=["--no-sandbox"], timeout=_TIMEOUT_MS
+        )
         try:
             yield browser
         finally:
@@ -37,22 +39,22 @@ def chromium() -> Iterator[Browser]:
 def opened(
     browser: Browser, path: Path, *, width: int = LAPTOP, scheme: Literal["light", "dark"] = "light"
 ) -> Iterator[Opened]:
-    """Yield a page opened as a file; every request but the one for it is refused."""
+    """Yield a page opened from a file; all other requests are rejected."""
     context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme)
-    context.set_default_timeout(_LONG_MS)
-    found = Opened(context.new_page())
+    context.set_default_timeout(_TIMEOUT_MS)
+    opened_page = Opened(context.new_page())
 
-    def judge(route: Route) -> None:
+    def filter_request(route: Route) -> None:
         if route.request.url == path.as_uri():
             route.continue_()
         else:
-            found.asked_for.append(route.request.url)
+            opened_page.asked_for.append(route.request.url)
             route.abort()
 
-    context.route("**/*", judge)
-    found.page.on("console", lambda message: found.said.append(message.text))
-    found.page.on("pageerror", lambda error: found.said.append(str(error)))
-    found.page.on("dialog", lambda dialog: found.said.append(f"dialog: {dialog.message}"))
-    found.page.goto(path.as_uri())
-    yield found
+    context.route("**/*", filter_request)
+    opened_page.page.on("console", lambda message: opened_page.said.append(message.text))
+    opened_page.page.on("pageerror", lambda error: opened_page.said.append(str(error)))
+    opened_page.page.on("dialog", lambda dialog: opened_page.said.append(f"dialog: {dialog.message}"))
+    opened_page.page.goto(path.as_uri())
+    yield opened_page
     context.close()

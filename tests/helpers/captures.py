@@ -1,4 +1,4 @@
-"""Captures for tests, from the bytes up: nothing here uses the code under test, but for the type of its result."""
+"""Captures for tests, built from bytes; the code under test is only used for the type of the result."""
 
 import struct
 from collections.abc import Iterable, Sequence
@@ -24,7 +24,7 @@ def transfer(protocol: Protocol) -> Transfer:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame with its moment."""
+    """A frame with its time."""
 
     time_ns: int
     data: bytes
@@ -33,12 +33,12 @@ class Frame:
 
 def file_bytes(frames: Iterable[Frame], *, order: str = "<", nano: bool = True, link_type: int = 101) -> bytes:
     magic, tick_ns = (0xA1B23C4D, 1) if nano else (0xA1B2C3D4, 1000)
-    out = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 128, link_type)]
+    parts = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 128, link_type)]
     for frame in frames:
         seconds, rest_ns = divmod(frame.time_ns, 1_000_000_000)
-        wire = len(frame.data) if frame.wire_bytes is None else frame.wire_bytes
-        out += [struct.pack(f"{order}4I", seconds, rest_ns // tick_ns, len(frame.data), wire), frame.data]
-    return b"".join(out)
+        wire_bytes = len(frame.data) if frame.wire_bytes is None else frame.wire_bytes
+        parts += [struct.pack(f"{order}4I", seconds, rest_ns // tick_ns, len(frame.data), wire_bytes), frame.data]
+    return b"".join(parts)
 
 
 def packets(frames: Iterable[Frame]) -> Packets:
@@ -56,26 +56,28 @@ def ipv4(
     src: str = SENDER,
     dst: str = RECEIVER,
 ) -> bytes:
-    """An IPv4 packet of which `size` bytes of payload are on the wire, and `payload` is what was kept."""
+    """An IPv4 packet with `size` payload bytes on the wire, of which the capture contains `payload`."""
     total = 20 + (len(payload) if size is None else size)
     fragment = offset // 8 | (0x2000 if more else 0)
     source, destination = IPv4Address(src).packed, IPv4Address(dst).packed
-    head = struct.pack(
+    header = struct.pack(
         ">BBHHHBBH4s4s", 0x45, 0, total & 0xFFFF, ip_id, fragment, 64, protocol, 0, source, destination
     )
-    return head + payload
+    return header + payload
 
 
 def datagram(ip_id: int, payload_bytes: int, *, mtu: int = 1500, port: int = PORT, sport: int = 40000) -> list[bytes]:
-    """The IP packets of one UDP datagram, as Linux cuts them: first fragment first."""
-    left = payload_bytes + 8
+    """The IP packets of a UDP datagram as Linux fragments it, first fragment first."""
+    datagram_bytes = payload_bytes + 8
     step = (mtu - 20) // 8 * 8
-    cut: list[bytes] = []
-    for offset in range(0, left, step):
-        size = min(step, left - offset)
-        head = struct.pack(">HHHH", sport, port, left, 0) if offset == 0 else b""
-        cut.append(ipv4(head, protocol=17, size=size, ip_id=ip_id, offset=offset, more=offset + size < left))
-    return cut
+    fragments: list[bytes] = []
+    for offset in range(0, datagram_bytes, step):
+        size = min(step, datagram_bytes - offset)
+        header = struct.pack(">HHHH", sport, port, datagram_bytes, 0) if offset == 0 else b""
+        fragments.append(
+            ipv4(header, protocol=17, size=size, ip_id=ip_id, offset=offset, more=offset + size < datagram_bytes)
+        )
+    return fragments
 
 
 def segment(
@@ -90,15 +92,17 @@ def segment(
     ack: int = 0,
     back: bool = False,
 ) -> bytes:
-    """One TCP frame, payload not kept; `back` from the receiver."""
+    """A TCP segment without its payload; `back` if it is from the receiver."""
     options = b"" if mss is None else struct.pack(">BBBBHBB", 1, 1, 2, 4, mss, 1, 0)
-    words = 5 + len(options) // 4
+    header_words = 5 + len(options) // 4
     ports, ends = ((port, sport), (RECEIVER, SENDER)) if back else ((sport, port), (SENDER, RECEIVER))
-    head = struct.pack(">HHIIBBHHH", *ports, seq % 2**32, ack % 2**32, words << 4, flags, 502, 0, 0) + options
-    return ipv4(head, protocol=6, size=len(head) + payload_bytes, ip_id=ip_id, src=ends[0], dst=ends[1])
+    header = (
+        struct.pack(">HHIIBBHHH", *ports, seq % 2**32, ack % 2**32, header_words << 4, flags, 502, 0, 0) + options
+    )
+    return ipv4(header, protocol=6, size=len(header) + payload_bytes, ip_id=ip_id, src=ends[0], dst=ends[1])
 
 
 def timed(
     data: Sequence[bytes], *, start_ns: int = 1_700_000_000_000_000_000, step_ns: int = 1_000_000
 ) -> list[Frame]:
-    return [Frame(start_ns + index * step_ns, one, wire_bytes=65535 + 20) for index, one in enumerate(data)]
+    return [Frame(start_ns + index * step_ns, content, wire_bytes=65535 + 20) for index, content in enumerate(data)]

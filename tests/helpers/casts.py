@@ -1,4 +1,4 @@
-"""Casts and plans for pure tests."""
+"""Casts and plans for tests without processes or robots."""
 
 from datetime import UTC, datetime
 
@@ -21,7 +21,7 @@ CAST = {
 
 
 def ros_of(profile: RobotProfile) -> Ros:
-    """The ROS side of a profile that has one."""
+    """The ROS section of a profile that has one."""
     assert profile.ros is not None
     return profile.ros
 

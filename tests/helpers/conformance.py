@@ -1,6 +1,6 @@
-"""What fieldkit relies on in every Shell and every testbed, as tests: subclass, give the fixtures, run pytest.
+"""Tests of the requirements of fieldkit on shells and testbeds: derive a class, add the fixtures, and run pytest.
 
-A backend of somebody else's is tested in the same way as fieldkit's own, see `test_conformance.py`.
+The backends of other packages are tested in the same way as those of fieldkit; see `test_conformance.py`.
 """
 
 import hashlib
@@ -25,15 +25,16 @@ from fieldkit.remote.shell import Shell
 from tests.helpers.sshd import wait_until
 
 SOON_S = 60.0
-# Larger than every window: paramiko's has 2 MiB.
+# Larger than all transport windows: that of paramiko has 2 MiB.
 LARGE_BYTES = 5_000_000
 LARGE_FILE_BYTES = fetching.PIECE_BYTES + 100
-"""Evidence of two pieces."""
+"""Size of an evidence file that is fetched in two pieces."""
 
 GAP_S = 3.0
 NOTICED_S = 40.0
-"""Within this time, also on a busy machine, a wait on a dead link must end. On a quiet one it takes 10 s at most:
-tests/remote/test_remote_dead_link.py.
+"""Time limit for a wait on a dead link, also on a busy machine; on an idle machine it takes at most 10 s.
+
+See tests/remote/test_remote_dead_link.py.
 """
 
 
@@ -43,9 +44,9 @@ class Subject:
 
     Attributes:
         shell: The Shell.
-        cut: Lets the way to the robot die without a word: nothing comes from it any more.
-        restore: Lets it come back.
-        give_up_s: How long the Shell tries to bring a lost link back, a last attempt included; short, to save time.
+        cut: Cuts the link to the robot silently, so that nothing arrives from it.
+        restore: Restores the link.
+        give_up_s: Time limit for restoring a lost link, including the last attempt; short, to save time.
     """
 
     shell: Shell
@@ -55,7 +56,7 @@ class Subject:
 
     @contextmanager
     def dead_link(self) -> Iterator[None]:
-        """Cut the link for as long as the context lasts."""
+        """Cut the link for the duration of the context."""
         self.cut()
         try:
             yield
@@ -72,10 +73,10 @@ def said(shell: Shell, *argv: str) -> str:
 
 
 @contextmanager
-def endless(shell: Shell, *, first: str = ":") -> Iterator[tuple[str, ...]]:
-    """Yield a command that does `first` and then nothing for long; at the end of the context it is ended.
+def endless_command(shell: Shell, *, first: str = ":") -> Iterator[tuple[str, ...]]:
+    """Yield a command that does `first` and then sleeps for a long time; it is killed at the end of the context.
 
-    Not every SSH server ends what a client leaves: OpenSSH does not.
+    Not all SSH servers kill the commands of a disconnected client: OpenSSH does not.
     """
     try:
         yield ("sh", "-c", f"{first}; echo $$ >endless; exec sleep 600")
@@ -84,19 +85,19 @@ def endless(shell: Shell, *, first: str = ":") -> Iterator[tuple[str, ...]]:
 
 
 @contextmanager
-def waiting(shell: Shell) -> Iterator[Callable[[float], BaseException | None]]:
-    """Let a thread wait for a command that never ends, with nothing to be said by either side.
+def waiting_thread(shell: Shell) -> Iterator[Callable[[float], BaseException | None]]:
+    """Let a thread wait for an endless command while neither side sends data.
 
-    Yields what gives the thread's error, within so many seconds.
+    Yields a function that returns the thread's error, within a number of seconds.
     """
-    with endless(shell, first="cat") as argv, ThreadPoolExecutor(1) as pool:
+    with endless_command(shell, first="cat") as argv, ThreadPoolExecutor(1) as pool:
         session = shell.begin(argv, deadline=soon())
         ended = pool.submit(session.end, deadline=Deadline.after(2 * SOON_S))
         said(shell, "sh", "-c", "until [ -s endless ]; do sleep 0.05; done")
         yield ended.exception
 
 
-def answers(shell: Shell) -> bool:
+def is_responsive(shell: Shell) -> bool:
     try:
         return said(shell, "echo", "back") == "back\n"
     except LinkError:
@@ -104,80 +105,85 @@ def answers(shell: Shell) -> bool:
 
 
 class ShellConformance:
-    """A Shell's promises; needs a fixture `subject` that gives a `Subject`, of class scope to save time."""
+    """Requirements on a Shell; needs a fixture `subject` with a `Subject`, of class scope to save time."""
 
     @pytest.mark.parametrize("code", [0, 1, 3, 124, 255])
     def test_both_streams_and_the_exit_code_arrive(self, subject: Subject, code: int) -> None:
         argv = ("sh", "-c", f"echo out; echo err >&2; exit {code}")
-        done = subject.shell.run(argv, deadline=soon(), check=False)
-        assert (done.argv, done.exit_code, done.stdout, done.stderr) == (argv, code, b"out\n", b"err\n")
+        completed = subject.shell.run(argv, deadline=soon(), check=False)
+        assert (completed.argv, completed.exit_code, completed.stdout, completed.stderr) == (
+            argv,
+            code,
+            b"out\n",
+            b"err\n",
+        )
 
-    def test_a_failed_command_is_the_robot_s_error_with_its_words(self, subject: Subject) -> None:
+    def test_a_failed_command_raises_a_robot_error_with_its_output(self, subject: Subject) -> None:
         with pytest.raises(RobotError, match=r"exit code 3.*no bag today"):
             subject.shell.run(("sh", "-c", "echo no bag today >&2; exit 3"), deadline=soon())
 
-    def test_a_command_that_is_not_there_has_exit_code_127(self, subject: Subject) -> None:
-        done = subject.shell.run(("no-such-program",), deadline=soon(), check=False)
-        assert done.exit_code == 127
-        assert b"no-such-program" in done.stderr
+    def test_a_missing_command_has_exit_code_127(self, subject: Subject) -> None:
+        completed = subject.shell.run(("no-such-program",), deadline=soon(), check=False)
+        assert completed.exit_code == 127
+        assert b"no-such-program" in completed.stderr
 
-    def test_words_arrive_as_they_are(self, subject: Subject) -> None:
-        words = ["", " ", "a b", "'", '"', "$HOME", "`id`", "\\", "*", "~", "a\nb", "-n", ";", "größe", "机器人"]
-        assert said(subject.shell, "printf", "%s\\0", *words).split("\0")[:-1] == words
+    def test_arguments_arrive_unchanged(self, subject: Subject) -> None:
+        arguments = ["", " ", "a b", "'", '"', "$HOME", "`id`", "\\", "*", "~", "a\nb", "-n", ";", "größe", "机器人"]
+        assert said(subject.shell, "printf", "%s\\0", *arguments).split("\0")[:-1] == arguments
 
-    def test_both_streams_may_be_large_at_once(self, subject: Subject) -> None:
+    def test_both_streams_may_be_large(self, subject: Subject) -> None:
         script = f"head -c {LARGE_BYTES} /dev/zero >&2 & head -c {LARGE_BYTES} /dev/zero; wait; echo end >&2"
-        done = subject.shell.run(("sh", "-c", script), deadline=soon())
-        assert done.stdout == bytes(LARGE_BYTES)
-        assert done.stderr.endswith(b"\0end\n")
+        completed = subject.shell.run(("sh", "-c", script), deadline=soon())
+        assert completed.stdout == bytes(LARGE_BYTES)
+        assert completed.stderr.endswith(b"\0end\n")
 
     def test_standard_input_may_be_large(self, subject: Subject) -> None:
         data = bytes(range(256)) * (LARGE_BYTES // 256)
-        done = subject.shell.run(("sha256sum",), stdin=data, deadline=soon())
-        assert done.stdout.split()[0].decode() == hashlib.sha256(data).hexdigest()
+        completed = subject.shell.run(("sha256sum",), stdin=data, deadline=soon())
+        assert completed.stdout.split()[0].decode() == hashlib.sha256(data).hexdigest()
 
-    def test_a_session_s_input_ends_when_its_end_is_awaited(self, subject: Subject) -> None:
+    def test_the_input_of_a_session_is_closed_when_its_end_is_awaited(self, subject: Subject) -> None:
         session = subject.shell.begin(("cat",), deadline=soon())
         assert said(subject.shell, "echo", "meanwhile") == "meanwhile\n"
         assert session.end(deadline=soon()).exit_code == 0
 
-    def test_silence_touches_no_link_that_lives(self, subject: Subject) -> None:
+    def test_silence_does_not_affect_a_working_link(self, subject: Subject) -> None:
         with subject.shell.silence(SOON_S):
             assert said(subject.shell, "echo", "here") == "here\n"
         assert said(subject.shell, "echo", "again") == "again\n"
 
-    def test_many_commands_run_at_once(self, subject: Subject) -> None:
+    def test_commands_run_concurrently(self, subject: Subject) -> None:
         with ThreadPoolExecutor(8) as pool:
             texts = [f"{number}\n" for number in range(8)]
             assert list(pool.map(lambda text: said(subject.shell, "printf", text), texts)) == texts
 
-    def test_a_file_is_fetched_whole(self, subject: Subject, tmp_path: Path) -> None:
+    def test_a_file_is_fetched_completely(self, subject: Subject, tmp_path: Path) -> None:
         script = f'head -c {LARGE_BYTES} /dev/urandom >"$HOME/large" && sha256sum "$HOME/large"'
         digest = said(subject.shell, "sh", "-c", script).split()[0]
-        take = ("sh", "-c", 'cat "$HOME/large" && rm "$HOME/large"')
-        subject.shell.fetch(take, tmp_path / "large", deadline=soon(), limit_bytes=LARGE_BYTES)
+        argv = ("sh", "-c", 'cat "$HOME/large" && rm "$HOME/large"')
+        subject.shell.fetch(argv, tmp_path / "large", deadline=soon(), limit_bytes=LARGE_BYTES)
         assert hashlib.sha256((tmp_path / "large").read_bytes()).hexdigest() == digest
 
-    def test_a_robot_that_sends_without_end_is_stopped(self, subject: Subject, tmp_path: Path) -> None:
+    def test_output_beyond_the_limit_raises_a_robot_error(self, subject: Subject, tmp_path: Path) -> None:
         with pytest.raises(RobotError, match="more than 1000 bytes"):
             subject.shell.fetch(("cat", "/dev/zero"), tmp_path / "endless", deadline=soon(), limit_bytes=1000)
         assert said(subject.shell, "echo", "on") == "on\n"
 
-    def test_a_command_that_never_ends_meets_the_deadline(self, subject: Subject) -> None:
-        with endless(subject.shell) as argv:
+    def test_an_endless_command_raises_a_link_error_at_the_deadline(self, subject: Subject) -> None:
+        with endless_command(subject.shell) as argv:
             began_s = time.monotonic()
             with pytest.raises(LinkError):
                 subject.shell.run(argv, deadline=Deadline.after(1.0))
             assert 1.0 <= time.monotonic() - began_s < 1.0 + NOTICED_S
         assert said(subject.shell, "echo", "on") == "on\n"
 
-    def test_a_killed_command_is_the_robot_s_error(self, subject: Subject) -> None:
+    def test_a_killed_command_raises_a_robot_error(self, subject: Subject) -> None:
         with pytest.raises(RobotError):
             subject.shell.run(("sh", "-c", "kill -KILL $$"), deadline=soon())
         assert said(subject.shell, "echo", "on") == "on\n"
 
-    def test_closing_ends_the_waiting_of_another_thread(self, subject: Subject) -> None:
-        with waiting(subject.shell) as error:
+    def test_close_ends_the_wait_of_another_thread(self, subject: Subject) -> None:
+        with waiting_thread(subject.shell) as error:
             subject.shell.close()
             assert isinstance(error(NOTICED_S), LinkError)
         assert said(subject.shell, "echo", "made again") == "made again\n"
@@ -196,46 +202,44 @@ class ShellConformance:
         assert (tmp_path / "slow.log").read_text(encoding="ascii") == "done\n"
         assert (tmp_path / "large.bag").stat().st_size == LARGE_FILE_BYTES
 
-    def test_a_gap_in_the_link_is_survived(self, subject: Subject) -> None:
+    def test_a_session_survives_a_short_link_outage(self, subject: Subject) -> None:
         session = subject.shell.begin(("sh", "-c", "sleep 1; echo done"), deadline=soon())
         subject.cut()
-        back = threading.Timer(GAP_S, subject.restore)
-        back.start()
+        timer = threading.Timer(GAP_S, subject.restore)
+        timer.start()
         try:
             assert session.end(deadline=soon()).stdout == b"done\n"
         finally:
-            back.join()
+            timer.join()
 
-    def test_a_dead_link_is_noticed_by_who_merely_waits(self, subject: Subject) -> None:
-        with waiting(subject.shell) as error, subject.dead_link():
+    def test_a_waiting_thread_detects_a_dead_link(self, subject: Subject) -> None:
+        with waiting_thread(subject.shell) as error, subject.dead_link():
             assert isinstance(error(NOTICED_S + subject.give_up_s), LinkError)
-        # The Shell gives up soon, to save time: on a busy machine sooner than a new connection takes.
-        wait_until(lambda: answers(subject.shell), soon())
+        # The Shell gives up early to save time; on a busy machine, a new connection may take longer.
+        wait_until(lambda: is_responsive(subject.shell), soon())
 
 
 class RebootConformance:
-    """What holds of a robot that can be rebooted; needs fixtures `subject` and `reboot`.
+    """Requirements on a robot that can be rebooted; needs fixtures `subject` and `reboot`.
 
-    `reboot` is a function that takes the robot's power and returns when it has power again.
+    `reboot` is a function that cuts the robot's power and returns when it has power again.
     """
 
-    def test_a_robot_that_reboots_is_reached_again(self, subject: Subject, reboot: Callable[[], object]) -> None:
+    def test_a_robot_is_reachable_after_a_reboot(self, subject: Subject, reboot: Callable[[], object]) -> None:
         boot = said(subject.shell, "cat", "/proc/sys/kernel/random/boot_id")
         reboot()
         assert said(subject.shell, "cat", "/proc/sys/kernel/random/boot_id") != boot
 
 
 class BackendConformance:
-    """What a backend's testbed promises; needs fixtures `testbed`, `cast` and `topology`."""
+    """Requirements on the testbed of a backend; needs fixtures `testbed`, `cast` and `topology`."""
 
-    def test_every_robot_of_the_cast_has_a_shell_of_its_name(self, testbed: Testbed, cast: Cast) -> None:
+    def test_each_robot_of_the_cast_has_a_shell_with_its_name(self, testbed: Testbed, cast: Cast) -> None:
         assert {role: shell.robot for role, shell in testbed.shells.items()} == {
             role: robot.name for role, robot in cast.items()
         }
 
-    def test_each_address_is_on_the_radio_and_the_others_are_reached_by_it(
-        self, testbed: Testbed, cast: Cast
-    ) -> None:
+    def test_each_address_is_on_the_radio_interface_and_routes_use_it(self, testbed: Testbed, cast: Cast) -> None:
         for role, robot in cast.items():
             interface = robot.profile.radio.interface
             assert f" {robot.address}/" in said(testbed.shells[role], "ip", "-4", "addr", "show", "dev", interface)
@@ -244,50 +248,48 @@ class BackendConformance:
                     route = said(testbed.shells[role], "ip", "route", "get", other.address)
                     assert f"dev {interface}" in route
 
-    def test_robots_hear_each_other_where_they_are_placed(
-        self, testbed: Testbed, cast: Cast, topology: Topology
-    ) -> None:
+    def test_placed_robots_reach_each_other(self, testbed: Testbed, cast: Cast, topology: Topology) -> None:
         for distance in ("10m", "5m"):
             testbed.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
             said(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
 
-    def test_what_a_testbed_can_know_does_not_change(self, testbed: Testbed) -> None:
+    def test_the_oracle_of_a_testbed_is_constant(self, testbed: Testbed) -> None:
         assert testbed.oracle is testbed.oracle
 
-    def test_an_oracle_knows_the_lateness_of_each_packet(self, testbed: Testbed, cast: Cast) -> None:
+    def test_the_oracle_reports_the_lateness_of_each_packet(self, testbed: Testbed, cast: Cast) -> None:
         if testbed.oracle is None:
-            return  # as of every testbed whose radio is real
+            return  # a testbed with a real radio has no oracle
         before = testbed.oracle.lateness()
         said(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
         after = testbed.oracle.lateness()
         assert sum(after.packets.values()) - sum(before.packets.values()) >= 10
         assert before.bound_ns == after.bound_ns > 0
 
-    def test_an_oracle_knows_the_delays_of_each_packet_that_arrived(self, testbed: Testbed, cast: Cast) -> None:
+    def test_the_oracle_reports_the_delays_of_arrived_packets(self, testbed: Testbed, cast: Cast) -> None:
         if (oracle := testbed.oracle) is None:
             return
-        flow, other = ((Role.SENDER, Role.RECEIVER, Protocol.UDP, port) for port in (9, 99))
+        flow, other_flow = ((Role.SENDER, Role.RECEIVER, Protocol.UDP, port) for port in (9, 99))
         before = oracle.delays(*flow)
-        assert oracle.delays(*other).packets == 0, "nobody has asked for it before"
-        says = "for n in 1 2 3 4 5; do echo x >/dev/udp/$0/9; sleep 0.1; done"
-        said(testbed.shells[Role.SENDER], "bash", "-c", says, cast[Role.RECEIVER].address)
+        assert oracle.delays(*other_flow).packets == 0, "the first query of a flow"
+        script = "for n in 1 2 3 4 5; do echo x >/dev/udp/$0/9; sleep 0.1; done"
+        said(testbed.shells[Role.SENDER], "bash", "-c", script, cast[Role.RECEIVER].address)
         wait_until(lambda: oracle.delays(*flow).packets >= before.packets + 5, Deadline.after(30))
         after = oracle.delays(*flow)
-        assert oracle.delays(*other).packets == 0, "packets to another port are another flow's"
+        assert oracle.delays(*other_flow).packets == 0, "packets to another port belong to another flow"
         parts = ("processing_ns", "transmission_ns", "propagation_ns", "queuing_ns")
         grown_ns = [getattr(after, name) - getattr(before, name) for name in parts]
         assert min(grown_ns) >= 0
         assert sum(grown_ns) > 0
 
-    def test_an_oracle_knows_where_each_robot_is(self, testbed: Testbed, cast: Cast) -> None:
+    def test_the_oracle_reports_the_position_of_each_robot(self, testbed: Testbed, cast: Cast) -> None:
         if testbed.oracle is None:
             return
         now_ns = time.time_ns()
         track = testbed.oracle.track(now_ns)
-        assert {one.role for one in track if one.utc_ns <= now_ns} == set(cast)
-        assert [one.utc_ns for one in track] == sorted(one.utc_ns for one in track)
+        assert {entry.role for entry in track if entry.utc_ns <= now_ns} == set(cast)
+        assert [entry.utc_ns for entry in track] == sorted(entry.utc_ns for entry in track)
 
-    def test_an_oracle_records_the_air_until_it_is_told_to_stop(
+    def test_the_oracle_records_frames_until_it_is_stopped(
         self, testbed: Testbed, cast: Cast, tmp_path: Path
     ) -> None:
         if testbed.oracle is None:

@@ -1,4 +1,4 @@
-"""A row of robots, each of which follows the one before it by what it hears over a network with a constant delay."""
+"""A convoy of robots, each of which follows its predecessor by messages over a network with a constant delay."""
 
 import math
 from collections.abc import Mapping
@@ -23,10 +23,10 @@ from sim_backends.world.motion import State
 
 MS = 1_000_000
 QUICK = DriveLimits(3.0, 20.0, 2.0, 6.0, radius_m=0.3, height_m=0.4)
-"""A robot whose own limits hardly matter, so that a row of it is linear."""
+"""Limits so high that they hardly have an effect, so the convoy is a linear system."""
 STANDSTILL_M = 2.0
 MEAN_M_S = 1.0
-EVERY_NS = 10 * MS
+SAMPLE_INTERVAL_NS = 10 * MS
 
 
 def places_m(
@@ -40,11 +40,11 @@ def places_m(
     period_ms: int = 10,
     seconds: float,
 ) -> tuple[Floats, Floats]:
-    """Return where robots are, the first's speed going up and down: times, and places as (times, robots, 3)."""
+    """Times, and positions of shape (times, robots, 3), of a convoy whose leader has an oscillating speed."""
     names = [f"v{number}" for number in range(followers + 1)]
-    # The row starts as it would go at the mean speed.
-    apart_m = STANDSTILL_M + headway_s * MEAN_M_S
-    bodies = Bodies({name: DifferentialDrive(QUICK, (-apart_m * number, 0.0)) for number, name in enumerate(names)})
+    # The initial spacing is the equilibrium at the mean speed.
+    spacing_m = STANDSTILL_M + headway_s * MEAN_M_S
+    bodies = Bodies({name: DifferentialDrive(QUICK, (-spacing_m * number, 0.0)) for number, name in enumerate(names)})
     programs: dict[str, Program] = {}
     for number, name in enumerate(names):
         parts: list[Program] = [
@@ -58,26 +58,26 @@ def places_m(
             if number
             else SpeedOscillation(MEAN_M_S, 0.2, math.tau / rate_rad_s)
         ]
-        parts += [Periodic(name, behind, period_ns=period_ms * MS) for behind in names[number + 1 : number + 2]]
+        parts += [Periodic(name, follower, period_ns=period_ms * MS) for follower in names[number + 1 : number + 2]]
         programs[name] = Several(parts)
-    watched = Watched(bodies)
+    sampled = SampledBodies(bodies)
     network = Disc(1e6, round(delay_s * 1e9))
-    Coordinator(Agents(watched, programs), network, policy, [*pairwise(names)]).advance(round(seconds * 1e9))
-    places = [[states[name].position_m for name in names] for states in watched.seen]
-    return np.arange(len(places)) * EVERY_NS / 1e9, np.array(places)
+    Coordinator(Agents(sampled, programs), network, policy, [*pairwise(names)]).advance(round(seconds * 1e9))
+    places = [[states[name].position_m for name in names] for states in sampled.samples]
+    return np.arange(len(places)) * SAMPLE_INTERVAL_NS / 1e9, np.array(places)
 
 
-class Watched:
-    """Bodies that are looked at in equal intervals; how they move it leaves as it is."""
+class SampledBodies:
+    """Bodies whose states are sampled at equal intervals, without an effect on their motion."""
 
     def __init__(self, bodies: Bodies) -> None:
         self._bodies = bodies
-        self.seen: list[Mapping[str, State]] = []
+        self.samples: list[Mapping[str, State]] = []
         self.step_ns = bodies.step_ns
         self.limits_m_s2 = bodies.limits_m_s2
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        while len(self.seen) * EVERY_NS <= to_ns:
-            self.seen.append(self._bodies.advance(len(self.seen) * EVERY_NS, commands))
+        while len(self.samples) * SAMPLE_INTERVAL_NS <= to_ns:
+            self.samples.append(self._bodies.advance(len(self.samples) * SAMPLE_INTERVAL_NS, commands))
             commands = {}
         return self._bodies.advance(to_ns, commands)

@@ -1,4 +1,4 @@
-"""A trial on a disk whose power is cut: at each sync, or at random moments, one cut after the other."""
+"""A trial on a disk whose power fails: at each sync, or repeatedly at random times."""
 
 import hashlib
 import itertools
@@ -31,28 +31,28 @@ _FSYNC: Final = os.fsync
 
 @contextmanager
 def robots_with_much_evidence() -> Iterator[None]:
-    """Let robots have measured, without robots, and leave what brings its own ways to get lost.
+    """Simulate robots with evidence that could be lost in different ways.
 
-    A folder with nothing in it, a file that is too large for a node of the file system, and one in a folder of its
-    own that got its name when it had been synced.
+    The evidence contains an empty folder, a file too large for an inode of the file system, and a file in a separate
+    folder that is renamed after it was synced.
     """
     with pytest.MonkeyPatch.context() as patch:
         robots_with_evidence(patch)
-        small: Callable[..., list[str]] = Robots.fetch
+        original_fetch: Callable[..., list[str]] = Robots.fetch
 
-        def fetch(robots: Robots, remote: str, into: Path, **more: object) -> list[str]:
-            reasons = small(robots, remote, into, **more)
+        def fetch(robots: Robots, remote: str, folder: Path, **options: object) -> list[str]:
+            reasons = original_fetch(robots, remote, folder, **options)
             if remote.endswith(VOID_FIRST):
-                (into / "ping.txt").unlink()
+                (folder / "ping.txt").unlink()
                 return reasons
-            (into / "sender.pcap").write_bytes(hashlib.sha256(remote.encode()).digest() * 4000)
-            part = into / "scan" / ".part"
-            part.parent.mkdir(exist_ok=True)
-            with part.open("wb") as file:
+            (folder / "sender.pcap").write_bytes(hashlib.sha256(remote.encode()).digest() * 4000)
+            temporary = folder / "scan" / ".part"
+            temporary.parent.mkdir(exist_ok=True)
+            with temporary.open("wb") as file:
                 file.write(remote.encode())
                 file.flush()
                 _FSYNC(file.fileno())
-            part.rename(part.with_name("metadata.yaml"))
+            temporary.rename(temporary.with_name("metadata.yaml"))
             return reasons
 
         patch.setattr(Robots, "fetch", fetch)
@@ -60,31 +60,31 @@ def robots_with_much_evidence() -> Iterator[None]:
 
 
 def run(out: Path, witness: Witness) -> None:
-    """Begin the trial in `out`, or go on with it where a cut left its plan; a witness hears what the user is told."""
-    begun = list(out.glob(f"*/{PLAN_FILE}"))
-    if begun:
-        resume_trial(begun[0].parent, IdleTestbed(), witness.hear)
+    """Start the trial in `out`, or resume it if a power cut left its plan; the witness receives the messages."""
+    plans = list(out.glob(f"*/{PLAN_FILE}"))
+    if plans:
+        resume_trial(plans[0].parent, IdleTestbed(), witness.on_event)
     else:
         out.mkdir(exist_ok=True)
-        for nothing in out.iterdir():  # of a trial that nobody was told of; the next has a name of its own
-            shutil.rmtree(nothing)
-        run_trial(plan(), IdleTestbed(), out, witness.hear)
+        for leftover in out.iterdir():  # a trial that was not reported to the user; the next one has a different name
+            shutil.rmtree(leftover)
+        run_trial(plan(), IdleTestbed(), out, witness.on_event)
 
 
 @contextmanager
 def at_every_sync(call: Callable[[str], bool]) -> Iterator[None]:
-    """Call something before each sync of a file or folder, with the place in fieldkit that asks for it.
+    """Call a function before each sync of a file or folder, with the location in fieldkit that requests the sync.
 
-    What is synced side by side is synced one after the other here.
+    Syncs that are normally concurrent are serialized.
 
     Args:
-        call: Returns whether to sync at all.
+        call: Returns False to skip the sync.
     """
-    alone = threading.Lock()
+    lock = threading.Lock()
 
     def sync(descriptor: int) -> None:
-        with alone:
-            if call(_place()):
+        with lock:
+            if call(_sync_location()):
                 _FSYNC(descriptor)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -92,68 +92,68 @@ def at_every_sync(call: Callable[[str], bool]) -> Iterator[None]:
         yield
 
 
-def _place() -> str:
-    """Return which line of fieldkit syncs: for a folder the one that calls `sync_folder`."""
+def _sync_location() -> str:
+    """Source location in fieldkit that requested the sync; for a folder, the caller of `sync_folder`."""
     frames: list[FrameType] = []
     frame: FrameType | None = sys._getframe(2)
     while frame is not None:
         if "fieldkit" in Path(frame.f_code.co_filename).parts[-3:]:
             frames.append(frame)
         frame = frame.f_back
-    frame = next((one for one in frames if one.f_code.co_name not in {"sync_folder", "_sync"}), frames[0])
+    frame = next((caller for caller in frames if caller.f_code.co_name not in {"sync_folder", "_sync"}), frames[0])
     line = linecache.getline(frame.f_code.co_filename, frame.f_lineno).strip()
     return f"{Path(frame.f_code.co_filename).stem}.{frame.f_code.co_name}: {line}"
 
 
 def cuts_at_every_sync(disk: Disk, place: Path, *, without: str = "") -> tuple[list[Cut], Witness, list[str]]:
-    """Run the trial on a disk and cut its power before each sync and at the end, when more has not reached it.
+    """Run the trial on a disk and cut its power before each sync and at the end, in the worst case for durability.
 
-    Between two syncs nothing reaches the disk, so these are all the disks that cuts there can leave, each with the
-    most that the user was told meanwhile.
+    Only synced data reaches the disk, so these are all disk states that a cut can leave. Each is combined with the
+    most that was reported to the user until then.
 
     Args:
         disk: The disk.
-        place: Folder to work in.
-        without: A place in fieldkit whose sync is taken out.
+        place: A working folder.
+        without: Location in fieldkit whose sync is skipped.
 
     Returns:
-        The cuts, who saw the trial, and the places that asked for a sync.
+        The cuts, the witness of the trial, and the locations that requested a sync.
     """
     cuts: list[Cut] = []
-    places: list[str] = []
+    locations: list[str] = []
     with disk.mounted(place / "disk") as mounted:
         (out := mounted / OUT).mkdir()
         witness = Witness(out)
 
-        def cut(at: str) -> bool:
+        def cut(location: str) -> bool:
             witness.look()
             image = disk.image(mounted, place / f"cut-{len(cuts)}.img")
-            cuts.append(Cut(image, dict(witness.told), witness.is_over, f"cut {len(cuts)}, before {at}"))
-            places.append(at)
-            return at != without
+            cuts.append(Cut(image, dict(witness.told), witness.is_over, f"cut {len(cuts)}, before {location}"))
+            locations.append(location)
+            return location != without
 
         with at_every_sync(cut):
             run(out, witness)
         cut("power off")
-    return cuts, witness, places[:-1]
+    return cuts, witness, locations[:-1]
 
 
 @contextmanager
 def at_call(number: int, then: Callable[[], None]) -> Iterator[None]:
-    """Call something when the body has made so many calls of functions and returns from them.
+    """Call a function after the body has made `number` function calls and returns.
 
-    They tell how far a trial is, as a clock would on a machine that does nothing else.
+    The count measures the progress of a trial reproducibly, unlike time.
     """
-    left = number
+    remaining_calls = number
 
-    def see(*_: object) -> None:
-        nonlocal left
-        left -= 1
-        if left < 0:
+    def count_call(*_: object) -> None:
+        nonlocal remaining_calls
+        remaining_calls -= 1
+        if remaining_calls < 0:
             sys.setprofile(None)
             then()
 
-    sys.setprofile(see)
+    sys.setprofile(count_call)
     try:
         yield
     finally:
@@ -161,7 +161,7 @@ def at_call(number: int, then: Callable[[], None]) -> Iterator[None]:
 
 
 def calls_of_a_trial(place: Path) -> int:
-    """Return how many calls and returns a trial makes, about; the first in a process makes more."""
+    """Approximate number of calls and returns in a trial; the first trial of a process has more."""
     counts = []
     for number in range(2):
         witness = Witness(place / f"whole-{number}")
@@ -176,69 +176,69 @@ def calls_of_a_trial(place: Path) -> int:
 
 
 def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tuple[Cut, Witness]:
-    """Run the trial on a disk, or go on with it, and cut the power after so many calls and returns, or at its end.
+    """Run or resume the trial on a disk, and cut the power after a number of calls and returns, or at its end.
 
-    The trial runs on while the disk is copied, so the power goes then or a little later.
+    The trial continues while the disk is copied, so the effective cut may be slightly later.
 
     Args:
         disk: The disk.
-        place: Folder to work in.
-        file: Gets what the cut leaves.
-        after_calls: When.
+        place: A working folder.
+        file: Path for the disk image after the cut.
+        after_calls: Number of calls and returns before the cut.
     """
     with disk.mounted(place / "disk") as mounted, ThreadPoolExecutor() as pool:
         (out := mounted / OUT).mkdir(exist_ok=True)
         witness = Witness(out)
         witness.look()
-        witness.told = dict.fromkeys(witness.versions, 0)  # what a cut has left is on disk, and must stay there
-        moments: list[tuple[dict[str, int], bool]] = []
-        asked = threading.Event()
+        witness.told = dict.fromkeys(witness.versions, 0)  # these versions are on disk and must stay there
+        states: list[tuple[dict[str, int], bool]] = []
+        cut_requested = threading.Event()
 
         def image() -> Cut:
-            asked.wait()
-            ((told, is_over),) = moments
+            cut_requested.wait()
+            ((told, is_over),) = states
             return Cut(disk.image(mounted, file), told, is_over, f"cut after {after_calls} calls and returns")
 
         def cut() -> None:
-            # The trial may be in any call, also in one that holds a lock of thread pools: start no thread here.
-            moments.append((dict(witness.told), witness.is_over))
-            asked.set()
+            # The trial may hold any lock here, including one of the thread pool, so no thread is started.
+            states.append((dict(witness.told), witness.is_over))
+            cut_requested.set()
 
-        def look(_place: str) -> bool:
+        def look(_location: str) -> bool:
             witness.look()
             return True
 
-        made = pool.submit(image)
+        cut_result = pool.submit(image)
         try:
             with at_every_sync(look), at_call(after_calls, cut):
                 run(out, witness)
             witness.look()
         finally:
-            if not moments:
+            if not states:
                 cut()
-        return made.result(), witness
+        return cut_result.result(), witness
 
 
 def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, *, calls: int, most: int) -> int:
-    """Run a trial whose power is cut at a random moment, go on with what that left, and so on; it ends whole.
+    """Run a trial with a power cut at a random time, resume it with the remaining data, and repeat until it ends.
 
     Args:
-        file_system: Of its disk.
-        place: Folder to work in.
-        draw: Says when to cut.
-        calls: From `calls_of_a_trial`.
-        most: How often to cut at most; then the trial runs to its end.
+        file_system: The file system of the disk.
+        place: A working folder.
+        draw: Random generator for the times of the cuts.
+        calls: The result of `calls_of_a_trial`.
+        most: Maximum number of cuts; the run after the last cut is completed.
 
     Returns:
-        How often it was cut.
+        The number of cuts.
 
     Raises:
-        AssertionError: Something is lost.
+        AssertionError: Data was lost.
     """
-    disk, left = Disk.make(file_system, place / "disk.img"), place / "left.img"
+    disk, image = Disk.make(file_system, place / "disk.img"), place / "left.img"
     for number in range(1, most + 1):
-        cut, witness = cut_at_a_moment(disk, place, left, draw.randrange(calls))
-        left.rename(disk.file)
+        cut, witness = cut_at_a_moment(disk, place, image, draw.randrange(calls))
+        image.rename(disk.file)
         with disk.mend().mounted(place / "disk") as mounted:
             lost = cut.lost(mounted / OUT, witness)
             assert not lost, lost

@@ -1,7 +1,7 @@
-"""Disks whose power can be cut: file systems on loop files, and images of what has reached them at a moment.
+"""Disks with simulated power cuts: file systems on loop files, and images of the data on disk at a given time.
 
-A file system's device is a file here. What a program wrote and nobody synced is in the memory of the kernel and not
-in that file, so a copy of the file is the disk as a power cut would leave it at that moment.
+The device of a file system is a file. Data that was written but not synced is in the page cache and not in this file,
+so a copy of the file is the disk as a power cut at that time would leave it.
 """
 
 import subprocess
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-SIZE_BYTES: Final = 512 << 20  # the files are sparse; xfs wants 300 MiB
-_TRIES: Final = 200
+SIZE_BYTES: Final = 512 << 20  # the files are sparse; xfs needs 300 MiB
+_MAX_COPIES: Final = 200
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,12 @@ class FileSystem:
     """A kind of file system.
 
     Attributes:
-        name: What it is called in tests.
-        kind: What `mount` calls it.
-        make: Command that makes it, but for the file.
-        options: How it is mounted. None commits by itself while a test runs, so what is not asked for stays away from
-            the disk: xfs writes its log every 30 s, ext4 and btrfs would every 5 s and 30 s.
-        mend: Command that must mend it after a cut, but for the file; empty where mounting does.
+        name: Name in tests.
+        kind: Type for `mount`.
+        make: Command that makes it, without the file.
+        options: Mount options. The file system must not commit automatically during a test, so that only requested
+            data reaches the disk: xfs writes its log every 30 s; by default ext4 commits every 5 s, btrfs every 30 s.
+        mend: Command that must repair it after a cut, without the file; empty if mounting repairs it.
     """
 
     name: str
@@ -37,7 +37,7 @@ class FileSystem:
 
 FILE_SYSTEMS: Final = (
     FileSystem("ext4", "ext4", ("mkfs.ext4", "-q", "-F"), "loop,commit=300"),
-    # It brings nothing to disk but what is named, where a journal brings all that happened before with it.
+    # It only writes the synced file, whereas a journal also writes all earlier changes.
     FileSystem(
         "ext4-without-journal",
         "ext4",
@@ -55,22 +55,22 @@ STRICTEST: Final = FILE_SYSTEMS[1]
 def workplace(folder: Path) -> Iterator[Path]:
     """Yield `folder` with a file system in memory, for disks and images.
 
-    Call it where mounts are of one's own (`host.namespaces_of_our_own`): whatever is mounted there, and the loop
-    devices under it, go with the thread that owns them, however it ends.
+    Call it in a separate mount namespace (`host.namespaces_of_our_own`): the kernel removes all mounts in it, and
+    their loop devices, when the thread that owns the namespace ends.
     """
-    _call("mount", "-t", "tmpfs", "-o", "size=8g", "power", str(folder))
+    _run("mount", "-t", "tmpfs", "-o", "size=8g", "power", str(folder))
     try:
         yield folder
     finally:
-        _call("umount", str(folder))
+        _run("umount", str(folder))
 
 
 class Disk:
     """A disk with a file system.
 
     Args:
-        file_system: Its kind.
-        file: Holds it.
+        file_system: The kind of file system.
+        file: The file with the content of the disk.
     """
 
     def __init__(self, file_system: FileSystem, file: Path) -> None:
@@ -82,56 +82,55 @@ class Disk:
         """Make a disk in a new file."""
         with file.open("xb") as created:
             created.truncate(SIZE_BYTES)
-        _call(*file_system.make, str(file))
+        _run(*file_system.make, str(file))
         return cls(file_system, file)
 
     def mend(self) -> "Disk":
-        """Do what a machine does that boots after a power cut, before it mounts the disk."""
+        """Repair the disk as at boot after a power cut, before it is mounted."""
         if command := self._file_system.mend:
-            done = subprocess.run((*command, str(self.file)), capture_output=True, text=True, check=False)
-            assert done.returncode in {0, 1}, done.stdout  # e2fsck(8): 1 is mended
+            completed = subprocess.run((*command, str(self.file)), capture_output=True, text=True, check=False)
+            assert completed.returncode in {0, 1}, completed.stdout  # e2fsck(8): 1 means that errors were corrected
         return self
 
     @contextmanager
-    def mounted(self, at: Path) -> Iterator[Path]:
-        """Mount the disk while the body runs; `umount` lets go of its loop device too."""
-        at.mkdir(exist_ok=True)
-        words = ("-t", self._file_system.kind, "-o", self._file_system.options)
-        _call("mount", *words, str(self.file), str(at))
+    def mounted(self, mount_point: Path) -> Iterator[Path]:
+        """Mount the disk during the body; `umount` also releases its loop device."""
+        mount_point.mkdir(exist_ok=True)
+        options = ("-t", self._file_system.kind, "-o", self._file_system.options)
+        _run("mount", *options, str(self.file), str(mount_point))
         try:
-            yield at
+            yield mount_point
         finally:
-            _call("umount", str(at))
+            _run("umount", str(mount_point))
 
     def image(self, mounted: Path, file: Path) -> "Disk":
-        """Return a copy of the disk as it is now while it is mounted, as a power cut would leave it.
+        """A copy of the present state of a mounted disk, as a power cut would leave it.
 
-        The kernel may write meanwhile; a copy counts that nothing was written beside.
+        The kernel may write during the copy, so the copy is repeated until nothing was written in the meantime.
         """
-        for _ in range(_TRIES):
-            before = _written(mounted)
-            _call("cp", "--sparse=always", str(self.file), str(file))
-            if _written(mounted) == before:
+        for _ in range(_MAX_COPIES):
+            before = _write_state(mounted)
+            _run("cp", "--sparse=always", str(self.file), str(file))
+            if _write_state(mounted) == before:
                 return Disk(self._file_system, file)
-        raise AssertionError("the disk never rests")
+        raise AssertionError("the disk is always being written")
 
 
-def _written(mounted: Path) -> tuple[str, ...]:
-    """Return how much a mounted disk was written, and what is under way.
+def _write_state(mounted: Path) -> tuple[str, ...]:
+    """The number of writes to a mounted disk and the requests in flight.
 
     Columns of /sys/block/*/stat (kernel, Documentation/block/stat.rst): writes, sectors written, requests in flight.
     """
     for line in Path("/proc/thread-self/mountinfo").read_text(encoding="utf-8").splitlines():
-        words = line.split()
-        if words[4] == str(
-            mounted
-        ):  # btrfs has a device number of its own, so the name tells which loop device it is
-            name = Path(words[words.index("-") + 2]).name
+        mount_fields = line.split()
+        if mount_fields[4] == str(mounted):
+            # btrfs has a separate device number, so the loop device is identified by its name.
+            name = Path(mount_fields[mount_fields.index("-") + 2]).name
             fields = Path(f"/sys/block/{name}/stat").read_text(encoding="ascii").split()
             return fields[4], fields[6], fields[8]
     raise AssertionError(f"{mounted} is not mounted")
 
 
-def _call(*words: str) -> None:
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{' '.join(words)}: {done.stderr}"
+def _run(*command: str) -> None:
+    completed = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert completed.returncode == 0, f"{' '.join(command)}: {completed.stderr}"

@@ -1,4 +1,4 @@
-"""What scapy's own dissector reads from a capture file, in the columns of `Packets`: the oracle."""
+"""The fields that scapy dissects from a capture file, in the columns of `Packets`; the reference for tests."""
 
 from collections.abc import Sequence
 from ipaddress import IPv4Address, IPv6Address
@@ -13,7 +13,7 @@ from scapy.utils import PcapReader, PcapWriter
 
 from fieldkit.measure.captures.packets import Packets
 
-# scapy knows this link type by its number on other systems only.
+# scapy only registers this link type number on other systems.
 conf.l2types.register_num2layer(12, IPv46)
 
 Row = tuple[int, ...]
@@ -33,7 +33,7 @@ def dissected(path: Path) -> list[Row]:
 
 
 def rows(packets: Packets) -> list[Row]:
-    """The rows of columns, addresses as numbers; content is a number of no meaning and left out."""
+    """The rows of columns, with addresses as numbers; `content` is omitted, since its values have no meaning."""
     columns = {name: getattr(packets, name) for name in Packets.__dataclass_fields__ if name != "content"}
     for name in ("src", "dst"):
         columns[name] = [int(upper) << 64 | int(lower) for upper, lower in columns[name].tolist()]
@@ -43,43 +43,50 @@ def rows(packets: Packets) -> list[Row]:
 def _rows_of(frame: Packet) -> list[Row]:
     if IP in frame:
         ip = frame[IP]
-        mapped = [0xFFFF << 32 | int(IPv4Address(text)) for text in (ip.src, ip.dst)]
-        part = (ip.proto, ip.id, ip.frag * 8, int("MF" in str(ip.flags)), ip.ihl * 4, ip.len - ip.ihl * 4)
-        return [_row(frame, mapped, part, ip.payload)]
+        addresses = [0xFFFF << 32 | int(IPv4Address(text)) for text in (ip.src, ip.dst)]
+        ip_fields = (ip.proto, ip.id, ip.frag * 8, int("MF" in str(ip.flags)), ip.ihl * 4, ip.len - ip.ihl * 4)
+        return [_row(frame, addresses, ip_fields, ip.payload)]
     if IPv6 in frame:
         ip = frame[IPv6]
         addresses = [int(IPv6Address(text)) for text in (ip.src, ip.dst)]
-        kind, identity, offset, more, left, upper = ip.nh, 0, 0, 0, ip.plen, ip.payload
+        protocol, identity, offset, more, payload_bytes, upper = ip.nh, 0, 0, 0, ip.plen, ip.payload
         while "ExtHdr" in type(upper).__name__ or type(upper).__name__ == "AH":
-            left -= len(bytes(upper)) - len(bytes(upper.payload))
+            payload_bytes -= len(bytes(upper)) - len(bytes(upper.payload))
             if isinstance(upper, IPv6ExtHdrFragment):
                 identity, offset, more = upper.id, upper.offset * 8, upper.m
-            kind, upper = upper.nh, upper.payload
+            protocol, upper = upper.nh, upper.payload
             if offset:
                 break
-        return [_row(frame, addresses, (kind, identity, offset, more, 40 + ip.plen - left, left), upper)]
+        return [
+            _row(
+                frame,
+                addresses,
+                (protocol, identity, offset, more, 40 + ip.plen - payload_bytes, payload_bytes),
+                upper,
+            )
+        ]
     return []
 
 
-def _row(frame: Packet, addresses: Sequence[int], part: Row, upper: Packet) -> Row:
-    _, _, offset, _, _, left = part
-    carries = isinstance(upper, TCP | UDP | SCTP) and offset == 0
-    tcp = upper if carries and isinstance(upper, TCP) else None
-    udp = upper if carries and isinstance(upper, UDP) else None
+def _row(frame: Packet, addresses: Sequence[int], ip_fields: Row, upper: Packet) -> Row:
+    _, _, offset, _, _, payload_bytes = ip_fields
+    has_ports = isinstance(upper, TCP | UDP | SCTP) and offset == 0
+    tcp = upper if has_ports and isinstance(upper, TCP) else None
+    udp = upper if has_ports and isinstance(upper, UDP) else None
     icmp = upper if isinstance(upper, ICMP) and offset == 0 and upper.type in {0, 8} else None
     return (
         round(frame.time * 10**9),
         frame.wirelen or len(frame),
         *addresses,
-        *part,
-        upper.sport if carries else -1,
-        upper.dport if carries else -1,
+        *ip_fields,
+        upper.sport if has_ports else -1,
+        upper.dport if has_ports else -1,
         tcp.seq if tcp else 0,
         tcp.ack if tcp else 0,
         int(tcp.flags) if tcp else 0,
         dict(tcp.options).get("Timestamp", (-1,))[0] if tcp else -1,
         dict(tcp.options).get("MSS", 0) if tcp and tcp.flags.S else 0,
-        left - tcp.dataofs * 4 if tcp else 0,
+        payload_bytes - tcp.dataofs * 4 if tcp else 0,
         udp.len if udp else 0,
         icmp.id + 65_536 * (icmp.type == 0) if icmp else -1,
         icmp.seq if icmp else -1,

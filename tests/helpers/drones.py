@@ -1,4 +1,4 @@
-"""A drone that a test talks with over a socket or a terminal, and telemetry logs made message by message."""
+"""A drone that a test connects to over a socket or a terminal, and synthetic telemetry logs."""
 
 import os
 import random
@@ -25,20 +25,20 @@ from tests.helpers.ground_station import LIMITS
 
 SYSTEM: Final = 7
 PEER: Final = ("gcs", 1)
-"""Who the drone takes everybody for."""
+"""The peer that the drone attributes all received data to."""
 START_US: Final = 1_795_000_000_000_000
-"""In November 2026."""
+"""A time in November 2026."""
 
 Damage = Callable[[bytes], Iterable[bytes]]
-"""Makes of a frame what is sent in its place."""
+"""Returns the data that is sent in place of a frame."""
 
 
 class Sender:
-    """Makes frames of messages, as one component does.
+    """Packs messages into frames, as one component does.
 
     Args:
-        system: Its system.
-        component: Its component.
+        system: Its system id.
+        component: Its component id.
     """
 
     def __init__(self, system: int = SYSTEM, component: int = 1) -> None:
@@ -51,7 +51,7 @@ class Sender:
 
 
 def stamped(frames: Iterable[tuple[int, bytes]]) -> bytes:
-    """Return a telemetry log of frames, each with its time in us after `START_US`."""
+    """A telemetry log of frames, each with its time in us after `START_US`."""
     return b"".join(struct.pack(">Q", START_US + at_us) + frame for at_us, frame in frames)
 
 
@@ -61,7 +61,7 @@ def beat(*, armed: bool = False) -> Any:  # noqa: ANN401
 
 
 def flight(seconds: float = 10.0, speed_m_s: float = 1.0, lost: Callable[[int], bool] = lambda _: False) -> bytes:
-    """Return the log of a drone that flies north at a height of 3 m, and looks there, 10 messages a second."""
+    """The log of a drone that flies north at a height of 3 m, facing north, with 10 messages a second."""
     sender, frames = Sender(), []
     frames.append((0, sender.frame(beat(armed=True))))
     for number in range(round(10 * seconds) + 1):
@@ -85,26 +85,26 @@ def flying(
     firmware: Firmware = PX4,
     boot_s: float = 0.0,
 ) -> Iterator[Autopilot]:
-    """Let an autopilot answer at a descriptor while the body runs."""
-    over = threading.Event()
+    """Run an autopilot at a file descriptor during the body."""
+    stop = threading.Event()
     autopilot = Autopilot(
         firmware=firmware,
         system=SYSTEM,
         limits=LIMITS,
-        can=DUCKIEDRONE,
-        around=Ground(None, None).around,
+        airframe_limits=DUCKIEDRONE,
+        obstacles=Ground(None, None).around,
         now_ns=time.monotonic_ns(),
         boot_s=boot_s,
     )
 
     def fly() -> None:
-        with selectors.DefaultSelector() as waiting:
-            waiting.register(descriptor, selectors.EVENT_READ)
-            while not over.is_set():
-                with suppress(OSError):  # nobody is there any more, or yet
-                    came = receive(65_536) if waiting.select(0.02) else b""
-                    answers = list(autopilot.receive(came, PEER, time.monotonic_ns()))
-                    for _, frame in (*answers, *autopilot.advance(time.monotonic_ns())):
+        with selectors.DefaultSelector() as selector:
+            selector.register(descriptor, selectors.EVENT_READ)
+            while not stop.is_set():
+                with suppress(OSError):  # no peer yet, or no longer
+                    received = receive(65_536) if selector.select(0.02) else b""
+                    replies = list(autopilot.receive(received, PEER, time.monotonic_ns()))
+                    for _, frame in (*replies, *autopilot.advance(time.monotonic_ns())):
                         send(frame)
 
     thread = threading.Thread(target=fly)
@@ -112,13 +112,13 @@ def flying(
     try:
         yield autopilot
     finally:
-        over.set()
+        stop.set()
         thread.join()
 
 
 @contextmanager
 def at_udp(damage: Damage = lambda frame: [frame], firmware: Firmware = PX4) -> Iterator[int]:
-    """Let a drone listen at a port of UDP on loopback, and what it sends be damaged."""
+    """Run a drone at a UDP port on loopback; `damage` changes its frames."""
     with autopilot_at_udp(damage, firmware) as (port, _):
         yield port
 
@@ -127,21 +127,21 @@ def at_udp(damage: Damage = lambda frame: [frame], firmware: Firmware = PX4) -> 
 def autopilot_at_udp(
     damage: Damage = lambda frame: [frame], firmware: Firmware = PX4, boot_s: float = 0.0
 ) -> Iterator[tuple[int, Autopilot]]:
-    """Do the same, and let the test see the autopilot itself; all clients get all frames, as from a router."""
+    """As `at_udp`, but also yield the autopilot; all clients receive all frames, as from a router."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind(("127.0.0.1", 0))
         peers: list[tuple[str, int]] = []
 
-        def receive(most: int) -> bytes:
-            data, sender = endpoint.recvfrom(most)
+        def receive(size: int) -> bytes:
+            data, sender = endpoint.recvfrom(size)
             if sender not in peers:
                 peers.append(sender)
             return data
 
         def send(frame: bytes) -> None:
-            for one in damage(frame):
+            for datagram in damage(frame):
                 for peer in peers:
-                    endpoint.sendto(one, peer)
+                    endpoint.sendto(datagram, peer)
 
         with flying(endpoint.fileno(), send, receive, firmware, boot_s) as autopilot:
             yield endpoint.getsockname()[1], autopilot
@@ -149,100 +149,100 @@ def autopilot_at_udp(
 
 @contextmanager
 def at_terminal(damage: Damage = lambda frame: [frame]) -> Iterator[str]:
-    """Let a drone be at a serial line, which goes on in the midst of a frame."""
-    ours, theirs = os.openpty()
+    """Run a drone at a serial line whose output starts in the middle of a frame."""
+    master, terminal = os.openpty()
 
     def send(frame: bytes) -> None:
-        os.write(ours, b"".join(damage(frame)))
+        os.write(master, b"".join(damage(frame)))
 
     try:
-        os.set_blocking(ours, True)
-        os.write(ours, Sender().frame(beat())[3:])
-        with flying(ours, send, lambda most: os.read(ours, most)):
-            yield os.ttyname(theirs)
+        os.set_blocking(master, True)
+        os.write(master, Sender().frame(beat())[3:])
+        with flying(master, send, lambda size: os.read(master, size)):
+            yield os.ttyname(terminal)
     finally:
-        os.close(ours)
-        os.close(theirs)
+        os.close(master)
+        os.close(terminal)
 
 
 class UsbSerial:
-    """A serial line at a USB port: its device disappears when it is pulled out, and comes back.
+    """A serial line at a USB port, whose device disappears when it is unplugged and appears again later.
 
     Args:
-        path: Of the device.
-        drone: Socket to the autopilot at its other end.
+        path: Path of the device.
+        drone: Socket to the autopilot at the other end.
     """
 
     def __init__(self, path: Path, drone: socket.socket) -> None:
         self.path = path
         self._drone = drone
-        self._ours, self._theirs = -1, -1
+        self._master, self._terminal = -1, -1
         self._changing = threading.Lock()
 
     def plug_in(self) -> None:
-        """Let the device appear."""
+        """Create the device."""
         with self._changing:
-            self._ours, self._theirs = os.openpty()
-            os.set_blocking(self._ours, False)
-            self.path.symlink_to(os.ttyname(self._theirs))
+            self._master, self._terminal = os.openpty()
+            os.set_blocking(self._master, False)
+            self.path.symlink_to(os.ttyname(self._terminal))
 
     def pull_out(self) -> None:
-        """Let the device disappear: a program that has opened it gets an error."""
+        """Remove the device: a program that has opened it gets an error."""
         with self._changing:
-            if self._ours >= 0:
+            if self._master >= 0:
                 self.path.unlink()
-                os.close(self._theirs)
-                os.close(self._ours)
-            self._ours = self._theirs = -1
+                os.close(self._terminal)
+                os.close(self._master)
+            self._master = self._terminal = -1
 
     def forward(self) -> None:
-        """Forward what has arrived, in both directions; without a device it is lost."""
+        """Forward received data in both directions; without a device, the data is lost."""
         drone = self._drone.fileno()
-        ready, _, _ = select.select([drone, *([self._ours] if self._ours >= 0 else [])], [], [], 0.01)
-        with self._changing, suppress(OSError):  # full, closed, or pulled out meanwhile
+        ready, _, _ = select.select([drone, *([self._master] if self._master >= 0 else [])], [], [], 0.01)
+        with self._changing, suppress(OSError):  # full, closed, or unplugged in the meantime
             if drone in ready:
                 data = self._drone.recv(65_536)
-                if self._ours >= 0:
-                    os.write(self._ours, data)
-            if self._ours >= 0 and self._ours in ready:
-                self._drone.sendall(os.read(self._ours, 65_536))
+                if self._master >= 0:
+                    os.write(self._master, data)
+            if self._master >= 0 and self._master in ready:
+                self._drone.sendall(os.read(self._master, 65_536))
 
 
 @contextmanager
 def autopilot_at_usb(path: Path, firmware: Firmware = ARDUCOPTER) -> Iterator[tuple[UsbSerial, Autopilot]]:
-    """Let a drone be at a serial device that can be pulled out."""
-    near, far = socket.socketpair()
-    usb, over = UsbSerial(path, near), threading.Event()
+    """Run a drone at a serial device that can be unplugged."""
+    usb_end, drone_end = socket.socketpair()
+    usb, stop = UsbSerial(path, usb_end), threading.Event()
 
     def forward() -> None:
-        while not over.is_set():
-            with suppress(OSError):  # pulled out while it waited
+        while not stop.is_set():
+            with suppress(OSError):  # unplugged during the wait
                 usb.forward()
 
     thread = threading.Thread(target=forward)
-    with near, far, flying(far.fileno(), far.sendall, far.recv, firmware) as autopilot:
+    with usb_end, drone_end, flying(drone_end.fileno(), drone_end.sendall, drone_end.recv, firmware) as autopilot:
         usb.plug_in()
         thread.start()
         try:
             yield usb, autopilot
         finally:
-            over.set()
+            stop.set()
             thread.join()
             usb.pull_out()
 
 
 def hostile(seed: int) -> Damage:
-    """Return what sends with each frame damaged ones, and bytes that are none."""
-    dice = random.Random(seed)
+    """A function that sends, with each frame, damaged frames and other bytes."""
+    random_source = random.Random(seed)
 
     def damaged(frame: bytes) -> Iterator[bytes]:
         yield frame
         flipped = bytearray(frame)
-        for _ in range(dice.choice((1, 1, 4, 16))):
-            flipped[dice.randrange(len(flipped))] = dice.randrange(256)
+        for _ in range(random_source.choice((1, 1, 4, 16))):
+            flipped[random_source.randrange(len(flipped))] = random_source.randrange(256)
         yield bytes(flipped)
-        yield frame[: dice.randrange(len(frame))]
-        yield dice.randbytes(dice.choice((0, 1, 2, 3, 8, 300)))
-        yield bytes((0xFD, 255, dice.randrange(256))) + dice.randbytes(dice.randrange(40))
+        yield frame[: random_source.randrange(len(frame))]
+        yield random_source.randbytes(random_source.choice((0, 1, 2, 3, 8, 300)))
+        yield bytes((0xFD, 255, random_source.randrange(256))) + random_source.randbytes(random_source.randrange(40))
 
     return damaged

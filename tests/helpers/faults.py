@@ -1,4 +1,4 @@
-"""Faults of emulated robots that last until the test has looked, however long that takes on a busy machine."""
+"""Faults of emulated robots whose duration the test controls, so that a slow machine does not matter."""
 
 import time
 from collections.abc import Iterator
@@ -15,19 +15,19 @@ from sim_backends.emulated import testbed
 from sim_backends.emulated.testbed import EmulatedTestbed
 from tests.helpers.sshd import wait_until
 
-_LONG_S = 120.0
+_TIMEOUT_S = 120.0
 
 
 @dataclass
 class _Clock:
-    """What a fault sleeps by: from when it began to when somebody has seen enough of it."""
+    """Replaces the clock of the testbed: `sleep` ends when the test releases the fault."""
 
     began: Event = field(default_factory=Event)
-    seen: Event = field(default_factory=Event)
+    released: Event = field(default_factory=Event)
 
     def sleep(self, _duration_s: float) -> None:
         self.began.set()
-        assert self.seen.wait(_LONG_S)
+        assert self.released.wait(_TIMEOUT_S)
 
     def monotonic(self) -> float:
         return time.monotonic()
@@ -35,14 +35,14 @@ class _Clock:
 
 @contextmanager
 def lasting(up: EmulatedTestbed, fault: Fault) -> Iterator[None]:
-    """Let `fault` last as long as the context, whatever its own time; it has begun when the context is entered."""
+    """Inject `fault` for the duration of the context, instead of its configured duration; it is active on entry."""
     clock = _Clock()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as pool:
         patch.setattr(testbed, "time", clock)
         injected = pool.submit(up.inject, fault)
         try:
-            wait_until(lambda: clock.began.is_set() or injected.done(), Deadline.after(_LONG_S))
+            wait_until(lambda: clock.began.is_set() or injected.done(), Deadline.after(_TIMEOUT_S))
             yield
         finally:
-            clock.seen.set()
+            clock.released.set()
         injected.result()

@@ -1,4 +1,4 @@
-"""Streams carried from loopback ports to somewhere else, by links that can die as a radio link does."""
+"""Forwards streams from loopback ports to other endpoints over links that can fail like radio links."""
 
 import ctypes
 import select
@@ -16,10 +16,10 @@ Connect = Callable[[float], socket.socket]
 
 _CHUNK: Final = 1 << 16
 _CONNECT_S: Final = 5.0
-_MOST_PIECES: Final = 1000
-"""That a delayed direction of a stream holds."""
+_MAX_CHUNKS: Final = 1000
+"""Maximum number of chunks in a delayed direction of a stream."""
 
-# asm-generic/socket.h; a classic BPF program of one instruction, `ret #0`, drops every packet.
+# From asm-generic/socket.h; a classic BPF program with the single instruction `ret #0` drops all packets.
 _SO_ATTACH_FILTER: Final = 26
 _SO_DETACH_FILTER: Final = 27
 _DROP_ALL: Final = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0))
@@ -31,11 +31,11 @@ class _Flow:
     """One direction of a stream.
 
     Attributes:
-        source: Where bytes come from.
-        sink: Where they go.
-        queue: Pieces that have come, each with the time from which it may go on; an empty one is the end.
-        finished: Whether the end has come from the source.
-        ended: Whether it was passed on.
+        source: Socket that is read.
+        sink: Socket that is written.
+        queue: Received chunks with the time from which each may be sent; an empty chunk is the end of the stream.
+        finished: True if the source has reached its end.
+        ended: True if the end was forwarded.
     """
 
     source: socket.socket
@@ -44,28 +44,28 @@ class _Flow:
     finished: bool = False
     ended: bool = False
 
-    def due_s(self) -> float | None:
-        """Return in how many seconds a piece may go on, 0 for now; None where there is none."""
+    def due_in_s(self) -> float | None:
+        """Seconds until the next chunk may be sent, 0 for now; None if there is none."""
         return max(self.queue[0][0] - time.monotonic(), 0.0) if self.queue else None
 
-    def reads(self, delay_s: float) -> bool:
-        """Whether it takes more: without a delay, not before the last piece has gone on."""
-        return not self.finished and (not self.queue or (delay_s > 0 and len(self.queue) < _MOST_PIECES))
+    def can_read(self, delay_s: float) -> bool:
+        """True if it accepts more data; without a delay, only after the last chunk was sent."""
+        return not self.finished and (not self.queue or (delay_s > 0 and len(self.queue) < _MAX_CHUNKS))
 
-    def take(self, delay_s: float) -> None:
-        """Take what has come."""
-        piece = self.source.recv(_CHUNK)
-        self.finished = not piece
-        self.queue.append((time.monotonic() + delay_s, piece))
+    def receive(self, delay_s: float) -> None:
+        """Read the next chunk from the source."""
+        chunk = self.source.recv(_CHUNK)
+        self.finished = not chunk
+        self.queue.append((time.monotonic() + delay_s, chunk))
 
-    def give(self) -> None:
-        """Pass on what may go on and can without waiting; the end, too."""
-        due_s, piece = self.queue.popleft()
-        if not piece:
+    def send(self) -> None:
+        """Send as much of the next chunk as possible without blocking, or the end of the stream."""
+        due_in_s, chunk = self.queue.popleft()
+        if not chunk:
             self.ended = True
             self.sink.shutdown(socket.SHUT_WR)
-        elif left := piece[self.sink.send(piece) :]:
-            self.queue.appendleft((due_s, left))
+        elif rest := chunk[self.sink.send(chunk) :]:
+            self.queue.appendleft((due_in_s, rest))
 
 
 @dataclass(eq=False)
@@ -78,29 +78,29 @@ class _Link:
     delay_s: float = 0.0
     streams: list[tuple[_Flow, _Flow]] = field(default_factory=list)
 
-    def near_ends(self) -> list[socket.socket]:
-        return [self.listener, *(there.source for there, _ in self.streams)]
+    def client_sockets(self) -> list[socket.socket]:
+        return [self.listener, *(forward.source for forward, _ in self.streams)]
 
     def accept(self) -> None:
-        near, _ = self.listener.accept()
+        client, _ = self.listener.accept()
         try:
-            far = self.connect(_CONNECT_S)
+            server = self.connect(_CONNECT_S)
         except OSError:
-            _reset(near)
+            _reset(client)
             return
-        for end in (near, far):
+        for end in (client, server):
             end.setblocking(False)
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.streams.append((_Flow(near, far), _Flow(far, near)))
+        self.streams.append((_Flow(client, server), _Flow(server, client)))
 
     def carry(self, readable: set[socket.socket], writable: set[socket.socket]) -> None:
         for stream in list(self.streams):
             try:
                 for flow in stream:
-                    if flow.source in readable and flow.reads(self.delay_s):
-                        flow.take(self.delay_s)
-                    if flow.due_s() == 0 and (flow.sink in writable or not flow.queue[0][1]):
-                        flow.give()
+                    if flow.source in readable and flow.can_read(self.delay_s):
+                        flow.receive(self.delay_s)
+                    if flow.due_in_s() == 0 and (flow.sink in writable or not flow.queue[0][1]):
+                        flow.send()
             except OSError:
                 self.end(stream, _reset)
             else:
@@ -116,19 +116,19 @@ class _Link:
 
 
 class Forwarder(Generic[Key]):
-    """Listens on a free loopback port per key and carries each stream to where `connect` of the key leads.
+    """Listens on a free loopback port per key and forwards each stream to the endpoint of the key.
 
-    One thread; use as a context manager.
+    It has one thread and is a context manager.
 
     Args:
-        ways: Opens a stream to the far side, within so many seconds, or raises OSError.
+        ways: For each key, a function that connects to the far side within a number of seconds, or raises OSError.
     """
 
     def __init__(self, ways: Mapping[Key, Connect]) -> None:
-        self._links = {key: _Link(way, socket.create_server(("127.0.0.1", 0))) for key, way in ways.items()}
+        self._links = {key: _Link(connect, socket.create_server(("127.0.0.1", 0))) for key, connect in ways.items()}
         self._lock = threading.Lock()
-        self._wake, self._woken = socket.socketpair()
-        self._over = False
+        self._wake, self._wake_receiver = socket.socketpair()
+        self._stopping = False
         self._thread = threading.Thread(target=self._run, name="forwarder")
 
     def __enter__(self) -> Self:
@@ -136,83 +136,83 @@ class Forwarder(Generic[Key]):
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._over = True
+        self._stopping = True
         self._wake.send(b"x")
         self._thread.join()
         for key, link in self._links.items():
             self.drop(key)
             link.listener.close()
         self._wake.close()
-        self._woken.close()
+        self._wake_receiver.close()
 
     def port(self, key: Key) -> int:
-        """Return the port of `key`."""
+        """The port of `key`."""
         port: int = self._links[key].listener.getsockname()[1]
         return port
 
     def reach(self, key: Key, timeout_s: float = _CONNECT_S) -> socket.socket:
-        """Return a stream through the port of `key`; raises OSError when there is none in time."""
+        """A stream through the port of `key`; raises OSError if it cannot be opened in time."""
         return socket.create_connection(("127.0.0.1", self.port(key)), timeout_s)
 
     def cut(self, key: Key) -> None:
-        """Let the link die: no byte, FIN, RST or ACK comes from it any more, and new connections hang."""
+        """Cut the link: no data, FIN, RST or ACK is sent any more, and new connections hang."""
         link = self._links[key]
         with self._lock:
             link.dead = True
-            for end in link.near_ends():
+            for end in link.client_sockets():
                 end.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, _DROP_ALL_PROGRAM)
 
     def restore(self, key: Key) -> None:
-        """Let the link come back, if it is dead; streams that both sides still hold go on where they stood."""
+        """Restore the link if it is cut; streams that are still open at both ends continue."""
         link = self._links[key]
         with self._lock:
             if not link.dead:
                 return
             link.dead = False
-            for end in link.near_ends():
+            for end in link.client_sockets():
                 end.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
         self._wake.send(b"x")
 
     def delay(self, key: Key, delay_s: float) -> None:
-        """Deliver what comes from now on this much later, either way."""
+        """Delay all data from now on by this time, in each direction."""
         with self._lock:
             self._links[key].delay_s = delay_s
         self._wake.send(b"x")
 
     def drop(self, key: Key) -> None:
-        """Reset every stream; new ones are carried."""
+        """Reset all streams; new streams are forwarded."""
         link = self._links[key]
         with self._lock:
             for stream in list(link.streams):
                 link.end(stream, _reset)
-        # A stream is reset when nobody waits on it any more.
+        # A socket is only reset when no `select` waits for it any more.
         self._wake.send(b"x")
 
     def _run(self) -> None:
-        while not self._over:
-            reading, writing, wait_s = self._watched()
+        while not self._stopping:
+            readers, writers, wait_s = self._select_arguments()
             try:
-                readable, writable, _ = select.select(reading, writing, [], wait_s)
+                readable, writable, _ = select.select(readers, writers, [], wait_s)
             except (OSError, ValueError):
-                continue  # `drop` closed one of them
-            if self._woken in readable:
-                self._woken.recv(_CHUNK)
+                continue  # `drop` has closed one of the sockets
+            if self._wake_receiver in readable:
+                self._wake_receiver.recv(_CHUNK)
             with self._lock:
                 for link in self._links.values():
                     if not link.dead:
                         link.carry({*readable}, {*writable})
 
-    def _watched(self) -> tuple[list[socket.socket], list[socket.socket], float | None]:
-        """Return what to read from, what to write to, and after which time to look again in any case."""
+    def _select_arguments(self) -> tuple[list[socket.socket], list[socket.socket], float | None]:
+        """The arguments of `select`: sockets to read, sockets to write, and the timeout."""
         with self._lock:
             alive = [link for link in self._links.values() if not link.dead]
             flows = [(link.delay_s, flow) for link in alive for stream in link.streams for flow in stream]
-            reading = [flow.source for delay_s, flow in flows if flow.reads(delay_s)]
-            due = [(flow.due_s(), flow) for _, flow in flows]
-            writing = [flow.sink for due_s, flow in due if due_s == 0]
-            waits_s = [due_s for due_s, _ in due if due_s]
+            readers = [flow.source for delay_s, flow in flows if flow.can_read(delay_s)]
+            flows_due = [(flow.due_in_s(), flow) for _, flow in flows]
+            writers = [flow.sink for due_in_s, flow in flows_due if due_in_s == 0]
+            waits_s = [due_in_s for due_in_s, _ in flows_due if due_in_s]
             listeners = [link.listener for link in alive]
-            return [self._woken, *listeners, *reading], writing, min(waits_s, default=None)
+            return [self._wake_receiver, *listeners, *readers], writers, min(waits_s, default=None)
 
 
 def _reset(end: socket.socket) -> None:

@@ -1,4 +1,4 @@
-"""A ground station of few lines, over nothing: it hands datagrams to an autopilot and reads what comes back."""
+"""A small ground station without a network: it passes datagrams to an autopilot and reads the answers."""
 
 import math
 import struct
@@ -23,88 +23,97 @@ HOME_M: Final = (120.0, -40.0, 0.0)
 
 
 class GroundStation:
-    """Talks with a new autopilot; its clock is a number.
+    """Client of a new autopilot; its clock is a number.
 
     Args:
-        lost: Says of each datagram, in either direction, whether it is lost.
-        limits: Of the drone's profile.
-        world: What it flies in; None for open flat ground.
+        is_lost: Returns True if the next datagram, in either direction, is lost.
+        limits: Limits of the drone's profile.
+        world: World that it flies in; None for open flat ground.
         firmware: Family of the autopilot.
         boot_s: Its boot time.
     """
 
     def __init__(
         self,
-        lost: Callable[[], bool] = lambda: False,
+        is_lost: Callable[[], bool] = lambda: False,
         limits: FlightLimits = LIMITS,
         world: World | None = None,
         firmware: Firmware = PX4,
         boot_s: float = 0.0,
     ) -> None:
-        around = Ground(world, None).around
+        obstacles = Ground(world, None).around
         self.autopilot = Autopilot(
-            firmware=firmware, system=SYSTEM, limits=limits, can=DUCKIEDRONE, around=around, now_ns=0, boot_s=boot_s
+            firmware=firmware,
+            system=SYSTEM,
+            limits=limits,
+            airframe_limits=DUCKIEDRONE,
+            obstacles=obstacles,
+            now_ns=0,
+            boot_s=boot_s,
         )
         self.autopilot.vehicle.place(HOME_M, math.pi / 2, 0)
         self._ardupilot = firmware.is_ardupilot
         self._parameters = Parameters(firmware.parameters(limits))
         self.now_ns = 0
-        self.heard: list[Message] = []
-        self._lost = lost
+        self.received: list[Message] = []
+        self._is_lost = is_lost
         self._link = d.MAVLink(None, srcSystem=255, srcComponent=190)
         self._reader = d.MAVLink(None)
 
-    def say(self, message: Message) -> list[Message]:
+    def send_message(self, message: Message) -> list[Message]:
         """Send a message; return the answers."""
         return self.send(message.pack(self._link))
 
     def send(self, datagram: bytes) -> list[Message]:
         """Send bytes; return the answers."""
-        if self._lost():
+        if self._is_lost():
             return []
-        return self._hear(frame for _, frame in self.autopilot.receive(datagram, ("gcs", 1), self.now_ns))
+        return self._receive(frame for _, frame in self.autopilot.receive(datagram, ("gcs", 1), self.now_ns))
 
     def wait(self, seconds: float) -> list[Message]:
-        """Let time pass, with heartbeats; return what was heard."""
-        heard, until_ns = [], self.now_ns + round(seconds * 1e9)
+        """Advance the time, with heartbeats; return the received messages."""
+        received, until_ns = [], self.now_ns + round(seconds * 1e9)
         while self.now_ns < until_ns:
             if self.now_ns % 1_000_000_000 == 0:
-                self.say(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+                self.send_message(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
             self.now_ns += TICK_NS
-            heard += self._hear(frame for _, frame in self.autopilot.advance(self.now_ns))
-        return heard
+            received += self._receive(frame for _, frame in self.autopilot.advance(self.now_ns))
+        return received
 
     def command(self, command: int, *parameters: float) -> int:
-        """Send a COMMAND_LONG; return the result that its COMMAND_ACK has."""
+        """Send a COMMAND_LONG; return the result in its COMMAND_ACK."""
         seven = (*parameters, *(0.0,) * (7 - len(parameters)))
-        answers = self.say(d.MAVLink_command_long_message(SYSTEM, 1, command, 0, *seven))
-        (ack,) = [one for one in answers if one.get_type() == "COMMAND_ACK"]
+        answers = self.send_message(d.MAVLink_command_long_message(SYSTEM, 1, command, 0, *seven))
+        (ack,) = [answer for answer in answers if answer.get_type() == "COMMAND_ACK"]
         assert ack.command == command
         return int(ack.result)
 
-    def ask(self, rate_hz: float, *kinds: int) -> None:
-        """Ask for messages at a rate."""
+    def request_rate(self, rate_hz: float, *kinds: int) -> None:
+        """Request messages at a rate."""
         for kind in kinds:
             assert self.command(d.MAV_CMD_SET_MESSAGE_INTERVAL, kind, 1e6 / rate_hz) == d.MAV_RESULT_ACCEPTED
 
     def texts(self) -> list[tuple[int, str]]:
         """Return severity and text of each STATUSTEXT so far."""
-        return [(one.severity, one.text) for one in self.heard if one.get_type() == "STATUSTEXT"]
+        return [(message.severity, message.text) for message in self.received if message.get_type() == "STATUSTEXT"]
 
     def set(self, name: str, value: float) -> None:
-        """Set a parameter by its name, and see that it has this value."""
+        """Set a parameter by its name, and check its new value."""
+
         is_integer = self._parameters.is_integer(name)
         bytewise = is_integer and not self._ardupilot
         packed = struct.unpack("<f", struct.pack("<i", round(value)))[0] if bytewise else value
         kind = d.MAV_PARAM_TYPE_INT32 if is_integer else d.MAV_PARAM_TYPE_REAL32
-        (now,) = self.say(d.MAVLink_param_set_message(SYSTEM, 1, name.encode(), packed, kind))
+        (now,) = self.send_message(d.MAVLink_param_set_message(SYSTEM, 1, name.encode(), packed, kind))
         assert now.param_value == struct.unpack("<f", struct.pack("<f", packed))[0], name
 
     def last(self, kind: str) -> Message:
         """Return the newest message of a kind."""
-        return next(one for one in reversed(self.heard) if one.get_type() == kind)
+        return next(message for message in reversed(self.received) if message.get_type() == kind)
 
-    def _hear(self, frames: Iterable[bytes]) -> list[Message]:
-        heard = [message for frame in frames if not self._lost() for message in self._reader.parse_buffer(frame)]
-        self.heard += heard
-        return heard
+    def _receive(self, frames: Iterable[bytes]) -> list[Message]:
+        received = [
+            message for frame in frames if not self._is_lost() for message in self._reader.parse_buffer(frame)
+        ]
+        self.received += received
+        return received

@@ -1,4 +1,4 @@
-"""Processes, interfaces and mounts of a test's own, and the error that says some of them stayed."""
+"""Processes, interfaces and mounts of a test, and the error for leaks of these."""
 
 import ctypes
 import os
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 ENDED = ("Z", "X")
-"""States in /proc of a process that has ended: it waits to be reaped, or is being reaped."""
+"""Process states in /proc that mean exited: zombie and dead."""
 
 # linux/sched.h
 _NAMESPACES: Final = {"net": 0x40000000, "mnt": 0x00020000}
@@ -20,7 +20,7 @@ _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 
 class LeakError(AssertionError):
-    """Something of a test's own outlived it. A test that fails by this gets no second try."""
+    """A resource of a test still exists after the test. A test that fails with this error gets no second try."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class HostState:
 
 
 def host_state() -> HostState:
-    """Return the state of network and mounts where the calling thread is, counters left out."""
+    """The network state and mounts of the calling thread, without counters."""
 
-    def ip(*words: str) -> str:
-        return subprocess.run(("ip", *words), capture_output=True, text=True, check=True).stdout
+    def ip(*arguments: str) -> str:
+        return subprocess.run(("ip", *arguments), capture_output=True, text=True, check=True).stdout
 
     return HostState(
         links=ip("-br", "link"),
@@ -49,25 +49,25 @@ def host_state() -> HostState:
 
 @contextmanager
 def namespaces_of_our_own() -> Iterator[None]:
-    """Give the calling thread, and what it starts, a network with loopback alone and mounts of its own.
+    """Give the calling thread and its children a separate network with only loopback, and separate mounts.
 
-    Nobody else on the machine puts anything there, so all that stays there is ours.
+    No other process of the machine adds anything there, so everything that remains is a leak of the test.
     """
     folder = os.open(".", os.O_PATH)
-    outside = {kind: os.open(f"/proc/thread-self/ns/{kind}", os.O_RDONLY) for kind in _NAMESPACES}
+    original = {kind: os.open(f"/proc/thread-self/ns/{kind}", os.O_RDONLY) for kind in _NAMESPACES}
     try:
         _checked(_LIBC.unshare(sum(_NAMESPACES.values())))
         subprocess.run(("mount", "--make-rprivate", "/"), check=True)
-        # A name that its owner deletes while we look would go from here too.
+        # A named namespace that its owner deletes during the test would also disappear here.
         for line in Path("/proc/thread-self/mounts").read_text(encoding="utf-8").splitlines():
             if line.split()[2] == "nsfs":
                 subprocess.run(("umount", "--lazy", line.split()[1]), check=True)
         subprocess.run(("ip", "link", "set", "lo", "up"), check=True)
         yield
     finally:
-        # A thread that was joined may not have gone yet; who shares a working folder cannot change mounts (setns(2)).
+        # A joined thread may not have exited yet, and setns(2) forbids changing mounts with a shared working folder.
         _checked(_LIBC.unshare(_CLONE_FS))
-        for kind, handle in outside.items():
+        for kind, handle in original.items():
             _checked(_LIBC.setns(handle, _NAMESPACES[kind]))
             os.close(handle)
         os.fchdir(folder)
@@ -81,30 +81,30 @@ def _checked(result: int) -> None:
 
 
 class Untouched:
-    """Compares the namespaces of a test with what they were when it began."""
+    """Compares the namespaces of a test with their initial state."""
 
     def __init__(self) -> None:
         self._before = host_state()
 
     def __call__(self) -> None:
-        """See that nothing was added or taken away.
+        """Check that nothing was added or removed.
 
         Raises:
-            LeakError: Something was.
+            LeakError: The state differs.
         """
-        now = host_state()
-        if now == self._before:
+        state = host_state()
+        if state == self._before:
             return
-        told = [
-            f"{name}: {sorted(set(was.splitlines()) ^ set(vars(now)[name].splitlines()))}"
-            for name, was in vars(self._before).items()
-            if was != vars(now)[name]
+        differences = [
+            f"{name}: {sorted(set(before.splitlines()) ^ set(vars(state)[name].splitlines()))}"
+            for name, before in vars(self._before).items()
+            if before != vars(state)[name]
         ]
-        raise LeakError("; ".join(told))
+        raise LeakError("; ".join(differences))
 
 
 def descendants(pid: int) -> set[int]:
-    """Return the processes that `pid` started, directly or not."""
+    """All direct and indirect child processes of `pid`."""
     children: dict[int, list[int]] = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -112,26 +112,26 @@ def descendants(pid: int) -> set[int]:
         except OSError:
             continue
         children.setdefault(int(fields[1]), []).append(int(folder.name))
-    found: set[int] = set()
-    waiting = [pid]
-    while waiting:
-        for child in children.get(waiting.pop(), []):
-            found.add(child)
-            waiting.append(child)
-    return found
+    result: set[int] = set()
+    pending = [pid]
+    while pending:
+        for child in children.get(pending.pop(), []):
+            result.add(child)
+            pending.append(child)
+    return result
 
 
 def owners(pids: set[int]) -> set[int]:
-    """Return the user ids that run `pids`; who has ended meanwhile has none."""
-    found: set[int] = set()
+    """The user ids of `pids`, without processes that have exited."""
+    user_ids: set[int] = set()
     for pid in pids:
         with suppress(FileNotFoundError):
-            found.add(Path(f"/proc/{pid}").stat().st_uid)
-    return found
+            user_ids.add(Path(f"/proc/{pid}").stat().st_uid)
+    return user_ids
 
 
 def alive(pid: int) -> bool:
-    """Return whether a process runs."""
+    """Return True if a process runs."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
     except OSError:
@@ -140,14 +140,14 @@ def alive(pid: int) -> bool:
 
 
 def wait_for_end(pids: set[int], *, within_s: float) -> None:
-    """Return when none of `pids` runs; with 0 s they must have ended.
+    """Wait until none of `pids` runs; with 0 s, they must already have exited.
 
     Raises:
-        LeakError: One still runs after `within_s`.
+        LeakError: A process still runs after `within_s`.
     """
-    ends = time.monotonic() + within_s
-    left = pids
-    while left := {pid for pid in left if alive(pid)}:
-        if time.monotonic() >= ends:
-            raise LeakError(f"still running: {left}")
+    deadline_s = time.monotonic() + within_s
+    remaining = pids
+    while remaining := {pid for pid in remaining if alive(pid)}:
+        if time.monotonic() >= deadline_s:
+            raise LeakError(f"still running: {remaining}")
         time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""A testbed whose robots nobody asks anything, for tests of what a trial does around them."""
+"""A testbed without real robots, for tests of the parts of a trial that do not need any."""
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -10,7 +10,7 @@ from fieldkit.remote.shell import Shell
 
 
 class IdleTestbed:
-    """It places robots and knows nothing; what it must not be asked fails.
+    """Accepts placements and has no oracle; operations that a test must not use raise an error.
 
     Args:
         shells: Its robots.

@@ -1,4 +1,4 @@
-"""Labs whose radio has a known loss and delay, and whole trials in them."""
+"""Labs whose radio has a known loss and delay, and complete trials in them."""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,9 +10,9 @@ from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 LOSSES_PERCENT = (0, 1, 10, 30)
 IN_CI, AT_NIGHT = 8, 20
-"""Repeats of each trial."""
+"""Number of repeats of each trial."""
 REPEATS = [IN_CI, pytest.param(AT_NIGHT, marks=pytest.mark.nightly)]
-"""For a fixture of the module, so that each of its tests is run with either number."""
+"""Parameters of a module fixture, so that each test that uses it runs with both numbers."""
 
 SITE = """\
 backend: emulated
@@ -26,10 +26,10 @@ emulated:
   radio: RADIO
 """
 
-# The paper's steps, quicker: a bag of about 15 kB per half second, few pings.
+# The steps of the paper, shortened: a bag of about 15 kB per 0.5 s, and few pings.
 PROCEDURE = """\
 name: quick
-summary: the paper's steps, quicker
+summary: the steps of the paper, shortened
 scenario: los
 topology: masterless
 protocols: [tcp, udp]
@@ -56,12 +56,12 @@ def make_lab(lab: Path, radio: str, *, topic: str = "/scan", pings: int = 1, rep
 def measured(runs: dict[Path, Run]) -> dict[str, list[dict[str, str]]]:
     for run in runs.values():
         assert run.code == 0, run.err + run.out
-    # A packet in the instant in which tcpdump ends voids an attempt, rightly; the repeat is then done again.
+    # A packet during the exit of tcpdump correctly voids an attempt, and the repeat is then measured again.
     return {lab.name: [row for row in rows(only_trial(lab)) if row["status"] == "valid"] for lab in runs}
 
 
-def run_all(labs: list[Path], *words: str) -> dict[str, list[dict[str, str]]]:
-    """Run the same trial in every lab at once: they share nothing but this machine."""
+def run_all(labs: list[Path], *arguments: str) -> dict[str, list[dict[str, str]]]:
+    """Run the same trial in all labs concurrently; they share only the machine."""
     with ThreadPoolExecutor(len(labs)) as pool:
-        runs = list(pool.map(lambda lab: fieldkit(lab, "trial", "quick", "5m", *words), labs))
+        runs = list(pool.map(lambda lab: fieldkit(lab, "trial", "quick", "5m", *arguments), labs))
     return measured(dict(zip(labs, runs, strict=True)))

@@ -1,4 +1,4 @@
-"""A lab's folder: procedures and profiles of its own, most of them shipped ones with changes."""
+"""The folder of a lab: its procedures and profiles, most of them changed copies of shipped files."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ limits: {max_speed_m_s: 1}
 
 
 def changed(text: str, *changes: str) -> str:
-    """Return a text with others in place of some that stand in it, in pairs."""
+    """The text with replacements, given as pairs of old and new strings; each old string must occur."""
     for old, new in zip(changes[::2], changes[1::2], strict=True):
         assert old in text, old
         text = text.replace(old, new)
@@ -26,9 +26,9 @@ def changed(text: str, *changes: str) -> str:
 
 
 def built_in_ros(folder: Path, name: str = SITE_FILE) -> Path:
-    """Write a site file with the robots that are there without one, but for Debian's ROS; return its path.
+    """Write a site file with the default robots but with the built-in ROS instead of Debian's; return its path.
 
-    For tests that ask nothing of ROS: a short trial takes two thirds of the processor time.
+    For tests that do not depend on ROS: a short trial takes two thirds of the CPU time.
     """
     site = folder / name
     site.write_text(f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin}}\n", encoding="utf-8")
@@ -36,14 +36,14 @@ def built_in_ros(folder: Path, name: str = SITE_FILE) -> Path:
 
 
 def own(lab: Path, kind: Kind, name: str, *changes: str, called: str = "") -> None:
-    """Give a lab its own copy of a shipped file, changed, under its own name or another."""
+    """Write a changed copy of a shipped file to a lab, under its name or the name `called`."""
     text = (ROOT / kind / f"{name}.yaml").read_text(encoding="utf-8")
     (lab / kind).mkdir(exist_ok=True)
     (lab / kind / f"{called or name}.yaml").write_text(changed(text, *changes), encoding="utf-8")
 
 
 def own_procedure(lab: Path, text: str) -> str:
-    """Give a lab a procedure; return its name."""
+    """Write a procedure to a lab; return its name."""
     name = text.partition("\n")[0].removeprefix("name: ")
     (lab / "procedures").mkdir(exist_ok=True)
     (lab / "procedures" / f"{name}.yaml").write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Tables of repeats for reports, made up: every condition, with intervals, voids and failures."""
+"""Synthetic tables of repeats for reports: all conditions, with intervals, void repeats and failures."""
 
 from itertools import product
 
@@ -13,8 +13,8 @@ DISTANCES = ("10ft", "20ft", "55ft")
 
 
 def row(number: int = 1, **changes: object) -> RepeatRow:
-    """Return a valid UDP repeat, changed."""
-    plain = replace(
+    """A valid UDP repeat with changed values."""
+    default = replace(
         tables.ROW,
         **dict.fromkeys(("ip_packets_sent", "ip_packets_received", "ip_loss", "file_loss")),
         trial="20261121T120000.000000Z_los_10ft_master",
@@ -31,19 +31,20 @@ def row(number: int = 1, **changes: object) -> RepeatRow:
         rtt_median_s=0.016,
         transfer_s=0.5,
     )
-    return replace(plain, **changes)
+    return replace(default, **changes)
 
 
 def lawn(repeats: int = 4) -> list[RepeatRow]:
-    """Return a lawn of trials: both scenarios, topologies, protocols and two backends at three distances."""
+    """Synthetic trials of the lawn: both scenarios, topologies, protocols and backends at three distances."""
+
     random = np.random.default_rng(5)
-    found = []
+    rows = []
     conditions = product(("field", "emulated"), ("los", "nlos"), ("master", "masterless"), DISTANCES, Protocol)
     for backend, scenario, topology, label, protocol in conditions:
         distance = parse_distance(label)
         for number in range(1, repeats + 1):
             is_void = number == 2 and label == "55ft"
-            found.append(
+            rows.append(
                 row(
                     number,
                     trial=f"{scenario}_{label}_{topology}_{backend}",
@@ -59,7 +60,7 @@ def lawn(repeats: int = 4) -> list[RepeatRow]:
                     **_figures(protocol, int(random.binomial(36, distance.metres / 60)), random.normal(0, 1e-4)),
                 )
             )
-    return found
+    return rows
 
 
 def _figures(protocol: Protocol, lost: int, noise_s: float) -> dict[str, object]:

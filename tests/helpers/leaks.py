@@ -1,7 +1,7 @@
-"""A pytest plugin: what tests leave behind fails the run, whatever the tests came to.
+"""A pytest plugin that fails the run if tests leave processes behind, whatever the result of the tests.
 
-The watch on processes is no fixture on purpose. The end of a fixture is part of the last test and is repeated with
-it: by then the leaked process is one of those that were there before.
+The process watch is deliberately not a fixture. The teardown of a fixture belongs to the last test and is repeated
+with it, and in the repetition the leaked process would be among those that existed before.
 """
 
 import ctypes
@@ -18,15 +18,15 @@ import pytest
 
 from tests.helpers.host import Untouched, alive, descendants, namespaces_of_our_own
 
-_PR_SET_CHILD_SUBREAPER: Final = 36  # linux/prctl.h: whoever loses its parent becomes a child of ours, not of init's
+_PR_SET_CHILD_SUBREAPER: Final = 36  # linux/prctl.h: orphans become children of this process, not of init
 _KEY: Final = "processes left behind"
 
 
-class _Watch:
-    """Knows which processes descend from this one, and after which file of tests each was first seen.
+class _ProcessWatch:
+    """Records the descendants of this process, and the test file after which each was first seen.
 
     Attributes:
-        leaks: A line per process that was left behind, of all workers.
+        leaks: One line per process that was left behind, of all workers.
     """
 
     def __init__(self, config: pytest.Config) -> None:
@@ -38,7 +38,7 @@ class _Watch:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_teardown(self, item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
-        """Note after the last test of a file what runs now."""
+        """Record the running processes after the last test of a file."""
         try:
             yield
         finally:
@@ -48,47 +48,47 @@ class _Watch:
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Wait for all processes to end, end those that do not, and tell of them; fixtures have ended by now."""
+        """Wait for all processes to exit, kill and report the others; fixtures are already torn down here."""
         if self._config.getoption("dist", "no") == "no":
-            self._look()
+            self._end_processes()
         if hasattr(self._config, "workeroutput"):
             self._config.workeroutput[_KEY] = self.leaks
         elif self.leaks and session.exitstatus in {pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED}:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
-    def _look(self) -> None:
-        ends = time.monotonic() + self._config.getoption("--end-within")
+    def _end_processes(self) -> None:
+        deadline_s = time.monotonic() + self._config.getoption("--end-within")
         # The tracker process of multiprocessing lives as long as the process that started it.
         resource_tracker._resource_tracker._stop()  # type: ignore[attr-defined]
-        while left := self._running():
-            if time.monotonic() >= ends:
+        while remaining := self._running():
+            if time.monotonic() >= deadline_s:
                 break
             time.sleep(0.05)
-        for pid in left:
+        for pid in remaining:
             self.leaks.append(f"{_command(pid)}(seen after {self._seen_after.get(pid, 'all tests')})")
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
     def _running(self) -> list[int]:
-        """Return the processes that run, after waiting for those that have ended.
+        """PIDs of the running processes, after reaping those that have exited.
 
-        This process adopts orphans, so it must also wait for them: the first process of a PID namespace cannot end
-        before its last zombie has been waited for, also one that `nsenter` started from outside.
+        This process adopts orphans, so it must also reap them: the first process of a PID namespace cannot exit
+        before its last zombie is reaped, including one that `nsenter` started from outside.
         """
-        started = descendants(os.getpid()) - self._before
-        for pid in started:
+        pids = descendants(os.getpid()) - self._before
+        for pid in pids:
             with suppress(ChildProcessError):
                 os.waitpid(pid, os.WNOHANG)
-        return [pid for pid in started if alive(pid)]
+        return [pid for pid in pids if alive(pid)]
 
     @pytest.hookimpl(optionalhook=True)
-    def pytest_testnodedown(self, node: Any) -> None:  # noqa: ANN401 (xdist tells no type)
-        """Take over what a worker found; one that crashed has told nothing, and fails the run by itself."""
+    def pytest_testnodedown(self, node: Any) -> None:  # noqa: ANN401 (xdist has no type hints)
+        """Collect the leaks of a worker; a crashed worker reports nothing, and the crash already fails the run."""
         self.leaks += getattr(node, "workeroutput", {}).get(_KEY, [])
 
     @pytest.hookimpl(trylast=True)
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """List the processes that were left behind, after all other sections: the end of a log is what people see."""
+        """List the processes that were left behind, after all other sections, where they are most visible."""
         if self.leaks:
             terminalreporter.section(_KEY, red=True)
             for leak in self.leaks:
@@ -96,20 +96,24 @@ class _Watch:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add how long to wait."""
+    """Add the option for the time limit."""
     parser.addoption(
-        "--end-within", type=float, default=60.0, metavar="SECONDS", help="until which all processes of tests ended"
+        "--end-within",
+        type=float,
+        default=60.0,
+        metavar="SECONDS",
+        help="time after which processes of tests that still run are an error",
     )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Begin to watch."""
-    config.pluginmanager.register(_Watch(config))
+    """Register the process watch."""
+    config.pluginmanager.register(_ProcessWatch(config))
 
 
 @pytest.fixture
 def untouched() -> Iterator[Untouched]:
-    """Run the test in network and mounts of its own, and see at its end, or when it asks, that they are as before."""
+    """Run the test in separate network and mount namespaces; a call, and the end, check that they are unchanged."""
     with namespaces_of_our_own():
         check = Untouched()
         yield check
@@ -117,7 +121,7 @@ def untouched() -> Iterator[Untouched]:
 
 
 def _command(pid: int) -> str:
-    """Return the command line of a process, or where it has none, as while it ends, its name in brackets."""
+    """Command line of a process; if it has none, for example while it exits, its name in brackets."""
     folder = Path(f"/proc/{pid}")
     try:
         command = (folder / "cmdline").read_text(encoding="utf-8", errors="replace").replace("\0", " ")

@@ -1,6 +1,6 @@
-"""A link of known truth: what was sent over it, and what both ends captured; every packet has a number of its own.
+"""A link with known ground truth: the sent packets and the captures of both ends; each packet has a unique number.
 
-Nothing here uses the code under test. Headers are written by struct; who is whose copy is known from the numbers.
+Nothing here uses the code under test. The headers are packed with struct, and copies are identified by the numbers.
 """
 
 import random
@@ -19,16 +19,16 @@ MSS = 1000
 
 @dataclass
 class Link:
-    """What a link does to each packet.
+    """The effect of a link on each packet.
 
     Attributes:
-        seed: Of its draws.
-        loss: Share of packets lost.
-        copied: Share of those that arrive that do so twice, the second time 10 us later.
-        late: Share of those that arrive that do so `late_ns` after the others.
-        delay_ns: How long the others take.
-        jitter_ns: And by how much more at most.
-        clock_ns: By how much the receiver's clock is ahead.
+        seed: Seed of the random numbers.
+        loss: Share of packets that are lost.
+        copied: Share of the arriving packets that arrive a second time 10 us later.
+        late: Share of the arriving packets that are delayed by an additional `late_ns`.
+        delay_ns: Delay of a packet.
+        jitter_ns: Maximum of the additional random delay.
+        clock_ns: Offset of the receiver's clock.
     """
 
     seed: int
@@ -45,28 +45,28 @@ class Link:
         self.draw = random.Random(self.seed)
 
     def arrivals(self, sent_ns: Sequence[int]) -> list[tuple[int, int]]:
-        """Return when, by the receiver's clock, and which packet arrived, in this order."""
-        found = []
-        for number, at_ns in enumerate(sent_ns):
+        """Arrival times by the receiver's clock with the index of the packet, in order of arrival."""
+        arrived = []
+        for number, sent_at_ns in enumerate(sent_ns):
             if self.draw.random() < self.loss:
                 continue
-            came_ns = at_ns + self.clock_ns + self.delay_ns + self.draw.randint(0, self.jitter_ns)
-            came_ns += self.late_ns * (self.draw.random() < self.late)
-            found.append((came_ns, number))
+            arrival_ns = sent_at_ns + self.clock_ns + self.delay_ns + self.draw.randint(0, self.jitter_ns)
+            arrival_ns += self.late_ns * (self.draw.random() < self.late)
+            arrived.append((arrival_ns, number))
             if self.draw.random() < self.copied:
-                found.append((came_ns + 10_000, number))
-        return sorted(found)
+                arrived.append((arrival_ns + 10_000, number))
+        return sorted(arrived)
 
 
 @dataclass(frozen=True)
 class Fate:
-    """What became of packets sent, by who sent them.
+    """The fate of the sent packets, known to the generator.
 
     Attributes:
-        lost: How many never arrived.
-        duplicated: How many came beyond the first of each.
-        reordered: How many arrived first after one that was sent later.
-        bursts: How many runs of lost ones there are.
+        lost: Number of packets that never arrived.
+        duplicated: Number of arrivals beyond the first of each packet.
+        reordered: Number of packets whose first arrival is after that of a packet sent later.
+        bursts: Number of runs of lost packets.
     """
 
     lost: int
@@ -76,38 +76,38 @@ class Fate:
 
     @classmethod
     def of(cls, sent: int, arrived: Sequence[int]) -> "Fate":
-        there = set(arrived)
+        arrived_once = set(arrived)
         latest, reordered = -1, 0
         for number in dict.fromkeys(arrived):
             reordered += number < latest
             latest = max(latest, number)
-        gone = [number not in there for number in range(sent)]
-        bursts = sum(now and not before for now, before in zip(gone, [False, *gone], strict=False))
-        return cls(sum(gone), len(arrived) - len(there), reordered, bursts)
+        is_lost = [number not in arrived_once for number in range(sent)]
+        bursts = sum(lost and not lost_before for lost, lost_before in zip(is_lost, [False, *is_lost], strict=False))
+        return cls(sum(is_lost), len(arrived) - len(arrived_once), reordered, bursts)
 
 
 def ip(
     payload: bytes, *, protocol: int, size: int, ip_id: int | None = 0, ends: tuple[str, str] | None = None
 ) -> bytes:
-    """A packet of which `size` bytes of payload are on the wire; of IPv6 where `ip_id` is None."""
+    """A packet with `size` payload bytes on the wire; an IPv6 packet if `ip_id` is None."""
     if ip_id is None:
-        source, target = (ip_address(one).packed for one in ends or (SENDER_V6, RECEIVER_V6))
-        # A super-frame has no room for its length, which is then 0.
+        source, target = (ip_address(address).packed for address in ends or (SENDER_V6, RECEIVER_V6))
+        # The length field of a super-frame is too small for its length and is 0.
         return struct.pack(">IHBB", 6 << 28, size if size < 65_536 else 0, protocol, 64) + source + target + payload
-    source, target = (ip_address(one).packed for one in ends or (SENDER, RECEIVER))
+    source, target = (ip_address(address).packed for address in ends or (SENDER, RECEIVER))
     total = size + 20 if size + 20 < 65_536 else 0
     return struct.pack(">BBHHHBBH", 0x45, 0, total, ip_id, 0x4000, 64, protocol, 0) + source + target + payload
 
 
 def udp(content: bytes, *, ip_id: int | None, sport: int = 40_000, ends: tuple[str, str] | None = None) -> bytes:
-    """An unfragmented datagram, cut as a capture cuts it."""
-    head = struct.pack(">HHHH", sport, PORT, 8 + len(content), 0)
-    return ip(head + content, protocol=17, size=8 + len(content), ip_id=ip_id, ends=ends)[:SNAP_BYTES]
+    """An unfragmented datagram, truncated as in a capture."""
+    udp_header = struct.pack(">HHHH", sport, PORT, 8 + len(content), 0)
+    return ip(udp_header + content, protocol=17, size=8 + len(content), ip_id=ip_id, ends=ends)[:SNAP_BYTES]
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A TCP segment as the wire carries it: where its payload begins, its bytes, its time stamp and IP id."""
+    """A TCP segment on the wire: the start of its payload, its size, its timestamp and its IP id."""
 
     start: int
     size: int
@@ -117,7 +117,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class TcpTruth:
-    """A transfer by TCP: both captures, and what they must be found to say."""
+    """A TCP transfer: both captures, and the correct results of their analysis."""
 
     sender: list[Frame]
     receiver: list[Frame]
@@ -141,21 +141,22 @@ def tcp(
     ends: tuple[str, str] | None = None,
     sport: int = 40_000,
 ) -> TcpTruth:
-    """Return a transfer: what is lost is sent again after 30 ms, and a share of all others, `again`, needlessly.
+    """A TCP transfer; lost segments are sent again after 30 ms, and a share `again` of the others without need.
 
-    The sender's capture holds up to `offload` segments in a frame, the receiver's too where they follow each other.
+    A frame in the sender's capture has up to `offload` segments; in the receiver's capture, contiguous segments are
+    coalesced likewise.
     """
     frames: list[list[Segment]] = []
     times_ns: list[int] = []
     clock = 10**18
     counter = iter(range(7, 10**9))
-    isn = 2**32 - 5 * MSS - 1  # wraps
-    ticks = 2**32 - 20  # so do the time stamps
+    isn = 2**32 - 5 * MSS - 1  # so that sequence numbers wrap
+    ticks = 2**32 - 20  # so that timestamps wrap
 
     def send(first: int, count: int, at_ns: int) -> None:
         stamp = (ticks + (at_ns - clock) // MS) % 2**32 if stamped else None
-        names = [None if ipv6 else next(counter) % 65_536 if ids else 0 for _ in range(count)]
-        frames.append([Segment((first + at) * MSS, MSS, stamp, name) for at, name in enumerate(names)])
+        ip_ids = [None if ipv6 else next(counter) % 65_536 if ids else 0 for _ in range(count)]
+        frames.append([Segment((first + index) * MSS, MSS, stamp, ip_id) for index, ip_id in enumerate(ip_ids)])
         times_ns.append(at_ns)
 
     at_ns, first = clock + MS, 0
@@ -163,93 +164,103 @@ def tcp(
         count = min(link.draw.randint(1, offload), segments - first)
         send(first, count, at_ns)
         first, at_ns = first + count, at_ns + 2 * MS
-    came = _carried(link, frames, times_ns, 0)
-    there = {segment.start for _, _, segment in came}
-    missing = [start for start in range(0, segments * MSS, MSS) if start not in there]
-    needless = [start for start in sorted(there) if link.draw.random() < again]
+    arrivals = _transmit(link, frames, times_ns, 0)
+    arrived_starts = {segment.start for _, _, segment in arrivals}
+    missing = [start for start in range(0, segments * MSS, MSS) if start not in arrived_starts]
+    unneeded = [start for start in sorted(arrived_starts) if link.draw.random() < again]
     again_ns = at_ns + 30 * MS
-    while missing or needless:
-        begin = len(frames)
-        for start in sorted(missing + needless):
+    while missing or unneeded:
+        first_frame = len(frames)
+        for start in sorted(missing + unneeded):
             send(start // MSS, 1, again_ns)
             again_ns += 2 * MS
-        more = _carried(link, frames[begin:], times_ns[begin:], begin)
-        came, needless = came + more, []
-        missing = sorted(set(missing) - {segment.start for _, _, segment in more})
+        new_arrivals = _transmit(link, frames[first_frame:], times_ns[first_frame:], first_frame)
+        arrivals, unneeded = arrivals + new_arrivals, []
+        missing = sorted(set(missing) - {segment.start for _, _, segment in new_arrivals})
         again_ns += 30 * MS
-    came.sort(key=lambda one: one[0])
+    arrivals.sort(key=lambda arrival: arrival[0])
 
     def packet(start: int, size: int, stamp: int | None, ip_id: int | None, flags: int = 0x10) -> bytes:
         options = b"" if stamp is None else struct.pack(">BBBBII", 1, 1, 8, 10, stamp, 1)
-        words = 5 + len(options) // 4
+        header_words = 5 + len(options) // 4
         seq = (isn + 1 + start) % 2**32
-        head = struct.pack(">HHIIBBHHH", sport, PORT, seq, 77, words << 4, flags, 502, 0, 0) + options
-        kept = bytes((start + at) % 251 for at in range(min(size, 64)))
-        return ip(head + kept, protocol=6, size=len(head) + size, ip_id=ip_id, ends=ends)
+        tcp_header = struct.pack(">HHIIBBHHH", sport, PORT, seq, 77, header_words << 4, flags, 502, 0, 0) + options
+        payload = bytes((start + index) % 251 for index in range(min(size, 64)))
+        return ip(tcp_header + payload, protocol=6, size=len(tcp_header) + size, ip_id=ip_id, ends=ends)
 
-    def frame(at_ns: int, these: Sequence[Segment]) -> Frame:
-        whole = packet(these[0].start, sum(one.size for one in these), these[0].stamp, these[0].ip_id)
-        return Frame(at_ns, whole[:SNAP_BYTES], 40 + 60 + MSS * len(these))
+    def frame(at_ns: int, group: Sequence[Segment]) -> Frame:
+        data = packet(group[0].start, sum(segment.size for segment in group), group[0].stamp, group[0].ip_id)
+        return Frame(at_ns, data[:SNAP_BYTES], 40 + 60 + MSS * len(group))
 
     syn = packet(-1, 0, ticks if stamped else None, None if ipv6 else 1, flags=0x02)
-    joined = list(_joined(came, offload))
-    order = [number for _, number, _ in came]
-    place = {(number, one.start): at for at, (number, one) in enumerate(
-        (number, one) for number, these in enumerate(frames) for one in these)}  # fmt: skip
-    arrived = {(number, one.start) for _, number, one in came}
-    sent = [one for these in frames for one in these]
+    joined = list(_coalesce(arrivals, offload))
+    order = [number for _, number, _ in arrivals]
+    position = {(number, segment.start): index for index, (number, segment) in enumerate(
+        (number, segment) for number, group in enumerate(frames) for segment in group)}  # fmt: skip
+    arrived = {(number, segment.start) for _, number, segment in arrivals}
+    sent = [segment for group in frames for segment in group]
     return TcpTruth(
-        sender=[Frame(clock, syn), *(frame(at, these) for at, these in zip(times_ns, frames, strict=True))],
+        sender=[Frame(clock, syn), *(frame(at_ns, group) for at_ns, group in zip(times_ns, frames, strict=True))],
         receiver=[
             Frame(clock + link.clock_ns + link.delay_ns, syn),
-            *(frame(at, [one for _, one in these]) for at, these in joined),
+            *(frame(at_ns, [segment for _, segment in group]) for at_ns, group in joined),
         ],
         sent_bytes=len(sent) * MSS,
         received_bytes=len(arrived) * MSS,
-        retransmitted=sum(frames[number][0].start in _starts(frames[:number]) for number in range(len(frames))),
-        spurious=sum(
-            all(any((before, one.start) in arrived for before in range(number)) for one in these)
-            for number, these in enumerate(frames)
+        retransmitted=sum(
+            frames[number][0].start in _segment_starts(frames[:number]) for number in range(len(frames))
         ),
-        reordered=_late(joined, place),
-        duplicated_bytes=(len(order) - len({one.start for _, _, one in came})) * MSS,
+        spurious=sum(
+            all(any((earlier, segment.start) in arrived for earlier in range(number)) for segment in group)
+            for number, group in enumerate(frames)
+        ),
+        reordered=_reordered(joined, position),
+        duplicated_bytes=(len(order) - len({segment.start for _, _, segment in arrivals})) * MSS,
     )
 
 
-def _carried(
-    link: Link, frames: Sequence[Sequence[Segment]], times_ns: Sequence[int], begin: int
+def _transmit(
+    link: Link, frames: Sequence[Sequence[Segment]], times_ns: Sequence[int], first_frame: int
 ) -> list[tuple[int, int, Segment]]:
-    each = [(at + number, begin + index, one) for index, (at, these) in enumerate(zip(times_ns, frames, strict=True))
-            for number, one in enumerate(these)]  # fmt: skip
-    return [(at, each[which][1], each[which][2]) for at, which in link.arrivals([at for at, _, _ in each])]
+    transmitted = [
+        (at_ns + number, first_frame + frame_index, segment)
+        for frame_index, (at_ns, frame) in enumerate(zip(times_ns, frames, strict=True))
+        for number, segment in enumerate(frame)
+    ]
+    return [
+        (at, transmitted[index][1], transmitted[index][2])
+        for at, index in link.arrivals([at for at, _, _ in transmitted])
+    ]
 
 
-def _joined(came: Sequence[tuple[int, int, Segment]], most: int) -> Iterator[tuple[int, list[tuple[int, Segment]]]]:
-    """Join segments that follow each other within 100 us and have one time stamp, as GRO does."""
-    at_ns, held = 0, list[tuple[int, Segment]]()
-    for came_ns, number, one in came:
-        last = held[-1][1] if held else None
-        follows = last is not None and last.start + last.size == one.start and last.stamp == one.stamp
-        if not (follows and len(held) < most and came_ns - at_ns < 100_000):
-            if held:
-                yield at_ns, held
-            at_ns, held = came_ns, []
-        held.append((number, one))
-    if held:
-        yield at_ns, held
+def _coalesce(
+    arrivals: Sequence[tuple[int, int, Segment]], limit: int
+) -> Iterator[tuple[int, list[tuple[int, Segment]]]]:
+    """Coalesce contiguous segments that arrive within 100 us with the same timestamp, as GRO does."""
+    at_ns, group = 0, list[tuple[int, Segment]]()
+    for arrival_ns, number, segment in arrivals:
+        last = group[-1][1] if group else None
+        is_contiguous = last is not None and last.start + last.size == segment.start and last.stamp == segment.stamp
+        if not (is_contiguous and len(group) < limit and arrival_ns - at_ns < 100_000):
+            if group:
+                yield at_ns, group
+            at_ns, group = arrival_ns, []
+        group.append((number, segment))
+    if group:
+        yield at_ns, group
 
 
-def _starts(frames: Sequence[Sequence[Segment]]) -> set[int]:
-    return {one.start for these in frames for one in these}
+def _segment_starts(frames: Sequence[Sequence[Segment]]) -> set[int]:
+    return {segment.start for group in frames for segment in group}
 
 
-def _late(joined: Sequence[tuple[int, list[tuple[int, Segment]]]], place: dict[tuple[int, int], int]) -> int:
-    seen, latest, late = set[int](), -1, 0
-    for _, these in joined:
-        for at, (number, one) in enumerate(these):
-            which = place[number, one.start]
-            late += at == 0 and which not in seen and which < latest
-            if which not in seen:
-                latest = max(latest, which)
-            seen.add(which)
-    return late
+def _reordered(joined: Sequence[tuple[int, list[tuple[int, Segment]]]], position: dict[tuple[int, int], int]) -> int:
+    seen, latest, reordered = set[int](), -1, 0
+    for _, group in joined:
+        for index, (number, segment) in enumerate(group):
+            order = position[number, segment.start]
+            reordered += index == 0 and order not in seen and order < latest
+            if order not in seen:
+                latest = max(latest, order)
+            seen.add(order)
+    return reordered

@@ -1,4 +1,4 @@
-"""SSH servers on loopback in namespaces of their own: home is a fresh folder, what they start ends with them."""
+"""SSH servers on loopback in separate namespaces, with an empty home folder; their processes exit with them."""
 
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
@@ -6,12 +6,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from fieldkit.core.deadline import Deadline
-from tests.helpers.sshd import UP_S, Server, answers, free_port, make_key, wait_until
+from tests.helpers.sshd import UP_S, Server, free_port, is_ssh_server, make_key, wait_until
 
 Command = Callable[[Path, int], Sequence[str]]
-"""Returns a server's command line from the file of its host key, as OpenSSH writes it, and its port."""
+"""Command line of a server, from the file of its host key in OpenSSH format and its port."""
 
-_WITH_OWN_HOME = """
+_WITH_SEPARATE_HOME = """
 mount -t tmpfs -o mode=700 tmpfs /root && mkdir -m 700 /root/.ssh &&
 cp "$1" /root/.ssh/authorized_keys && mkdir -p /run/sshd && shift && exec "$@"
 """
@@ -35,15 +35,23 @@ def dropbear(host_key: Path, port: int) -> Sequence[str]:
 
 @contextmanager
 def serve(folder: Path, command: Command) -> Iterator[Server]:
-    """Yield a running server, its keys and log in `folder`."""
+    """Yield a running server whose keys and log are in `folder`."""
     host_key = make_key(folder / "host")
     make_key(folder / "client")
     port = free_port()
-    own = ("unshare", "--mount", "--propagation", "private", "--pid", "--fork", "--kill-child", "--mount-proc")
-    argv = (*own, "sh", "-c", _WITH_OWN_HOME, "sh", str(folder / "client.pub"), *command(folder / "host", port))
+    namespaces = ("unshare", "--mount", "--propagation", "private", "--pid", "--fork", "--kill-child", "--mount-proc")
+    argv = (
+        *namespaces,
+        "sh",
+        "-c",
+        _WITH_SEPARATE_HOME,
+        "sh",
+        str(folder / "client.pub"),
+        *command(folder / "host", port),
+    )
     with (folder / "log").open("wb") as log, subprocess.Popen(argv, stderr=log) as process:
         try:
-            wait_until(lambda: answers(port), Deadline.after(UP_S))
+            wait_until(lambda: is_ssh_server(port), Deadline.after(UP_S))
             yield Server(port, host_key, (folder / "client").read_text(encoding="ascii"), folder, process.pid)
         finally:
-            process.kill()  # unshare itself ignores SIGTERM
+            process.kill()  # unshare ignores SIGTERM

@@ -1,7 +1,8 @@
-"""Record MAVLink behind a router while the kernel drops messages, in a network namespace of its own.
+"""Records MAVLink behind a router while the kernel drops messages, in a separate network namespace.
 
-Arguments: the log to write, seconds, percent of the periodic messages to drop. It writes a JSON object to standard
-output: what the kernel's counters, the router and the recorder report. It changes the firewall of its namespace.
+Arguments: the log to write, the duration in seconds, and the percentage of periodic messages to drop. The program
+writes a JSON object with the counters of the kernel, the router and the recorder to standard output. It changes the
+firewall of its namespace.
 """
 
 import json
@@ -38,59 +39,59 @@ table ip lossy {{
 """The id of a MAVLink 2 message is in bytes 7 to 9 of its frame, little-endian; the UDP header has 8 bytes."""
 
 
-def kind_in_header(kind: int) -> str:
-    """Return the id of a message as the kernel compares it."""
-    return "0x" + kind.to_bytes(3, "little").hex()
+def message_id_hex(message_id: int) -> str:
+    """The id of a message in the byte order in which the kernel compares it."""
+    return "0x" + message_id.to_bytes(3, "little").hex()
 
 
 def counters() -> dict[str, int]:
-    """Return the packets of each named counter."""
-    done = subprocess.run(("nft", "-j", "list", "counters"), capture_output=True, text=True, check=True)
-    entries = [entry["counter"] for entry in json.loads(done.stdout)["nftables"] if "counter" in entry]
+    """The packet count of each named counter."""
+    completed = subprocess.run(("nft", "-j", "list", "counters"), capture_output=True, text=True, check=True)
+    entries = [entry["counter"] for entry in json.loads(completed.stdout)["nftables"] if "counter" in entry]
     return {entry["name"]: entry["packets"] for entry in entries}
 
 
-def other_station(port: int, over: threading.Event) -> None:
-    """Send commands as another ground station: the router withholds their acknowledgements from the recorder."""
+def other_station(port: int, stop: threading.Event) -> None:
+    """Send commands as another ground station, whose acknowledgements the router withholds from the recorder."""
     sender = drones.Sender(255, 190)
     request = d.MAVLink_command_long_message(
         *(drones.SYSTEM, 1, d.MAV_CMD_REQUEST_MESSAGE, 0, d.MAVLINK_MSG_ID_AUTOPILOT_VERSION, *(0,) * 6)
     )
     with socket.create_connection(("127.0.0.1", port)) as stream:
         stream.settimeout(0.2)
-        while not over.wait(0.25):
+        while not stop.wait(0.25):
             stream.sendall(sender.frame(drones.beat()) + sender.frame(request))
             stream.recv(65_536)
 
 
-def main(log: Path, lasts_s: float, percent: int) -> dict[str, Any]:
-    """Record, and return what was counted."""
+def main(log: Path, duration_s: float, percent: int) -> dict[str, Any]:
+    """Record messages; return the counts."""
     subprocess.run(("ip", "link", "set", "lo", "up"), check=True)
-    over = threading.Event()
+    stop = threading.Event()
     with drones.at_udp(firmware=ARDUCOPTER) as port, MavlinkRouter(port) as router:
-        intervals_us = {str(kind): round(1e6 / RATE_HZ) for kind in PERIODIC}
+        intervals_us = {str(message_id): round(1e6 / RATE_HZ) for message_id in PERIODIC}
         request = json.dumps({"connection": f"udpout:127.0.0.1:{router.udp}", "intervals_us": intervals_us})
-        words = (sys.executable, "-m", "fieldkit.agent", "mavlink", request, str(log))
-        other = threading.Thread(target=other_station, args=(router.tcp, over))
-        with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as recorder:
+        argv = (sys.executable, "-m", "fieldkit.agent", "mavlink", request, str(log))
+        station_thread = threading.Thread(target=other_station, args=(router.tcp, stop))
+        with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as recorder:
             try:
                 assert recorder.stderr is not None
                 while recorder.stderr.readline() != b"up, MAVLink\n":
                     assert recorder.poll() is None
-                other.start()
-                kinds = ", ".join(map(kind_in_header, PERIODIC))
+                station_thread.start()
+                kinds = ", ".join(map(message_id_hex, PERIODIC))
                 rules = _RULES.format(percent=percent, port=router.udp, kinds=kinds)
                 subprocess.run(("nft", "-f", "-"), input=rules.encode(), check=True)
-                time.sleep(lasts_s)
+                time.sleep(duration_s)
                 subprocess.run(("nft", "flush", "chain", "ip", "lossy", "incoming"), check=True)
-                time.sleep(0.5)  # messages after the last dropped one show that it is missing
+                time.sleep(0.5)  # later messages reveal that the last dropped one is missing
                 recorder.send_signal(signal.SIGINT)
-                told, _ = recorder.communicate(timeout=60)
+                report, _ = recorder.communicate(timeout=60)
             finally:
                 recorder.kill()
-                over.set()
-                other.join()
-        return {**counters(), "withheld": router.withheld, "ended_us": json.loads(told)["ended_us"]}
+                stop.set()
+                station_thread.join()
+        return {**counters(), "withheld": router.withheld, "ended_us": json.loads(report)["ended_us"]}
 
 
 if __name__ == "__main__":

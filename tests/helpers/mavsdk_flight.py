@@ -1,7 +1,7 @@
-"""A flight by MAVSDK, as a program that runs on a robot: `python -m tests.helpers.mavsdk_flight HOST PORT LOSS`.
+"""A flight with MAVSDK, run as a program on a robot: `python -m tests.helpers.mavsdk_flight HOST PORT LOSS`.
 
-It arms, takes off, flies three points and lands, over a link that loses this share of the datagrams each way; it
-prints one line of JSON. A program, because MAVSDK is a library of C++ with threads of its own.
+It arms, takes off, flies to three points and lands, over a link that loses the share LOSS of the datagrams in each
+direction, and prints one line of JSON. It is a separate program because MAVSDK is a C++ library with its own threads.
 """
 
 import json
@@ -23,29 +23,31 @@ from mavsdk.plugins.telemetry import Telemetry, TelemetryError
 
 HEIGHT_M: Final = 1.0
 CORNERS_M: Final = ((0.0, 2.0), (2.0, 2.0), (2.0, 0.0))
-"""North and east of where it took off."""
+"""Distances north and east of the take-off position."""
 M_PER_DEGREE: Final = 111_319.5
-"""Near the crossing of the equator and the first meridian, to 1 %."""
+"""Metres per degree near the equator and the prime meridian, to 1 %."""
 PATIENCE_S: Final = 60.0
 UPLOADS: Final = 5
 NAN: Final = float("nan")
 
 
-def lossy(near: socket.socket, drone: tuple[str, int], loss: float) -> None:
-    """Carry datagrams between whoever sends to `near` and the drone, but for a share of them."""
-    dice = random.Random(1)
-    far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+def lossy(client_socket: socket.socket, drone: tuple[str, int], loss: float) -> None:
+    """Forward datagrams between the client of `client_socket` and the drone, with random losses."""
+    random_source = random.Random(1)
+    drone_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     client: tuple[str, int] | None = None
     while True:
-        for one in select.select([near, far], [], [])[0]:
-            data, sender = one.recvfrom(65_536)
-            client = sender if one is near else client
-            if client and dice.random() >= loss:
-                (far if one is near else near).sendto(data, drone if one is near else client)
+        for readable in select.select([client_socket, drone_socket], [], [])[0]:
+            data, sender = readable.recvfrom(65_536)
+            client = sender if readable is client_socket else client
+            if client and random_source.random() >= loss:
+                (drone_socket if readable is client_socket else client_socket).sendto(
+                    data, drone if readable is client_socket else client
+                )
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait until a condition holds, at most as long as a flight may take."""
+    """Wait until a condition is true, for at most `PATIENCE_S`."""
     end_s = time.monotonic() + PATIENCE_S
     while not condition():
         if time.monotonic() > end_s:
@@ -54,7 +56,7 @@ def until(condition: Callable[[], bool]) -> None:
 
 
 def corner(latitude: float, longitude: float, north_m: float, east_m: float) -> MissionItem:
-    """Return the item that flies over a corner."""
+    """The mission item that flies over a corner."""
     return MissionItem(
         latitude_deg=latitude + north_m / M_PER_DEGREE,
         longitude_deg=longitude + east_m / M_PER_DEGREE,
@@ -74,7 +76,7 @@ def corner(latitude: float, longitude: float, north_m: float, east_m: float) -> 
 
 
 def upload(mission: Mission, plan: MissionPlan) -> None:
-    """Upload a mission, again where that fails: MAVSDK waits in vain for a last MISSION_ACK that is lost."""
+    """Upload a mission, repeatedly if it fails: MAVSDK waits without effect for a lost last MISSION_ACK."""
     for _ in range(UPLOADS - 1):
         with suppress(MissionError):
             mission.upload_mission(plan)
@@ -83,7 +85,7 @@ def upload(mission: Mission, plan: MissionPlan) -> None:
 
 
 def request_positions(telemetry: Telemetry) -> None:
-    """Request positions at 20 Hz, which a PX4 sends at 1 Hz unasked; again if the request is lost."""
+    """Request positions at 20 Hz, which PX4 otherwise sends at 1 Hz; repeat a lost request."""
     for _ in range(UPLOADS - 1):
         with suppress(TelemetryError):
             telemetry.set_rate_position_velocity_ned(20.0)
@@ -92,7 +94,7 @@ def request_positions(telemetry: Telemetry) -> None:
 
 
 def fly(url: str) -> dict[str, object]:
-    """Fly, and return what was seen."""
+    """Fly the mission; return the observations."""
     mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
     mavsdk.add_any_connection(url)
     system = mavsdk.first_autopilot(PATIENCE_S)
@@ -104,16 +106,16 @@ def fly(url: str) -> dict[str, object]:
     action.takeoff()
     until(lambda: telemetry.position().relative_altitude_m > HEIGHT_M - 0.15)
     home = telemetry.home()
-    items = [corner(home.latitude_deg, home.longitude_deg, *one) for one in CORNERS_M]
+    items = [corner(home.latitude_deg, home.longitude_deg, *corner_m) for corner_m in CORNERS_M]
     upload(mission, MissionPlan(items))
-    back = mission.download_mission().mission_items
+    downloaded = mission.download_mission().mission_items
     nearest_m = [float("inf")] * len(CORNERS_M)
 
     def finished() -> bool:
-        place = telemetry.position_velocity_ned().position
+        position = telemetry.position_velocity_ned().position
         for number, (north_m, east_m) in enumerate(CORNERS_M):
-            far_m = ((place.north_m - north_m) ** 2 + (place.east_m - east_m) ** 2) ** 0.5
-            nearest_m[number] = min(nearest_m[number], far_m)
+            distance_m = ((position.north_m - north_m) ** 2 + (position.east_m - east_m) ** 2) ** 0.5
+            nearest_m[number] = min(nearest_m[number], distance_m)
         return bool(mission.is_mission_finished())
 
     mission.start_mission()
@@ -121,15 +123,15 @@ def fly(url: str) -> dict[str, object]:
     action.land()
     until(lambda: not telemetry.armed())
     battery = telemetry.battery().remaining_percent
-    return {"nearest_m": nearest_m, "items": len(back), "battery": battery}
+    return {"nearest_m": nearest_m, "items": len(downloaded), "battery": battery}
 
 
 def main(host: str, port: str, loss: str) -> None:
     """Fly the drone at this address."""
-    near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    near.bind(("127.0.0.1", 0))
-    threading.Thread(target=lossy, args=(near, (host, int(port)), float(loss)), daemon=True).start()
-    sys.stdout.write(json.dumps(fly(f"udpout://127.0.0.1:{near.getsockname()[1]}")) + "\n")
+    client_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    client_socket.bind(("127.0.0.1", 0))
+    threading.Thread(target=lossy, args=(client_socket, (host, int(port)), float(loss)), daemon=True).start()
+    sys.stdout.write(json.dumps(fly(f"udpout://127.0.0.1:{client_socket.getsockname()[1]}")) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""All figures of an attempt's folder at once, without a plan: of transfer, ping, captures, faults and testbed."""
+"""All figures of an attempt's folder, computed without a plan: transfer, ping, captures, faults and testbed."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from fieldkit.trial.columns import measures
 
 
 class Measures(dict[str, Any]):
-    """Figures by column, also as attributes; one that is missing is not there, and None as an attribute."""
+    """Figures by column, also available as attributes; a missing figure has no key, and its attribute is None."""
 
     def __init__(self, **values: Any) -> None:  # noqa: ANN401 (any value of a column)
         super().__init__({name: value for name, value in values.items() if value is not None})
@@ -29,37 +29,37 @@ class Measures(dict[str, Any]):
 COLUMNS = frozenset(column.name for column in measures())
 
 
-def every(found: Measures) -> dict[str, Any]:
-    """Return every column, None for one that is missing."""
-    return {name: found.get(name) for name in COLUMNS}
+def every(figures_by_column: Measures) -> dict[str, Any]:
+    """All columns; None for a missing figure."""
+    return {name: figures_by_column.get(name) for name in COLUMNS}
 
 
 def measure(folder: Path, transfer: Transfer | None) -> Measures:
-    """Return what the evidence in `folder` says; each column has a value, or is said to be missing, once."""
+    """All figures from the evidence in `folder`; each column occurs once, either with a value or as missing."""
     evidence = AttemptEvidence(folder)
     pings = evidence.read_or_none(ping.read, ping.FILE)
-    where = evidence.read_or_none(track.read, track.FILE)
-    replied_ns = [at for one in pings.answers if (at := one.at_utc_ns)] if pings else []
-    found = lateness.measure(evidence.read_or_none(lateness.read, lateness.FILE)) | ping.measure(pings)
-    found |= track.measure(where, ping.WAY_COLUMNS, (Role.SENDER, Role.RECEIVER), replied_ns)
+    positions = evidence.read_or_none(track.read, track.FILE)
+    reply_times_ns = [at for answer in pings.answers if (at := answer.at_utc_ns)] if pings else []
+    measured = lateness.measure(evidence.read_or_none(lateness.read, lateness.FILE)) | ping.measure(pings)
+    measured |= track.measure(positions, ping.WAY_COLUMNS, (Role.SENDER, Role.RECEIVER), reply_times_ns)
     if transfer is not None:
-        found |= figures.measure(evidence, transfer) | _captures(evidence)
-        assert not {column.name for column in of_transfers.COLUMNS} - found.values.keys() - found.missing.keys()
+        measured |= figures.measure(evidence, transfer) | _captures(evidence)
+        assert not {column.name for column in of_transfers.COLUMNS} - measured.values.keys() - measured.missing.keys()
     for kind in FaultKind:
         try:
-            found |= recovery.measure(kind, evidence.read(recovery.read, "", kind))
+            measured |= recovery.measure(kind, evidence.read(recovery.read, "", kind))
         except EvidenceError:
             continue
-    assert not found.values.keys() & found.missing.keys()
-    return Measures(**found.values)
+    assert not measured.values.keys() & measured.missing.keys()
+    return Measures(**measured.values)
 
 
 def _captures(evidence: AttemptEvidence) -> Measured:
-    found = Measured()
+    measured = Measured()
     for role in (Role.SENDER, Role.RECEIVER):
         capture = evidence.whole_capture(tcpdump_log.capture_file(role))
         log = evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_file(role))
-        captured = capture.frames if capture else None
+        frame_count = capture.frames if capture else None
         dropped = log.dropped_by_kernel if log else None
-        found |= Measured.of({f"{role}_captured": captured, f"{role}_capture_dropped": dropped}, "not at hand")
-    return found
+        measured |= Measured.of({f"{role}_captured": frame_count, f"{role}_capture_dropped": dropped}, "not at hand")
+    return measured

@@ -1,4 +1,4 @@
-"""A kind of step as another package may have it, which declares columns by instance: `- meter: {...}`."""
+"""An example step kind of another package that declares columns for each instance: `- meter: {...}`."""
 
 from collections.abc import Iterator
 
@@ -15,16 +15,16 @@ TARGET = "tests.helpers.meter:Meter"
 
 
 class Meter(Step):
-    """It does nothing, and measures what its YAML says.
+    """A step without effect that declares the columns in its YAML.
 
     Attributes:
-        called: The name that its columns begin with.
+        called: Prefix of its columns.
         measures: Names of columns, in dBm.
-        robot: Whose.
+        robot: The role of the robot.
     """
 
     columns = columns(
-        7, ("meter_level", "dBm", "What the meter says.", Figure("level by meter", Kind.MEDIAN), (-150, 50))
+        7, ("meter_level", "dBm", "Level of the meter.", Figure("level by meter", Kind.MEDIAN), (-150, 50))
     )
 
     called: str = ""
@@ -38,8 +38,10 @@ class Meter(Step):
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        own = (Column(name, "dBm", "As its YAML says.", figure=Figure(name, Kind.MEDIAN)) for name in self.measures)
-        return (*self.columns, *own)
+        extra_columns = (
+            Column(name, "dBm", "Column from the YAML.", figure=Figure(name, Kind.MEDIAN)) for name in self.measures
+        )
+        return (*self.columns, *extra_columns)
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:

@@ -1,7 +1,7 @@
-"""Cells of the fault matrix of moving robots, and the behaviour and bounds that follow for each from stated rules.
+"""Cells of the fault matrix of moving robots, and the expected behaviour and time limits of each, derived from rules.
 
-A cell is a kind of robot, one party or two, a fault and a phase. Its bound is the time within which the fault must be
-detected, plus the time in which the robot brakes or comes down then; all of them are constants here.
+A cell is a kind of robot, one or two parties, a fault and a phase. The limit is the time within which the fault must
+be detected, plus the time in which the robot brakes or lands after that; all these times are constants here.
 """
 
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ class Craft(StrEnum):
 
     @property
     def flies(self) -> bool:
-        """Whether it is a drone."""
+        """True if the robot is a drone."""
         return self is not Craft.ROVER
 
 
 class Blow(StrEnum):
-    """What is done to each party of a cell."""
+    """The fault that is applied to each party of a cell."""
 
     KILL = "kill"
     PAUSE = "pause"
@@ -40,7 +40,7 @@ class Blow(StrEnum):
 
 
 class Moment(StrEnum):
-    """A phase of a drive or of a flight."""
+    """A phase of a drive or a flight."""
 
     WAITING = "waiting"
     OUT = "out"
@@ -66,67 +66,67 @@ AT_REST: Final = (Moment.WAITING, Moment.GROUND)
 """Phases before the first motion."""
 
 PAUSE_S: Final = 6.0
-"""A paused process continues after this time, and a link carries again."""
+"""After this time, a paused process continues and a cut link is restored."""
 DELAY_S: Final = 3.5
-"""A slow link delivers each byte this much later, either way: more than a lease."""
+"""Additional delay of a slow link in each direction, longer than a lease."""
 
 DRIVE_LEASE_S: Final = 2.0
 FLIGHT_LEASE_S: Final = 3.0
 BASE_S: Final = 0.5
-"""The base of a ground robot stops this long after the last Twist."""
+"""The base of a ground robot stops the robot this long after the last Twist."""
 PEER_S: Final = 1.0
-"""Within this time the pilot and the guard of a drone detect that the other does not run."""
+"""Within this time, the pilot and the guard of a drone detect that the other does not run."""
 SERVER_S: Final = 0.5
-"""Within this time a client detects that the link server does not run."""
+"""Within this time, a client detects that the link server does not run."""
 OPERATOR_S: Final = 1.0
-"""Within this time a robot obeys Ctrl-C or `fieldkit stop`."""
+"""Within this time, a robot obeys Ctrl-C or `fieldkit stop`."""
 
 RESCUE_S: Final = 1.0
-"""Within this time fieldkit detects that neither the pilot nor the guard of a drone runs."""
+"""Within this time, fieldkit detects that neither the pilot nor the guard of a drone runs."""
 RESCUE_STARTS_S: Final = 2.0
-"""From there to the first command: Python starts on the robot, and the next heartbeat comes, one a second."""
+"""Time from the detection to the first command: Python starts on the robot and receives a heartbeat, sent at 1 Hz."""
 
 UNHEARD_S: Final = 60.0
-"""Programs that bring a drone down end this long after they began, where the autopilot is not heard."""
+"""Programs that land a drone exit this long after their start if they receive nothing from the autopilot."""
 ENDS_S: Final = 5.0
-"""`fieldkit abort` reaches the robot and waits 2 s for its jobs; the link server ends 1 s after its last client."""
+"""`fieldkit abort` reaches the robot and waits 2 s for its jobs; the link server exits 1 s after its last client."""
 
 ALARM_S: Final = 15.0
-"""Within this time fieldkit prints an alarm where a drone may be in the air and nothing of ours brings it down."""
+"""Within this time, fieldkit prints an alarm if a drone may be in the air and no program of fieldkit lands it."""
 
 DRIVE_SPEED_M_S: Final = 0.6
 DRIVE_ACCELERATION_M_S2: Final = 2.0
 FLIGHT_HEIGHT_M: Final = 3.0
 LAND_M_S: Final = 0.5
-"""The slowest of the land speeds of both autopilots: ArduCopter's LAND_SPEED; PX4's MPC_LAND_SPEED is 0.7 m/s."""
+"""The lower landing speed of the two autopilots: LAND_SPEED of ArduCopter; MPC_LAND_SPEED of PX4 is 0.7 m/s."""
 
 LOAD_S: Final = 0.5
-"""Allowed for a busy machine: the programs on the robot are processes of the machine that the matrix runs on."""
+"""Allowance for load: the programs of the robot are processes of the machine that runs the matrix."""
 TURN_S: Final = 0.1
-"""One turn of the loop of a program on the robot, 20 or 10 times a second, and one look at the orders."""
+"""One loop iteration of a program on the robot, at 20 or 10 Hz, and one check of the stored commands."""
 MODE_S: Final = 1.0
-"""From the command to descend to a descent of 0.1 m/s: the answer, the mode, braking."""
+"""Time from the command to descend to a descent of 0.1 m/s: acknowledgement, mode change and braking."""
 REST_S: Final = 4.0
-"""From the last metre to a drone that is stationary: both autopilots descend more slowly near the ground."""
+"""Time from the last metre to a stationary drone: both autopilots descend more slowly near the ground."""
 
 FENCE_M: Final = MappingProxyType({Craft.ROVER: 30.0, Craft.PX4: 40.0, Craft.COPTER: 40.0})
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """What must be seen of a cell in the lab.
+    """The expected observations of a cell in the lab.
 
     Attributes:
-        detected_by: Who detects the fault.
-        does: What the robot does.
-        begins_s: A ground robot is stationary, or a drone descends, at most this long after the fault; None where it
-            may go on.
-        ends_s: A drone is on the ground at most this long after the fault; None where it may go on.
-        alarm: Whether fieldkit prints an alarm in capitals, unless the drone has landed.
-        alarm_s: Within this time fieldkit prints an alarm in any case; None for no such time.
-        programs_s: Within this time all programs of fieldkit on the robot have ended; None for no such time.
-        judged: Whether the bounds must hold; otherwise nothing on the robot is left that could act, and the cell
-            shows what the base or the autopilot does by itself.
+        detected_by: The program that detects the fault.
+        does: The behaviour of the robot.
+        begins_s: A ground robot is stationary, or a drone descends, at most this long after the fault; None if it may
+            continue.
+        ends_s: A drone is on the ground at most this long after the fault; None if it may continue.
+        alarm: True if fieldkit prints an alarm in capitals, unless the drone has landed.
+        alarm_s: Time limit for the alarm, even if the drone lands; None for no limit.
+        programs_s: Time limit for all programs of fieldkit on the robot to exit; None for no limit.
+        judged: True if the limits must be met; False if no program on the robot can act, and the cell only shows the
+            behaviour of the base or the autopilot.
     """
 
     detected_by: str
@@ -145,9 +145,9 @@ class MotionCell:
 
     Attributes:
         craft: The kind of robot.
-        parties: Who is hit; the operator acts, and another party may be hit a second before.
-        blow: What is done to each.
-        moment: In which phase.
+        parties: The affected parties; the operator acts, and another party may be affected one second earlier.
+        blow: The fault of each party.
+        moment: The phase.
     """
 
     craft: Craft
@@ -157,20 +157,20 @@ class MotionCell:
 
     @property
     def name(self) -> str:
-        """Name for the command line: robot/parties/fault/phase."""
+        """Name on the command line: robot/parties/fault/phase."""
         return f"{self.craft}/{'+'.join(self.parties)}/{self.blow}/{self.moment}"
 
     @property
     def routed(self) -> bool:
-        """Whether the drone's programs reach their autopilot through a router."""
+        """True if the drone's programs reach the autopilot through a router."""
         return Party.ROUTER in self.parties
 
     @property
     def cuts_link(self) -> bool:
-        """Whether the link of the drone's programs to its autopilot must be lost, and the flight log can show it."""
-        struck = {*self.parties} & {Party.ROUTER, Party.SERVER}
-        shows = Party.SERVER in struck or Party.PILOT not in self.parties
-        return bool(struck) and shows and self.blow is not Blow.SLOW and self.moment not in AT_REST
+        """True if the programs must lose their link to the autopilot and the flight log can show it."""
+        link_parties = {*self.parties} & {Party.ROUTER, Party.SERVER}
+        is_logged = Party.SERVER in link_parties or Party.PILOT not in self.parties
+        return bool(link_parties) and is_logged and self.blow is not Blow.SLOW and self.moment not in AT_REST
 
 
 _CONTROL: Final = {Party.LAPTOP, Party.FIELDKIT, Party.LINK}
@@ -198,106 +198,115 @@ def _parties(craft: Craft) -> tuple[Party, ...]:
     return (Party.LAPTOP, Party.FIELDKIT, Party.LINK, Party.AGENT, Party.OPERATOR)
 
 
-def _makes_sense(pair: tuple[Party, Party]) -> bool:
-    """Return whether a pair is one: a laptop that is off takes its fieldkit and its end of the link with it."""
+def _is_valid_pair(pair: tuple[Party, Party]) -> bool:
+    """Return True if the pair can occur: a laptop that is off also stops its fieldkit and its end of the link."""
     return not (Party.LAPTOP in pair and _CONTROL & {*pair} - {Party.LAPTOP}) and Party.OPERATOR not in pair
 
 
 def _all_cells() -> tuple[MotionCell, ...]:
-    found = []
-    lost = (Party.PILOT, Party.GUARD)
+    cells = []
+    flight_programs = (Party.PILOT, Party.GUARD)
     for craft in Craft:
         moments = FLIGHT_MOMENTS if craft.flies else DRIVE_MOMENTS
         parties = _parties(craft)
         for party in parties:
             blows = _BLOWS.get(party, _ALL_BLOWS)
-            found += [MotionCell(craft, (party,), blow, moment) for blow, moment in product(blows, moments)]
-        # `fieldkit stop` where the fieldkit of the trial is suspended.
-        found += [MotionCell(craft, (Party.FIELDKIT, Party.OPERATOR), Blow.STOP, moment) for moment in moments]
-        pairs = list(filter(_makes_sense, combinations(parties, 2)))
-        if craft is Craft.PX4:  # others act on our programs, which are the same for both autopilots
+            cells += [MotionCell(craft, (party,), blow, moment) for blow, moment in product(blows, moments)]
+        # `fieldkit stop` while the fieldkit process of the trial is suspended.
+        cells += [MotionCell(craft, (Party.FIELDKIT, Party.OPERATOR), Blow.STOP, moment) for moment in moments]
+        pairs = list(filter(_is_valid_pair, combinations(parties, 2)))
+        if craft is Craft.PX4:  # other faults affect only programs that are the same for both autopilots
             pairs = [(Party.PILOT, Party.GUARD)]
         for pair in pairs:
             for blow, moment in product(_PAIR_BLOWS, moments):
                 if all(blow in _BLOWS.get(party, _ALL_BLOWS) for party in pair):
-                    found.append(MotionCell(craft, pair, blow, moment))
-        if craft.flies:  # what fieldkit alone can detect
-            found += [MotionCell(craft, lost, Blow.SUSPEND, moment) for moment in moments]
-            three = (*lost, Party.SERVER)
-            found += [MotionCell(craft, three, *of) for of in product((Blow.KILL, Blow.SUSPEND), moments)]
-            # The router is killed, then a person runs `fieldkit abort`.
-            dead = (Party.ROUTER, Party.OPERATOR)
-            found += [MotionCell(craft, dead, Blow.ABORT, moment) for moment in (Moment.FLYING, Moment.THERE)]
-    return tuple(found)
+                    cells.append(MotionCell(craft, pair, blow, moment))
+        if craft.flies:  # only fieldkit can detect these
+            cells += [MotionCell(craft, flight_programs, Blow.SUSPEND, moment) for moment in moments]
+            drone_programs = (*flight_programs, Party.SERVER)
+            cells += [
+                MotionCell(craft, drone_programs, *blow_and_moment)
+                for blow_and_moment in product((Blow.KILL, Blow.SUSPEND), moments)
+            ]
+            # The router is killed, and then a person runs `fieldkit abort`.
+            router_and_operator = (Party.ROUTER, Party.OPERATOR)
+            cells += [
+                MotionCell(craft, router_and_operator, Blow.ABORT, moment) for moment in (Moment.FLYING, Moment.THERE)
+            ]
+    return tuple(cells)
 
 
 CELLS: Final = _all_cells()
 
 
 def chosen(patterns: str) -> list[MotionCell]:
-    """Return the cells whose names match one of some patterns, with commas between them, as in a shell.
+    """The cells whose names match at least one of the comma-separated shell patterns.
 
     Raises:
         ValueError: A pattern matches no cell.
     """
-    found: dict[MotionCell, None] = {}
+    selected: dict[MotionCell, None] = {}
     for pattern in patterns.split(","):
         matches = [cell for cell in CELLS if fnmatch(cell.name, pattern)]
         if not matches:
             raise ValueError(f"no cell matches {pattern}")
-        found |= dict.fromkeys(matches)
-    return list(found)
+        selected |= dict.fromkeys(matches)
+    return list(selected)
 
 
 def expected(cell: MotionCell) -> Expectation:
-    """Return what must be seen of a cell."""
+    """The expected observations of a cell."""
     if cell.moment in AT_REST and not _CONTROL & {*cell.parties} and Party.OPERATOR not in cell.parties:
-        # Nothing has moved yet, so that no fault has stopped a motion: fieldkit may begin another attempt.
-        return Expectation("fieldkit", "does not start, or anew", None)
-    return _of_flight(cell) if cell.craft.flies else _of_drive(cell)
+        # The robot has not moved, so the fault stops no motion, and fieldkit may start another attempt.
+        return Expectation("fieldkit", "does not start, or restarts", None)
+    return _flight_expectation(cell) if cell.craft.flies else _drive_expectation(cell)
 
 
-def _of_drive(cell: MotionCell) -> Expectation:
+def _drive_expectation(cell: MotionCell) -> Expectation:
     brakes_s = DRIVE_SPEED_M_S / DRIVE_ACCELERATION_M_S2 + TURN_S + LOAD_S
     lease_s = DRIVE_LEASE_S + brakes_s
     if Party.OPERATOR in cell.parties:
         return Expectation("operator", "stops, stays", OPERATOR_S + brakes_s)
     if cell.blow is Blow.SLOW and Party.LINK not in cell.parties:
-        return Expectation("", "may go on, or stops", None)
+        return Expectation("", "may continue, or stops", None)
     if Party.AGENT in cell.parties and cell.blow is not Blow.SLOW:
         return Expectation("base: no Twists", "stops, stays", BASE_S + brakes_s)
     return Expectation("agent: lease", "stops, stays", lease_s)
 
 
-def _of_flight(cell: MotionCell) -> Expectation:
+def _flight_expectation(cell: MotionCell) -> Expectation:
     parties = {*cell.parties}
     paused_s = PAUSE_S if cell.blow is Blow.PAUSE else 0.0
-    heard = not parties & _CONTROL  # fieldkit runs, and reaches the drone
-    later_s = (SERVER_S if Party.SERVER in parties else 0.0) + (paused_s if Party.ROUTER in parties else 0.0)
+    has_control_link = not parties & _CONTROL  # fieldkit runs and reaches the drone
+    delay_s = (SERVER_S if Party.SERVER in parties else 0.0) + (paused_s if Party.ROUTER in parties else 0.0)
     if cell.blow is Blow.ABORT:
-        does, ends_s = "what the autopilot does", UNHEARD_S + ENDS_S + LOAD_S
-        wants = Expectation("pilot, guard", does, None, alarm=True, judged=False, programs_s=ends_s)
+        does, ends_s = "behaviour of the autopilot", UNHEARD_S + ENDS_S + LOAD_S
+        expectation = Expectation("pilot, guard", does, None, alarm=True, judged=False, programs_s=ends_s)
     elif Party.OPERATOR in parties:
-        wants = _lands("operator", OPERATOR_S)
+        expectation = _lands("operator", OPERATOR_S)
     elif (cell.blow is Blow.SLOW and Party.LINK not in parties) or parties == {Party.SERVER}:
-        wants = Expectation("clients: a new server" if Party.SERVER in parties else "", "may go on, or lands", None)
+        expectation = Expectation(
+            "clients: a new server" if Party.SERVER in parties else "", "may continue, or lands", None
+        )
     elif parties >= {Party.PILOT, Party.GUARD}:
-        wants = _lands("fieldkit", RESCUE_S + RESCUE_STARTS_S + later_s, alarm_s=RESCUE_S + LOAD_S)
+        expectation = _lands("fieldkit", RESCUE_S + RESCUE_STARTS_S + delay_s, alarm_s=RESCUE_S + LOAD_S)
     elif Party.ROUTER in parties and cell.blow is not Blow.PAUSE:
-        # Nothing of ours on the drone reaches the autopilot any more.
-        by = "fieldkit: no log" if heard else "autopilot"
-        wants = Expectation(by, "what the autopilot does", None, None, alarm=heard, judged=False)
+        # No program on the drone reaches the autopilot any more.
+        detected_by = "fieldkit: no log" if has_control_link else "autopilot"
+        expectation = Expectation(
+            detected_by, "behaviour of the autopilot", None, None, alarm=has_control_link, judged=False
+        )
     elif parties & {Party.PILOT, Party.GUARD}:
-        wants = _lands("guard" if Party.PILOT in parties else "pilot", PEER_S + later_s, alarm=heard)
+        expectation = _lands("guard" if Party.PILOT in parties else "pilot", PEER_S + delay_s, alarm=has_control_link)
     elif parties & _CONTROL:
-        wants = _lands("pilot: lease", FLIGHT_LEASE_S + later_s)
+        expectation = _lands("pilot: lease", FLIGHT_LEASE_S + delay_s)
     else:
-        wants = _lands("pilot: autopilot silent", FLIGHT_LEASE_S + later_s)
-    return wants
+        expectation = _lands("pilot: autopilot silent", FLIGHT_LEASE_S + delay_s)
+    return expectation
 
 
-def _lands(by: str, within_s: float, *, alarm: bool = False, alarm_s: float | None = None) -> Expectation:
-    """Return the expectation of a drone that comes down where somebody has detected the fault within a time."""
+def _lands(detected_by: str, within_s: float, *, alarm: bool = False, alarm_s: float | None = None) -> Expectation:
+    """The expectation of a drone that lands after the fault was detected within a time."""
     begins_s = within_s + MODE_S + TURN_S + LOAD_S
     ends_s = begins_s + FLIGHT_HEIGHT_M / LAND_M_S + REST_S
-    return Expectation(by, "descends, lands", begins_s, ends_s, alarm, alarm_s=alarm_s)
+    return Expectation(detected_by, "descends, lands", begins_s, ends_s, alarm, alarm_s=alarm_s)

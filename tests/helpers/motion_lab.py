@@ -1,4 +1,4 @@
-"""An emulated lab whose robots are real ones for fieldkit: a rover and two drones, each of which drives or flies."""
+"""An emulated lab with a rover and two drones that drive or fly; fieldkit uses them like real robots."""
 
 import os
 import shutil
@@ -31,7 +31,7 @@ from tests.helpers.motion_cells import (
     Moment,
     MotionCell,
 )
-from tests.helpers.motion_parties import agents_on, send, words_of
+from tests.helpers.motion_parties import agents_on, command_line, send
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.paths import ROOT
 from tests.helpers.rovers import rover_profile
@@ -65,9 +65,9 @@ attempts: 3
 steps:
   - move:
       robot: receiver
-      path: [{{away: {way_m}m}}]
+      path: [{{away: {path_m}m}}]
       speed: {speed_m_s}m/s
-      during: [{{wait: {{duration: {inside_s}s}}}}]
+      during: [{{wait: {{duration: {inner_s}s}}}}]
 """
 _FLY: Final = """\
 name: matrix
@@ -82,14 +82,14 @@ steps:
   - fly:
       robot: receiver
       height: {height_m}m
-      path: [{{away: {way_m}m}}]
+      path: [{{away: {path_m}m}}]
       speed: 2m/s
       climb: 1m/s
       then: return
       lease: {lease_s}s
-      during: [{{wait: {{duration: {inside_s}s}}}}]
+      during: [{{wait: {{duration: {inner_s}s}}}}]
 """
-_WAYS: Final = {
+_PATHS: Final = {
     Moment.WAITING: (4, 9),
     Moment.OUT: (18, 20),
     Moment.GROUND: (6, 8),
@@ -97,23 +97,23 @@ _WAYS: Final = {
     Moment.FLYING: (30, 20),
     Moment.LANDING: (2, 2),
 }
-"""Length of the way in metres, and how long the step inside lasts in seconds."""
-_DRIVEN_WAYS: Final = {Moment.THERE: (1, 14), Moment.BACK: (6, 11)}
-_FLOWN_WAYS: Final = {Moment.THERE: (2, 14), Moment.BACK: (12, 8)}
+"""Length of the path in metres, and duration of the inner step in seconds."""
+_DRIVEN_PATHS: Final = {Moment.THERE: (1, 14), Moment.BACK: (6, 11)}
+_FLOWN_PATHS: Final = {Moment.THERE: (2, 14), Moment.BACK: (12, 8)}
 
 
 def profiles(folder: Path) -> None:
-    """Write the profiles of the robots into a lab's folder: a fast rover, two drones, and these behind a router."""
+    """Write the robot profiles to a lab's folder: a fast rover, and two drones, each with and without a router."""
     (folder / "robots").mkdir()
     rover = rover_profile(
         fence_m=FENCE_M[Craft.ROVER], ros="ros2", lease_s=DRIVE_LEASE_S, acceleration_m_s2=DRIVE_ACCELERATION_M_S2
     )
     (folder / "robots/rover.yaml").write_text(rover, encoding="utf-8")
     for craft, autopilot in ((Craft.PX4, "px4"), (Craft.COPTER, "ardupilot")):
-        for name, more in ((craft, ""), (f"{craft}_routed", f", connection: tcp:127.0.0.1:{ROUTER_PORT}")):
+        for name, connection in ((craft, ""), (f"{craft}_routed", f", connection: tcp:127.0.0.1:{ROUTER_PORT}")):
             text = changed(BOX, "name: box", f"name: {name}", "kind: ugv", "kind: uav")
             limits = f"limits: {{max_speed_m_s: 3, max_height_m: 30, fence_m: {FENCE_M[craft]:g}}}"
-            mavlink = f"mavlink: {{port: {AUTOPILOT_PORT}, autopilot: {autopilot}{more}}}"
+            mavlink = f"mavlink: {{port: {AUTOPILOT_PORT}, autopilot: {autopilot}{connection}}}"
             text = changed(text, "limits: {max_speed_m_s: 1}", f"{limits}\n{mavlink}")
             (folder / "robots" / f"{name}.yaml").write_text(text, encoding="utf-8")
 
@@ -130,50 +130,52 @@ class MotionLab:
     _routers: dict[Craft, "subprocess.Popen[str]"] = field(default_factory=dict)
 
     def role(self, craft: Craft) -> Role:
-        """Return the role of a robot in the lab, which keys its shells and links."""
+        """The role of a robot in the lab, the key of its shell and link."""
         return _ROLES[craft]
 
     def robot(self, craft: Craft) -> EmulatedRobot:
-        """Return a robot."""
+        """The robot of a kind."""
         return self.outside.testbed.robots[_ROLES[craft]]
 
     def place_m(self, craft: Craft) -> Vector:
-        """Return where a robot is that is stationary."""
+        """Position of a stationary robot."""
         role = _ROLES[craft]
-        places = [where.position_m for where in self.outside.testbed.oracle.track(0) if where.role is role]
-        assert places[-1] is not None
-        return places[-1]
+        positions = [
+            position.position_m for position in self.outside.testbed.oracle.track(0) if position.role is role
+        ]
+        assert positions[-1] is not None
+        return positions[-1]
 
     def home(self, craft: Craft) -> Path:
-        """Return the folder of fieldkit on a robot, as this machine sees it."""
+        """The folder of fieldkit on a robot, as a path of this machine."""
         outermost = self.robot(craft).pid
         children = Path(f"/proc/{outermost}/task/{outermost}/children").read_text(encoding="ascii").split()
         return Path(f"/proc/{children[0]}/root/root/.fieldkit")
 
     def logs(self, craft: Craft) -> set[Path]:
-        """Return the logs of motion that lie on a robot, of all attempts."""
+        """The motion logs of all attempts on a robot."""
         name = "fly.jsonl" if craft.flies else "drive.jsonl"
         return set(self.home(craft).glob(f"*/*/{name}"))
 
     def prepare(self, cell: MotionCell, folder: Path) -> None:
-        """Make the folder of a trial of a cell: fieldkit is run there."""
+        """Write the folder of a cell's trial, in which fieldkit runs."""
         outside, craft = self.outside, cell.craft
         shutil.copytree(outside.folder / "robots", folder / "robots")
         lines = (outside.folder / SITE_FILE).read_text(encoding="utf-8").splitlines()
         other = outside.cast[_ROLES[Craft.ROVER if craft.flies else Craft.PX4]].name
-        own = outside.cast[_ROLES[craft]].name
-        roles = f"roles: {{masterless: {{sender: {other}, receiver: {own}}}}}"
+        name = outside.cast[_ROLES[craft]].name
+        roles = f"roles: {{masterless: {{sender: {other}, receiver: {name}}}}}"
         lines = [line for line in lines if not line.startswith("roles:")] + [roles]
         text = "\n".join(lines) + "\n"
         if cell.routed:
-            text = changed(text, f"{own}: {{profile: {craft},", f"{own}: {{profile: {craft}_routed,")
+            text = changed(text, f"{name}: {{profile: {craft},", f"{name}: {{profile: {craft}_routed,")
         (folder / SITE_FILE).write_text(text, encoding="utf-8")
-        way_m, inside_s = (_WAYS | (_FLOWN_WAYS if craft.flies else _DRIVEN_WAYS))[cell.moment]
+        path_m, inner_s = (_PATHS | (_FLOWN_PATHS if craft.flies else _DRIVEN_PATHS))[cell.moment]
         own_procedure(
             folder,
             (_FLY if craft.flies else _DRIVE).format(
-                way_m=way_m,
-                inside_s=inside_s,
+                path_m=path_m,
+                inner_s=inner_s,
                 speed_m_s=DRIVE_SPEED_M_S,
                 height_m=FLIGHT_HEIGHT_M,
                 lease_s=FLIGHT_LEASE_S,
@@ -181,46 +183,48 @@ class MotionLab:
         )
 
     def start_router(self, craft: Craft) -> None:
-        """Start a router of MAVLink on a drone, and return when it takes clients."""
+        """Start a MAVLink router on a drone, and wait until it accepts clients."""
         inner = self.home(craft).parts[2]
-        words = (sys.executable, str(Path(motion_router.__file__)), str(ROUTER_PORT), str(AUTOPILOT_PORT))
+        argv = (sys.executable, str(Path(motion_router.__file__)), str(ROUTER_PORT), str(AUTOPILOT_PORT))
         process = subprocess.Popen(
-            ("nsenter", "--target", inner, "--net", "--pid", "--", *words), stdout=subprocess.PIPE, text=True
+            ("nsenter", "--target", inner, "--net", "--pid", "--", *argv), stdout=subprocess.PIPE, text=True
         )
         self._routers[craft] = process
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
 
     def router_pids(self, craft: Craft) -> set[int]:
-        """Return the process of the router on a drone."""
+        """The process ids of the router on a drone."""
         process = self._routers.get(craft)
         if process is None:
             return set()
-        family = {process.pid, *descendants(process.pid)}
-        return {pid for pid in family if any(word.endswith("motion_router.py") for word in words_of(pid)[:2])}
+        pids = {process.pid, *descendants(process.pid)}
+        return {
+            pid for pid in pids if any(argument.endswith("motion_router.py") for argument in command_line(pid)[:2])
+        }
 
     def stop_router(self, craft: Craft) -> None:
-        """End the router on a drone, where there is one."""
+        """Stop the router on a drone, if there is one."""
         process = self._routers.pop(craft, None)
         if process is not None:
-            # Not `nsenter` itself: it waits for the router, which would otherwise become an orphan.
+            # `nsenter` is not killed, since it waits for the router, which would otherwise become an orphan.
             send(signal.SIGKILL, descendants(process.pid))
             process.wait(LONG_S)
             assert process.stdout is not None
             process.stdout.close()
 
     def tidy(self, craft: Craft, folder: Path) -> list[str]:
-        """Put everything back after a trial, as an operator would; return what was left behind.
+        """Restore the lab after a trial, as an operator would; return descriptions of what was left behind.
 
         Args:
             craft: The robot that moved.
-            folder: The folder of its trial.
+            folder: The folder of the trial.
         """
         for role in self.outside.cast:
             self.outside.links.restore(role)
             self.outside.links.delay(role, 0.0)
             self.outside.links.drop(role)
-        if craft in self._routers:  # another one, through which the drone's programs bring it down
+        if craft in self._routers:  # a new router, so that the drone's programs can land it
             self.stop_router(craft)
             self.start_router(craft)
         problems = []
@@ -231,15 +235,15 @@ class MotionLab:
         try:
             wait_until(lambda: not agents_on(pid), Deadline.after(40))
         except AssertionError:
-            left = agents_on(pid)
-            problems = [f"left running: {' '.join(words)[:80]}" for words in left.values()]
-            send(signal.SIGKILL, left)
+            remaining = agents_on(pid)
+            problems = [f"left running: {' '.join(argv)[:80]}" for argv in remaining.values()]
+            send(signal.SIGKILL, remaining)
         self.stop_router(craft)
         self.outside.testbed.bring_back(_ROLES[craft], by_itself=False)
         return problems
 
     def close(self) -> None:
-        """End the routers."""
+        """Stop the routers."""
         for craft in list(self._routers):
             self.stop_router(craft)
 
@@ -252,18 +256,18 @@ class MotionLab:
 
 @contextmanager
 def motion_lab(folder: Path) -> Iterator[MotionLab]:
-    """Yield the lab, in an empty folder; it ends with the calling thread at the latest."""
+    """Yield the lab in an empty folder; it stops at the latest when the calling thread ends."""
     profiles(folder)
     (folder / "lab.yaml").write_text(_SITE, encoding="utf-8")
     with ExitStack() as stack:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.chdir(folder)  # where profiles are looked for
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.chdir(folder)  # profiles are loaded from here
             outside = stack.enter_context(robots_outside(folder, site=folder / "lab.yaml", topology=Topology.MASTER))
         yield stack.enter_context(MotionLab(outside))
 
 
 def start_trial(folder: Path) -> "subprocess.Popen[bytes]":
-    """Start fieldkit's trial of a prepared folder in a process group of its own; its output goes to files there."""
+    """Start fieldkit's trial of a prepared folder in a separate process group, with its output in files there."""
     with (folder / "out").open("wb") as out, (folder / "err").open("wb") as err:
         return subprocess.Popen(
             (sys.executable, "-m", "fieldkit", "trial", "matrix", "5m", "--yes", "--allow-motion", "--json"),

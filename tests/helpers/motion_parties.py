@@ -1,4 +1,4 @@
-"""Processes of the parties of a motion trial, found on emulated robots, and what is done to them."""
+"""Processes of the parties of a motion trial on emulated robots, and signals to them."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from tests.helpers.host import alive, descendants
 
 SLOW_STOPPED_S: Final = 0.2
 SLOW_RUNS_S: Final = 0.2
-"""A slow process is suspended for the one of these times and runs for the other, in turn."""
+"""A slow process is alternately suspended and running for these times."""
 
 
 class Party(StrEnum):
@@ -34,73 +34,73 @@ class Party(StrEnum):
 ON_ROBOT: Final = (Party.AGENT, Party.PILOT, Party.GUARD, Party.ROUTER, Party.SERVER)
 
 
-def words_of(pid: int) -> list[str]:
-    """Return the command line of a process; empty where it has ended."""
+def command_line(pid: int) -> list[str]:
+    """The command line of a process; empty if the process has exited."""
     with suppress(OSError):
-        return [os.fsdecode(word) for word in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[:-1]]
+        return [os.fsdecode(argument) for argument in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[:-1]]
     return []
 
 
 def agents_on(robot_pid: int) -> dict[int, list[str]]:
-    """Return the programs of fieldkit that run on a robot: of each process id, verb and arguments.
+    """The programs of fieldkit that run on a robot: command and arguments by process id.
 
     Args:
-        robot_pid: The outermost process of the robot; all its processes descend from it.
+        robot_pid: The outermost process of the robot, the ancestor of all its processes.
     """
-    found = {}
+    agents = {}
     for pid in descendants(robot_pid):
-        words = words_of(pid)
-        if not words or not words[0].rpartition("/")[2].startswith("python") or not alive(pid):
+        argv = command_line(pid)
+        if not argv or not argv[0].rpartition("/")[2].startswith("python") or not alive(pid):
             continue
-        at = next((number for number, word in enumerate(words[:3]) if _is_agent(word)), None)
-        if at is not None:
-            found[pid] = words[at + 1 :]
-    return found
+        index = next((number for number, argument in enumerate(argv[:3]) if _is_agent(argument)), None)
+        if index is not None:
+            agents[pid] = argv[index + 1 :]
+    return agents
 
 
-def _is_agent(word: str) -> bool:
-    name = word.rpartition("/")[2]
-    return word == "fieldkit.agent" or (name.startswith("agent-") and name.endswith(".pyz"))
+def _is_agent(argument: str) -> bool:
+    name = argument.rpartition("/")[2]
+    return argument == "fieldkit.agent" or (name.startswith("agent-") and name.endswith(".pyz"))
 
 
 def pids_of(party: Party, robot_pid: int, router: Callable[[], Iterable[int]] = tuple) -> set[int]:
-    """Return the processes of a party that runs on a robot.
+    """The processes of a party that runs on a robot.
 
     Args:
-        party: One of `ON_ROBOT`.
-        robot_pid: See `agents_on`.
-        router: Returns the processes of the router, where there is one.
+        party: A party in `ON_ROBOT`.
+        robot_pid: As in `agents_on`.
+        router: Returns the processes of the router, if the robot has one.
     """
     if party is Party.ROUTER:
         return set(router())
     agents = agents_on(robot_pid)
-    return {pid for pid, words in agents.items() if words and _party(words) is party}
+    return {pid for pid, argv in agents.items() if argv and _party(argv) is party}
 
 
-def _party(words: list[str]) -> Party | None:
-    """Return the party that a program of fieldkit on a robot is, by its verb and its plan."""
-    verb = words[0]
+def _party(argv: list[str]) -> Party | None:
+    """The party of a program of fieldkit on a robot, from its command and its plan."""
+    verb = argv[0]
     if verb == "drive":
         return Party.AGENT
     if verb == "link":
         return Party.SERVER
     if verb == "guard":
         return Party.GUARD
-    if verb == "fly" and len(words) > 1:
-        plan = json.loads(words[1])
+    if verb == "fly" and len(argv) > 1:
+        plan = json.loads(argv[1])
         return Party.GUARD if plan.get("guards") or not plan.get("height_m") else Party.PILOT
     return None
 
 
-def send(number: signal.Signals, pids: Iterable[int]) -> None:
-    """Send a signal to processes; one that has ended meanwhile gets none."""
+def send(signal_number: signal.Signals, pids: Iterable[int]) -> None:
+    """Send a signal to processes that have not exited."""
     for pid in pids:
         with suppress(ProcessLookupError):
-            os.kill(pid, number)
+            os.kill(pid, signal_number)
 
 
 class SlowProcesses:
-    """Suspends processes for `SLOW_STOPPED_S` again and again, until `end`.
+    """Suspends processes periodically for `SLOW_STOPPED_S` until `end` is called.
 
     Args:
         pids: The processes.
@@ -108,18 +108,18 @@ class SlowProcesses:
 
     def __init__(self, pids: Iterable[int]) -> None:
         self._pids = set(pids)
-        self._left = threading.Event()
+        self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="slow processes", daemon=True)
         self._thread.start()
 
     def end(self) -> None:
-        """Let them run."""
-        self._left.set()
+        """Let the processes continue."""
+        self._stopping.set()
         self._thread.join()
 
     def _run(self) -> None:
-        while not self._left.is_set():
+        while not self._stopping.is_set():
             send(signal.SIGSTOP, self._pids)
-            self._left.wait(SLOW_STOPPED_S)
+            self._stopping.wait(SLOW_STOPPED_S)
             send(signal.SIGCONT, self._pids)
-            self._left.wait(SLOW_RUNS_S)
+            self._stopping.wait(SLOW_RUNS_S)

@@ -1,7 +1,7 @@
-"""A router of MAVLink in the manner of mavlink-router, for one autopilot: clients by TCP, the autopilot by UDP.
+"""A MAVLink router similar to mavlink-router, for one autopilot: clients connect by TCP, the autopilot uses UDP.
 
-`python3 motion_router.py PORT AUTOPILOT_PORT` runs on the robot; all frames of a client go to the autopilot, all
-frames of the autopilot to each client.
+`python3 motion_router.py PORT AUTOPILOT_PORT` runs on the robot. All frames of a client are forwarded to the
+autopilot, and all frames of the autopilot to each client.
 """
 
 import selectors
@@ -11,7 +11,7 @@ from contextlib import suppress
 
 
 def main() -> None:
-    """Forward until it is killed."""
+    """Forward frames until the process is killed."""
     port, autopilot = int(sys.argv[1]), ("127.0.0.1", int(sys.argv[2]))
     clients: set[socket.socket] = set()
     with (
@@ -26,29 +26,29 @@ def main() -> None:
         sys.stdout.flush()
         while True:
             for key, _ in selector.select():
-                ready = key.fileobj
-                if ready is server:
+                ready_socket = key.fileobj
+                if ready_socket is server:
                     client, _ = server.accept()
                     client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                     clients.add(client)
                     selector.register(client, selectors.EVENT_READ)
-                elif ready is endpoint:
+                elif ready_socket is endpoint:
                     with suppress(OSError):
                         datagram = endpoint.recv(65_536)
                         for client in clients:
                             with suppress(OSError):
                                 client.sendall(datagram)
-                elif isinstance(ready, socket.socket):
+                elif isinstance(ready_socket, socket.socket):
                     data = b""
                     with suppress(OSError):
-                        data = ready.recv(65_536)
+                        data = ready_socket.recv(65_536)
                     if data:
                         with suppress(OSError):
                             endpoint.sendto(data, autopilot)
                     else:
-                        selector.unregister(ready)
-                        clients.discard(ready)
-                        ready.close()
+                        selector.unregister(ready_socket)
+                        clients.discard(ready_socket)
+                        ready_socket.close()
 
 
 if __name__ == "__main__":

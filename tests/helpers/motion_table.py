@@ -1,4 +1,4 @@
-"""Tables of the fault matrix, in Markdown: one per kind of robot, a row per parties and fault, over all phases."""
+"""Markdown tables of the fault matrix: one per kind of robot, one row per parties and fault, over all phases."""
 
 import statistics
 from collections.abc import Iterator, Sequence
@@ -30,21 +30,23 @@ _CELLS: Final = {cell.name: cell for cell in CELLS}
 
 
 def tables(outcomes: Sequence[MotionOutcome], made: str) -> str:
-    """Return the tables of outcomes.
+    """The tables of outcomes.
 
     Args:
-        outcomes: Of any cells, in any order.
-        made: When and where they were observed.
+        outcomes: Outcomes of any cells, in any order.
+        made: Date and machine of the observations.
     """
-    lines = [f"{made}: {len(outcomes)} trials, {sum(bool(seen.problems) for seen in outcomes)} beyond their bounds."]
+    lines = [
+        f"{made}: {len(outcomes)} trials, {sum(bool(outcome.problems) for outcome in outcomes)} beyond their bounds."
+    ]
     for craft, title in _TITLES.items():
         rows = list(_rows(craft, outcomes))
         if rows:
             ground = " on the ground, bound | median | max |" if craft.flies else ""
-            begins = "descends" if craft.flies else "stationary"
+            start_column = "descends" if craft.flies else "stationary"
             lines += ["", f"### {title}", ""]
             lines.append(
-                f"| who | fault | who detects it | robot | {begins}, bound | median | max |{ground} n | beyond |"
+                f"| party | fault | detected by | robot | {start_column}, bound | median | max |{ground} n | beyond |"
             )
             lines.append("| --- " * (12 if craft.flies else 9) + "|")
             lines += rows
@@ -53,19 +55,19 @@ def tables(outcomes: Sequence[MotionOutcome], made: str) -> str:
 
 def _rows(craft: Craft, outcomes: Sequence[MotionOutcome]) -> Iterator[str]:
     groups: dict[tuple[tuple[Party, ...], Blow], list[tuple[MotionCell, MotionOutcome]]] = {}
-    for seen in outcomes:
-        cell = _CELLS[seen.cell]
+    for outcome in outcomes:
+        cell = _CELLS[outcome.cell]
         if cell.craft is craft:
-            groups.setdefault((cell.parties, cell.blow), []).append((cell, seen))
+            groups.setdefault((cell.parties, cell.blow), []).append((cell, outcome))
     order = list(dict.fromkeys((cell.parties, cell.blow) for cell in CELLS if cell.craft is craft))
     for key in sorted(groups, key=order.index):
         (parties, blow), members = key, groups[key]
-        wants = expected(next((cell for cell, _ in members if cell.moment not in AT_REST), members[0][0]))
-        cells = [", ".join(parties), _fault(parties, blow), wants.detected_by, wants.does]
-        cells += _times(wants.begins_s, [(cell, seen.begins_s) for cell, seen in members])
+        expectation = expected(next((cell for cell, _ in members if cell.moment not in AT_REST), members[0][0]))
+        cells = [", ".join(parties), _fault(parties, blow), expectation.detected_by, expectation.does]
+        cells += _times(expectation.begins_s, [(cell, outcome.begins_s) for cell, outcome in members])
         if craft.flies:
-            cells += _times(wants.ends_s, [(cell, seen.ends_s) for cell, seen in members])
-        beyond = sum(bool(seen.problems) for _, seen in members)
+            cells += _times(expectation.ends_s, [(cell, outcome.ends_s) for cell, outcome in members])
+        beyond = sum(bool(outcome.problems) for _, outcome in members)
         yield "| " + " | ".join([*cells, str(len(members)), str(beyond)]) + " |"
 
 
@@ -80,24 +82,24 @@ def _fault(parties: Sequence[Party], blow: Blow) -> str:
 
 
 def _times(bound_s: float | None, times: Sequence[tuple[MotionCell, float | None]]) -> list[str]:
-    """Return bound, median and maximum, each in seconds; one that never came is a maximum of `never`."""
+    """Bound, median and maximum in seconds; the maximum is `never` if an event did not occur."""
     bound = "" if bound_s is None else f"{bound_s:.1f}"
-    known = [value for _, value in times if value is not None]
-    if not known:
+    known_times = [value for _, value in times if value is not None]
+    if not known_times:
         return [bound, "", "never"]
-    last = max(times, key=lambda one: float("inf") if one[1] is None else one[1])
-    greatest = "never" if last[1] is None else f"{last[1]:.1f}"
-    return [bound, f"{statistics.median(known):.1f}", f"{greatest} ({last[0].moment})"]
+    slowest = max(times, key=lambda entry: float("inf") if entry[1] is None else entry[1])
+    maximum = "never" if slowest[1] is None else f"{slowest[1]:.1f}"
+    return [bound, f"{statistics.median(known_times):.1f}", f"{maximum} ({slowest[0].moment})"]
 
 
 def write(page: Path, text: str) -> None:
-    """Put tables into a page, between the markers.
+    """Write tables into a page, between the markers.
 
     Raises:
         ValueError: The page has no markers.
     """
-    before, begin, rest = page.read_text(encoding="utf-8").partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
+    before, begin_marker, rest = page.read_text(encoding="utf-8").partition(BEGIN)
+    _, end_marker, after = rest.partition(END)
+    if not begin_marker or not end_marker:
         raise ValueError(f"{page} has no {BEGIN} and {END}")
     page.write_text(f"{before}{BEGIN}\n\n{text}\n{END}{after}", encoding="utf-8")

@@ -32,15 +32,15 @@ from tests.helpers.runs import fieldkit
 from tests.helpers.sshd import wait_until
 
 REACHES_S: Final = 60.0
-"""Within this time a trial comes to the phase of its cell."""
+"""Time limit for a trial to reach the phase of its cell."""
 OBSERVED_S: Final = 5.0
-"""For this time a robot is observed after it has stopped, and after the last suspended process continues."""
+"""Time of observation after a robot has stopped, and after the last suspended process continues."""
 ENDS_S: Final = 45.0
-"""For this time at most a fieldkit that runs is observed until it ends by itself."""
+"""Maximum time of observation of a running fieldkit until it exits."""
 ARRIVES_S: Final = 40.0
-"""For this time at most a robot is observed that does not stop, or is not on the ground."""
+"""Maximum time of observation of a robot that does not stop or is not on the ground."""
 LOST_HZ: Final = 2.0
-"""Positions that arrive at a lower rate are those of a lost link: 10 are requested, and the rate is over 1 s."""
+"""Positions at a lower rate indicate a lost link: 10 Hz are requested, and the rate is averaged over 1 s."""
 _PHASES: Final = {
     Moment.OUT: ("out",),
     Moment.THERE: ("there",),
@@ -51,9 +51,9 @@ _PHASES: Final = {
     Moment.LANDING: ("coming down",),
 }
 """Names of each phase in the logs of robots."""
-_LATER_S: Final = 0.5
-"""The fault comes at most this long after the phase has begun, at random."""
-_DISARMED: Final = """\
+_MAX_DELAY_S: Final = 0.5
+"""Maximum of the random delay between the start of the phase and the fault."""
+_DISARM_CHECK: Final = """\
 import time
 from pymavlink import mavutil
 drone = mavutil.mavlink_connection("udpout:127.0.0.1:14550", source_system=251)
@@ -64,27 +64,27 @@ while (beat is None or beat.base_mode & 128) and time.monotonic() < until_s:
 raise SystemExit(beat is None or bool(beat.base_mode & 128))
 """
 _CAPITALS: Final = re.compile(r"\b(?:[A-Z][A-Z'-]+[ ,:;.!]+){2,}[A-Z]{2,}")
-"""Three words in capitals, one after the other."""
+"""At least three words in capitals in a row."""
 
 
 @dataclass
 class MotionTrial:
-    """One trial.
+    """A trial.
 
     Args:
         lab: The robots.
-        cell: What is to be done, and when.
-        folder: An empty folder, for fieldkit.
-        seed: Of the moment.
+        cell: The fault and its phase.
+        folder: An empty folder for fieldkit.
+        seed: Seed of the time of the fault.
     """
 
     lab: MotionLab
     cell: MotionCell
     folder: Path
     seed: int
-    _undo: list[Callable[[], object]] = field(default_factory=list)
+    _restorers: list[Callable[[], object]] = field(default_factory=list)
     _process: "subprocess.Popen[bytes] | None" = None
-    _before: set[Path] = field(default_factory=set)
+    _previous_logs: set[Path] = field(default_factory=set)
     _logs: set[Path] = field(default_factory=set)
     _alarm_s: float | None = None
     _programs_s: float | None = None
@@ -92,156 +92,158 @@ class MotionTrial:
     _link_lost: bool = False
 
     def run(self) -> MotionOutcome:
-        """Run it, and put everything back."""
+        """Run the trial, and restore the lab."""
         cell, craft, began_s = self.cell, self.cell.craft, time.monotonic()
         self.lab.prepare(cell, self.folder)
         if cell.routed:
             self.lab.start_router(craft)
-        self._before = self.lab.logs(craft)
+        self._previous_logs = self.lab.logs(craft)
         with MotionSampler(self.lab.robot(craft).steered, self.lab.place_m(craft)) as sampler:
             self._process = start_trial(self.folder)
             try:
                 self._reach(sampler)
-                time.sleep(random.Random(self.seed).uniform(0.0, self._latest_s))
+                time.sleep(random.Random(self.seed).uniform(0.0, self._max_delay_s))
                 at_s = time.monotonic()
                 self._inject()
                 self._observe(sampler, at_s)
-                seen = self._outcome(sampler, at_s)
+                outcome = self._outcome(sampler, at_s)
             except AssertionError as error:
-                seen = MotionOutcome(cell.name, self.seed, problems=(f"{error}; {self._said()[-300:]}",))
+                outcome = MotionOutcome(cell.name, self.seed, problems=(f"{error}; {self._printed()[-300:]}",))
             finally:
                 self._end()
-        left = self.lab.tidy(craft, self.folder)
-        took_s = round(time.monotonic() - began_s, 1)
-        return replace(seen, problems=(*seen.problems, *left), took_s=took_s)
+        leftovers = self.lab.tidy(craft, self.folder)
+        duration_s = round(time.monotonic() - began_s, 1)
+        return replace(outcome, problems=(*outcome.problems, *leftovers), took_s=duration_s)
 
     @property
-    def _latest_s(self) -> float:
-        """Phases that last for a moment only are hit at once."""
-        return 0.0 if self.cell.moment in AT_REST else _LATER_S
+    def _max_delay_s(self) -> float:
+        """Maximum delay of the fault; 0 for short phases."""
+        return 0.0 if self.cell.moment in AT_REST else _MAX_DELAY_S
 
     def _reach(self, sampler: MotionSampler) -> None:
         process = self._process
         assert process is not None
 
-        def reached() -> bool:
+        def is_reached() -> bool:
             assert process.poll() is None, f"fieldkit ended before {self.cell.moment} with {process.returncode}"
             return self._in_phase(sampler)
 
         try:
-            wait_until(reached, Deadline.after(REACHES_S))
+            wait_until(is_reached, Deadline.after(REACHES_S))
         except AssertionError as error:
             raise AssertionError(f"{self.cell.moment} was not reached: {error}") from error
 
     def _in_phase(self, sampler: MotionSampler) -> bool:
-        """Whether the robot is in the phase: by its own log, and by its motion as the lab knows it."""
-        now, moment = sampler.now, self.cell.moment
-        if now is None:
+        """Return True if the robot is in the phase, by its log and by its ground-truth motion."""
+        sample, moment = sampler.now, self.cell.moment
+        if sample is None:
             return False
         if moment is Moment.WAITING:
             return bool(pids_of(Party.AGENT, self.lab.robot(self.cell.craft).pid))
-        moves = {
-            Moment.OUT: now.speed_m_s > 0.3,
-            Moment.BACK: now.speed_m_s > 0.3,
-            Moment.CLIMBING: now.up_m > 0.5,
-            Moment.FLYING: now.speed_m_s > 0.5,
-            Moment.LANDING: now.rises_m_s < -0.1,
+        motion_checks = {
+            Moment.OUT: sample.speed_m_s > 0.3,
+            Moment.BACK: sample.speed_m_s > 0.3,
+            Moment.CLIMBING: sample.up_m > 0.5,
+            Moment.FLYING: sample.speed_m_s > 0.5,
+            Moment.LANDING: sample.rises_m_s < -0.1,
         }
-        return self._phase() in _PHASES[moment] and moves.get(moment, True)
+        return self._phase() in _PHASES[moment] and motion_checks.get(moment, True)
 
     def _phase(self) -> str:
-        """Return the phase that the newest log on the robot shows; empty where there is none."""
+        """The phase in the newest log on the robot; empty if there is no log."""
         return str(self._last_line().get("phase", ""))
 
     def _last_line(self) -> dict[str, object]:
-        """Return the last line of the newest log on the robot; empty where there is none."""
-        for path in self.lab.logs(self.cell.craft) - self._before:
+        """The last line of the newest log on the robot; empty if there is no log."""
+        for path in self.lab.logs(self.cell.craft) - self._previous_logs:
             with suppress(OSError, ValueError, IndexError):
                 lines = path.read_bytes()[-2000:].split(b"\n")
                 return dict(json.loads(lines[-2]))
         return {}
 
     def _is_link_lost(self) -> bool:
-        """Return whether the struck link server was replaced, or positions stopped arriving behind the router."""
+        """Return True if the link server was replaced after the fault, or positions stopped behind the router."""
         if Party.SERVER in self.cell.parties:
-            new = pids_of(Party.SERVER, self.lab.robot(self.cell.craft).pid) - self._servers
-            return bool(new)
+            new_servers = pids_of(Party.SERVER, self.lab.robot(self.cell.craft).pid) - self._servers
+            return bool(new_servers)
         rate_hz = self._last_line().get("rate_hz")
         return isinstance(rate_hz, float) and rate_hz < LOST_HZ
 
     def _inject(self) -> None:
-        """Hit the parties; an operator acts last."""
+        """Apply the fault to the parties; an operator acts last."""
         assert self._process is not None
         blow, parties = self.cell.blow, {*self.cell.parties}
-        pids = {pid for party in parties & {*ON_ROBOT} for pid in self._on_robot(party)}
-        self._servers = self._on_robot(Party.SERVER) if self.cell.cuts_link else set()
+        pids = {pid for party in parties & {*ON_ROBOT} for pid in self._pids_on_robot(party)}
+        self._servers = self._pids_on_robot(Party.SERVER) if self.cell.cuts_link else set()
         if parties & {Party.FIELDKIT, Party.LAPTOP}:
             pids.add(self._process.pid)
         if parties & {Party.LINK, Party.LAPTOP}:
-            self._hit_link()
+            self._disturb_link()
         if blow is Blow.CTRL_C:
             send(signal.SIGINT, {self._process.pid})
         elif blow in {Blow.KILL, Blow.ABORT}:
             send(signal.SIGKILL, pids)
         elif blow is Blow.SLOW and pids:
-            self._undo.append(SlowProcesses(pids).end)
+            self._restorers.append(SlowProcesses(pids).end)
         elif blow is not Blow.SLOW:
             send(signal.SIGSTOP, pids)
-            self._undo.append(lambda: send(signal.SIGCONT, pids))
+            self._restorers.append(lambda: send(signal.SIGCONT, pids))
         if blow in {Blow.STOP, Blow.ABORT}:
-            self._command(blow)
+            self._run_command(blow)
 
-    def _hit_link(self) -> None:
-        """Cut the control link, or delay it."""
+    def _disturb_link(self) -> None:
+        """Cut or delay the control link."""
         links, role = self.lab.outside.links, self.lab.role(self.cell.craft)
         if self.cell.blow is Blow.SLOW:
             links.delay(role, DELAY_S)
-            self._undo.append(lambda: links.delay(role, 0.0))
+            self._restorers.append(lambda: links.delay(role, 0.0))
         else:
             links.cut(role)
-            self._undo.append(lambda: links.restore(role))
+            self._restorers.append(lambda: links.restore(role))
 
-    def _on_robot(self, party: Party) -> set[int]:
+    def _pids_on_robot(self, party: Party) -> set[int]:
         craft = self.cell.craft
-        found = pids_of(party, self.lab.robot(craft).pid, lambda: self.lab.router_pids(craft))
-        assert found, f"no process of the {party} runs on the robot"
-        return found
+        pids = pids_of(party, self.lab.robot(craft).pid, lambda: self.lab.router_pids(craft))
+        assert pids, f"no process of the {party} runs on the robot"
+        return pids
 
-    def _command(self, blow: Blow) -> None:
-        """Run `fieldkit stop` or `fieldkit abort` as from another terminal."""
+    def _run_command(self, blow: Blow) -> None:
+        """Run `fieldkit stop` or `fieldkit abort`, as from another terminal."""
         name = self.lab.robot(self.cell.craft).name
-        done = fieldkit(self.folder, *(("stop", name) if blow is Blow.STOP else ("abort", "--yes")))
-        (self.folder / "stop").write_text(done.out + done.err, encoding="utf-8")
+        completed = fieldkit(self.folder, *(("stop", name) if blow is Blow.STOP else ("abort", "--yes")))
+        (self.folder / "stop").write_text(completed.out + completed.err, encoding="utf-8")
 
     def _observe(self, sampler: MotionSampler, at_s: float) -> None:
-        """Wait until the robot has stopped or landed, and observe it for a while; continue what is paused in time."""
+        """Observe the robot until some time after it has stopped or landed; end a pause in time."""
         paused_until_s = at_s + PAUSE_S if self.cell.blow is Blow.PAUSE else None
-        frozen = self.cell.blow in {Blow.SUSPEND, Blow.STOP} and {Party.FIELDKIT, Party.LAPTOP} & {*self.cell.parties}
+        is_suspended = self.cell.blow in {Blow.SUSPEND, Blow.STOP} and {Party.FIELDKIT, Party.LAPTOP} & {
+            *self.cell.parties
+        }
         rest_at_s: float | None = None
         while True:
             time.sleep(0.05)
             now_s = time.monotonic()
-            self._logs |= self.lab.logs(self.cell.craft) - self._before  # collected ones are deleted
+            self._logs |= self.lab.logs(self.cell.craft) - self._previous_logs  # collected logs are deleted
             self._link_lost = self._link_lost or (self.cell.cuts_link and self._is_link_lost())
-            if self._alarm_s is None and _CAPITALS.search(self._said()):
+            if self._alarm_s is None and _CAPITALS.search(self._printed()):
                 self._alarm_s = now_s - at_s
             if paused_until_s is not None and now_s >= paused_until_s:
-                self._continue()
+                self._undo_fault()
                 paused_until_s = None
                 rest_at_s = None
             if rest_at_s is None and self._rest_s(sampler, at_s) is not None:
                 rest_at_s = now_s
             if paused_until_s is not None or self._programs_run(at_s):
                 continue
-            runs = self._process is not None and self._process.poll() is None and not frozen
-            watched_s = now_s - (rest_at_s if rest_at_s is not None else now_s)
+            is_running = self._process is not None and self._process.poll() is None and not is_suspended
+            observed_s = now_s - (rest_at_s if rest_at_s is not None else now_s)
             if rest_at_s is None and now_s - at_s > ARRIVES_S:
                 return
-            if rest_at_s is not None and watched_s > OBSERVED_S and (not runs or watched_s > ENDS_S):
+            if rest_at_s is not None and observed_s > OBSERVED_S and (not is_running or observed_s > ENDS_S):
                 return
 
     def _programs_run(self, at_s: float) -> bool:
-        """Return whether programs of fieldkit run on the robot that must end within a time that is not over yet."""
+        """Return True if programs of fieldkit still run on the robot and their time limit has not expired."""
         bound_s, now_s = expected(self.cell).programs_s, time.monotonic()
         if bound_s is None or self._programs_s is not None:
             return False
@@ -251,7 +253,7 @@ class MotionTrial:
         return False
 
     def _rest_s(self, sampler: MotionSampler, at_s: float) -> float | None:
-        """Return how long after the fault the robot was stationary, or a drone on the ground."""
+        """Time after the fault at which the robot was stationary, or a drone was on the ground."""
         samples = list(sampler.samples)
         return (grounded_s if self.cell.craft.flies else stopped_s)(samples, at_s, self._remains_s)
 
@@ -259,10 +261,10 @@ class MotionTrial:
     def _remains_s(self) -> float:
         return REMAINS_S if self.cell.moment in AT_REST else STILL_FOR_S
 
-    def _continue(self) -> None:
-        """Undo the fault: suspended processes continue, the link carries again, a killed router runs again."""
-        while self._undo:
-            self._undo.pop()()
+    def _undo_fault(self) -> None:
+        """Undo the fault: suspended processes continue, the link is restored, and a killed router is restarted."""
+        while self._restorers:
+            self._restorers.pop()()
 
     def _outcome(self, sampler: MotionSampler, at_s: float) -> MotionOutcome:
         cell, samples = self.cell, list(sampler.samples)
@@ -271,8 +273,8 @@ class MotionTrial:
         begins_s = descended_s(samples, at_s) if cell.craft.flies else rest_s
         again_m = 0.0 if rest_s is None else moved_again_m(samples, at_s + rest_s + STILL_FOR_S / 2)
         code = self._process.poll() if self._process is not None else None
-        said = self._said()
-        seen = MotionOutcome(
+        printed = self._printed()
+        outcome = MotionOutcome(
             cell=cell.name,
             seed=self.seed,
             begins_s=_rounded(begins_s),
@@ -285,28 +287,28 @@ class MotionTrial:
             alarm_s=_rounded(self._alarm_s),
             programs_s=_rounded(self._programs_s),
             link_lost=self._link_lost if cell.cuts_link else None,
-            message=(said.strip().splitlines() or [""])[-1][:300],
+            message=(printed.strip().splitlines() or [""])[-1][:300],
             load=round(os.getloadavg()[0], 2),
         )
-        return replace(seen, problems=tuple(problems(cell, seen)))
+        return replace(outcome, problems=tuple(problems(cell, outcome)))
 
     def _disarmed(self) -> bool:
         shell = self.lab.outside.testbed.shells[self.lab.role(self.cell.craft)]
-        done = shell.run((sys.executable, "-c", _DISARMED), deadline=Deadline.after(LONG_S), check=False)
-        return done.exit_code == 0
+        completed = shell.run((sys.executable, "-c", _DISARM_CHECK), deadline=Deadline.after(LONG_S), check=False)
+        return completed.exit_code == 0
 
-    def _said(self) -> str:
-        """Return what fieldkit has printed for people: notices in its JSON, errors, and that of `fieldkit stop`."""
-        text = ""
+    def _printed(self) -> str:
+        """All output of fieldkit: notices in its JSON, errors, and the output of `fieldkit stop`."""
+        printed = ""
         for name in ("out", "err", "stop"):
             path = self.folder / name
             if path.exists():
-                text += path.read_text(encoding="utf-8", errors="replace")
-        return text
+                printed += path.read_text(encoding="utf-8", errors="replace")
+        return printed
 
     def _end(self) -> None:
-        """Continue what is suspended, and end fieldkit."""
-        self._continue()
+        """Continue suspended processes, and kill fieldkit."""
+        self._undo_fault()
         process = self._process
         if process is not None:
             if process.poll() is None:

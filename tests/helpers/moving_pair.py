@@ -1,4 +1,4 @@
-"""A co-simulation that can be worked out on paper: a robot passes another, and publishes to it."""
+"""A co-simulation with an analytic solution: a robot passes another robot and publishes to it."""
 
 from dataclasses import dataclass
 
@@ -18,16 +18,16 @@ RANGE_M = 4.0
 PERIOD_NS = 3_700_001
 DELAY_NS = 1_234_567
 STEP_NS = 10_000
-"""So short that where somebody is at the last step is where he is."""
+"""So short that the position at the last step is practically the present position."""
 ENTERS_NS, LEAVES_NS = 3_529_411_765, 8_235_294_118
-"""When the one comes into the other's range, and leaves it: 4 m before and behind 10 m, at 1.7 m/s."""
+"""Times at which the moving robot enters and leaves the range: 4 m before and after 10 m, at 1.7 m/s."""
 END_NS = 10_000_000_000
 PAIR_END_NS = 5_000_000_000
 WINDOW_S = 0.05
 
 
 def moving_agents(first_ns: int = 0, step_ns: int = STEP_NS) -> Agents:
-    """Return a robot that goes straight over another, which stands 10 m before it, and publishes from a time on."""
+    """A robot that drives straight over another one 10 m ahead of it, and publishes from `first_ns` on."""
     physics = Paths(
         [
             WayPoints("a", [(0.0, 0.0, 0.0), (100.0, 0.0, 0.0)], SPEED_M_S),
@@ -39,21 +39,21 @@ def moving_agents(first_ns: int = 0, step_ns: int = STEP_NS) -> Agents:
 
 
 def moving_pair(policy: SyncPolicy) -> Coordinator:
-    """Return them on links with a hard range limit."""
+    """The two robots on links with a hard range limit."""
     return Coordinator(moving_agents(), Disc(RANGE_M, DELAY_NS, extrapolates=True), policy, [("a", "b")])
 
 
 def moving_run(policy: SyncPolicy) -> Run:
-    """Return their whole run."""
+    """The complete run of the two robots."""
     return moving_pair(policy).advance(END_NS)
 
 
 @dataclass
 class MovingPair:
-    """The same with steps of 1 ms, ready to run: a seed draws when the first packet is sent.
+    """The same scenario with steps of 1 ms; the seed determines the time of the first packet.
 
     Attributes:
-        policy: Name of the sync policy; windows are `WINDOW_S` long where they have one length.
+        policy: Name of the sync policy; fixed windows are `WINDOW_S` long.
         seed: The seed.
     """
 
@@ -64,7 +64,7 @@ class MovingPair:
         self.agents = moving_agents(int(RandomStream(self.seed, "phase").draw(0) * PERIOD_NS), 1_000_000)
 
     def run(self) -> Run:
-        """Run it for half that time."""
+        """Run half of the scenario."""
         policy = make_policy(self.policy, window_s=0.0005 if self.policy == "velocity_aware_raw" else WINDOW_S)
         return Coordinator(
             self.agents, Disc(RANGE_M, DELAY_NS, extrapolates=True), policy, [("a", "b"), ("b", "a")]

@@ -1,4 +1,4 @@
-"""Which values of a parametrized test CI runs."""
+"""Selection of the values of a parametrized test that CI runs."""
 
 from collections.abc import Collection, Iterable
 from typing import TypeVar
@@ -10,12 +10,12 @@ T = TypeVar("T")
 
 
 def others_at_night(values: Iterable[T], *, in_ci: Collection[T] = ()) -> list[T | ParameterSet]:
-    """Return values for `parametrize`, all but some of which are left to `make nightly`.
+    """Values for `pytest.mark.parametrize`; those that CI skips are marked `nightly` and run with `make nightly`.
 
     Args:
-        values: The values.
-        in_ci: Those that CI runs, too; without any, the first of the values.
+        values: All values of the parameter.
+        in_ci: The values that CI runs as well; if empty, the first of `values`.
     """
-    every = list(values)
-    kept = in_ci or every[:1]
-    return [value if value in kept else pytest.param(value, marks=pytest.mark.nightly) for value in every]
+    all_values = list(values)
+    ci_values = in_ci or all_values[:1]
+    return [value if value in ci_values else pytest.param(value, marks=pytest.mark.nightly) for value in all_values]

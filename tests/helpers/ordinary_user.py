@@ -1,7 +1,8 @@
-"""An ordinary user and what it sees: a mount namespace with an account that this machine need not have.
+"""An unprivileged user in a separate mount namespace, with an account that the machine does not need to have.
 
-Run as `unshare --mount -- python -m tests.ordinary_user SCRIPT WORD...`: as root, the script changes what the user
-sees; then the user runs the words in its home. The machine keeps none of it, however that ends.
+The module runs as `unshare --mount -- python -m tests.helpers.ordinary_user SCRIPT WORD...`. SCRIPT runs as root and
+changes the mounts and files of the namespace; then the user runs the WORDs in the home directory. When the namespace
+ends, the machine is unchanged.
 """
 
 import os
@@ -17,34 +18,34 @@ NAME: Final = "operator-of-tests"
 UID: Final = 54321
 HOME: Final = Path("/home", NAME)
 
-# Ordinary systems open the device to everyone, bare images do not.
+# Ordinary systems make this device accessible to all users; minimal images do not.
 _OPEN_TUN: Final = (
     "mount -t tmpfs tmpfs /mnt; mknod -m 666 /mnt/tun c 10 200; mount --bind /mnt/tun /dev/net/tun; umount -l /mnt"
 )
 
 
 def command(*words: str, change: str = "") -> tuple[str, ...]:
-    """Return the command that runs `words` as the user, after root ran the shell script `change`."""
-    own = ("unshare", "--mount", "--propagation", "private", "--")
-    return (*own, sys.executable, "-m", "tests.helpers.ordinary_user", change, *words)
+    """The command that runs `words` as the user, after the shell script `change` has run as root."""
+    namespace = ("unshare", "--mount", "--propagation", "private", "--")
+    return (*namespace, sys.executable, "-m", "tests.helpers.ordinary_user", change, *words)
 
 
 def environment() -> dict[str, str]:
-    """Return the environment that `command` wants."""
+    """The environment variables for `command`."""
     return os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "HOME": str(HOME)}
 
 
 def main() -> None:
-    """Prepare what the user sees, and become the user."""
+    """Prepare the mount namespace and switch to the user."""
     mounts.isolate()
-    Path("/root").chmod(0o755)  # this Python may live there
+    Path("/root").chmod(0o755)  # the Python interpreter may be in there
     accounts = Path("/etc/passwd").read_text(encoding="utf-8")
-    own = {
+    account_files = {
         "passwd": f"{accounts}{NAME}:x:{UID}:{UID}::{HOME}:/bin/sh\n",
         "subuid": f"{NAME}:200000:65536\n",
         "subgid": f"{NAME}:200000:65536\n",
     }
-    for name, content in own.items():
+    for name, content in account_files.items():
         file = Path("/run", name)
         file.write_text(content, encoding="utf-8")
         mounts.bind(file, Path("/etc", name))

@@ -1,4 +1,4 @@
-"""Emulated robots that outlive fieldkit: the test holds them, the field backend reaches them over loopback ports."""
+"""Emulated robots that outlive fieldkit: the test starts them, and the field backend connects to loopback ports."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,13 +22,13 @@ from tests.helpers.sshd import make_key
 
 @dataclass(frozen=True)
 class Outside:
-    """Robots on the air, as the field has them.
+    """Running robots on the emulated medium, as a field deployment would provide them.
 
     Attributes:
-        folder: Where `fieldkit.yaml` for the field backend and the login key are; run fieldkit here.
-        cast: Who plays which role.
-        testbed: The robots and their medium: faults go in here; its `shells` reach robots whose link is cut.
-        links: The way to each robot's SSH server: `cut`, `restore` and `drop` it.
+        folder: Folder with `fieldkit.yaml` for the field backend and with the login key; run fieldkit here.
+        cast: The robot of each role.
+        testbed: The robots and their medium; inject faults here. Its `shells` reach robots whose link is cut.
+        links: The forwarder to each robot's SSH server, with `cut`, `restore` and `drop`.
     """
 
     folder: Path
@@ -41,15 +41,15 @@ class Outside:
 def robots_outside(
     folder: Path, *, topology: Topology = Topology.MASTERLESS, site: Path | None = None, distance: str = "5m"
 ) -> Iterator[Outside]:
-    """Yield the robots of an emulated testbed, placed, with a site file in `folder` that reaches them by SSH.
+    """Yield the placed robots of an emulated testbed, and write a site file to `folder` that reaches them by SSH.
 
-    They end with the calling thread at the latest, so call this in one that lives as long as the test.
+    The robots stop at the latest when the calling thread ends, so the thread must live as long as the test.
 
     Args:
-        folder: Gets the site files and the key.
-        topology: Whose robots to bring up.
-        site: Site file of the emulated testbed; without one, robots as `built_in_ros` has them.
-        distance: How far apart they stand, in line of sight; `testbed.place` moves them.
+        folder: Receives the site files and the key.
+        topology: The topology of the robots to start.
+        site: Site file of the emulated testbed; if None, robots as in `built_in_ros` are used.
+        distance: Distance between the robots, in line of sight; `testbed.place` changes it.
     """
     backend = EmulatedBackend(*load_site(site or built_in_ros(folder, "robots.yaml")))
     cast = backend.cast(topology)
@@ -67,16 +67,16 @@ def _site(outside: Outside, topology: Topology) -> str:
     authorized = make_key(key)
     lines = ["backend: field", "robots:"]
     for role, robot in outside.cast.items():
-        pinned = _let_in(outside.testbed, role, authorized)
-        access = f"host: 127.0.0.1, port: {outside.links.port(role)}, user: root, key: {key}, host_key: {pinned}"
+        host_key = _authorize(outside.testbed, role, authorized)
+        access = f"host: 127.0.0.1, port: {outside.links.port(role)}, user: root, key: {key}, host_key: {host_key}"
         lines.append(f"  {robot.name}: {{profile: {robot.profile.name}, address: {robot.address}, {access}}}")
     roles = ", ".join(f"{role}: {robot.name}" for role, robot in outside.cast.items())
     return "\n".join([*lines, f"roles: {{{topology}: {{{roles}}}}}"]) + "\n"
 
 
-def _let_in(testbed: EmulatedTestbed, role: Role, authorized: str) -> str:
-    """Let a key log in on a robot; return the robot's host key."""
+def _authorize(testbed: EmulatedTestbed, role: Role, authorized: str) -> str:
+    """Authorize a key to log in to a robot; return the robot's host key."""
     script = 'cat >>"$HOME/.ssh/authorized_keys" && ssh-keygen -y -f "$1"'
     argv = ("sh", "-c", script, "sh", ssh_server.HOST_KEY)
-    done = testbed.shells[role].run(argv, stdin=authorized.encode(), deadline=Deadline.after(30))
-    return " ".join(done.stdout.decode().split()[:2])
+    completed = testbed.shells[role].run(argv, stdin=authorized.encode(), deadline=Deadline.after(30))
+    return " ".join(completed.stdout.decode().split()[:2])

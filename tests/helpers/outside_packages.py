@@ -1,12 +1,12 @@
-"""Packages that are installed beside fieldkit, as far as pip's files tell of them."""
+"""Metadata of packages that are installed next to fieldkit, as pip writes it."""
 
 from pathlib import Path
 
 
 def write_package(folder: Path, name: str, entry_points: str, version: str = "1.0") -> None:
-    """Write what pip writes beside a package, in a folder of `sys.path`."""
-    about = folder / f"{name.replace('-', '_')}-{version}.dist-info"
-    about.mkdir(parents=True)
-    said = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n\nName: of its description\n"
-    (about / "METADATA").write_text(said, encoding="utf-8")
-    (about / "entry_points.txt").write_text(entry_points, encoding="utf-8")
+    """Write the metadata of a package to a folder of `sys.path`, as pip does."""
+    metadata_folder = folder / f"{name.replace('-', '_')}-{version}.dist-info"
+    metadata_folder.mkdir(parents=True)
+    metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n\nName: of its description\n"
+    (metadata_folder / "METADATA").write_text(metadata, encoding="utf-8")
+    (metadata_folder / "entry_points.txt").write_text(entry_points, encoding="utf-8")

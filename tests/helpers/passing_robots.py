@@ -1,4 +1,4 @@
-"""Two robots that pass each other and talk: a run of which every number is known, also as a program to be killed."""
+"""Two robots that pass each other and exchange packets: a deterministic run, also as a killable program."""
 
 import resource
 import sys
@@ -24,9 +24,9 @@ ABOUT = About("robots: two\n", "sliding_window", {"window_s": 0.0033}, 1)
 
 
 def passing_robots(observer: WindowObserver | None = None, policy: SyncPolicy | None = None) -> Coordinator:
-    """Return a run of robots that go to and fro within range of each other and out of it."""
-    way = [(0.0, 0.0, 0.0), (1e6, 0.0, 0.0)]
-    physics = Paths([WayPoints("a", way, 1.0), WayPoints("b", [(4.5, 1.0, 0.0), (-1e6, 1.0, 0.0)], 0.7)])
+    """A run of two robots that move through each other's range."""
+    path = [(0.0, 0.0, 0.0), (1e6, 0.0, 0.0)]
+    physics = Paths([WayPoints("a", path, 1.0), WayPoints("b", [(4.5, 1.0, 0.0), (-1e6, 1.0, 0.0)], 0.7)])
     agents = Agents(
         physics,
         {
@@ -38,8 +38,8 @@ def passing_robots(observer: WindowObserver | None = None, policy: SyncPolicy | 
     return Coordinator(agents, Disc(4.0, 1_234_567), policy or SlidingWindow(0.0033), pairs, observer=observer)
 
 
-class Told:
-    """Says, in a line each, how many windows there were, and captures what was sent."""
+class ProgressRecorder:
+    """Records a run, and prints the number of windows every 100 windows."""
 
     def __init__(self, recorder: RunRecorder) -> None:
         self._recorder = recorder
@@ -48,9 +48,18 @@ class Told:
 
     def window(self, window: Window) -> None:
         for fate in window.entered:
-            sent = fate.packet
-            packet = IpPacket(sent.source, sent.destination, "udp", 28 + sent.size_bytes, sent.identity, None)
-            self._recorder.log_ip(sent.sent_ns, sent.source, Fragment(packet, 0, 0, 1, 0, packet.size_bytes))
+            program_packet = fate.packet
+            packet = IpPacket(
+                program_packet.source,
+                program_packet.destination,
+                "udp",
+                28 + program_packet.size_bytes,
+                program_packet.identity,
+                None,
+            )
+            self._recorder.log_ip(
+                program_packet.sent_ns, program_packet.source, Fragment(packet, 0, 0, 1, 0, packet.size_bytes)
+            )
         self._recorder.window(window)
         self._windows += 1
         if self._windows % 100 == 0:
@@ -59,11 +68,11 @@ class Told:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Record a run without end into a folder, in files no larger than a number of bytes, if one is named."""
-    if limit_bytes := [int(one) for one in arguments[1:]]:
+    """Record an endless run to a folder, optionally with a maximum file size in bytes."""
+    if limit_bytes := [int(argument) for argument in arguments[1:]]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes[0], limit_bytes[0]))
     with RunRecorder(Path(arguments[0]), ABOUT, part_every_s=0.01) as recorder:
-        passing_robots(Told(recorder)).advance(10**18)
+        passing_robots(ProgressRecorder(recorder)).advance(10**18)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Where the repository is, and the real outputs of tools that tests read."""
+"""Paths of the repository and of the recorded outputs of tools."""
 
 from pathlib import Path
 from typing import Final

@@ -1,4 +1,4 @@
-"""What a user was told of a trial before a power cut, and whether the disk that the cut left still has it."""
+"""What fieldkit had reported to the user before a power cut, compared with the disk after the cut."""
 
 import hashlib
 from collections.abc import Iterator
@@ -21,10 +21,10 @@ _MANIFEST: Final = "MANIFEST.sha256"
 
 @dataclass
 class Witness:
-    """Sees each version of each file that has its final name, and remembers which stood there when the user was told.
+    """Records all versions of files with their final name, and the version of each at the last report to the user.
 
     Args:
-        folder: Where trials go; must be there when it begins to look.
+        folder: Folder of the trials; must exist before the first `look`.
     """
 
     folder: Path
@@ -33,17 +33,17 @@ class Witness:
     is_over: bool = False
 
     def look(self) -> None:
-        """Take in what is there now."""
+        """Record the present versions of all files."""
         for name, content in visible(self.folder).items():
-            seen = self.versions.setdefault(name, [])
-            if not seen or seen[-1] != content:
-                seen.append(content)
+            versions = self.versions.setdefault(name, [])
+            if not versions or versions[-1] != content:
+                versions.append(content)
 
-    def hear(self, event: Event) -> None:
-        """Remember what stands there where an event tells the user that something is done."""
+    def on_event(self, event: Event) -> None:
+        """Record the present versions if an event reports completed work to the user."""
         if isinstance(event, Note | RepeatEnded | TrialEnded):
             self.look()
-            self.told |= {name: len(seen) - 1 for name, seen in self.versions.items()}
+            self.told |= {name: len(versions) - 1 for name, versions in self.versions.items()}
             self.is_over = isinstance(event, TrialEnded)
 
 
@@ -52,10 +52,10 @@ class Cut:
     """A power cut.
 
     Attributes:
-        disk: What it left.
-        told: What the user had been told by then: for each file, which version stood there.
-        is_over: Whether the user had been told that the trial ended.
-        at: Which moment of the trial it was.
+        disk: The disk after the cut.
+        told: For each file, the version at the last report to the user.
+        is_over: True if the end of the trial had been reported.
+        at: Description of the time of the cut.
     """
 
     disk: Disk
@@ -64,49 +64,51 @@ class Cut:
     at: str
 
     def lost(self, folder: Path, witness: Witness) -> list[str]:
-        """Return what is lost or half there in what the cut left, in sentences.
+        """Descriptions of lost or partial files on the disk after the cut.
 
         Args:
-            folder: Where trials went, on the disk that the cut left, mended and mounted.
-            witness: Saw the trial that was cut.
+            folder: Folder of the trials on the repaired and mounted disk.
+            witness: The witness of the interrupted trial.
         """
-        left = visible(folder)
+        remaining = visible(folder)
         lost = [
-            f"{self.at}: {name} is {'not as told' if name in left else 'gone'}"
+            f"{self.at}: {name} is {'older than reported' if name in remaining else 'missing'}"
             for name, number in self.told.items()
-            if not _is_since(left.get(name), witness.versions[name][number:], grows=name.endswith(JOURNAL_FILE))
+            if not _is_current(
+                remaining.get(name), witness.versions[name][number:], grows=name.endswith(JOURNAL_FILE)
+            )
         ]
         lost += [
-            f"{self.at}: {name} is half there"
-            for name, content in left.items()
+            f"{self.at}: {name} is incomplete"
+            for name, content in remaining.items()
             if not name.endswith(JOURNAL_FILE) and content not in witness.versions.get(name, [])
         ]
-        return lost + [f"{self.at}: {problem}" for problem in _unkept(folder, witness)]
+        return lost + [f"{self.at}: {problem}" for problem in _lost_evidence(folder, witness)]
 
 
 def everything(folder: Path) -> dict[str, bytes | None]:
-    """Return the content of each file below a folder, and None for each folder."""
-    found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")}
-    return {name: path.read_bytes() if path.is_file() else None for name, path in found.items()}
+    """The content of each file below a folder, and None for each subfolder."""
+    paths = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")}
+    return {name: path.read_bytes() if path.is_file() else None for name, path in paths.items()}
 
 
 def visible(folder: Path) -> dict[str, bytes]:
-    """Return the content of each file below a folder that has its final name."""
-    found = everything(folder).items()
-    return {name: content for name, content in found if "/." not in f"/{name}" and content is not None}
+    """The content of each file below a folder that has its final name."""
+    entries = everything(folder).items()
+    return {name: content for name, content in entries if "/." not in f"/{name}" and content is not None}
 
 
-def _is_since(content: bytes | None, versions: list[bytes], *, grows: bool) -> bool:
-    """Return whether a file is one of the versions from the one that was told; a journal only grows from that one."""
+def _is_current(content: bytes | None, versions: list[bytes], *, grows: bool) -> bool:
+    """Return True if the content is that of the reported version or of a later one; a journal may be longer."""
     if content is None:
         return False
-    told = versions[0]
-    return content.startswith(told[: told.rfind(b"\n") + 1]) if grows else content in versions
+    reported = versions[0]
+    return content.startswith(reported[: reported.rfind(b"\n") + 1]) if grows else content in versions
 
 
-def _unkept(folder: Path, witness: Witness) -> Iterator[str]:
-    """Yield what the journal or the manifest tell that is not there: evidence of attempts that ended."""
-    left = visible(folder)
+def _lost_evidence(folder: Path, witness: Witness) -> Iterator[str]:
+    """Yield differences between the evidence of ended attempts and the journal or manifest."""
+    remaining = visible(folder)
     for path in folder.glob(f"*/{JOURNAL_FILE}"):
         try:
             ended = journal.ended(journal.read(path.parent))
@@ -114,29 +116,33 @@ def _unkept(folder: Path, witness: Witness) -> Iterator[str]:
             yield error.what
             continue
         for attempt in ended:
-            kept = path.parent / "repeats" / attempt.folder
-            prefix = f"{kept.relative_to(folder).as_posix()}/"
-            seen = {name: content[-1] for name, content in witness.versions.items() if name.startswith(prefix)}
-            if not kept.is_dir() or seen != {name: left[name] for name in left if name.startswith(prefix)}:
-                yield f"the evidence of {attempt.folder} is not what its journal line tells of"
-    for manifest in [name for name in left if name.endswith(f"/{_MANIFEST}")]:
-        for digest, name in (line.split("  ", 1) for line in left[manifest].decode().splitlines()):
-            content = left.get(manifest.replace(_MANIFEST, name))
+            attempt_folder = path.parent / "repeats" / attempt.folder
+            prefix = f"{attempt_folder.relative_to(folder).as_posix()}/"
+            expected = {name: content[-1] for name, content in witness.versions.items() if name.startswith(prefix)}
+            if not attempt_folder.is_dir() or expected != {
+                name: remaining[name] for name in remaining if name.startswith(prefix)
+            }:
+                yield f"the evidence of {attempt.folder} does not match its journal line"
+    for manifest in [name for name in remaining if name.endswith(f"/{_MANIFEST}")]:
+        for digest, name in (line.split("  ", 1) for line in remaining[manifest].decode().splitlines()):
+            content = remaining.get(manifest.replace(_MANIFEST, name))
             if name.startswith("repeats/") and (content is None or hashlib.sha256(content).hexdigest() != digest):
-                yield f"{name} is not what the manifest tells of"
+                yield f"{name} does not match the manifest"
 
 
 def demand_resumable(out: Path) -> None:
-    """Go on with a trial after a cut, and demand that it ends whole with every attempt that was over or measured."""
+    """Resume a trial after a cut; it must end complete, with all attempts that had ended or were measured."""
     folder = trial_of(out)
     entries = journal.read(folder) if (folder / JOURNAL_FILE).is_file() else []
     before, evidence = journal.ended(entries), visible(folder / "repeats")
-    measured = [one for one in journal.cut_short(entries) if one.status is Status.MEASURED]
+    measured = [attempt for attempt in journal.cut_short(entries) if attempt.status is Status.MEASURED]
     resume_trial(folder, IdleTestbed(), lambda _: None)
     demand_whole(out)
     after = journal.ended(journal.read(folder))
     assert after[: len(before)] == before
     assert evidence.items() <= visible(folder / "repeats").items()
-    is_valid = {(one.repeat, one.number): one.status is Status.VALID for one in after}
-    for one in measured:
-        assert is_valid[one.repeat, one.number] == (not VOID_FIRST.endswith(f"{one.repeat}-{one.number}")), one
+    is_valid = {(attempt.repeat, attempt.number): attempt.status is Status.VALID for attempt in after}
+    for attempt in measured:
+        assert is_valid[attempt.repeat, attempt.number] == (
+            not VOID_FIRST.endswith(f"{attempt.repeat}-{attempt.number}")
+        ), attempt

@@ -1,4 +1,4 @@
-"""Radio networks in small for tests: agents that stand or move, and packets that are sent at given times."""
+"""Small radio networks for tests: stationary or moving agents, and packets that are sent at given times."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,46 +16,46 @@ from sim_backends.world.motion import State
 
 MS = 1_000_000
 IN_THE_OPEN = RadioOptions(fading=False, mode="g6")
-"""Free of chance but for contention and bit errors, which near stations do not have."""
+"""Deterministic except for contention and bit errors; nearby stations have no bit errors."""
 ANTENNA = Antenna("802.11g", 15.0, -85.0)
-"""Heard as far as about 70 m, where the exponent is 3."""
+"""Has a range of about 70 m with a path loss exponent of 3."""
 
 
 @dataclass
 class Outcome:
-    """What became of packets, by their identity."""
+    """The fate of packets, by their identity."""
 
     arrived: dict[tuple[str, int], int] = field(default_factory=dict)
     dropped: dict[tuple[str, int], str] = field(default_factory=dict)
 
 
 def wifi(names: Sequence[str], options: RadioOptions = IN_THE_OPEN, *, seed: int = 1) -> WifiInWorld[Fragment]:
-    """Return Wi-Fi stations on open ground."""
+    """Wi-Fi stations on open ground."""
     return WifiInWorld(seed, options, dict.fromkeys(names, ANTENNA), None)
 
 
 def fixed(seed: int = 1, **options: str | int) -> UniformLinks[Fragment]:
-    """Return links that do the same wherever stations stand, unlimited and without delay but for what is said."""
+    """Links that do not depend on positions; by default with an unlimited rate and no delay."""
     return UniformLinks(seed, RadioOptions.model_validate({"delay": "0ms", "rate": "unlimited"} | options))
 
 
 def standing(places_m: Mapping[str, Vector]) -> dict[str, State]:
-    """Return the states of agents that stand at places."""
-    return {name: State(place_m) for name, place_m in places_m.items()}
+    """The states of stationary agents at the given positions."""
+    return {name: State(position_m) for name, position_m in places_m.items()}
 
 
 def packets(
     sends: Sequence[tuple[int, str, str, int]], *, protocol: str = "udp", flow: str | None = None
 ) -> list[Packet]:
-    """Return packets of time, source, destination and size, in order, each pair with a flow of its own."""
-    made: list[Packet] = []
+    """Packets from (time, source, destination, size), in order; each pair has a separate flow without `flow`."""
+    result: list[Packet] = []
     numbers: dict[str, int] = {}
     for packet_id, (at_ns, source, destination, size_bytes) in enumerate(sends, start=1):
         name = flow or f"{source} to {destination}"
         number = numbers.get(name, 0)
         numbers[name] = number + 1
-        made.append(Packet(packet_id, source, destination, size_bytes, (name, number), at_ns, at_ns, protocol))
-    return made
+        result.append(Packet(packet_id, source, destination, size_bytes, (name, number), at_ns, at_ns, protocol))
+    return result
 
 
 def network(
@@ -66,7 +66,7 @@ def network(
     disturbances: Sequence[Disturbance] = (),
     relay: str | None = None,
 ) -> RadioNetwork:
-    """Return a radio network."""
+    """A radio network."""
     return RadioNetwork(radio, names, transports=transports, disturbances=disturbances, relay=relay)
 
 
@@ -77,20 +77,20 @@ def carry(
     *,
     to_ns: int = 1000 * 10**9,
 ) -> Outcome:
-    """Return what becomes of packets, none of which may end twice."""
+    """The fate of packets; a packet must not end twice."""
     arrivals, drops = net.advance(to_ns, sent, states)
     return outcome(sent, arrivals, drops)
 
 
 def outcome(sent: Sequence[Packet], arrivals: Sequence[Arrival], drops: Sequence[Drop]) -> Outcome:
-    """Return arrivals and drops by identity."""
+    """Arrivals and drops by identity."""
     by_id = {packet.packet_id: packet for packet in sent}
-    ended = [one.packet_id for one in arrivals] + [one.packet_id for one in drops]
-    assert len(ended) == len(set(ended)), "a packet ended twice"
+    packet_ids = [event.packet_id for event in arrivals] + [event.packet_id for event in drops]
+    assert len(packet_ids) == len(set(packet_ids)), "a packet ended twice"
     for arrival in arrivals:
         assert arrival.receiver == by_id[arrival.packet_id].destination
-    assert [one.at_ns for one in arrivals] == sorted(one.at_ns for one in arrivals)
+    assert [event.at_ns for event in arrivals] == sorted(event.at_ns for event in arrivals)
     return Outcome(
-        {by_id[one.packet_id].identity: one.at_ns for one in arrivals},
-        {by_id[one.packet_id].identity: one.reason for one in drops},
+        {by_id[event.packet_id].identity: event.at_ns for event in arrivals},
+        {by_id[event.packet_id].identity: event.reason for event in drops},
     )

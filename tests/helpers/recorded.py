@@ -1,4 +1,4 @@
-"""A small trial on disk, made by hand: every packet, reply and journal entry is known."""
+"""A small hand-written trial on disk whose packets, replies and journal entries are all known."""
 
 import struct
 from collections.abc import Sequence
@@ -13,9 +13,9 @@ from tests.measure.evidence.test_measure_bag import write_bag
 
 START_NS = 1_700_000_000_000_000_000
 SECOND_NS = 1_000_000_000
-# The receiver's clock is an hour ahead.
+# Offset of the receiver's clock.
 AHEAD_NS = 3600 * SECOND_NS
-SENDER, RECEIVER = (one.address for one in list(CAST.values())[:2])
+SENDER, RECEIVER = (robot.address for robot in list(CAST.values())[:2])
 PACKETS = 40
 LOST = (3, 4, 17)
 REPEATED = 8
@@ -26,19 +26,19 @@ PING_TAIL = "10 packets transmitted, 3 received, 70% packet loss, time 1800ms"
 
 
 def packet(number: int) -> bytes:
-    """One UDP datagram of the transfer, unfragmented, its payload not kept."""
-    head = struct.pack(">HHHH", 40000, 1234, 1008, 0)
-    return ipv4(head, protocol=17, size=1008, ip_id=number, src=SENDER, dst=RECEIVER)
+    """A UDP datagram of the transfer, unfragmented, without its payload."""
+    header = struct.pack(">HHHH", 40000, 1234, 1008, 0)
+    return ipv4(header, protocol=17, size=1008, ip_id=number, src=SENDER, dst=RECEIVER)
 
 
 def segment(number: int, payload_bytes: int) -> bytes:
-    """One TCP frame of the transfer, its payload not kept."""
-    head = struct.pack(">HHIIBBHHH", 40000, 1234, number * payload_bytes, 0, 0x50, 0x10, 502, 0, 0)
-    return ipv4(head, protocol=6, size=20 + payload_bytes, src=SENDER, dst=RECEIVER)
+    """A TCP segment of the transfer, without its payload."""
+    header = struct.pack(">HHIIBBHHH", 40000, 1234, number * payload_bytes, 0, 0x50, 0x10, 502, 0, 0)
+    return ipv4(header, protocol=6, size=20 + payload_bytes, src=SENDER, dst=RECEIVER)
 
 
 def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Path:
-    """Make the folder of a trial of one repeat whose first attempt is void."""
+    """Write the folder of a trial with one repeat whose first attempt is void."""
     plan = los_plan(repeats=1, protocols=(Protocol.UDP,), record_s=2.0)
     folder = store.create(out, plan)
     (repeat,) = plan.order()
@@ -46,11 +46,11 @@ def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Pa
     valid = Attempt(repeat, 2, START_NS + 10 * SECOND_NS, Status.VALID)
     entries = [JournalEntry(START_NS - SECOND_NS, repeat.protocol, 1, 0, Status.PLANNED)]
     for attempt in (void, valid):
-        begun = JournalEntry(attempt.started_utc_ns, repeat.protocol, 1, attempt.number, Status.RUNNING)
+        started = JournalEntry(attempt.started_utc_ns, repeat.protocol, 1, attempt.number, Status.RUNNING)
         ended = JournalEntry(
-            begun.utc_ns + 5 * SECOND_NS, repeat.protocol, 1, attempt.number, attempt.status, attempt.reason
+            started.utc_ns + 5 * SECOND_NS, repeat.protocol, 1, attempt.number, attempt.status, attempt.reason
         )
-        entries += [begun, ended]
+        entries += [started, ended]
     journal.append(folder, *entries)
     (folder / store.REPEATS / void.folder).mkdir()
     write_evidence(folder / store.REPEATS / valid.folder, valid.started_utc_ns, packets, lost)
@@ -58,21 +58,23 @@ def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Pa
     return folder
 
 
-def write_evidence(folder: Path, begin_ns: int, packets: int, lost: Sequence[int]) -> None:
-    """Write a repeat's evidence: the transfer begins 2 s after it, the ping 3 s; one packet arrives twice."""
+def write_evidence(folder: Path, start_ns: int, packets: int, lost: Sequence[int]) -> None:
+    """Write the evidence of a repeat: the transfer starts after 2 s, the ping after 3 s; one packet arrives twice."""
     folder.mkdir()
     write_bag(folder / "scan.bag", {"/scan": 11})
     (folder / "recv.bag").touch()
-    sent = [Frame(begin_ns + 2 * SECOND_NS + 1_000_000 * index, packet(index), 1042) for index in range(packets)]
-    came = [Frame(one.time_ns + AHEAD_NS, one.data, 1042) for index, one in enumerate(sent) if index not in lost]
-    came.append(Frame(came[-1].time_ns + 1_000_000, packet(REPEATED), 1042))
+    sent = [Frame(start_ns + 2 * SECOND_NS + 1_000_000 * index, packet(index), 1042) for index in range(packets)]
+    received = [
+        Frame(frame.time_ns + AHEAD_NS, frame.data, 1042) for index, frame in enumerate(sent) if index not in lost
+    ]
+    received.append(Frame(received[-1].time_ns + 1_000_000, packet(REPEATED), 1042))
     (folder / "sender.pcap").write_bytes(file_bytes(sent))
-    (folder / "receiver.pcap").write_bytes(file_bytes(came))
+    (folder / "receiver.pcap").write_bytes(file_bytes(received))
     replies = [
-        f"[{begin_ns // SECOND_NS + 3}.{200_000 * (seq - 1):06}] 8200 bytes from {RECEIVER}: icmp_seq={seq} ttl=64 "
+        f"[{start_ns // SECOND_NS + 3}.{200_000 * (seq - 1):06}] 8200 bytes from {RECEIVER}: icmp_seq={seq} ttl=64 "
         f"time={rtt_ms:.3f} ms"
         for seq, rtt_ms in enumerate(RTT_MS, start=1)
     ]
-    problem = f"[{begin_ns // SECOND_NS + 3}.900000] From {SENDER} icmp_seq=4 Destination Host Unreachable"
+    problem = f"[{start_ns // SECOND_NS + 3}.900000] From {SENDER} icmp_seq=4 Destination Host Unreachable"
     text = "\n".join([PING_HEAD, *replies, problem, PING_TAIL])
     (folder / "ping.txt").write_text(text, encoding="utf-8")

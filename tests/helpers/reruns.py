@@ -1,4 +1,4 @@
-"""A pytest plugin: real programs get a second try on a busy machine, and a run with many of those fails."""
+"""A pytest plugin that repeats failed tests of real programs once, and fails a run with too many repetitions."""
 
 from collections.abc import Generator
 from pathlib import Path
@@ -9,16 +9,16 @@ import pytest
 from tests.helpers.host import LeakError
 
 ALLOWED: Final = 3
-"""Second tries that a run may have. The cause of each must be found: then none is allowed."""
+"""Number of second tries that a run may have; find the cause of each. If the causes are fixed, set this to 0."""
 
 _FAILED: Final = pytest.StashKey[bool]()
 
 
 class _Count:
-    """Counts second tries where all reports come together.
+    """Counts second tries in the process that collects all reports.
 
     Attributes:
-        tries: The tests that had one, those of earlier parts of the run first.
+        tries: The tests that had a second try, in order; those of earlier parts of the run come first.
     """
 
     def __init__(self, log: Path | None) -> None:
@@ -26,45 +26,48 @@ class _Count:
         self._log = log
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Count a first try that failed, once, whether in its body, in what ends it, or in both."""
+        """Count a failed first try once, even if both the test and its teardown failed."""
         if str(report.outcome) == "rerun" and report.nodeid not in self.tries:
             self.tries.append(report.nodeid)
             if self._log is not None:
                 self._log.write_text("".join(f"{test}\n" for test in self.tries), encoding="utf-8")
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Fail the run if there were too many."""
+        """Fail the run if there were too many second tries."""
         if len(self.tries) > ALLOWED and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     @pytest.hookimpl(trylast=True)
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Show why tests ran twice, and that there were too many."""
+        """Show why tests ran twice, and whether too many did."""
         for report in terminalreporter.stats.get("rerun", []):
             terminalreporter.section(f"first try of {report.nodeid}")
             terminalreporter.write_line(report.longreprtext)
         if len(self.tries) > ALLOWED:
-            terminalreporter.section(f"{len(self.tries)} tests ran twice, at most {ALLOWED} may", red=True)
+            terminalreporter.section(f"{len(self.tries)} tests ran twice; at most {ALLOWED} are allowed", red=True)
             for test in self.tries:
                 terminalreporter.write_line(test)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the file in which the parts of a run add up."""
+    """Add the option for the file that counts second tries over all parts of a run."""
     parser.addoption(
-        "--rerun-log", type=Path, metavar="FILE", help="tests that ran twice, a line each: what is in it counts too"
+        "--rerun-log",
+        type=Path,
+        metavar="FILE",
+        help="tests that ran twice, one per line; existing lines count as well",
     )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Count, but not in a worker: its reports go on to where all come together."""
+    """Register the counter, but not in an xdist worker, whose reports are sent to the controller."""
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(_Count(config.getoption("--rerun-log")))
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Note what a try came to before its fixtures end."""
+    """Store whether the test failed, before its fixtures are torn down."""
     report = yield
     if report.when != "teardown":
         item.stash[_FAILED] = report.failed
@@ -73,13 +76,13 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_teardown(item: pytest.Item) -> None:
-    """End the fixtures of the module of a test that failed: its next try gets a lab that no first try has touched."""
+    """Tear down the module fixtures of a failed test, so that its second try uses a new lab."""
     if item.stash.get(_FAILED, False):
         item.session._setupstate.teardown_exact(item.session)  # type: ignore[arg-type]  # a session is a node with parents too
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give tests of real programs, or of times, a second try; what is left behind is left behind the first time."""
+    """Allow tests of real programs or of timing a second try, but not if a process or file was left behind."""
     for item in items:
         if item.get_closest_marker("emulated") or item.get_closest_marker("quiet"):
             item.add_marker(pytest.mark.flaky(reruns=1, rerun_except=LeakError.__name__))

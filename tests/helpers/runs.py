@@ -1,4 +1,4 @@
-"""Run fieldkit as its users do: as a command, in a folder of its own."""
+"""Runs fieldkit like its users: as a command in a separate folder."""
 
 import csv
 import json
@@ -16,7 +16,7 @@ LIMIT_S = 600.0
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run.
+    """A completed run.
 
     Attributes:
         code: Exit code.
@@ -29,14 +29,14 @@ class Run:
     err: str
 
     def events(self, name: str) -> list[dict[str, Any]]:
-        """Return the JSON events of one kind."""
+        """The JSON events of one kind."""
         return [event for event in map(json.loads, self.out.splitlines()) if event["event"] == name]
 
 
-def start(lab: Path, *words: str) -> "subprocess.Popen[str]":
-    """Start `fieldkit` with `words` in the folder `lab`."""
+def start(lab: Path, *arguments: str) -> "subprocess.Popen[str]":
+    """Start `fieldkit` with `arguments` in the folder `lab`."""
     return subprocess.Popen(
-        (sys.executable, "-m", "fieldkit", *words),
+        (sys.executable, "-m", "fieldkit", *arguments),
         cwd=lab,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
@@ -47,28 +47,28 @@ def start(lab: Path, *words: str) -> "subprocess.Popen[str]":
 
 
 def wait_for_line(process: "subprocess.Popen[str]", text: str) -> None:
-    """Return when a started run printed a line with `text`."""
+    """Wait until a started run has printed a line with `text`."""
     assert process.stdout is not None
-    assert any(text in line for line in process.stdout), f"{text} never came"
+    assert any(text in line for line in process.stdout), f"{text} was not printed"
 
 
 def wait_during(process: "subprocess.Popen[str]", condition: Callable[[], bool], *, within_s: float = 90.0) -> None:
-    """Return when a condition is true while a started run goes on.
+    """Wait until a condition is true while a started run continues.
 
     Raises:
-        AssertionError: The run ended before, or the time is over. It says what the run printed, and the run is ended.
+        AssertionError: The run ended earlier, or the time is over; the message has its output, and the run is killed.
     """
-    ends_s = time.monotonic() + within_s
+    deadline_s = time.monotonic() + within_s
     while not condition():
-        if process.poll() is not None or time.monotonic() > ends_s:
-            why = "in time" if process.poll() is None else "before the run ended"
+        if process.poll() is not None or time.monotonic() > deadline_s:
+            reason = "in time" if process.poll() is None else "before the run ended"
             process.kill()
-            raise AssertionError(f"the condition did not become true {why}: {finish(process)}")
+            raise AssertionError(f"the condition did not become true {reason}: {finish(process)}")
         time.sleep(0.01)
 
 
 def finish(process: "subprocess.Popen[str]") -> Run:
-    """Wait for a started run."""
+    """Wait for a started run to exit."""
     try:
         out, err = process.communicate(timeout=LIMIT_S)
     except subprocess.TimeoutExpired:
@@ -77,23 +77,24 @@ def finish(process: "subprocess.Popen[str]") -> Run:
     return Run(process.returncode, out, err)
 
 
-def fieldkit(lab: Path, *words: str) -> Run:
-    """Run `fieldkit` with `words` in the folder `lab`."""
-    return finish(start(lab, *words))
+def fieldkit(lab: Path, *arguments: str) -> Run:
+    """Run `fieldkit` with `arguments` in the folder `lab`."""
+    return finish(start(lab, *arguments))
 
 
 def only_trial(lab: Path) -> Path:
-    """Return the one trial folder of a lab."""
+    """The only trial folder of a lab."""
     (folder,) = (lab / "trials").iterdir()
     return folder
 
 
 def rows(trial: Path, name: str = "trial.csv") -> list[dict[str, str]]:
-    """Return the rows of a trial's CSV."""
+    """The rows of a CSV file of a trial."""
     with (trial / name).open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
 def total(table: Sequence[dict[str, str]], column: str) -> int:
-    """Return the sum over a column of counts; an empty cell is an error."""
+    """The sum of a column of counts; an empty cell is an error."""
+
     return sum(int(row[column]) for row in table)

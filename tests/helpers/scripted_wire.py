@@ -1,4 +1,4 @@
-"""A wire for transports in tests: a fixed delay, a rate, and what becomes of each packet written down beforehand."""
+"""A wire for transport tests: a constant delay, a rate, and a script for the fate of each packet."""
 
 import heapq
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -8,28 +8,28 @@ from sim_backends.network.packets import Packet
 from sim_backends.network.wire import IpPacket, Transport
 
 Script = Callable[[IpPacket, str, int], Sequence[int]]
-"""What becomes of a packet, by the packet, its receiver, and which it is, from 0, of all between these two that way.
+"""The fate of a packet, from the packet, its receiver, and its index (from 0) among all packets of this direction.
 
-The answer is by how much longer than the wire's delay each copy takes that arrives, in ns: `(0,)` is as sent, `()` is
-lost, `(0, 5)` is twice, the copy 5 ns later.
+The result has one entry per copy that arrives: its delay in ns in addition to the delay of the wire. `(0,)` is a
+normal delivery, `()` is a loss, and `(0, 5)` is a duplicate that arrives 5 ns later.
 """
 
 _SECOND_NS = 1_000_000_000
 
 
 def losing(numbers: Mapping[str, Collection[int]]) -> Script:
-    """Return the script that loses, per source, the packets with these numbers and no others."""
+    """A script that loses exactly the packets with the given indices, per source."""
     return lambda packet, _, number: () if number in numbers.get(packet.source, ()) else (0,)
 
 
 @dataclass(frozen=True)
 class Transmitted:
-    """An IP packet that a transport sent.
+    """An IP packet sent by a transport.
 
     Attributes:
-        at_ns: When it was handed to the wire.
-        packet: What it was.
-        arrived: Whether a copy of it arrives.
+        at_ns: The time at which it was passed to the wire.
+        packet: The packet.
+        arrived: True if at least one copy arrives.
     """
 
     at_ns: int
@@ -38,23 +38,24 @@ class Transmitted:
 
 
 class ScriptedWire:
-    """A `Wire` that keeps an account of everything.
+    """A `Wire` that records all packets.
 
-    Packets from one host to another go on a line of their own, one after the other at the rate, then take the delay.
+    Each pair of source and destination has a separate link, on which packets are serialized at the rate and then
+    delayed.
 
     Args:
-        delay_ns: From the end of a packet's serialization to its arrival.
-        rate_bit_s: Of each line; None is unlimited.
-        queue_packets: How many packets wait on a line beside the one that is sent; None is any number.
-        script: What becomes of each packet; None is that each arrives once.
-        hosts: Who gets what is sent to everyone.
+        delay_ns: Delay from the end of a packet's serialization to its arrival.
+        rate_bit_s: Rate of each link; None is unlimited.
+        queue_packets: Maximum number of packets that wait on a link, without the one being sent; None is unlimited.
+        script: The fate of each packet; None delivers each once.
+        hosts: The receivers of broadcasts.
 
     Attributes:
-        now_ns: Now.
-        transports: Whom arriving packets are handed to, by name; to be filled in by the test.
-        transmitted: All that was sent, in order.
-        delivered: When each program's packet was delivered, in order.
-        dropped: Why each program's packet was dropped.
+        now_ns: The present time.
+        transports: Transports by name, which receive arriving packets; filled by the test.
+        transmitted: All sent packets, in order.
+        delivered: Delivery time of each program packet, in order.
+        dropped: Drop reason of each program packet.
     """
 
     def __init__(
@@ -82,36 +83,36 @@ class ScriptedWire:
         self._order = 0
 
     def transmit(self, packet: IpPacket) -> None:
-        """See `Wire.transmit`."""
+        """Implement `Wire.transmit`."""
         receivers = self._hosts if packet.destination is None else [packet.destination]
-        arrived = [self._put(packet, receiver) for receiver in receivers if receiver != packet.source]
+        arrived = [self._enqueue(packet, receiver) for receiver in receivers if receiver != packet.source]
         self.transmitted.append(Transmitted(self.now_ns, packet, any(arrived)))
 
     def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
-        """See `Wire.at`; of calls at the same time the one planned first comes first."""
+        """Implement `Wire.at`; calls for the same time run in the order of scheduling."""
         assert isinstance(at_ns, int)
-        assert at_ns >= self.now_ns, "planned for the past"
+        assert at_ns >= self.now_ns, "scheduled in the past"
         self._order += 1
         heapq.heappush(self._calls, (at_ns, self._order, call))
 
     def deliver(self, packet_id: int) -> None:
-        """See `Wire.deliver`."""
+        """Implement `Wire.deliver`."""
         assert packet_id not in self.delivered, "delivered twice"
         assert packet_id not in self.dropped, "delivered after it was dropped"
         self.delivered[packet_id] = self.now_ns
 
     def drop(self, packet_id: int, reason: str) -> None:
-        """See `Wire.drop`."""
+        """Implement `Wire.drop`."""
         assert packet_id not in self.dropped, "dropped twice"
         if packet_id not in self.delivered:
             self.dropped[packet_id] = reason
 
     def next_event_ns(self) -> int | None:
-        """Return when something happens next, None when nothing is planned."""
+        """The time of the next event, or None if no event is scheduled."""
         return self._calls[0][0] if self._calls else None
 
     def run(self, until_ns: int | None = None) -> None:
-        """Let everything happen up to `until_ns`, or until nothing is planned any more."""
+        """Run all events up to `until_ns`, or all events if None."""
         while self._calls and (until_ns is None or self._calls[0][0] <= until_ns):
             self.now_ns, _, call = heapq.heappop(self._calls)
             call()
@@ -119,30 +120,30 @@ class ScriptedWire:
             self.now_ns = max(self.now_ns, until_ns)
 
     def send_at(self, at_ns: int, packet: Packet) -> None:
-        """Let a program send a packet at `at_ns`, by the transport that the packet names."""
+        """Schedule the sending of a program's packet by the transport that the packet names."""
         self.at(at_ns, packet.source, lambda: self.transports[packet.protocol].send(packet))
 
-    def _put(self, packet: IpPacket, receiver: str) -> bool:
-        """Put a packet on the line to one receiver; return whether it arrives."""
-        line = packet.source, receiver
-        number = self._counts.get(line, 0)
-        self._counts[line] = number + 1
-        ends_ns = self._ends_ns.setdefault(line, [])
+    def _enqueue(self, packet: IpPacket, receiver: str) -> bool:
+        """Put a packet on the link to one receiver; return True if it arrives."""
+        link = packet.source, receiver
+        number = self._counts.get(link, 0)
+        self._counts[link] = number + 1
+        ends_ns = self._ends_ns.setdefault(link, [])
         while ends_ns and ends_ns[0] <= self.now_ns:
             ends_ns.pop(0)
-        # The first of those on the line is being sent, the others wait.
-        full = self._queue_packets is not None and len(ends_ns) > self._queue_packets
-        later_ns = () if full else self._script(packet, receiver, number)
+        # The first packet on the link is being sent, and the others wait.
+        is_full = self._queue_packets is not None and len(ends_ns) > self._queue_packets
+        extra_delays_ns = () if is_full else self._script(packet, receiver, number)
         end_ns = self.now_ns
-        if self._rate_bit_s is not None and not full:
-            begun_ns = ends_ns[-1] if ends_ns else self.now_ns
-            end_ns = begun_ns - (-8 * packet.size_bytes * _SECOND_NS // self._rate_bit_s)
+        if self._rate_bit_s is not None and not is_full:
+            start_ns = ends_ns[-1] if ends_ns else self.now_ns
+            end_ns = start_ns - (-8 * packet.size_bytes * _SECOND_NS // self._rate_bit_s)
             ends_ns.append(end_ns)
         transport = self.transports[packet.transport]
-        arrives_ns = end_ns + self._delay_ns
-        for extra_ns in later_ns:
-            self.at(arrives_ns + extra_ns, receiver, lambda: transport.receive(receiver, packet))
-        if not later_ns:
-            reason = "queue full" if full else "lost by script"
-            self.at(arrives_ns, receiver, lambda: transport.lost(packet, reason))
-        return bool(later_ns)
+        arrival_ns = end_ns + self._delay_ns
+        for extra_ns in extra_delays_ns:
+            self.at(arrival_ns + extra_ns, receiver, lambda: transport.receive(receiver, packet))
+        if not extra_delays_ns:
+            reason = "queue full" if is_full else "lost by script"
+            self.at(arrival_ns, receiver, lambda: transport.lost(packet, reason))
+        return bool(extra_delays_ns)

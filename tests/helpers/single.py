@@ -1,4 +1,4 @@
-"""Intervals of one cell, where the code under test has many at once."""
+"""Intervals of a single cell; the functions under test compute many at the same time."""
 
 import math
 
@@ -12,9 +12,9 @@ from fieldkit.core.model import Interval
 
 
 def wilson(events: int, trials: int) -> Interval:
-    found = _single(statistics.wilsons([events], [trials]))
-    assert found is not None
-    return found
+    interval = _single(statistics.wilsons([events], [trials]))
+    assert interval is not None
+    return interval
 
 
 def share(lost: ArrayLike, sent: ArrayLike) -> Interval | None:
@@ -34,10 +34,10 @@ def median(values: ArrayLike, least: float = -math.inf) -> Interval | None:
 
 
 def more_wanted(interval: Interval, n: int, half_width: float, kind: Kind) -> int:
-    one = Intervals(*(np.array([part]) for part in (interval.value, interval.low, interval.high)))
-    return int(planning.more_wanted(one, n, half_width, kind)[0])
+    intervals = Intervals(*(np.array([bound]) for bound in (interval.value, interval.low, interval.high)))
+    return int(planning.more_wanted(intervals, n, half_width, kind)[0])
 
 
-def _single(found: Intervals) -> Interval | None:
-    value, low, high = float(found.value[0]), float(found.low[0]), float(found.high[0])
+def _single(intervals: Intervals) -> Interval | None:
+    value, low, high = float(intervals.value[0]), float(intervals.low[0]), float(intervals.high[0])
     return None if math.isnan(low) else Interval(value=value, low=low, high=high)

@@ -1,4 +1,4 @@
-"""Links of a built site: every target is a file in it, and every anchor exists there."""
+"""Links of a built site: each target must be a file of the site, and each anchor must exist in it."""
 
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
@@ -7,19 +7,19 @@ from typing import Final
 from urllib.parse import unquote, urlsplit
 
 _TARGETS: Final = ("href", "src")
-_OPENED: Final = {"a"}
-"""Elements that load nothing before somebody clicks on them."""
+_LINK_ELEMENTS: Final = {"a"}
+"""Elements that load nothing until the user clicks on them."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """The links of a page, each with its element, and its anchors."""
+    """The links of a page with their elements, and its anchors."""
 
     links: list[tuple[str, str]] = field(default_factory=list)
     anchors: set[str] = field(default_factory=set)
 
 
-class _Reader(HTMLParser):
+class _LinkParser(HTMLParser):
     def __init__(self, page: Page) -> None:
         super().__init__()
         self._page = page
@@ -31,21 +31,21 @@ class _Reader(HTMLParser):
 
 
 def read(path: Path) -> Page:
-    """Return links and anchors of an HTML file."""
+    """The links and anchors of an HTML file."""
     page = Page()
-    _Reader(page).feed(path.read_text(encoding="utf-8"))
+    _LinkParser(page).feed(path.read_text(encoding="utf-8"))
     return page
 
 
 def broken(site: Path) -> list[str]:
-    """Return every link of a site that leads nowhere, and everything that a page loads from elsewhere."""
+    """All broken links of a site, and all resources that a page loads from other sites."""
     pages = {path.resolve(): read(path) for path in site.rglob("*.html") if path.name != "404.html"}
     problems = []
     for path, page in pages.items():
         for tag, link in page.links:
             url = urlsplit(link)
             if url.scheme or url.netloc:
-                if tag not in _OPENED and url.scheme != "data":
+                if tag not in _LINK_ELEMENTS and url.scheme != "data":
                     problems.append(f"{path.relative_to(site.resolve())} loads {link}")
                 continue
             target = (path.parent / unquote(url.path)).resolve() if url.path else path

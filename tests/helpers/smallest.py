@@ -1,6 +1,7 @@
-"""The smallest run of each benchmark: `python -m tests.helpers.smallest NAME FOLDER` runs one in an empty folder.
+"""Minimal runs of the benchmarks: `python -m tests.helpers.smallest NAME FOLDER` runs one in an empty folder.
 
-It shows that a benchmark still works; its figures mean nothing. To replace a constant that is not there is an error.
+A run shows that the benchmark still works; its figures have no meaning. Replacing a constant that does not exist is
+an error.
 """
 
 import os
@@ -23,13 +24,13 @@ Shrink = Callable[[ModuleType, Path], None]
 
 @dataclass(frozen=True)
 class Smallest:
-    """How a benchmark runs at its smallest size.
+    """Configuration of the minimal run of a benchmark.
 
     Attributes:
-        arguments: Of the command line; `FOLDER` is replaced by the folder.
-        constants: Constants of the module, and smaller values.
-        shrink: Makes smaller what is not a constant.
-        emulated: It needs namespaces or programs of robots.
+        arguments: Command-line arguments; `FOLDER` is replaced by the folder.
+        constants: Constants of the module, with smaller values.
+        shrink: Function that reduces the parts that are not constants.
+        emulated: True if the benchmark needs network namespaces or robot programs.
     """
 
     arguments: str = ""
@@ -41,10 +42,10 @@ class Smallest:
 LONGEST_S: Final = 600.0
 
 
-def run_module(*words: str) -> "subprocess.CompletedProcess[str]":
-    """Run a module of the clone as a program."""
+def run_module(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    """Run a Python module of the repository as a program."""
     return subprocess.run(
-        (sys.executable, "-m", *words),
+        (sys.executable, "-m", *arguments),
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -55,37 +56,37 @@ def run_module(*words: str) -> "subprocess.CompletedProcess[str]":
 
 
 def run_smallest(name: str, folder: Path) -> None:
-    """Run a benchmark at its smallest size in an empty folder.
+    """Run a benchmark with its minimal configuration in an empty folder.
 
     Raises:
-        AssertionError: It failed, or it printed no figures.
+        AssertionError: The benchmark failed or printed no figures.
     """
-    done = run_module("tests.helpers.smallest", name, str(folder))
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert any(character.isdigit() for character in done.stdout), "a benchmark prints figures"
+    completed = run_module("tests.helpers.smallest", name, str(folder))
+    assert completed.returncode == 0, completed.stderr[-3000:]
+    assert any(character.isdigit() for character in completed.stdout), "a benchmark prints figures"
 
 
 def replace(module: ModuleType, name: str, value: object) -> None:
     """Replace a constant of a module.
 
     Raises:
-        AttributeError: It has no such constant.
+        AttributeError: The module has no such constant.
     """
     getattr(module, name)
     setattr(module, name, value)
 
 
 class StandInNs3(Ns3):
-    """Prints what ns-3 could print: CI has no ns-3."""
+    """Prints plausible output of ns-3, which is not installed in CI."""
 
     def __call__(self, **options: object) -> str:
-        """Return a plausible output of `ns3_link.cc`."""
-        what = options.get("what")
-        if what == "errors":
+        """Plausible output of `ns3_link.cc`."""
+        output = options.get("what")
+        if output == "errors":
             return "\n".join(f"{ratio_db} {1.0 if ratio_db < 15 else 0.0}" for ratio_db in range(0, 40, 5))
-        if what == "udp":
+        if output == "udp":
             return "2.0 0.0\n"
-        if what == "tcp":
+        if output == "tcp":
             return "1000000 window 14480\n2000000 sent 0\n20.0 0\n"
         return "20.0\n"
 
@@ -95,7 +96,7 @@ def _without_ns3(module: ModuleType, folder: Path) -> None:
 
 
 def _one_link(module: ModuleType, folder: Path) -> None:
-    """Let `cosim_vs_ns3` measure a single link, twice."""
+    """Reduce `cosim_vs_ns3` to two measurements of a single link."""
     _without_ns3(module, folder)
     replace(module, "DISTANCES_M", {("g54", False): (10,)})
     replace(module, "SECONDS", 0.2)
@@ -104,18 +105,18 @@ def _one_link(module: ModuleType, folder: Path) -> None:
 
 
 def _few_losses(module: ModuleType, folder: Path) -> None:
-    """Let `tcp_vs_ns3` look at one pattern and one chance."""
+    """Reduce `tcp_vs_ns3` to one loss pattern and one loss probability."""
     _without_ns3(module, folder)
     replace(module, "PATTERNS", {"1 packet": module.PATTERNS["1 packet"]})
     replace(module, "CHANCES", {"2 % of data": (0.02, 0.0, 1.0)})
 
 
 def _stand_in_iw(module: ModuleType, folder: Path) -> None:
-    """Let `telemetry` find a program `iw` that does nothing, where there is none."""
+    """Provide a program `iw` that fails, for `telemetry` on machines without `iw`."""
     del module
-    program = folder / "iw"
-    program.write_text("#!/bin/sh\nexit 1\n", encoding="ascii")
-    program.chmod(0o755)
+    script = folder / "iw"
+    script.write_text("#!/bin/sh\nexit 1\n", encoding="ascii")
+    script.chmod(0o755)
     os.environ["PATH"] += f":{folder}"
 
 
@@ -124,13 +125,13 @@ def _two_commands(module: ModuleType, folder: Path) -> None:
     replace(module, "COMMANDS", {name: module.COMMANDS[name] for name in ("--version", "columns")})
 
 
-def _two_ways(module: ModuleType, folder: Path) -> None:
+def _two_bridge_paths(module: ModuleType, folder: Path) -> None:
     del folder
     replace(module, "WAYS", tuple(way for way in module.WAYS if way.name in {"ros1 plain", "ros1 bridged to dds"}))
 
 
 def _slow_iperf(module: ModuleType, folder: Path) -> None:
-    """Let iperf3 send slowly: at full rate it keeps both cores busy."""
+    """Limit the rate of iperf3, which would otherwise load all cores."""
     del folder
     at_full_rate = module.iperf
     replace(module, "iperf", lambda near, seconds, *options: at_full_rate(near, seconds, *options, "-b", "5M"))
@@ -154,12 +155,14 @@ def _one_layer(module: ModuleType, folder: Path) -> None:
 
 
 def _one_setting(module: ModuleType, folder: Path) -> None:
-    """Let `zenoh_images` measure one pair of each kind in a lab of two robots."""
+    """Reduce `zenoh_images` to one pair of each kind in a lab of two robots."""
     lab = folder / "small-lab"
     lab.mkdir()
     text = (module.LAB / "fieldkit.yaml").read_text(encoding="utf-8")
-    kept = [line for line in text.splitlines() if not line.lstrip().startswith(("rover-2", "rover-3", "rover-4"))]
-    small = changed("\n".join(kept) + "\n", ", rover2: rover-2, rover3: rover-3, rover4: rover-4", "")
+    site_lines = [
+        line for line in text.splitlines() if not line.lstrip().startswith(("rover-2", "rover-3", "rover-4"))
+    ]
+    small = changed("\n".join(site_lines) + "\n", ", rover2: rover-2, rover3: rover-3, rover4: rover-4", "")
     (lab / "fieldkit.yaml").write_text(small, encoding="utf-8")
     replace(module, "LAB", lab)
     replace(module, "SUBSCRIBER", ("base", "10.42.0.2"))
@@ -167,7 +170,7 @@ def _one_setting(module: ModuleType, folder: Path) -> None:
 
 
 def _one_trial(module: ModuleType, folder: Path) -> None:
-    """Let `field_shape` run one trial of a repeat for each protocol."""
+    """Reduce `field_shape` to one trial of one repeat for each protocol."""
     lab = folder / "lawn"
     shutil.copytree(module.LAB, lab)
     path = lab / "masterless-los.yaml"
@@ -205,13 +208,15 @@ steps:
 
 
 def _one_stream(module: ModuleType, folder: Path) -> None:
-    """Let `middleware` run one short stream between two robots."""
+    """Reduce `middleware` to one short stream between two robots."""
     lab = folder / "small-lab"
     (lab / "procedures").mkdir(parents=True)
     text = (module.LAB / "fieldkit.yaml").read_text(encoding="utf-8")
-    kept = [line for line in text.splitlines() if not line.lstrip().startswith(("rover-2", "rover-3", "rover-4"))]
+    site_lines = [
+        line for line in text.splitlines() if not line.lstrip().startswith(("rover-2", "rover-3", "rover-4"))
+    ]
     small = changed(
-        "\n".join(kept) + "\n",
+        "\n".join(site_lines) + "\n",
         ", rover2: rover-2, rover3: rover-3, rover4: rover-4",
         "",
         "ros: debian",
@@ -228,7 +233,7 @@ def _one_stream(module: ModuleType, folder: Path) -> None:
 
 _ROW: Final = """\
 name: mesh_small
-summary: Three in a row, one of which is away for a second
+summary: Three robots in a row, one of which is disconnected for a second
 scenario: los
 topology: masterless
 protocols: [udp]
@@ -249,7 +254,7 @@ steps:
 
 
 def _short_row(module: ModuleType, folder: Path) -> None:
-    """Let `mesh` lose one robot of three for a second."""
+    """Reduce `mesh` to the loss of one of three robots for a second."""
     source = folder / "mesh"
     source.mkdir()
     shutil.copy(ROOT / "benchmarks" / "mesh" / "box.yaml", source)
@@ -257,12 +262,12 @@ def _short_row(module: ModuleType, folder: Path) -> None:
     replace(module, "HERE", folder)
     replace(module, "HELLOS_S", (1,))
     replace(module, "LAYOUTS", {"row": module.Layout("row of three", "mesh_small", "120m", ("first",))})
-    kept = [line for line in module.SITE.splitlines() if not line.strip().startswith(("r4", "r5", "r6", "r7"))]
-    replace(module, "SITE", "\n".join(kept) + "\n")
+    site_lines = [line for line in module.SITE.splitlines() if not line.strip().startswith(("r4", "r5", "r6", "r7"))]
+    replace(module, "SITE", "\n".join(site_lines) + "\n")
 
 
 def _short_detour(module: ModuleType, folder: Path) -> None:
-    """Let `mesh_losses` lose one robot of four."""
+    """Reduce `mesh_losses` to the loss of one of four robots."""
     del folder
     places = {"sender": (0, 0), "first": (60, -35), "left": (60, 35), "receiver": (120, 0)}
     detour = module.Detour("two hops beside two", places, ("first", "left"), fading=False)
@@ -273,7 +278,7 @@ def _short_detour(module: ModuleType, folder: Path) -> None:
 CASES: Final[Mapping[str, Smallest]] = {
     "aggregate": Smallest("--rounds 1 --tables 1 --rows 80"),
     "bridge": Smallest(
-        "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLES_S": 0.5}, shrink=_two_ways, emulated=True
+        "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLES_S": 0.5}, shrink=_two_bridge_paths, emulated=True
     ),
     "cosim_discovery": Smallest("", {"COUNT": 3, "SEEDS": (1,), "ROWS": ((0.0, None), (0.1, "g6"))}),
     "cosim_speed": Smallest("--rounds 1 --seconds 0.2 --robots 2 --scenarios convoy"),
@@ -299,11 +304,11 @@ CASES: Final[Mapping[str, Smallest]] = {
     "trial_overhead": Smallest("--rounds 1 --record 1s --round-trips 0s", emulated=True),
     "zenoh_images": Smallest("--rounds 1", {"SAMPLES": 2, "BYTES": 10_000}, shrink=_one_setting, emulated=True),
 }
-"""Each benchmark that runs here."""
+"""The minimal run of each benchmark that the tests run."""
 
 
 def main() -> int:
-    """Run a benchmark at its smallest size; return its exit code."""
+    """Run a benchmark with its minimal configuration; return its exit code."""
     name, folder = sys.argv[1], Path(sys.argv[2]).resolve()
     case = CASES[name]
     module = import_module(f"benchmarks.{name}")

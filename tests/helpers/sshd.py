@@ -1,4 +1,4 @@
-"""A real OpenSSH server on loopback, with keys made on the fly."""
+"""A real OpenSSH server on loopback with newly generated keys."""
 
 import random
 import shutil
@@ -17,7 +17,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.remote.ssh import SshShell
 
 UP_S: Final = 60.0
-"""How long a server may take to answer first, on a machine with much else to do."""
+"""Time limit for the first answer of a server on a busy machine."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +25,11 @@ class Server:
     """A running sshd.
 
     Attributes:
-        port: Its port on loopback.
-        host_key: Its public key.
-        private_key: A key that it accepts.
-        folder: Where its files are.
-        pid: Its process.
+        port: Port on loopback.
+        host_key: Public host key.
+        private_key: A key that the server accepts.
+        folder: Folder with its files.
+        pid: Process id.
     """
 
     port: int
@@ -57,10 +57,10 @@ def make_key(path: Path, kind: str = "ed25519") -> str:
 
 
 def free_port() -> int:
-    """Return a port that nothing uses, and that the kernel gives to nobody who asks for any port."""
-    lowest_given, _ = map(int, Path("/proc/sys/net/ipv4/ip_local_port_range").read_text(encoding="ascii").split())
+    """An unused port outside the ephemeral range, which the kernel does not assign automatically."""
+    first_ephemeral, _ = map(int, Path("/proc/sys/net/ipv4/ip_local_port_range").read_text(encoding="ascii").split())
     while True:
-        port = random.SystemRandom().randrange(10_000, max(lowest_given, 30_000))
+        port = random.SystemRandom().randrange(10_000, max(first_ephemeral, 30_000))
         with socket.socket() as probe:
             try:
                 probe.bind(("", port))
@@ -80,15 +80,15 @@ def sshd(folder: Path, *, within: Sequence[str] = (), **options: str) -> Iterato
     """Run sshd on loopback with its files in `folder`.
 
     Args:
-        folder: Gets its keys and log.
+        folder: Receives the keys and the log.
         within: Words before its command line.
-        options: Of sshd_config, beside those that it needs here.
+        options: Options of sshd_config in addition to the required ones.
     """
     host_key = make_key(folder / "host")
     (folder / "authorized_keys").write_text(make_key(folder / "client"), encoding="ascii")
     program = shutil.which("sshd", path="/usr/sbin:/usr/bin")
     assert program is not None
-    Path("/run/sshd").mkdir(exist_ok=True)  # its privilege separation folder, which Debian's service would make
+    Path("/run/sshd").mkdir(exist_ok=True)  # privilege separation folder, otherwise created by Debian's service
     port = free_port()
     options = {
         "ListenAddress": f"127.0.0.1:{port}",
@@ -102,21 +102,21 @@ def sshd(folder: Path, *, within: Sequence[str] = (), **options: str) -> Iterato
     argv += [f"-o{name}={value}" for name, value in options.items()]
     with (folder / "log").open("wb") as log, subprocess.Popen(argv, stderr=log) as process:
         try:
-            wait_until(lambda: answers(port), Deadline.after(UP_S))
+            wait_until(lambda: is_ssh_server(port), Deadline.after(UP_S))
             yield Server(port, host_key, (folder / "client").read_text(encoding="ascii"), folder, process.pid)
         finally:
             process.terminate()
 
 
-def answers(port: int) -> bool:
+def is_ssh_server(port: int) -> bool:
     try:
-        with socket.create_connection(("127.0.0.1", port), timeout=1) as link:
-            return link.recv(4) == b"SSH-"
+        with socket.create_connection(("127.0.0.1", port), timeout=1) as connection:
+            return connection.recv(4) == b"SSH-"
     except OSError:
         return False
 
 
 def wait_until(condition: Callable[[], bool], deadline: Deadline) -> None:
     while not condition():
-        assert not deadline.expired, "the condition did not come true in time"
+        assert not deadline.expired, "the condition did not become true in time"
         time.sleep(0.01)

@@ -1,4 +1,4 @@
-"""Stations on one channel whose strengths are set by hand, and saturated traffic over them."""
+"""Stations on one radio channel with manually set signal strengths, and saturated traffic between them."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ HEADERS_BYTES = 28
 
 
 class ByHand(RadioChannel):
-    """Each hears each as strongly, but for the pairs in `deaf`, which do not hear each other at all."""
+    """A channel where all stations receive each other equally well, except the pairs in `deaf`."""
 
     def __init__(self, names: Sequence[str], mode: WifiMode, *, deaf: Sequence[tuple[str, str]] = ()) -> None:
         self.names = tuple(names)
@@ -52,7 +52,7 @@ def saturate(
     seed: int = 1,
     log: list[TransmissionAttempt] | None = None,
 ) -> dict[str, float]:
-    """Return the goodput of each sender in bit/s, of UDP payload; each always has some packets waiting."""
+    """UDP goodput of each sender in bit/s; each sender always has packets in its queue."""
     wifi: Wifi[str] = Wifi(channel, seed)
     wifi.log_attempts(None if log is None else log.append)
     wifi.relay(relay)

@@ -1,7 +1,7 @@
-"""Every output of fieldkit on the stored trials, as texts, to compare one version of the code with another.
+"""All outputs of fieldkit for the stored trials as texts, for comparisons between versions of the code.
 
-Run as a program by the Python of the version to record: `python -P tests/helpers/stored_trials.py FOLDER` writes the
-texts into FOLDER. It imports nothing of the tests, so any version can run it.
+Run this file with the Python of the version to record: `python -P tests/helpers/stored_trials.py FOLDER` writes the
+texts to FOLDER. It imports no test modules, so any version can run it.
 """
 
 import contextlib
@@ -30,13 +30,13 @@ STORED: Final = Path(__file__).resolve().parents[1] / "data" / "fieldkit" / "4"
 TRIALS: Final = STORED / "trials"
 OUTPUTS: Final = STORED / "outputs"
 
-_DRAWN: Final = frozenset(("style", "script", "svg"))
-"""Elements of the page whose text is no sentence: matplotlib's letters among them."""
+_SKIPPED_ELEMENTS: Final = frozenset(("style", "script", "svg"))
+"""Elements of the page whose text is not prose, such as the letters that matplotlib draws."""
 
 
 @contextlib.contextmanager
 def copied(folder: Path) -> Iterator[list[Path]]:
-    """Copy the stored trials to `folder`/trials, work there, and yield their relative paths in order of time."""
+    """Copy the stored trials to `folder`/trials, change to `folder`, and yield their relative paths by time."""
     shutil.copytree(TRIALS, folder / "trials")
     with contextlib.chdir(folder):
         yield sorted(Path("trials").iterdir())
@@ -45,7 +45,7 @@ def copied(folder: Path) -> Iterator[list[Path]]:
 def texts(trials: Sequence[Path]) -> Iterator[tuple[str, str]]:
     """Yield the name and text of each output; the working folder is that of `copied`.
 
-    `trials` is the lossless run, the lossy run, and others, as they are stored.
+    `trials` contains the lossless run, the lossy run, and others, in the order in which they are stored.
     """
     for form in ("csv", "json", "markdown", "latex"):
         yield f"aggregate.{form}", said("aggregate", "trials", "--format", form)
@@ -55,30 +55,30 @@ def texts(trials: Sequence[Path]) -> Iterator[tuple[str, str]]:
     said("export", "trials", "--format", "csv", "-o", "table.csv")
     yield "export.csv", Path("table.csv").read_text(encoding="utf-8")
     yield "mcap.json", _json({trial.name: _timeline(trial) for trial in trials})
-    made: list[contents.Contents] = []
+    recorded: list[contents.Contents] = []
     put_together = contents.put_together
 
-    def kept(*words: Any, **options: Any) -> contents.Contents:  # noqa: ANN401 (what it takes is its own affair)
-        made.append(put_together(*words, **options))
-        return made[-1]
+    def record_contents(*arguments: Any, **options: Any) -> contents.Contents:  # noqa: ANN401 (passed on unchanged)
+        recorded.append(put_together(*arguments, **options))
+        return recorded[-1]
 
-    with patch.object(contents, "put_together", kept):
+    with patch.object(contents, "put_together", record_contents):
         said("report", "trials", "-o", "report.html")
-    yield "report.txt", _words(Path("report.html").read_text(encoding="utf-8"))
-    yield "figures.json", _json(list(_figures(made[0])))
+    yield "report.txt", _page_text(Path("report.html").read_text(encoding="utf-8"))
+    yield "figures.json", _json(list(_figures(recorded[0])))
 
 
-def said(*words: str) -> str:
-    """Return what a command prints.
+def said(*arguments: str) -> str:
+    """The output of a command.
 
     Raises:
-        AssertionError: It failed.
+        AssertionError: The command failed.
     """
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out):
-        code = main(list(words))
-    assert code == 0, f"{words} ended with {code}"
-    return out.getvalue()
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
+        code = main(list(arguments))
+    assert code == 0, f"{arguments} exited with {code}"
+    return output.getvalue()
 
 
 def _json(value: object) -> str:
@@ -90,77 +90,84 @@ def _digest(value: object) -> str:
 
 
 def _timeline(trial: Path) -> dict[str, Any]:
-    """Return per topic of a trial's MCAP file its schema, times, and a digest of all messages."""
-    out = Path(f"{trial.name}.mcap")
-    said("export", str(trial), "--format", "mcap", "-o", str(out))
+    """Schema, times, and a digest of all messages for each topic of a trial's MCAP file."""
+    path = Path(f"{trial.name}.mcap")
+    said("export", str(trial), "--format", "mcap", "-o", str(path))
     topics: dict[str, list[Any]] = {}
-    about: dict[str, Any] = {}
-    with out.open("rb") as file:
+    descriptions: dict[str, Any] = {}
+    with path.open("rb") as file:
         reader = make_reader(file)
         for schema, channel, message in reader.iter_messages():
             assert schema is not None
-            about[channel.topic] = {
+            descriptions[channel.topic] = {
                 "schema": [schema.name, schema.encoding, _digest(json.loads(schema.data))],
                 "channel": [channel.message_encoding, dict(channel.metadata)],
             }
-            stamps = message.log_time, message.publish_time
-            topics.setdefault(channel.topic, []).append((*stamps, json.loads(message.data, parse_float=_float)))
-        kept = {one.name: dict(one.metadata) for one in reader.iter_metadata()}
-    found: dict[str, Any] = {
-        topic: about[topic]
-        | {"messages": len(each), "first_ns": each[0][0], "last_ns": each[-1][0], "sha256": _digest(each)}
-        for topic, each in sorted(topics.items())
+            times_ns = message.log_time, message.publish_time
+            topics.setdefault(channel.topic, []).append((*times_ns, json.loads(message.data, parse_float=_float)))
+        metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+    topic_summaries: dict[str, Any] = {
+        topic: descriptions[topic]
+        | {
+            "messages": len(topic_messages),
+            "first_ns": topic_messages[0][0],
+            "last_ns": topic_messages[-1][0],
+            "sha256": _digest(topic_messages),
+        }
+        for topic, topic_messages in sorted(topics.items())
     }
-    return {"metadata": kept, "topics": found}
+    return {"metadata": metadata, "topics": topic_summaries}
 
 
 def _float(text: str) -> float:
-    """Return a number in 12 digits: numpy adds up in another order where a processor has wider vectors."""
+    """A number with 12 digits: numpy sums in a different order on processors with wider vectors."""
     return float(f"{float(text):.12g}")
 
 
 class _Page(HTMLParser):
-    """Collects the texts and links of a page, a line each, and how long its bars are."""
+    """Collects the texts, links and bar lengths of a page, one per line."""
 
     def __init__(self) -> None:
         super().__init__()
         self.lines: list[str] = []
-        self._inside = 0
+        self._skipped_depth = 0
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        told = dict(attrs)
-        if tag in _DRAWN:
-            self._inside += 1
+        attributes = dict(attrs)
+        if tag in _SKIPPED_ELEMENTS:
+            self._skipped_depth += 1
         self.lines.extend(
-            f"[{name}] {told[name]}" for name in ("href", "aria-label", "title", "style") if told.get(name)
+            f"[{name}] {attributes[name]}"
+            for name in ("href", "aria-label", "title", "style")
+            if attributes.get(name)
         )
 
     def handle_endtag(self, tag: str) -> None:
-        if tag in _DRAWN:
-            self._inside -= 1
+        if tag in _SKIPPED_ELEMENTS:
+            self._skipped_depth -= 1
 
     def handle_data(self, data: str) -> None:
-        if not self._inside and data.strip():
+        if not self._skipped_depth and data.strip():
             self.lines.append(" ".join(data.split()))
 
 
-def _words(page: str) -> str:
-    """Return what a reader reads on a page, without the version that made it."""
+def _page_text(page: str) -> str:
+    """The visible text of a page, without the version of fieldkit."""
     parser = _Page()
     parser.feed(page)
     lines = [re.sub(r"(fieldkit) \d\S*", r"\1 VERSION", line) for line in parser.lines]
     return "\n".join(lines) + "\n"
 
 
-def _figures(made: contents.Contents) -> Iterator[dict[str, Any]]:
-    """Yield each chart of the report: its words, the number of values of each panel, and a digest of them."""
-    for section in (*made.against_distance, *made.sections):
+def _figures(report_contents: contents.Contents) -> Iterator[dict[str, Any]]:
+    """Yield each chart of the report: its texts, the count and sum of its values, and a digest of the chart."""
+    for section in (*report_contents.against_distance, *report_contents.sections):
         for chart in section.charts:
             plain = _plain(chart)
-            numbers = [one for one in _leaves(plain) if isinstance(one, float)]
+            numbers = [leaf for leaf in _leaves(plain) if isinstance(leaf, float)]
             yield {
                 "section": section.title,
-                "words": [one for one in _leaves(plain) if isinstance(one, str)],
+                "words": [leaf for leaf in _leaves(plain) if isinstance(leaf, str)],
                 "numbers": len(numbers),
                 "sum": float(f"{sum(numbers):.9g}"),
                 "sha256": _digest(plain),
@@ -168,24 +175,25 @@ def _figures(made: contents.Contents) -> Iterator[dict[str, Any]]:
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 (whatever a chart is made of)
-    """Return lists, texts and numbers: no field names, and 9 digits, so that neither naming nor a processor shows."""
+    """Lists, texts and numbers with 9 digits, without field names, so that names and processors have no effect."""
+
     if dataclasses.is_dataclass(value):
         return [_plain(getattr(value, field.name)) for field in dataclasses.fields(value)]
     if isinstance(value, Mapping):
-        return [[_plain(key), _plain(one)] for key, one in value.items()]
+        return [[_plain(key), _plain(item)] for key, item in value.items()]
     if isinstance(value, np.ndarray | np.generic):
         return _plain(value.tolist())
     if isinstance(value, int | float):
         return float(f"{value:.9g}")
     if isinstance(value, Path | Enum):
         return value.name
-    return value if isinstance(value, str | None) else [_plain(one) for one in value]
+    return value if isinstance(value, str | None) else [_plain(item) for item in value]
 
 
 def _leaves(value: Any) -> Iterator[str | float | None]:  # noqa: ANN401 (what `_plain` returns)
     if isinstance(value, list):
-        for one in value:
-            yield from _leaves(one)
+        for item in value:
+            yield from _leaves(item)
     else:
         yield value
 

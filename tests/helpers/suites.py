@@ -1,4 +1,4 @@
-"""Suites of tests in folders of their own, run by pytest as a command, as those who write them do."""
+"""Test suites in separate folders, run by the pytest command as their authors would."""
 
 import os
 import subprocess
@@ -24,13 +24,13 @@ LIMIT_S = 300.0
 
 @dataclass(frozen=True)
 class SuiteRun:
-    """A finished run of pytest.
+    """A completed run of pytest.
 
     Attributes:
-        code: Its exit code.
-        said: What it printed.
-        ended: How each test ended, `passed`, `failure` or `error`.
-        properties: What was told of each test beside, by name of the property.
+        code: Exit code.
+        said: Output.
+        ended: Result of each test: `passed`, `failure` or `error`.
+        properties: Recorded properties of each test, as pairs of name and value.
     """
 
     code: int
@@ -39,18 +39,18 @@ class SuiteRun:
     properties: dict[str, list[tuple[str, str]]]
 
 
-def command(*words: str, python: str = sys.executable) -> tuple[str, ...]:
-    """Return the command that runs the tests of the current folder."""
-    return (python, "-m", "pytest", "-p", "no:cacheprovider", *words)
+def command(*arguments: str, python: str = sys.executable) -> tuple[str, ...]:
+    """The command that runs the tests of the current folder."""
+    return (python, "-m", "pytest", "-p", "no:cacheprovider", *arguments)
 
 
 def environment() -> dict[str, str]:
-    """Return the environment without what an outer pytest has put there."""
+    """The environment without the variables of an outer pytest."""
     return {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
 
 
 def write(folder: Path, *, site: str | None = SITE, **files: str) -> None:
-    """Write files of tests, by their names without `.py`, and a site file."""
+    """Write test files, given by their names without `.py`, and a site file."""
     if site is not None:
         (folder / "fieldkit.yaml").write_text(site, encoding="utf-8")
     for name, text in files.items():
@@ -62,12 +62,12 @@ def run(folder: Path, *words: str, python: str = sys.executable, beside: Sequenc
 
     Args:
         folder: The folder.
-        words: More words of the command.
+        words: Additional arguments of pytest.
         python: The interpreter.
-        beside: Folders that it finds modules in.
+        beside: Folders in which the interpreter finds modules.
     """
     report = folder / "junit.xml"
-    done = subprocess.run(
+    completed = subprocess.run(
         command(f"--rootdir={folder}", f"--junitxml={report}", *words, python=python),
         cwd=folder,
         env=environment() | {"PYTHONPATH": os.pathsep.join(map(str, beside))},
@@ -82,7 +82,9 @@ def run(folder: Path, *words: str, python: str = sys.executable, beside: Sequenc
     properties: dict[str, list[tuple[str, str]]] = {}
     for case in ET.parse(report).iter("testcase") if report.exists() else ():
         name = case.attrib["name"]
-        ended[name] = next((one.tag for one in case if one.tag in {"failure", "error", "skipped"}), "passed")
-        properties[name] = [(one.attrib["name"], one.attrib["value"]) for one in case.iter("property")]
+        ended[name] = next(
+            (element.tag for element in case if element.tag in {"failure", "error", "skipped"}), "passed"
+        )
+        properties[name] = [(element.attrib["name"], element.attrib["value"]) for element in case.iter("property")]
     report.unlink(missing_ok=True)
-    return SuiteRun(done.returncode, done.stdout, ended, properties)
+    return SuiteRun(completed.returncode, completed.stdout, ended, properties)

@@ -1,4 +1,4 @@
-"""Trials as their tables alone: what aggregate and its like read."""
+"""Trials that consist only of their tables, the input of `aggregate` and similar commands."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from fieldkit.trial.columns import trial_columns
 
 
 class RepeatRow(dict[str, Any]):
-    """A row of trial.csv, its columns also as attributes; one that is missing is not there, as an attribute None."""
+    """A row of trial.csv, with columns also as attributes; a missing column has no key, and its attribute is None."""
 
     def __init__(self, **values: object) -> None:
         super().__init__({name: value for name, value in values.items() if value is not None})
@@ -30,7 +30,7 @@ COLUMNS = frozenset(column.name for column in trial_columns())
 
 
 def replace(row: RepeatRow, **changes: object) -> RepeatRow:
-    """Return the row with other values; None takes one out."""
+    """The row with changed values; None removes a value."""
     return RepeatRow(**{**row, **changes})
 
 
@@ -64,38 +64,44 @@ COMPARABLE = replace(
     procedure_sha256="bbbb",
     code_sha256="cccc",
 )
-"""A row that says all that `compare` wants to know."""
+"""A row with all columns that `compare` needs."""
 
 
 def repeats(row: RepeatRow, count: int) -> list[RepeatRow]:
-    """Return `count` valid repeats like `row`, each with numbers of its own."""
+    """`count` valid repeats like `row`, with different measured values."""
     return [
-        replace(row, repeat=1 + n, ip_packets_received=206 - n, ip_loss=(10 + n) / 216, transfer_s=1.0 + 0.01 * n)
-        for n in range(count)
+        replace(
+            row,
+            repeat=1 + index,
+            ip_packets_received=206 - index,
+            ip_loss=(10 + index) / 216,
+            transfer_s=1.0 + 0.01 * index,
+        )
+        for index in range(count)
     ]
 
 
 def bursty(row: RepeatRow, count: int, *, seed: int, loss: float = 0.1) -> list[RepeatRow]:
-    """Return valid repeats like `row` whose losses vary from repeat to repeat, as bursts make them, about `loss`."""
+    """Valid repeats like `row` with a mean loss of `loss` that varies between repeats, as with burst losses."""
     random = np.random.default_rng(seed)
-    arrived = random.binomial(216, 1 - random.beta(2, 2 / loss - 2, count)).tolist()
+    received_packets = random.binomial(216, 1 - random.beta(2, 2 / loss - 2, count)).tolist()
     times_s = random.lognormal(0.0, 0.2, (count, 2)).tolist()
     return [
         replace(
             row,
-            repeat=1 + n,
+            repeat=1 + index,
             ip_packets_sent=216,
-            ip_packets_received=arrived[n],
-            ip_loss=1 - arrived[n] / 216,
-            rtt_median_s=0.01 * times_s[n][0],
-            transfer_s=times_s[n][1],
+            ip_packets_received=received_packets[index],
+            ip_loss=1 - received_packets[index] / 216,
+            rtt_median_s=0.01 * times_s[index][0],
+            transfer_s=times_s[index][1],
         )
-        for n in range(count)
+        for index in range(count)
     ]
 
 
 def parsed(rows_of: Sequence[Mapping[str, Value]]) -> Repeats:
-    """Return rows as they are read from the trial.csv that they make, each cell by itself."""
+    """Rows as parsed from the trial.csv that contains them."""
     numbers: dict[str, Numbers] = {}
     texts: dict[str, Texts] = {}
     for column in trial_columns():
@@ -111,7 +117,7 @@ def parsed(rows_of: Sequence[Mapping[str, Value]]) -> Repeats:
 
 
 def write(folder: Path, repeats_of: Sequence[RepeatRow], name: str = "trial.csv") -> Path:
-    """Write a table of repeats into a folder, which is made; return the table's path."""
+    """Write a table of repeats to a new folder; return the path of the table."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / name
     path.write_text(rows.to_csv(repeats_of, trial_columns()), encoding="utf-8")

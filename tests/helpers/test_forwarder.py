@@ -1,4 +1,4 @@
-"""The tests' own forwarder: what it calls a dead link is dead down to the acknowledgements."""
+"""Tests of the tests' forwarder; a cut link does not even send acknowledgements."""
 
 import socket
 import threading
@@ -9,30 +9,32 @@ import pytest
 
 from tests.helpers.forwarder import Forwarder
 
-LONG_S = 60.0
-DATA = bytes(range(256)) * 80_000  # more than all socket buffers on the way hold
+TIMEOUT_S = 60.0
+DATA = bytes(range(256)) * 80_000  # more than all socket buffers on the path hold
 
 
 @pytest.fixture
 def server() -> Iterator[socket.socket]:
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        listener.settimeout(LONG_S)
+        listener.settimeout(TIMEOUT_S)
         yield listener
 
 
 @pytest.fixture
 def links(server: socket.socket) -> Iterator[Forwarder[str]]:
-    with Forwarder({"robot": lambda timeout_s: socket.create_connection(server.getsockname(), timeout_s)}) as made:
-        yield made
+    with Forwarder(
+        {"robot": lambda timeout_s: socket.create_connection(server.getsockname(), timeout_s)}
+    ) as forwarder:
+        yield forwarder
 
 
 @pytest.fixture
 def ends(links: Forwarder[str], server: socket.socket) -> Iterator[tuple[socket.socket, socket.socket]]:
     with ExitStack() as stack:
-        near = stack.enter_context(links.reach("robot", LONG_S))
-        far = stack.enter_context(server.accept()[0])
-        far.settimeout(LONG_S)
-        yield near, far
+        client = stack.enter_context(links.reach("robot", TIMEOUT_S))
+        server_end = stack.enter_context(server.accept()[0])
+        server_end.settimeout(TIMEOUT_S)
+        yield client, server_end
 
 
 def receive_all(end: socket.socket) -> bytes:
@@ -40,78 +42,80 @@ def receive_all(end: socket.socket) -> bytes:
         return file.read()
 
 
-def test_both_ways_arrive_whole_and_each_end_is_passed_on(ends: tuple[socket.socket, socket.socket]) -> None:
-    near, far = ends
+def test_both_directions_and_both_stream_ends_are_forwarded(ends: tuple[socket.socket, socket.socket]) -> None:
+    client, server_end = ends
 
-    def answer() -> None:
-        far.sendall(receive_all(far))
-        far.shutdown(socket.SHUT_WR)
+    def echo() -> None:
+        server_end.sendall(receive_all(server_end))
+        server_end.shutdown(socket.SHUT_WR)
 
-    thread = threading.Thread(target=answer)
+    thread = threading.Thread(target=echo)
     thread.start()
-    near.sendall(DATA)
-    near.shutdown(socket.SHUT_WR)
-    assert receive_all(near) == DATA
+    client.sendall(DATA)
+    client.shutdown(socket.SHUT_WR)
+    assert receive_all(client) == DATA
     thread.join()
 
 
-def test_a_dead_link_acknowledges_nothing(links: Forwarder[str], ends: tuple[socket.socket, socket.socket]) -> None:
-    near, _ = ends
-    near.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 300)
-    links.cut("robot")
-    near.sendall(b"x")
-    with pytest.raises(TimeoutError, match="Connection timed out"):
-        near.recv(1)
-
-
-def test_a_dead_link_passes_no_end_on_and_hangs_new_connections(
+def test_a_cut_link_sends_no_acknowledgements(
     links: Forwarder[str], ends: tuple[socket.socket, socket.socket]
 ) -> None:
-    near, far = ends
+    client, _ = ends
+    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 300)
     links.cut("robot")
-    far.close()
-    near.settimeout(0.3)
+    client.sendall(b"x")
+    with pytest.raises(TimeoutError, match="Connection timed out"):
+        client.recv(1)
+
+
+def test_a_cut_link_forwards_no_stream_end_and_new_connections_hang(
+    links: Forwarder[str], ends: tuple[socket.socket, socket.socket]
+) -> None:
+    client, server_end = ends
+    links.cut("robot")
+    server_end.close()
+    client.settimeout(0.3)
     with pytest.raises(TimeoutError):
-        near.recv(1)
+        client.recv(1)
     with pytest.raises(TimeoutError):
         links.reach("robot", timeout_s=0.3)
 
 
-def test_a_stream_goes_on_where_it_stood_when_the_link_comes_back(
+def test_a_stream_continues_when_the_link_is_restored(
     links: Forwarder[str], ends: tuple[socket.socket, socket.socket]
 ) -> None:
-    near, far = ends
-    thread = threading.Thread(target=far.sendall, args=(DATA,))
+    client, server_end = ends
+    thread = threading.Thread(target=server_end.sendall, args=(DATA,))
     thread.start()
-    begun = bytearray(near.recv(1))
+    received = bytearray(client.recv(1))
     links.cut("robot")
-    near.settimeout(0.2)
+    client.settimeout(0.2)
     with suppress(TimeoutError):
-        while data := near.recv(1 << 16):  # what was under way
-            begun += data
-    assert len(begun) < len(DATA)
+        while data := client.recv(1 << 16):  # data in transit
+            received += data
+    assert len(received) < len(DATA)
     links.restore("robot")
-    near.settimeout(LONG_S)
-    while len(begun) < len(DATA):
-        begun += near.recv(1 << 16)
-    assert begun == DATA
+    client.settimeout(TIMEOUT_S)
+    while len(received) < len(DATA):
+        received += client.recv(1 << 16)
+    assert received == DATA
     thread.join()
 
 
-def test_a_dropped_stream_is_reset_and_a_new_one_carried(
+def test_a_dropped_stream_is_reset_and_a_new_one_is_forwarded(
     links: Forwarder[str], ends: tuple[socket.socket, socket.socket], server: socket.socket
 ) -> None:
-    near, far = ends
+    client, server_end = ends
     links.drop("robot")
-    for end in (near, far):
+    for end in (client, server_end):
         with pytest.raises(ConnectionResetError):
             end.recv(1)
-    with links.reach("robot", LONG_S) as again, server.accept()[0] as there:
-        again.sendall(b"x")
-        assert there.recv(1) == b"x"
+    with links.reach("robot", TIMEOUT_S) as new_client, server.accept()[0] as new_server_end:
+        new_client.sendall(b"x")
+        assert new_server_end.recv(1) == b"x"
 
 
-def test_a_far_side_that_is_not_there_resets(links: Forwarder[str], server: socket.socket) -> None:
+def test_an_unreachable_far_side_resets_the_stream(links: Forwarder[str], server: socket.socket) -> None:
     server.close()
-    with pytest.raises(ConnectionResetError), links.reach("robot", LONG_S) as near:
-        near.recv(1)
+    with pytest.raises(ConnectionResetError), links.reach("robot", TIMEOUT_S) as client:
+        client.recv(1)

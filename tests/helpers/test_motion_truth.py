@@ -1,4 +1,4 @@
-"""Times from motion as the lab knows it, on courses whose times are known, and what contradicts an expectation."""
+"""Tests of times from ground-truth motion, on courses with known times, and of the check against expectations."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +19,7 @@ FLYING = MotionCell(Craft.COPTER, (Party.PILOT,), Blow.KILL, Moment.FLYING)
 def course(
     speed_m_s: Callable[[float], float], rises_m_s: Callable[[float], float] = lambda _: 0.0
 ) -> list[MotionSample]:
-    """Return 20 s of motion to the east, from 3 m up, integrated in steps of 10 ms."""
+    """20 s of motion to the east, starting 3 m above the ground, integrated in steps of 10 ms."""
     samples, east_m, up_m = [], 0.0, 3.0
     for step in range(2000):
         at_s = step / 100
@@ -30,31 +30,31 @@ def course(
     return samples
 
 
-def test_a_robot_that_brakes_has_stopped_when_it_stands_for_a_while() -> None:
-    drives = course(lambda at_s: 0.6 if at_s < 5 or 7 <= at_s < 7.5 else 0.0)
-    assert stopped_s(drives, 4.0) == pytest.approx(1.0, abs=0.02)
-    assert stopped_s(drives, 4.0, 3.0) == pytest.approx(3.5, abs=0.02), "it was stationary for 2 s only"
-    assert moved_again_m(drives, 5.5) == pytest.approx(0.3, abs=0.02)
-    assert moved_again_m(drives, 8.0) == 0.0
+def test_a_robot_has_stopped_once_it_is_stationary_for_the_given_time() -> None:
+    samples = course(lambda at_s: 0.6 if at_s < 5 or 7 <= at_s < 7.5 else 0.0)
+    assert stopped_s(samples, 4.0) == pytest.approx(1.0, abs=0.02)
+    assert stopped_s(samples, 4.0, 3.0) == pytest.approx(3.5, abs=0.02), "it was stationary for 2 s only"
+    assert moved_again_m(samples, 5.5) == pytest.approx(0.3, abs=0.02)
+    assert moved_again_m(samples, 8.0) == 0.0
 
 
-def test_one_that_drives_on_has_not_stopped() -> None:
+def test_a_robot_that_continues_to_drive_has_not_stopped() -> None:
     assert stopped_s(course(lambda _: 0.6), 4.0) is None
-    crawls = course(lambda at_s: 0.6 if at_s < 5 else 0.1)
-    assert stopped_s(crawls, 4.0) is None
+    slow = course(lambda at_s: 0.6 if at_s < 5 else 0.1)
+    assert stopped_s(slow, 4.0) is None
 
 
 def test_a_turn_on_the_spot_is_motion() -> None:
-    turns = [replaced._replace(turn_rad_s=0.5, heading_rad=0.5 * replaced.at_s) for replaced in course(lambda _: 0.0)]
-    assert stopped_s(turns, 0.0) is None
-    assert moved_again_m(turns, 19.0) == pytest.approx(0.25, abs=0.01)
+    turning = [sample._replace(turn_rad_s=0.5, heading_rad=0.5 * sample.at_s) for sample in course(lambda _: 0.0)]
+    assert stopped_s(turning, 0.0) is None
+    assert moved_again_m(turning, 19.0) == pytest.approx(0.25, abs=0.01)
 
 
 def test_a_drone_descends_and_is_on_the_ground() -> None:
-    lands = course(lambda _: 0.0, lambda at_s: -0.5 if at_s >= 6 else 0.0)
-    assert descended_s(lands, 4.0) == pytest.approx(2.0, abs=0.02)
-    assert grounded_s(lands, 4.0) == pytest.approx(8.0, abs=0.05)
-    assert grounded_s(course(lambda _: 0.0), 4.0) is None, "it hovers"
+    landing = course(lambda _: 0.0, lambda at_s: -0.5 if at_s >= 6 else 0.0)
+    assert descended_s(landing, 4.0) == pytest.approx(2.0, abs=0.02)
+    assert grounded_s(landing, 4.0) == pytest.approx(8.0, abs=0.05)
+    assert grounded_s(course(lambda _: 0.0), 4.0) is None, "the drone hovers"
     assert descended_s(course(lambda _: 1.0), 4.0) is None
 
 
@@ -62,14 +62,14 @@ GOOD = MotionOutcome(OUT.name, 1, begins_s=2.2, farthest_m=5.0)
 LANDED = MotionOutcome(FLYING.name, 1, begins_s=1.5, ends_s=9.0, farthest_m=5.0, disarmed=True, alarm_s=2.0)
 
 
-def test_what_is_within_its_bounds_is_no_problem() -> None:
+def test_an_outcome_within_its_limits_has_no_problems() -> None:
     assert problems(ROUTED, replace(LANDED, link_lost=True)) == []
     assert problems(OUT, GOOD) == []
     assert problems(FLYING, LANDED) == []
 
 
 @pytest.mark.parametrize(
-    ("cell", "seen", "why"),
+    ("cell", "outcome", "message"),
     [
         (OUT, replace(GOOD, begins_s=None), "never"),
         (OUT, replace(GOOD, begins_s=20.0), "stops after 20.0 s"),
@@ -85,22 +85,24 @@ def test_what_is_within_its_bounds_is_no_problem() -> None:
         (ROUTED, replace(LANDED, link_lost=None), "was not lost"),
     ],
 )
-def test_what_is_beyond_is_one(cell: MotionCell, seen: MotionOutcome, why: str) -> None:
-    assert any(why in problem for problem in problems(cell, seen))
+def test_an_outcome_beyond_a_limit_has_a_problem(cell: MotionCell, outcome: MotionOutcome, message: str) -> None:
+    assert any(message in problem for problem in problems(cell, outcome))
 
 
-def test_each_party_and_each_pair_is_hit_in_each_phase() -> None:
+def test_the_cells_cover_each_party_and_each_pair() -> None:
     singles = {(cell.craft, *cell.parties, cell.moment) for cell in CELLS if len(cell.parties) == 1}
     assert (Craft.ROVER, Party.AGENT, Moment.BACK) in singles
     assert (Craft.PX4, Party.GUARD, Moment.LANDING) in singles
     pairs = {frozenset(cell.parties) for cell in CELLS if cell.craft is Craft.COPTER and len(cell.parties) == 2}
-    on_drone = (Party.PILOT, Party.GUARD, Party.SERVER, Party.ROUTER)
-    assert pairs >= {frozenset({one, other}) for one in on_drone for other in on_drone if one is not other}
+    drone_parties = (Party.PILOT, Party.GUARD, Party.SERVER, Party.ROUTER)
+    assert pairs >= {
+        frozenset({first, second}) for first in drone_parties for second in drone_parties if first is not second
+    }
     assert len({cell.name for cell in CELLS}) == len(CELLS)
     assert all(expected(cell).does for cell in CELLS)
 
 
-def test_cells_are_chosen_by_name() -> None:
+def test_cells_are_selected_by_name() -> None:
     assert [cell.name for cell in chosen("rover/agent/kill/*")] == [
         f"rover/agent/kill/{moment}" for moment in ("waiting", "out", "there", "back")
     ]
@@ -109,9 +111,9 @@ def test_cells_are_chosen_by_name() -> None:
 
 
 def test_a_table_shows_the_median_and_the_phase_of_the_maximum() -> None:
-    again = MotionOutcome("rover/fieldkit/kill/back", 1, begins_s=2.6)
-    late = replace(again, begins_s=2.8, problems=("late",))
-    text = tables([GOOD, again, late, LANDED], "today")
+    early = MotionOutcome("rover/fieldkit/kill/back", 1, begins_s=2.6)
+    late = replace(early, begins_s=2.8, problems=("late",))
+    text = tables([GOOD, early, late, LANDED], "today")
     assert "| fieldkit | killed | agent: lease | stops, stays | 2.9 | 2.6 | 2.8 (back) | 3 | 1 |" in text
     assert "4 trials, 1 beyond" in text
     assert "### Drone with ArduCopter" in text

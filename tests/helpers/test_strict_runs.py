@@ -1,4 +1,4 @@
-"""Run pytest in pytest: leaks and many second tries fail a run, strangers on the machine do not."""
+"""Tests of the pytest plugins in a pytest subprocess: leaks and many second tries fail a run."""
 
 import os
 from pathlib import Path
@@ -60,12 +60,12 @@ LEAKS_AN_INTERFACE = """
         if first_try("tried"):
             subprocess.run(("ip", "tuntap", "add", "left", "mode", "tun"), check=True)
 """
-LEAKS_A_NAME = """
+LEAKS_A_NAMESPACE = """
     def test_it(untouched):
         if first_try("tried"):
             subprocess.run(("ip", "netns", "add", "{name}"), check=True)
 """
-WAITS_IN_VAIN = """
+WAIT_TIMES_OUT = """
     from tests.helpers.host import wait_for_end
     def test_it():
         with subprocess.Popen(("sleep", "600")) as child:
@@ -93,24 +93,25 @@ ORPHAN_OF_A_NAMESPACE = """
             process.wait()
         wait_until(lambda: not alive(orphan), Deadline.after(30))
 """
-STRANGER = """
+OTHER_PROCESS = """
     @pytest.fixture
-    def stranger():
-        # Begun before the test has namespaces of its own, so it works in those of the machine.
+    def other_process():
+        # Started before the test has separate namespaces, so it works in those of the machine.
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         with subprocess.Popen(("sh", "-e"), text=True, **pipes) as shell:
             yield shell
-    def test_it(stranger, untouched):
-        def do(line):
-            stranger.stdin.write(f"{line}; echo done\\n")
-            stranger.stdin.flush()
-            assert stranger.stdout.readline() == "done\\n"
+    def test_it(other_process, untouched):
+        def run(line):
+            other_process.stdin.write(f"{line}; echo done\\n")
+            other_process.stdin.flush()
+            assert other_process.stdout.readline() == "done\\n"
         name = f"t{os.getpid()}"
-        do(f"ip netns add {name}; ip link add {name} type veth peer name in netns {name}; mount -t tmpfs {name} /mnt")
+        run(f"ip netns add {name}; ip link add {name} type veth peer name in netns {name}")
+        run(f"mount -t tmpfs {name} /mnt")
         untouched()
-        do(f"umount /mnt; ip link del {name}; ip netns del {name}")
+        run(f"umount /mnt; ip link del {name}; ip netns del {name}")
 """
-SHARED = """
+SHARED_FIXTURE = """
     @pytest.fixture(scope="module")
     def lab():
         yield (broken := [])
@@ -118,125 +119,127 @@ SHARED = """
     def test_before(lab):
         pass
     def test_it(lab):
-        assert not lab, "a try before this one left it so"
+        assert not lab, "the first try has left this state"
         lab.append("node lost")
         assert not first_try("tried")
 """
-TOO_MANY = """
+MANY_RERUNS = """
     @pytest.mark.parametrize("name", range({tests}))
     def test_it(name):
         assert not first_try(str(name))
 """
 
-ALONE, SIDE_BY_SIDE = ("-p", "no:xdist"), ("-n", "2")
+SEQUENTIAL, PARALLEL = ("-p", "no:xdist"), ("-n", "2")
 
 
-def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str, *words: str) -> pytest.RunResult:
+def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str, *arguments: str) -> pytest.RunResult:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     pytester.makeconftest(CONFTEST)
-    pytester.makepyfile(test_inner="import os\n" + "\n".join(map(_flat, (FIRST_TRY, test))))
-    return pytester.runpytest_subprocess("-p", "no:hypothesispytest", "--end-within", "0.5", *words)
+    pytester.makepyfile(test_inner="import os\n" + "\n".join(map(_unindent, (FIRST_TRY, test))))
+    return pytester.runpytest_subprocess("-p", "no:hypothesispytest", "--end-within", "0.5", *arguments)
 
 
-def _flat(text: str) -> str:
+def _unindent(text: str) -> str:
     return "\n".join(line.removeprefix("    ") for line in text.splitlines())
 
 
-@pytest.mark.parametrize("how", [ALONE, SIDE_BY_SIDE], ids=["alone", "side by side"])
+@pytest.mark.parametrize("mode", [SEQUENTIAL, PARALLEL], ids=["sequential", "parallel"])
 @pytest.mark.parametrize("test", [LEAKS_A_PROCESS, DETACHES_A_PROCESS], ids=["child", "detached"])
-def test_a_process_that_a_first_try_leaves_fails_the_run(
-    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str, how: tuple[str, ...]
+def test_a_process_left_by_a_first_try_fails_the_run(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str, mode: tuple[str, ...]
 ) -> None:
-    done = run(pytester, monkeypatch, test, *how)
-    assert done.ret == pytest.ExitCode.TESTS_FAILED
-    done.stdout.fnmatch_lines(
+    result = run(pytester, monkeypatch, test, *mode)
+    assert result.ret == pytest.ExitCode.TESTS_FAILED
+    result.stdout.fnmatch_lines(
         ["*processes left behind*", "sleep 600 (seen after test_inner.py)", "*1 passed, 1 rerun*"]
     )
 
 
 @pytest.mark.emulated
-def test_an_orphan_in_a_pid_namespace_that_ended_is_not_left_behind(
+def test_an_orphan_in_an_ended_pid_namespace_is_not_left_behind(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done = run(pytester, monkeypatch, ORPHAN_IN_A_PID_NAMESPACE, *ALONE)
-    done.stdout.no_fnmatch_line("*processes left behind*")
-    assert done.ret == pytest.ExitCode.OK
+    result = run(pytester, monkeypatch, ORPHAN_IN_A_PID_NAMESPACE, *SEQUENTIAL)
+    result.stdout.no_fnmatch_line("*processes left behind*")
+    assert result.ret == pytest.ExitCode.OK
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("test", [LEAKS_AN_INTERFACE, LEAKS_A_NAME], ids=["interface", "namespace"])
-def test_what_a_first_try_leaves_in_the_namespaces_of_the_test_is_no_matter_of_luck(
+@pytest.mark.parametrize("test", [LEAKS_AN_INTERFACE, LEAKS_A_NAMESPACE], ids=["interface", "namespace"])
+def test_a_first_try_that_leaves_network_state_always_fails(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str
 ) -> None:
     name = f"left-{os.getpid()}"
-    done = run(pytester, monkeypatch, test.replace("{name}", name), *ALONE)
-    Path("/run/netns", name).unlink(missing_ok=True)  # `ip` keeps a name as a file, too
-    assert done.ret == pytest.ExitCode.TESTS_FAILED
-    done.assert_outcomes(passed=1, errors=1)
-    done.stdout.fnmatch_lines(["*LeakError*left*"])
+    result = run(pytester, monkeypatch, test.replace("{name}", name), *SEQUENTIAL)
+    Path("/run/netns", name).unlink(missing_ok=True)  # `ip` also keeps the name as a file
+    assert result.ret == pytest.ExitCode.TESTS_FAILED
+    result.assert_outcomes(passed=1, errors=1)
+    result.stdout.fnmatch_lines(["*LeakError*left*"])
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("how", [ALONE, SIDE_BY_SIDE], ids=["alone", "side by side"])
-def test_an_orphan_that_has_ended_does_not_keep_its_namespace_from_ending(
-    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, how: tuple[str, ...]
+@pytest.mark.parametrize("mode", [SEQUENTIAL, PARALLEL], ids=["sequential", "parallel"])
+def test_an_exited_orphan_does_not_block_the_end_of_its_namespace(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, mode: tuple[str, ...]
 ) -> None:
-    done = run(pytester, monkeypatch, ORPHAN_OF_A_NAMESPACE, *how)
-    done.assert_outcomes(passed=1)
-    assert done.ret == pytest.ExitCode.OK, str(done.stdout)
+    result = run(pytester, monkeypatch, ORPHAN_OF_A_NAMESPACE, *mode)
+    result.assert_outcomes(passed=1)
+    assert result.ret == pytest.ExitCode.OK, str(result.stdout)
 
 
-def test_waiting_in_vain_for_an_end_gets_no_second_try(
+def test_a_process_that_does_not_exit_gets_no_second_try(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done = run(pytester, monkeypatch, WAITS_IN_VAIN, *ALONE)
-    assert done.ret == pytest.ExitCode.TESTS_FAILED
-    done.assert_outcomes(failed=1)
-    done.stdout.fnmatch_lines(["*LeakError: still running*"])
+    result = run(pytester, monkeypatch, WAIT_TIMES_OUT, *SEQUENTIAL)
+    assert result.ret == pytest.ExitCode.TESTS_FAILED
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*LeakError: still running*"])
 
 
 def test_a_second_try_shares_nothing_with_the_first(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done = run(pytester, monkeypatch, SHARED, *ALONE, "-s")
-    assert done.ret == pytest.ExitCode.OK
-    done.stdout.fnmatch_lines(["*2 passed, 1 rerun*"])
-    assert str(done.stdout).count("taken down ['node lost']") == 2
+    result = run(pytester, monkeypatch, SHARED_FIXTURE, *SEQUENTIAL, "-s")
+    assert result.ret == pytest.ExitCode.OK
+    result.stdout.fnmatch_lines(["*2 passed, 1 rerun*"])
+    assert str(result.stdout).count("taken down ['node lost']") == 2
 
 
 @pytest.mark.emulated
-def test_what_strangers_do_on_the_machine_fails_nothing(
+def test_changes_by_other_processes_of_the_machine_do_not_fail_a_test(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    done = run(pytester, monkeypatch, STRANGER, *ALONE)
-    assert done.ret == pytest.ExitCode.OK
-    done.assert_outcomes(passed=1)
+    result = run(pytester, monkeypatch, OTHER_PROCESS, *SEQUENTIAL)
+    assert result.ret == pytest.ExitCode.OK
+    result.assert_outcomes(passed=1)
 
 
-@pytest.mark.parametrize("how", [ALONE, SIDE_BY_SIDE], ids=["alone", "side by side"])
+@pytest.mark.parametrize("mode", [SEQUENTIAL, PARALLEL], ids=["sequential", "parallel"])
 def test_more_second_tries_than_allowed_fail_a_run(
-    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, how: tuple[str, ...]
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, mode: tuple[str, ...]
 ) -> None:
-    done = run(pytester, monkeypatch, TOO_MANY.format(tests=ALLOWED + 1), *how)
-    assert done.ret == pytest.ExitCode.TESTS_FAILED
-    done.stdout.fnmatch_lines(
+    result = run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED + 1), *mode)
+    assert result.ret == pytest.ExitCode.TESTS_FAILED
+    result.stdout.fnmatch_lines(
         [
-            f"*{ALLOWED + 1} tests ran twice, at most {ALLOWED} may*",
+            f"*{ALLOWED + 1} tests ran twice; at most {ALLOWED} are allowed*",
             "*test_it?0?",
             f"*{ALLOWED + 1} passed, {ALLOWED + 1} rerun*",
         ]
     )
 
 
-def test_as_many_as_allowed_do_not(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
-    done = run(pytester, monkeypatch, TOO_MANY.format(tests=ALLOWED), *ALONE)
-    assert done.ret == pytest.ExitCode.OK
-    done.stdout.fnmatch_lines([f"*{ALLOWED} passed, {ALLOWED} rerun*"])
+def test_the_allowed_number_of_second_tries_does_not_fail_a_run(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED), *SEQUENTIAL)
+    assert result.ret == pytest.ExitCode.OK
+    result.stdout.fnmatch_lines([f"*{ALLOWED} passed, {ALLOWED} rerun*"])
 
 
 def test_both_parts_of_a_run_count(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = (*ALONE, "--rerun-log", "reruns.txt")
-    assert run(pytester, monkeypatch, TOO_MANY.format(tests=ALLOWED), *words).ret == pytest.ExitCode.OK
-    second = run(pytester, monkeypatch, TOO_MANY.format(tests=ALLOWED + 1), *words)
-    assert second.ret == pytest.ExitCode.TESTS_FAILED, "one more, and those of the first part"
-    second.stdout.fnmatch_lines([f"*{ALLOWED + 1} tests ran twice, at most {ALLOWED} may*"])
+    arguments = (*SEQUENTIAL, "--rerun-log", "reruns.txt")
+    assert run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED), *arguments).ret == pytest.ExitCode.OK
+    second = run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED + 1), *arguments)
+    assert second.ret == pytest.ExitCode.TESTS_FAILED, "one more than allowed, including those of the first part"
+    second.stdout.fnmatch_lines([f"*{ALLOWED + 1} tests ran twice; at most {ALLOWED} are allowed*"])

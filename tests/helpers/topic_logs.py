@@ -1,4 +1,4 @@
-"""Logs of topics while they grow: their records, read without the reader that is under test elsewhere."""
+"""Parser of topic logs that are still being written; independent of the reader under test."""
 
 from pathlib import Path
 
@@ -6,9 +6,9 @@ from fieldkit.agent import records
 
 
 def rows(path: Path) -> list[tuple[int, ...]]:
-    """Return kind, nothing, size, sequence, time sent and time here of each record that is whole."""
+    """Fields of each complete record: kind, padding, size, sequence number, send time and local time."""
     content = path.read_bytes()
     assert content.startswith(records.MAGIC)
-    begins = range(len(records.MAGIC), len(content) - records.RECORD.size + 1, records.RECORD.size)
-    found = (records.RECORD.unpack_from(content, begin) for begin in begins)
-    return [one for one in found if one[-1]]
+    offsets = range(len(records.MAGIC), len(content) - records.RECORD.size + 1, records.RECORD.size)
+    records_found = (records.RECORD.unpack_from(content, offset) for offset in offsets)
+    return [record for record in records_found if record[-1]]

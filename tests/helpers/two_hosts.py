@@ -11,11 +11,11 @@ ADDRESSES: Final = ("10.99.0.1", "10.99.0.2")
 
 @dataclass(frozen=True)
 class TestHost:
-    """One of them.
+    """A host.
 
     Attributes:
         address: Its address on the cable.
-        pid: Of the process that holds its namespace.
+        pid: The process that holds its namespace.
     """
 
     __test__ = False
@@ -25,7 +25,7 @@ class TestHost:
 
     @contextmanager
     def start(self, argv: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
-        """Run a command there; what still runs behind the body is ended."""
+        """Run a command on the host; kill it at the end of the body if it still runs."""
         with subprocess.Popen(("nsenter", "-t", str(self.pid), "-n", *argv), stderr=subprocess.PIPE) as process:
             try:
                 yield process
@@ -35,21 +35,21 @@ class TestHost:
 
 @contextmanager
 def cabled() -> Iterator[tuple[TestHost, TestHost]]:
-    """Give two hosts on one cable."""
+    """Yield two hosts on one cable."""
     with ExitStack() as stack:
-        near, far = (stack.enter_context(_namespace()) for _ in ADDRESSES)
-        _ip(near, "link", "add", "radio0", "type", "veth", "peer", "name", "radio0", "netns", str(far))
-        for pid, address in zip((near, far), ADDRESSES, strict=True):
+        first, second = (stack.enter_context(_namespace()) for _ in ADDRESSES)
+        _ip(first, "link", "add", "radio0", "type", "veth", "peer", "name", "radio0", "netns", str(second))
+        for pid, address in zip((first, second), ADDRESSES, strict=True):
             _ip(pid, "addr", "add", f"{address}/24", "dev", "radio0")
             for device in ("lo", "radio0"):
                 _ip(pid, "link", "set", device, "up")
             _ip(pid, "route", "add", "224.0.0.0/4", "dev", "radio0")
-        yield TestHost(ADDRESSES[0], near), TestHost(ADDRESSES[1], far)
+        yield TestHost(ADDRESSES[0], first), TestHost(ADDRESSES[1], second)
 
 
 @contextmanager
 def _namespace() -> Iterator[int]:
-    """Give the process that holds a network namespace of its own."""
+    """Yield the id of a process that holds a new network namespace."""
     holder = subprocess.Popen(
         ("unshare", "--net", "sh", "-c", "echo up; exec cat"), stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
@@ -61,5 +61,5 @@ def _namespace() -> Iterator[int]:
         holder.stdin.close()
 
 
-def _ip(pid: int, *words: str) -> None:
-    subprocess.run(("nsenter", "-t", str(pid), "-n", "ip", *words), check=True)
+def _ip(pid: int, *arguments: str) -> None:
+    subprocess.run(("nsenter", "-t", str(pid), "-n", "ip", *arguments), check=True)

@@ -1,4 +1,4 @@
-"""Robots that this machine can play: a folder as home, a userland first in PATH, no SSH."""
+"""Robots simulated on this machine without SSH: a folder is the home, and a userland comes first in PATH."""
 
 import os
 import shutil
@@ -13,11 +13,11 @@ from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Completed
 
 USERLANDS = ("debian", "busybox", "bash")
-"""dash with coreutils and util-linux; busybox alone, its ash as sh; and bash as sh."""
+"""dash with coreutils and util-linux; BusyBox alone with its ash as sh; bash as sh."""
 
 
 def path_of(userland: str, folder: Path) -> str:
-    """Return the PATH of a robot with that userland, whose programs are linked in `folder`."""
+    """The PATH of a robot with the userland, whose programs are linked in `folder`."""
     folder.mkdir(exist_ok=True)
     if userland == "bash":
         link(folder, "sh", "bash")
@@ -29,25 +29,25 @@ def path_of(userland: str, folder: Path) -> str:
 
 
 def link(folder: Path, name: str, program: str) -> None:
-    """Let `name` in `folder` be a program of this machine."""
+    """Link `name` in `folder` to a program of this machine."""
     target = shutil.which(program)
     assert target is not None
     (folder / name).symlink_to(target)
 
 
 class LocalSession:
-    """A command that runs in the home of such a robot."""
+    """A command that runs in the home folder of such a robot."""
 
     def __init__(self, shell: "LocalShell", argv: Sequence[str], until: bytes | None = None) -> None:
         self.shell = shell
         self.argv = tuple(argv)
         environment = os.environ | {"HOME": str(shell.home), "PATH": shell.path}
-        # Found as the robot finds it: Python would look in its own PATH.
+        # The robot's PATH is searched; Python would search the PATH of this process.
         program = shutil.which(argv[0], path=shell.path) or argv[0]
         pipe = subprocess.PIPE
-        given = pipe if until is None else subprocess.DEVNULL
+        stdin = pipe if until is None else subprocess.DEVNULL
         self.process = subprocess.Popen(
-            (program, *argv[1:]), cwd=shell.home, stdin=given, stdout=pipe, stderr=pipe, env=environment
+            (program, *argv[1:]), cwd=shell.home, stdin=stdin, stdout=pipe, stderr=pipe, env=environment
         )
         assert self.process.stdout is not None
         self.told = not until or self.process.stdout.readline() == until
@@ -63,7 +63,7 @@ class LocalSession:
 
 
 class LocalShell:
-    """Runs commands in a folder that stands for a robot's home."""
+    """Runs commands in a folder that represents a robot's home."""
 
     def __init__(self, home: Path, path: str = os.environ["PATH"], robot: str = "here") -> None:
         self.home = home
@@ -80,17 +80,17 @@ class LocalShell:
         return self.begin(argv, deadline=deadline).end(deadline=deadline, check=check, stdin=stdin)
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
-        done = self.run(argv, deadline=deadline, check=False)
-        to.write_bytes(done.stdout[:limit_bytes])
-        if done.exit_code:
-            raise RobotError(f"exit code {done.exit_code}: {printable(done.stderr)}", where=self.robot)
-        return done
+        completed = self.run(argv, deadline=deadline, check=False)
+        to.write_bytes(completed.stdout[:limit_bytes])
+        if completed.exit_code:
+            raise RobotError(f"exit code {completed.exit_code}: {printable(completed.stderr)}", where=self.robot)
+        return completed
 
     def silence(self, seconds: float) -> AbstractContextManager[None]:
         return nullcontext()
 
     def close(self) -> None:
-        """End the input of every command, as a connection does that is closed; a job's report waits for that."""
+        """Close the input of all commands, as a closed connection does; the report of a job waits for that."""
         while self.sessions:
             process = self.sessions.pop().process
             if process.stdin is not None:

@@ -1,4 +1,4 @@
-"""Trials of procedures that differ, as plans and tables: named transfers and pings, and a vendor's meter."""
+"""Trials of different procedures, as plans and tables: named transfers and pings, and the meter of a vendor."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,27 +20,27 @@ NAMED = (
     *(named(step, column) for step in ("up", "down") for column in COLUMNS),
     *(named(step, column) for step in ("p502", "p8192") for column in ping.COLUMNS),
 )
-"""What two transfers and two pings with names measure."""
+"""Columns of two named transfers and two named pings."""
 VENDOR = columns.columns(
     100,
-    ("probe.level", "dBm", "What the vendor's meter says.", Figure("probe: level", Kind.MEDIAN)),
+    ("probe.level", "dBm", "Reading of the vendor's meter.", Figure("probe: level", Kind.MEDIAN)),
     ("probe.volt", "V", "Voltage of the battery.", Figure("probe: voltage", Kind.MEAN)),
-    ("probe.resets", "count", "How often the meter began again.", Figure("probe: resets", Kind.MEAN)),
-    ("probe.locked", "bool", "Whether the meter had found its channel.", Figure("probe: locked", Kind.FLAG)),
-    ("probe.firmware", "text", "What the meter calls itself."),
-    ("wind", "text", "What the operator said of the wind."),
+    ("probe.resets", "count", "Number of restarts of the meter.", Figure("probe: resets", Kind.MEAN)),
+    ("probe.locked", "bool", "True if the meter had found its channel.", Figure("probe: locked", Kind.FLAG)),
+    ("probe.firmware", "text", "Name of the meter's firmware."),
+    ("wind", "text", "The operator's note about the wind."),
 )
-"""What a package of somebody else's measures, and what an operator said."""
+"""Columns of a third-party package, and an operator's note."""
 
 
 def plan(name: str, *, distance: str, metres: float, columns: Sequence[Column]) -> Plan:
-    """Return the plan of a trial at a distance whose steps measure such columns."""
-    own = {"trial": name, "distance": distance, "distance_m": metres, "columns": freeze(columns)}
-    return los_plan().model_copy(update=own)
+    """The plan of a trial whose steps measure the columns."""
+    changes = {"trial": name, "distance": distance, "distance_m": metres, "columns": freeze(columns)}
+    return los_plan().model_copy(update=changes)
 
 
 def write(folder: Path, of: Plan, table: Sequence[Mapping[str, Value]], *, with_plan: bool = True) -> Path:
-    """Write a trial with these rows into a folder of its name in `folder`; return the trial's folder."""
+    """Write a trial with these rows to a new folder with its name in `folder`; return the trial's folder."""
     trial = folder / of.trial
     trial.mkdir(parents=True)
     (trial / "trial.csv").write_text(rows.to_csv(table, of.table), encoding="utf-8")
@@ -50,9 +50,9 @@ def write(folder: Path, of: Plan, table: Sequence[Mapping[str, Value]], *, with_
 
 
 def measured(of: Plan, *, repeats: int = 8, seed: int = 1, level_dbm: float = -40.0) -> list[dict[str, Value]]:
-    """Return valid rows of a trial, all of whose columns have a value that they can have.
+    """Valid rows of a trial; each column has a possible value.
 
-    Each column has random numbers of its own, so that a further column changes no other.
+    Each column has a separate random stream, so that an additional column does not change the others.
     """
     random = {column.name: np.random.default_rng([seed, *column.name.encode()]) for column in of.table}
     table = []

@@ -1,4 +1,4 @@
-"""fieldkit as its users install it: a wheel in an environment of its own."""
+"""fieldkit as installed by its users: a wheel in a separate virtual environment."""
 
 import shutil
 import subprocess
@@ -13,12 +13,12 @@ _FILES = ("pyproject.toml", "README.md", "LICENSE")
 
 
 def installed(folder: Path) -> Path:
-    """Build fieldkit's wheel, install it, and return the interpreter that has it.
+    """Build the wheel of fieldkit and install it; return the interpreter of the environment.
 
-    Everything else comes from the environment that runs the tests: no registry is asked, and it takes 5 s.
+    All dependencies come from the environment of the tests, so no package registry is used. This takes about 5 s.
 
     Args:
-        folder: Gets sources, wheel and environment.
+        folder: Receives the sources, the wheel and the environment.
     """
     source, wheels, venv = (folder / name for name in ("source", "wheels", "venv"))
     for name in _SOURCES:
@@ -32,11 +32,11 @@ def installed(folder: Path) -> Path:
     (wheel,) = wheels.iterdir()
     _run(*pip, "--python", str(python), "install", "--no-index", "--no-deps", str(wheel))
     (packages,) = (venv / "lib").glob("python*/site-packages")
-    # Behind its own packages; the line that makes this checkout importable is not read there.
+    # Packages of the environment take precedence; .pth files in this path, such as that of the checkout, are ignored.
     (packages / "dependencies.pth").write_text(f"{sysconfig.get_path('purelib')}\n", encoding="utf-8")
     return python
 
 
-def _run(*words: str) -> None:
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+def _run(*command: str) -> None:
+    completed = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert completed.returncode == 0, completed.stdout + completed.stderr

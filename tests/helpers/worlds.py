@@ -1,11 +1,11 @@
-"""Worlds of a few obstacles."""
+"""Worlds with a few obstacles."""
 
 from collections.abc import Mapping
 from typing import Any, Final
 
 from sim_backends.world.world import World
 
-_USUAL: Final[Mapping[str, Mapping[str, Any]]] = {
+_DEFAULTS: Final[Mapping[str, Mapping[str, Any]]] = {
     "wall": {"height": "2m", "thickness": "0.1m", "material": "brick"},
     "tree": {"height": "6m", "crown_base": "2m", "crown_radius": "2m", "trunk_radius": "0.3m"},
     "box": {"material": "wood"},
@@ -16,6 +16,6 @@ _USUAL: Final[Mapping[str, Mapping[str, Any]]] = {
 
 
 def world(*obstacles: Mapping[str, Any]) -> World:
-    """Return a world with obstacles as a world file has them; what they do not say is usual."""
-    completed = [{**_USUAL[obstacle["kind"]], **obstacle} for obstacle in obstacles]
+    """A world with obstacles in the format of a world file; missing values get defaults."""
+    completed = [{**_DEFAULTS[obstacle["kind"]], **obstacle} for obstacle in obstacles]
     return World.model_validate({"name": "w", "summary": "s", "area_m": (20, 20), "obstacles": completed})

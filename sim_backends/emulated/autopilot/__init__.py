@@ -1,1 +1,1 @@
-"""The autopilot of an emulated drone: a point mass with limits, flown over MAVLink as PX4 is."""
+"""Autopilot of an emulated drone, which flies a quadrotor model over MAVLink like PX4 or ArduCopter."""

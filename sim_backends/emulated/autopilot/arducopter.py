@@ -120,7 +120,7 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         Parameter("WPNAV_SPEED_DN", 150.0, 10.0, 500.0, "MPC_Z_VEL_MAX_DN", _CM),
         Parameter("WPNAV_SPEED_UP", 250.0, 10.0, 1000.0, "MPC_Z_VEL_MAX_UP", _CM),
         integer("WP_YAW_BEHAVIOR", 2, 0, 3),
-        # Constants of its code, or parameters of PX4 that the vehicle reads.
+        # Constants in its code, or parameters of PX4 that the vehicle reads.
         fixed("", 2.1, "COM_DISARM_LAND"),
         fixed("", 1.0, "MPC_ACC_DOWN_MAX"),
         fixed("", 0.0, "MIS_TAKEOFF_ALT"),
@@ -129,7 +129,7 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
     )
 
 
-def _unfit(parameters: Parameters, battery: Battery) -> list[str]:
+def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
     low = battery.voltage_v < parameters["BATT_ARM_VOLT"]
     return ["Battery 1 below minimum arming voltage"] if low else []
 
@@ -139,7 +139,7 @@ ARDUCOPTER: Final = Firmware(
     version=0x040600FF,
     capabilities=COMMON_CAPABILITIES | _d.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST,
     base=_d.MAV_MODE_FLAG_STABILIZE_ENABLED | _d.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
-    # ArduCopter/mode.h; a take-off by command is a part of GUIDED, and the last phase of RTL one of RTL.
+    # ArduCopter/mode.h; a commanded take-off is part of GUIDED, and the descent at home is part of RTL.
     modes={
         Mode.OFFBOARD: 4,
         Mode.TAKEOFF: 4,
@@ -171,7 +171,7 @@ ARDUCOPTER: Final = Firmware(
     unknown_rate=_d.MAV_RESULT_DENIED,
     unknown_message=_d.MAV_RESULT_FAILED,
     prearm=("PreArm: ", "Arm: "),
-    unfit=_unfit,
+    arming_errors=_arming_errors,
     parameters=_declared,
     failsafes=ArduCopterFailsafes,
     streams_hz={_d.MAVLINK_MSG_ID_TIMESYNC: 0.1},

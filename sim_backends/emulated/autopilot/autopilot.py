@@ -1,4 +1,4 @@
-"""The autopilot: its answers to messages, and what it sends by itself. It has neither socket nor clock."""
+"""The autopilot: its answers to messages, and the messages that it sends unasked. It has neither socket nor clock."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -32,12 +32,12 @@ class Autopilot:
     """An autopilot and its vehicle.
 
     Args:
-        firmware: Its family.
-        system: Its system id.
+        firmware: Family of the autopilot.
+        system: System id.
         limits: Limits of the robot's profile.
-        can: What its body can do.
-        around: Obstacles in the world, including the floor.
-        now_ns: When it is switched on.
+        airframe_limits: Limits of its airframe.
+        obstacles: Obstacles in the world, including the floor.
+        now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
     """
 
@@ -47,8 +47,8 @@ class Autopilot:
         firmware: Firmware,
         system: int,
         limits: FlightLimits,
-        can: QuadrotorLimits,
-        around: Sequence[Footprint],
+        airframe_limits: QuadrotorLimits,
+        obstacles: Sequence[Footprint],
         now_ns: int,
         boot_s: float = 0.0,
     ) -> None:
@@ -56,27 +56,27 @@ class Autopilot:
         self._parameters = Parameters(firmware.parameters(limits))
         self._parameters.change("MAV_SYS_ID", system)
         self._system = system
-        self.vehicle = Vehicle(firmware, self._parameters, can, around, now_ns, boot_s=boot_s)
+        self.vehicle = Vehicle(firmware, self._parameters, airframe_limits, obstacles, now_ns, boot_s=boot_s)
         self._telemetry = Telemetry(self.vehicle, self._parameters)
         self._commands = Commands(self.vehicle, self._parameters)
         self._transfer = MissionTransfer(lambda: self.vehicle.mission.items, self._fault, self.vehicle.load)
-        self._parameter_service = ParameterService(firmware, self._parameters, self._set, self.vehicle.say)
+        self._parameter_service = ParameterService(firmware, self._parameters, self._set, self.vehicle.report)
         self._port = MavlinkPort(system)
         self._now_ns = now_ns
         self._booted_ns = self.vehicle.estimate.booted_ns
-        self._streams = self._usual_streams()
+        self._streams = self._default_streams()
 
     def receive(self, datagram: bytes, sender: Address, now_ns: int) -> Iterator[Frame]:
-        """Yield the answers to a datagram with any content; the caller takes all.
+        """Yield the answers to a datagram with any content; the caller must consume all.
 
         Args:
             datagram: The datagram.
             sender: Its source address.
-            now_ns: When it was received.
+            now_ns: Time of reception.
         """
         self._now_ns = now_ns
         for message in mavlink.read(datagram):
-            if not self._port.heard(sender, message, now_ns):
+            if not self._port.register(sender, message, now_ns):
                 continue
             if message.get_type() == "HEARTBEAT":
                 self.vehicle.failsafes.heartbeat(message.get_srcSystem(), message.type, now_ns)
@@ -84,39 +84,39 @@ class Autopilot:
                 yield from self._port.frames(self._answers(message, now_ns))
 
     def advance(self, now_ns: int) -> Iterator[Frame]:
-        """Fly until this time and yield the frames that are due; the caller takes all."""
+        """Fly until this time and yield the frames that are due; the caller must consume all."""
         self._now_ns = now_ns
         self.vehicle.advance(now_ns)
         if self.vehicle.estimate.booted_ns != self._booted_ns:
             self._reboot()
         self._port.expire(now_ns)
         made = (self._telemetry.makers[kind]() for kind in self._streams.due(now_ns))
-        messages = (*self._news(now_ns), *self._transfer.remind(now_ns), *made)
+        messages = (*self._reports(now_ns), *self._transfer.retries(now_ns), *made)
         yield from self._port.frames(message for message in messages if message is not None)
 
     def next_ns(self) -> int | None:
-        """Return when `advance` has something to send next, None without clients."""
+        """Return when `advance` has the next frame to send, or None without clients."""
         return self._streams.next_ns if self._port.is_used else None
 
     def _reboot(self) -> None:
-        """Begin as after power-on: parameters stay, and the system id and the rates are read from them."""
+        """Start as after power-on: parameters are kept, and the system id and the rates are read from them."""
         self._booted_ns = self.vehicle.estimate.booted_ns
         self._system = round(self._parameters["MAV_SYS_ID"])
         self._port.identify(self._system)
-        self._streams = self._usual_streams()
+        self._streams = self._default_streams()
 
-    def _usual_streams(self) -> Streams:
+    def _default_streams(self) -> Streams:
         rates_hz = dict(self._firmware.streams_hz)
         for group in self._firmware.groups:
             rates_hz.update(dict.fromkeys(group.messages, self._parameters[group.parameter]))
         return Streams(rates_hz, self._now_ns)
 
     def _set(self, name: str) -> None:
-        """Apply a parameter that was set: the rate of a group of messages."""
+        """Apply a parameter that was set, if it is the rate of a group of messages."""
         for group in self._firmware.groups:
             if group.parameter == name:
                 for kind in group.messages:
-                    self._streams.set_usual(kind, self._parameters[name], self._now_ns)
+                    self._streams.set_default(kind, self._parameters[name], self._now_ns)
 
     def _is_for_us(self, message: Message) -> bool:
         system, component = mavlink.addressee(message)
@@ -125,8 +125,8 @@ class Autopilot:
     def _fault(self, item: Item) -> int:
         return fault(item, self.vehicle.home_m, self.vehicle.fence.limits_m)
 
-    def _news(self, now_ns: int) -> Iterator[Message]:
-        """Yield what the vehicle reports since the last call, for all clients."""
+    def _reports(self, now_ns: int) -> Iterator[Message]:
+        """Yield the vehicle's reports since the last call, for all clients."""
         mission, remarks = self.vehicle.mission, self.vehicle.remarks
         yield from (dialect.MAVLink_mission_item_reached_message(number) for number in mission.reached(now_ns))
         for severity, text in remarks:
@@ -139,7 +139,7 @@ class Autopilot:
             yield from self._command(message, now_ns)
         elif kind.startswith("MISSION_"):
             if kind == "MISSION_SET_CURRENT" and message.seq < len(self.vehicle.mission.items):
-                self.vehicle.mission.go_on_at(message.seq)
+                self.vehicle.mission.set_current(message.seq)
                 yield self._telemetry.mission_current()
             yield from self._transfer.handle(message, now_ns)
         elif kind.startswith("PARAM_"):
@@ -149,12 +149,12 @@ class Autopilot:
         elif kind == "SET_MODE":
             self._commands.set_mode(message.custom_mode)
         elif kind in {"SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT"}:
-            self._take_set_point(message)
+            self._accept_set_point(message)
         else:
             yield from services.answers(message, now_ns)
 
     def _request_streams(self, message: Message) -> None:
-        """Set the parameters of the groups of messages that are requested; rate 0 stops them. PX4 has no groups."""
+        """Set the rate parameters of the requested groups of messages; rate 0 stops them. PX4 has no groups."""
         rate_hz = min(message.req_message_rate, 50) if message.start_stop else 0
         for group in self._firmware.groups:
             if message.req_stream_id in {dialect.MAV_DATA_STREAM_ALL, group.number}:
@@ -162,7 +162,7 @@ class Autopilot:
                 self._set(group.parameter)
 
     def _command(self, message: Message, now_ns: int) -> Iterator[Message]:
-        """Yield the answer to a command: its COMMAND_ACK, and the message that it requests."""
+        """Yield the answer to a command: COMMAND_ACK, and the message that the command requests."""
         param1, requested = message.param1, list[Message]()
         if message.command == dialect.MAV_CMD_REQUEST_MESSAGE:
             requested = self._requested(param1, message.param2)
@@ -179,12 +179,12 @@ class Autopilot:
             result = self._firmware.unknown_message
         else:
             result = self._commands.run(message)
-        asker = message.get_srcSystem(), message.get_srcComponent()
-        yield dialect.MAVLink_command_ack_message(message.command, result, 0, 0, *asker)
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        yield dialect.MAVLink_command_ack_message(message.command, result, 0, 0, *sender)
         yield from requested
 
     def _requested(self, kind: float, param2: float) -> list[Message]:
-        """Return the messages of an id, empty for one that it does not send on request."""
+        """Return the messages of an id, empty if the autopilot does not send them on request."""
         if kind == AVAILABLE_MODES:
             return self._telemetry.available_modes(param2)
         make = self._telemetry.makers.get(int(kind)) if int_in(kind, _LAST_MESSAGE_ID) else None
@@ -192,14 +192,14 @@ class Autopilot:
         return [] if made is None else [made]
 
     def _set_interval(self, kind: float, interval_us: float, now_ns: int) -> int:
-        known = int_in(kind, _LAST_MESSAGE_ID) and int(kind) in self._telemetry.makers
-        if not known or not math.isfinite(interval_us):
+        is_sent = int_in(kind, _LAST_MESSAGE_ID) and int(kind) in self._telemetry.makers
+        if not is_sent or not math.isfinite(interval_us):
             return self._firmware.unknown_rate
         self._streams.set_interval(int(kind), interval_us, now_ns)
         return int(dialect.MAV_RESULT_ACCEPTED)
 
-    def _take_set_point(self, message: Message) -> None:
-        """Take a place or a velocity; with a velocity, the place beside it is ignored."""
+    def _accept_set_point(self, message: Message) -> None:
+        """Accept a position or a velocity; if a message has both, the velocity counts."""
         if message.get_type() == "SET_POSITION_TARGET_GLOBAL_INT":
             args = message.coordinate_frame, message.lat_int, message.lon_int, message.alt
             place = goal_m(*args, self.vehicle.home_m)
@@ -212,9 +212,9 @@ class Autopilot:
         velocity = (message.vy, message.vx, -message.vz)
         if not message.type_mask & _VELOCITY_IGNORED:
             if all(map(math.isfinite, velocity)):
-                self.vehicle.lead(SetPoint(velocity, is_place=False, yaw_rad=yaw_rad))
+                self.vehicle.accept_set_point(SetPoint(velocity, is_place=False, yaw_rad=yaw_rad))
         elif not message.type_mask & _POSITION_IGNORED and place and all(map(math.isfinite, place)):
-            self.vehicle.lead(SetPoint(place, is_place=True, yaw_rad=yaw_rad))
+            self.vehicle.accept_set_point(SetPoint(place, is_place=True, yaw_rad=yaw_rad))
 
 
 _QUESTIONS: Final = frozenset({dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_GET_MESSAGE_INTERVAL})

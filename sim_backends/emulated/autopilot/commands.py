@@ -1,4 +1,4 @@
-"""Commands to the vehicle: what COMMAND_LONG and COMMAND_INT ask for, and the MAV_RESULT that they get."""
+"""Commands to the vehicle: execution of COMMAND_LONG and COMMAND_INT, and their MAV_RESULT."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from sim_backends.emulated.autopilot.plan import goal_m
 from sim_backends.emulated.autopilot.vehicle import Refused, Vehicle
 
 FORCE: Final = 21196
-"""Second parameter of MAV_CMD_COMPONENT_ARM_DISARM to stop the motors in the air, too."""
+"""Second parameter of MAV_CMD_COMPONENT_ARM_DISARM that stops the motors also in the air."""
 
 _FRAME_RELATIVE: Final = dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 
@@ -20,17 +20,17 @@ _DENIED: Final = int(dialect.MAV_RESULT_DENIED)
 
 
 class Commands:
-    """Carries out commands.
+    """Executes commands.
 
     Args:
-        vehicle: Who flies.
-        parameters: What some of them change.
+        vehicle: The vehicle.
+        parameters: Its parameters, which some commands change.
     """
 
     def __init__(self, vehicle: Vehicle, parameters: Parameters) -> None:
         self._vehicle = vehicle
         self._parameters = parameters
-        self._known: Final[dict[int, Callable[[Message], int]]] = {
+        self._handlers: Final[dict[int, Callable[[Message], int]]] = {
             dialect.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             dialect.MAV_CMD_RUN_PREARM_CHECKS: self._check,
             dialect.MAV_CMD_NAV_TAKEOFF: self._take_off,
@@ -45,31 +45,31 @@ class Commands:
         }
 
     def run(self, message: Message) -> int:
-        """Carry out the command in a COMMAND_LONG or COMMAND_INT; return its MAV_RESULT.
+        """Execute the command in a COMMAND_LONG or COMMAND_INT; return its MAV_RESULT.
 
-        Whatever the vehicle refuses is among its remarks.
+        The reason of a refusal is added to the vehicle's remarks.
         """
-        do = self._known.get(message.command)
-        if do is None:
+        handler = self._handlers.get(message.command)
+        if handler is None:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
         try:
-            return do(message)
+            return handler(message)
         except Refused as refusal:
-            self._regret(refusal)
+            self._report_refusal(refusal)
             return self._vehicle.firmware.refused
 
     def set_mode(self, custom_mode: int) -> None:
-        """Do what SET_MODE asks for, which has no answer."""
+        """Execute SET_MODE, which has no answer."""
         try:
             self._change(custom_mode)
         except Refused as refusal:
-            self._regret(refusal)
+            self._report_refusal(refusal)
 
-    def _regret(self, refusal: Refused) -> None:
+    def _report_refusal(self, refusal: Refused) -> None:
         if str(refusal):
             ardupilot = self._vehicle.firmware.is_ardupilot
             severity = dialect.MAV_SEVERITY_WARNING if ardupilot else dialect.MAV_SEVERITY_CRITICAL
-            self._vehicle.say(severity, str(refusal))
+            self._vehicle.report(severity, str(refusal))
 
     def _check(self, _: Message) -> int:
         self._vehicle.check()
@@ -85,7 +85,7 @@ class Commands:
         return _DONE
 
     def _take_off(self, message: Message) -> int:
-        """Take off to a height above home (COMMAND_LONG) or in the frame that is named; NaN is the usual one."""
+        """Take off to a height above home (COMMAND_LONG) or in the named frame; NaN or 0 is the default height."""
         height_m, home_m = _z(message), self._vehicle.home_m
         if not math.isfinite(height_m) or height_m == 0:
             self._vehicle.take_off()
@@ -102,7 +102,7 @@ class Commands:
         return _DONE
 
     def _start(self, message: Message) -> int:
-        if message.param1 > 0 and not self._go_on_at(message.param1):
+        if message.param1 > 0 and not self._select_item(message.param1):
             return _DENIED
         return self._mode(Mode.MISSION)
 
@@ -117,16 +117,16 @@ class Commands:
         return _DONE if self._change(number) else self._vehicle.firmware.unknown_mode
 
     def _change(self, custom_mode: int) -> bool:
-        """Change to the mode of a number; return whether it has it."""
+        """Change to the mode of a number; return True if the firmware has it."""
         mode = self._vehicle.firmware.mode_of(custom_mode)
         if mode is not None:
             self._vehicle.change_mode(mode)
         elif self._vehicle.firmware.is_ardupilot:
-            self._vehicle.say(dialect.MAV_SEVERITY_WARNING, f"No such mode {custom_mode}")
+            self._vehicle.report(dialect.MAV_SEVERITY_WARNING, f"No such mode {custom_mode}")
         return mode is not None
 
     def _reboot(self, message: Message) -> int:
-        """Boot again (param1 is 1); refused while armed."""
+        """Reboot (param1 is 1); refused while armed."""
         if message.param1 != 1:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
         if self._vehicle.armed:
@@ -135,7 +135,7 @@ class Commands:
         return _DONE
 
     def _reposition(self, message: Message) -> int:
-        """Fly to a place; NaN, or the largest integer, is where it is (MAV_CMD_DO_REPOSITION)."""
+        """Fly to a position; NaN, or the largest integer, keeps a coordinate (MAV_CMD_DO_REPOSITION)."""
         if message.get_type() != "COMMAND_INT":
             return int(dialect.MAV_RESULT_COMMAND_INT_ONLY)
         here_m = self._vehicle.body.position_m
@@ -144,7 +144,7 @@ class Commands:
             goal = goal_m(_FRAME_RELATIVE, message.x, message.y, here_m[2], self._vehicle.home_m)
         if goal is None:
             return int(dialect.MAV_RESULT_COMMAND_UNSUPPORTED_MAV_FRAME)
-        if _NOWHERE in {message.x, message.y}:
+        if _CURRENT_PLACE in {message.x, message.y}:
             goal = (*here_m[:2], goal[2])
         self._vehicle.go_to(goal)
         return _DONE
@@ -154,27 +154,27 @@ class Commands:
         return _DONE if self._parameters.change(key, message.param2) else _DENIED
 
     def _set_current(self, message: Message) -> int:
-        return _DONE if self._go_on_at(message.param1) else _DENIED
+        return _DONE if self._select_item(message.param1) else _DENIED
 
-    def _go_on_at(self, number: float) -> bool:
-        """Make an item the current one; return whether there is one of this number."""
+    def _select_item(self, number: float) -> bool:
+        """Make an item the current one; return True if there is one of this number."""
         mission = self._vehicle.mission
         if not int_in(number, len(mission.items) - 1):
             return False
-        mission.go_on_at(int(number))
+        mission.set_current(int(number))
         return True
 
 
 _SPEEDS: Final = {2: "MPC_Z_VEL_MAX_UP", 3: "MPC_Z_VEL_MAX_DN"}
-"""What MAV_CMD_DO_CHANGE_SPEED changes, by SPEED_TYPE; any other is over the ground."""
-_NOWHERE: Final = 0x7FFFFFFF
+"""Parameter that MAV_CMD_DO_CHANGE_SPEED sets, by SPEED_TYPE; other types set the ground speed."""
+_CURRENT_PLACE: Final = 0x7FFFFFFF
 
 
 def int_in(value: float, most: int) -> bool:
-    """Return whether a field that carries an integer as a float has one from 0 to `most`: it may be NaN."""
+    """Return True if a float field, which may be NaN, holds an integer from 0 to `most`."""
     return math.isfinite(value) and value == int(value) and 0 <= value <= most
 
 
 def _z(message: Message) -> float:
-    """Return the seventh parameter of a command in either form."""
+    """Return the seventh parameter of a command in either message."""
     return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

@@ -1,4 +1,4 @@
-"""Fail-safes of the emulated autopilots: battery and ground station; what they make the vehicle do.
+"""Fail-safes of the emulated autopilots for battery and ground station, and the reactions of the vehicle.
 
 ArduCopter: https://ardupilot.org/copter/docs/failsafe-battery.html, https://ardupilot.org/copter/docs/gcs-failsafe.html.
 PX4: https://docs.px4.io/main/en/config/safety.html.
@@ -20,12 +20,12 @@ _INFO: Final = dialect.MAV_SEVERITY_INFO
 
 @dataclass(frozen=True)
 class VehicleState:
-    """State of the vehicle that fail-safes depend on.
+    """State of the vehicle on which fail-safes depend.
 
     Attributes:
         now_ns: Time.
-        armed: Whether it is armed.
-        landed: Whether it is on the ground.
+        armed: True if it is armed.
+        landed: True if it is on the ground.
         mode: Its mode.
         battery: Its battery.
     """
@@ -42,10 +42,10 @@ class Reaction:
     """Reaction of a fail-safe.
 
     Attributes:
-        text: Text for people, empty for none.
+        text: Text for people, or empty.
         severity: MAV_SEVERITY of the text.
-        mode: Mode to change to; None for none.
-        disarm: Whether to stop the motors.
+        mode: Mode to change to; None to keep the mode.
+        disarm: True to stop the motors.
     """
 
     text: str = ""
@@ -58,35 +58,35 @@ class Failsafes(Protocol):
     """The fail-safes of a vehicle.
 
     Attributes:
-        active: Whether one is triggered: HEARTBEAT is MAV_STATE_CRITICAL then.
-        unfit: Reasons for which they do not let it be armed.
+        active: True if a fail-safe is triggered; HEARTBEAT then has MAV_STATE_CRITICAL.
+        arming_errors: Reasons for which they prevent arming.
     """
 
     @property
     def active(self) -> bool:
-        """See the class."""
+        """True if a fail-safe is triggered."""
 
     @property
-    def unfit(self) -> list[str]:
-        """See the class."""
+    def arming_errors(self) -> list[str]:
+        """Reasons for which they prevent arming."""
 
     def heartbeat(self, system: int, kind: int, now_ns: int) -> None:
-        """Take a heartbeat: system id and MAV_TYPE of its sender."""
+        """Process a heartbeat: system id and MAV_TYPE of its sender."""
 
     def mode_changed(self, now_ns: int) -> None:
-        """Take note that a client changed the mode, or that the vehicle was disarmed."""
+        """Note that a client has changed the mode, or that the vehicle was disarmed."""
 
     def set_points_lost(self) -> None:
-        """Take note that the vehicle changed its mode because set-points are missing; only PX4 does."""
+        """Note that the vehicle has changed its mode because set-points are missing, which only PX4 does."""
 
     def advance(self, now: VehicleState) -> Iterator[Reaction]:
-        """Yield the reactions that are due; to be called again and again."""
+        """Yield the reactions that are due; call it periodically."""
 
 
 class ArduCopterFailsafes:
     """Battery and ground-station fail-safes of ArduCopter.
 
-    A triggered battery fail-safe lasts until the next boot; that of the ground station until it is heard again.
+    A triggered battery fail-safe lasts until the next boot, one of the ground station until a heartbeat arrives.
 
     Args:
         parameters: BATT_*, FS_GCS_*, SYSID_MYGCS.
@@ -98,32 +98,32 @@ class ArduCopterFailsafes:
         self._parameters = parameters
         self._stage = 0
         self._below_ns: dict[str, int] = {}
-        self._gcs_heard_ns: int | None = None
+        self._gcs_heartbeat_ns: int | None = None
         self._gcs_lost = False
 
     @property
     def active(self) -> bool:
-        """See `Failsafes`."""
+        """Implement `Failsafes.active`."""
         return self._stage > 0 or self._gcs_lost
 
     @property
-    def unfit(self) -> list[str]:
-        """See `Failsafes`."""
+    def arming_errors(self) -> list[str]:
+        """Implement `Failsafes.arming_errors`."""
         return ["Battery failsafe"] * (self._stage > 0) + ["GCS failsafe on"] * self._gcs_lost
 
     def heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any type counts)
-        """See `Failsafes.heartbeat`."""
+        """Implement `Failsafes.heartbeat`."""
         if system == self._parameters["SYSID_MYGCS"]:
-            self._gcs_heard_ns = now_ns
+            self._gcs_heartbeat_ns = now_ns
 
     def mode_changed(self, now_ns: int) -> None:
-        """See `Failsafes.mode_changed`: nothing depends on it."""
+        """Implement `Failsafes.mode_changed`: nothing depends on the mode."""
 
     def set_points_lost(self) -> None:
-        """See `Failsafes.set_points_lost`."""
+        """Implement `Failsafes.set_points_lost`: ArduCopter has no such fail-safe."""
 
     def advance(self, now: VehicleState) -> Iterator[Reaction]:
-        """See `Failsafes.advance`."""
+        """Implement `Failsafes.advance`."""
         yield from self._battery(now)
         yield from self._gcs(now)
 
@@ -147,12 +147,12 @@ class ArduCopterFailsafes:
 
     def _gcs(self, now: VehicleState) -> Iterator[Reaction]:
         get = self._parameters
-        if not get["FS_GCS_ENABLE"] or self._gcs_heard_ns is None:
+        if not get["FS_GCS_ENABLE"] or self._gcs_heartbeat_ns is None:
             if self._gcs_lost:
                 self._gcs_lost = False
                 yield Reaction("GCS Failsafe Cleared")
             return
-        lost = now.now_ns - self._gcs_heard_ns > get["FS_GCS_TIMEOUT"] * 1e9
+        lost = now.now_ns - self._gcs_heartbeat_ns > get["FS_GCS_TIMEOUT"] * 1e9
         if lost and not self._gcs_lost:
             self._gcs_lost = True
             yield from self._act(int(get["FS_GCS_ENABLE"]), _GCS_ACTIONS, "GCS Failsafe", now)
@@ -181,7 +181,7 @@ _GCS_ACTIONS: Final = {1: Mode.RTL, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 5: M
 class Px4Failsafes:
     """Ground-station (data-link) and battery fail-safes of PX4.
 
-    The vehicle first holds for COM_FAIL_ACT_T, so that a pilot can take over. A change of the mode ends a fail-safe.
+    The vehicle first holds for COM_FAIL_ACT_T, so that a pilot can take over. A mode change ends a fail-safe.
 
     Args:
         parameters: NAV_DLL_ACT, COM_DL_LOSS_T, COM_LOW_BAT_ACT, BAT_*_THR, COM_FAIL_ACT_T.
@@ -189,7 +189,7 @@ class Px4Failsafes:
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
-        self._gcs_heard_ns: int | None = None
+        self._gcs_heartbeat_ns: int | None = None
         self._gcs_lost = False
         self._warning = 0
         self._active = False
@@ -197,30 +197,30 @@ class Px4Failsafes:
 
     @property
     def active(self) -> bool:
-        """See `Failsafes`."""
+        """Implement `Failsafes.active`."""
         return self._active
 
     @property
-    def unfit(self) -> list[str]:
-        """See `Failsafes`."""
-        gone = self._parameters["NAV_DLL_ACT"] > 0 and (self._gcs_lost or self._gcs_heard_ns is None)
-        return ["No connection to the ground control station"] * gone
+    def arming_errors(self) -> list[str]:
+        """Implement `Failsafes.arming_errors`."""
+        is_missing = self._parameters["NAV_DLL_ACT"] > 0 and (self._gcs_lost or self._gcs_heartbeat_ns is None)
+        return ["No connection to the ground control station"] * is_missing
 
     def heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any system counts)
-        """See `Failsafes.heartbeat`."""
+        """Implement `Failsafes.heartbeat`."""
         if kind == dialect.MAV_TYPE_GCS:
-            self._gcs_heard_ns = now_ns
+            self._gcs_heartbeat_ns = now_ns
 
     def mode_changed(self, now_ns: int) -> None:  # noqa: ARG002
-        """See `Failsafes.mode_changed`: the fail-safe ends."""
+        """Implement `Failsafes.mode_changed`: the fail-safe ends."""
         self._active, self._next = False, None
 
     def set_points_lost(self) -> None:
-        """See `Failsafes.set_points_lost`: it lasts until a client changes the mode."""
+        """Implement `Failsafes.set_points_lost`: the fail-safe lasts until a client changes the mode."""
         self._active = True
 
     def advance(self, now: VehicleState) -> Iterator[Reaction]:
-        """See `Failsafes.advance`."""
+        """Implement `Failsafes.advance`."""
         yield from self._data_link(now)
         yield from self._battery(now)
         if self._next is not None and now.now_ns >= self._next[0]:
@@ -228,9 +228,9 @@ class Px4Failsafes:
             yield Reaction("Failsafe activated", _CRITICAL, mode)
 
     def _data_link(self, now: VehicleState) -> Iterator[Reaction]:
-        if self._gcs_heard_ns is None:
+        if self._gcs_heartbeat_ns is None:
             return
-        lost = now.now_ns - self._gcs_heard_ns > self._parameters["COM_DL_LOSS_T"] * 1e9
+        lost = now.now_ns - self._gcs_heartbeat_ns > self._parameters["COM_DL_LOSS_T"] * 1e9
         if lost and not self._gcs_lost:
             self._gcs_lost = True
             yield Reaction("Connection to ground station lost", _INFO)
@@ -271,4 +271,4 @@ _BATTERY_LEVELS: Final = {
     (3, 2): Mode.RTL,
     (3, 3): Mode.LAND,
 }
-"""By COM_LOW_BAT_ACT and the warning: 2 is critical, 3 emergency."""
+"""Mode by COM_LOW_BAT_ACT and the warning: 2 is critical, 3 emergency."""

@@ -1,6 +1,6 @@
-"""The autopilot's own fence: a cylinder around home, and what a breach makes the vehicle do.
+"""Fence of the autopilot, a cylinder around home, and the reaction of the vehicle to a breach.
 
-ArduCopter: https://ardupilot.org/copter/docs/common-ac2_simple_geofence.html. PX4 refuses what leads out of it.
+ArduCopter: https://ardupilot.org/copter/docs/common-ac2_simple_geofence.html. PX4 refuses goals outside its fence.
 """
 
 import math
@@ -17,7 +17,7 @@ _ACTIONS: Final = {0: None, 1: Mode.RTL, 2: Mode.LAND, 3: Mode.RTL, 4: Mode.BRAK
 
 
 class Fence:
-    """The fence of one vehicle; places are relative to home: metres east, north, up.
+    """Fence of one vehicle; positions are relative to home: metres east, north, up.
 
     Args:
         parameters: GF_MAX_*, FENCE_ACTION.
@@ -29,33 +29,33 @@ class Fence:
 
     @property
     def limits_m(self) -> tuple[float, float]:
-        """Largest distance from home, over the ground and up."""
+        """Maximum distance from home, horizontal and vertical."""
         return self._parameters["GF_MAX_HOR_DIST"], self._parameters["GF_MAX_VER_DIST"]
 
     def contains(self, place_m: Vector) -> bool:
-        """Return whether the vehicle may fly to a place."""
+        """Return True if the vehicle may fly to a position."""
         return is_within(place_m, self.limits_m)
 
     def nearest_inside(self, place_m: Vector) -> Vector:
-        """Return the place itself, or the place on the fence between home and it."""
-        (east, north, up), (far_m, high_m) = place_m, self.limits_m
-        part = far_m / max(math.hypot(east, north), far_m)
-        return part * east, part * north, min(up, high_m)
+        """Return the position itself, or the point where the line from home to it crosses the fence."""
+        (east, north, up), (radius_m, height_m) = place_m, self.limits_m
+        part = radius_m / max(math.hypot(east, north), radius_m)
+        return part * east, part * north, min(up, height_m)
 
     def is_crossed(self, here_m: Vector, rest_m: Vector) -> bool:
-        """Return whether a vehicle that brakes now comes to rest outside, farther out than it is."""
-        far_m, high_m = self.limits_m
+        """Return True if a vehicle that brakes now comes to rest outside, and farther out than it is."""
+        radius_m, height_m = self.limits_m
         out_m = math.hypot(*rest_m[:2])
-        return out_m > max(far_m, math.hypot(*here_m[:2])) or rest_m[2] > max(high_m, here_m[2])
+        return out_m > max(radius_m, math.hypot(*here_m[:2])) or rest_m[2] > max(height_m, here_m[2])
 
     def reset(self) -> None:
-        """Regard the vehicle as inside, as when it is armed or carried to another place."""
+        """Treat the vehicle as inside, after it was armed or carried to another place."""
         self._is_breached = False
 
     def advance(self, now: VehicleState, place_m: Vector) -> Reaction | None:
-        """Return ArduCopter's reaction to a new breach in flight; None if there is none."""
-        (east, north, up), (far_m, high_m) = place_m, self.limits_m
-        fences = ["Max Alt"] * (up > high_m) + ["Circle"] * (math.hypot(east, north) > far_m)
+        """Return ArduCopter's reaction to a new breach in flight, or None."""
+        (east, north, up), (radius_m, height_m) = place_m, self.limits_m
+        fences = ["Max Alt"] * (up > height_m) + ["Circle"] * (math.hypot(east, north) > radius_m)
         is_new, self._is_breached = bool(fences) and not self._is_breached, bool(fences)
         if not is_new or not now.armed or now.landed:
             return None
@@ -65,5 +65,5 @@ class Fence:
 
 
 def is_within(place_m: Vector, limits_m: tuple[float, float]) -> bool:
-    """Return whether a place relative to home is inside of a cylinder, over the ground and up."""
+    """Return True if a position relative to home is inside a cylinder, given by radius and height."""
     return math.hypot(*place_m[:2]) <= limits_m[0] and 0 <= place_m[2] <= limits_m[1]

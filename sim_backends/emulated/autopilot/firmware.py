@@ -1,4 +1,4 @@
-"""Differences between families of autopilots: modes, parameters, messages, refusals."""
+"""Differences between firmware families: modes, parameters, messages, refusals."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -32,28 +32,28 @@ class Firmware:
         autopilot: MAV_AUTOPILOT.
         version: AUTOPILOT_VERSION.flight_sw_version: major, minor, patch, type.
         capabilities: MAV_PROTOCOL_CAPABILITY.
-        base: MAV_MODE_FLAG of its heartbeat that do not change.
+        base: Constant MAV_MODE_FLAG bits of its heartbeat.
         modes: Custom mode of each mode.
-        names: Name of each mode that AVAILABLE_MODES lists.
+        names: Name of each mode in AVAILABLE_MODES.
         boot_mode: Mode after power-on.
         unarmable: Modes in which it cannot be armed.
         refused: MAV_RESULT of a command that it refuses now.
         unknown_mode: MAV_RESULT of a change to a mode that it does not have.
         unknown_rate: MAV_RESULT of MAV_CMD_SET_MESSAGE_INTERVAL for a message that it does not send.
-        unknown_message: MAV_RESULT of MAV_CMD_REQUEST_MESSAGE for one.
-        prearm: Prefixes of the texts with the reasons why it cannot be armed: when asked, and on arming.
-        unfit: Returns the reasons.
+        unknown_message: MAV_RESULT of MAV_CMD_REQUEST_MESSAGE for such a message.
+        prearm: Prefixes of the texts with the reasons against arming: on request, and on arming.
+        arming_errors: Returns the reasons against arming.
         parameters: Its parameters, within the limits of a profile.
         failsafes: Its fail-safes.
         streams_hz: Default rates of messages on a telemetry port.
-        groups: Groups of messages that parameters and REQUEST_DATA_STREAM set; empty where it ignores those.
+        groups: Groups of messages whose rates parameters and REQUEST_DATA_STREAM set; empty if it ignores these.
         spool_s: Time from arming to the earliest lift-off.
         landed_s: Time on the ground after which it has detected its landing.
         fix_type: GPS_FIX_TYPE with a good receiver.
-        guided_holds: Whether it stays in the mode of set-points, and at its place, without set-points.
-        lifts_off: Whether set-points make it lift off.
-        lands_anywhere: Whether it accepts LAND and RTL on the ground.
-        first_item: Number of the first item of a mission that is flown: before it is home.
+        guided_holds: True if it holds its position in the mode of set-points when set-points are missing.
+        lifts_off: True if set-points make it lift off.
+        lands_anywhere: True if it accepts LAND and RTL on the ground.
+        first_item: Number of the first item of a mission that is flown; ArduPilot's item 0 is home.
     """
 
     autopilot: int
@@ -69,7 +69,7 @@ class Firmware:
     unknown_rate: int
     unknown_message: int
     prearm: tuple[str, str]
-    unfit: Callable[[Parameters, Battery], list[str]]
+    arming_errors: Callable[[Parameters, Battery], list[str]]
     parameters: Callable[[FlightLimits], tuple[Parameter, ...]]
     failsafes: Callable[[Parameters], Failsafes]
     streams_hz: Mapping[int, float]
@@ -84,9 +84,9 @@ class Firmware:
 
     @property
     def is_ardupilot(self) -> bool:
-        """Whether it is ArduPilot's."""
+        """True if it is ArduPilot."""
         return self.guided_holds
 
     def mode_of(self, custom_mode: int) -> Mode | None:
-        """Return the mode of a number; None for one that it does not have."""
+        """Return the mode of a custom mode number, or None if the firmware has no such mode."""
         return next((mode for mode, number in self.modes.items() if number == custom_mode), None)

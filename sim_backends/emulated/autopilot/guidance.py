@@ -1,4 +1,4 @@
-"""Guidance: the velocity and the heading with which the vehicle flies to its goal or follows set-points."""
+"""Guidance: velocity and heading with which the vehicle flies to its goal or follows set-points."""
 
 import math
 from typing import Final, NamedTuple
@@ -11,7 +11,7 @@ from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.physics.quadrotor import QuadrotorLimits
 
 NEAR_M: Final = 0.1
-"""A drone this near to a point has reached it."""
+"""Distance at which a drone has reached a point."""
 _EXCEPT_RTL: Final = 2
 """WP_YAW_BEHAVIOR: turn to the next waypoint, except in RTL."""
 
@@ -20,8 +20,8 @@ class SetPoint(NamedTuple):
     """A set-point.
 
     Attributes:
-        vector: Place relative to home in m, or velocity in m/s: east, north, up.
-        is_place: Whether it is a place.
+        vector: Position relative to home in m, or velocity in m/s: east, north, up.
+        is_place: True if it is a position.
         yaw_rad: Heading from east towards north; None if it has none.
     """
 
@@ -31,65 +31,65 @@ class SetPoint(NamedTuple):
 
 
 class Guidance:
-    """What the vehicle flies to; places are relative to home.
+    """Goal and set-points of the vehicle; positions are relative to home.
 
     Args:
         firmware: Family of the autopilot.
         parameters: Its parameters.
 
     Attributes:
-        goal_m: Where it flies to in modes that follow no set-points; below home: it lands there.
+        goal_m: Goal in modes that follow no set-points; a goal below home is a landing.
         set_point: The last set-point.
-        led_ns: When the last set-point came; None before there was one.
+        set_point_ns: Time of the last set-point; None before the first one.
     """
 
     def __init__(self, firmware: Firmware, parameters: Parameters) -> None:
         self._firmware = firmware
         self._parameters = parameters
-        self.led_ns: int | None = None
+        self.set_point_ns: int | None = None
         self.hold((0.0, 0.0, 0.0))
 
     def hold(self, place_m: Vector) -> None:
-        """Stay at a place, with set-points and without."""
+        """Hold a position, in all modes."""
         self.goal_m = place_m
         self.set_point = SetPoint(place_m, is_place=True)
 
-    def is_led(self, now_ns: int) -> bool:
-        """Return whether set-points come often enough."""
-        return self.led_ns is not None and now_ns - self.led_ns <= self._parameters["COM_OF_LOSS_T"] * 1e9
+    def has_recent_set_point(self, now_ns: int) -> bool:
+        """Return True if the last set-point is recent enough."""
+        return self.set_point_ns is not None and now_ns - self.set_point_ns <= self._parameters["COM_OF_LOSS_T"] * 1e9
 
     def is_home(self, body: Airframe) -> bool:
-        """Return whether it is near enough to home to descend."""
+        """Return True if it is near enough to home to descend."""
         return math.hypot(*body.position_m[:2]) < self._parameters["NAV_ACC_RAD"]
 
-    def velocity_m_s(self, mode: Mode, body: Airframe, can: QuadrotorLimits, ceiling_m: float) -> Vector:
-        """Return the velocity to fly with in the air.
+    def velocity_m_s(self, mode: Mode, body: Airframe, limits: QuadrotorLimits, ceiling_m: float) -> Vector:
+        """Return the target velocity in the air.
 
         Args:
             mode: The mode.
-            body: Where it is.
-            can: What it can do.
+            body: State of motion.
+            limits: Current limits of the airframe.
             ceiling_m: Height of the fence.
         """
         if mode is Mode.OFFBOARD:
             vector, is_place, _ = self.set_point
-            return velocity_to(vector, body, can) if is_place else vector
+            return velocity_to(vector, body, limits) if is_place else vector
         if mode is Mode.RTL:
-            return self._return_m_s(body, can, ceiling_m)
+            return self._return_m_s(body, limits, ceiling_m)
         if mode in LANDING or (mode is Mode.MISSION and self.goal_m[2] < 0):
-            return self._descent_m_s(body, can)
-        return velocity_to(self.goal_m, body, can)
+            return self._descent_m_s(body, limits)
+        return velocity_to(self.goal_m, body, limits)
 
-    def _return_m_s(self, body: Airframe, can: QuadrotorLimits, ceiling_m: float) -> Vector:
-        """Rise, then fly home (PX4's return mode)."""
+    def _return_m_s(self, body: Airframe, limits: QuadrotorLimits, ceiling_m: float) -> Vector:
+        """Climb, then fly home (PX4's return mode)."""
         height_m = min(max(self.goal_m[2], self._parameters["RTL_RETURN_ALT"]), ceiling_m)
-        rises = body.position_m[2] < height_m - NEAR_M and not self.is_home(body)
-        return velocity_to((*self.goal_m[:2], height_m) if rises else (0.0, 0.0, height_m), body, can)
+        climbs = body.position_m[2] < height_m - NEAR_M and not self.is_home(body)
+        return velocity_to((*self.goal_m[:2], height_m) if climbs else (0.0, 0.0, height_m), body, limits)
 
-    def _descent_m_s(self, body: Airframe, can: QuadrotorLimits) -> Vector:
+    def _descent_m_s(self, body: Airframe, limits: QuadrotorLimits) -> Vector:
         is_fast = body.position_m[2] > self._parameters["MPC_LAND_ALT2"]
         speed_m_s = self._parameters["MPC_Z_VEL_MAX_DN" if is_fast else "MPC_LAND_SPEED"]
-        east, north, _ = velocity_to(self.goal_m, body, can)
+        east, north, _ = velocity_to(self.goal_m, body, limits)
         return east, north, -speed_m_s
 
     def yaw_rad(self, mode: Mode, body: Airframe) -> float | None:
@@ -97,9 +97,9 @@ class Guidance:
         behavior = self._parameters["WP_YAW_BEHAVIOR"]
         if mode is Mode.OFFBOARD and self.set_point.yaw_rad is not None:
             return self.set_point.yaw_rad
-        keeps = mode in LANDING or mode in PILOTED or mode is Mode.TAKEOFF
+        keeps_heading = mode in LANDING or mode in PILOTED or mode is Mode.TAKEOFF
         if mode is Mode.OFFBOARD and not self._firmware.is_ardupilot:
-            keeps = True
-        if keeps or not behavior or (mode is Mode.RTL and behavior == _EXCEPT_RTL):
+            keeps_heading = True
+        if keeps_heading or not behavior or (mode is Mode.RTL and behavior == _EXCEPT_RTL):
             return None
         return body.course_rad

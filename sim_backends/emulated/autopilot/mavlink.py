@@ -1,4 +1,4 @@
-"""MAVLink frames, by the common dialect; the only user of `pymavlink`.
+"""MAVLink frames of the common dialect; the only module that imports `pymavlink` for the emulated autopilot.
 
 Constants and messages have the names of the dialect (https://mavlink.io/en/messages/common.html).
 """
@@ -10,7 +10,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 Message = Any
-"""One message: an object with its fields as attributes, of a class that the dialect generates."""
+"""A message: an object with its fields as attributes, of a class that the dialect generates."""
 
 __all__ = [
     "AUTOPILOT_COMPONENT",
@@ -38,15 +38,15 @@ COMMON_CAPABILITIES: Final[int] = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 )
 EKF_STATUS_REPORT: Final = 193
-"""Message of ArduPilot's own dialect."""
+"""Message of ArduPilot's dialect."""
 PROTOCOL_VERSION: Final = 300
 COMPONENT_METADATA: Final = 397
 AVAILABLE_MODES: Final = 435
-"""Messages of the common dialect that pymavlink's `common` does not have."""
+"""Messages of the common dialect that are missing in pymavlink's `common`."""
 
 
 class _RawMessage(dialect.MAVLink_message):  # type: ignore[misc]  # pymavlink has no types
-    """A message whose payload is packed here."""
+    """A message whose payload is packed by this module."""
 
     def __init__(self, number: int, name: str, payload: bytes, crc_extra: int) -> None:
         super().__init__(number, name)
@@ -66,20 +66,20 @@ def protocol_version() -> Message:
 
 
 def component_metadata(boot_ms: int, uri: str) -> Message:
-    """Return COMPONENT_METADATA with the place of the general metadata file, whose checksum is not known (0)."""
+    """Return COMPONENT_METADATA with the URI of the general metadata file; 0 means that its checksum is unknown."""
     payload = struct.pack("<II100s", boot_ms, 0, uri.encode("ascii"))
     return _RawMessage(COMPONENT_METADATA, "COMPONENT_METADATA", payload, 182)
 
 
 def available_modes(count: int, index: int, standard: int, custom: int, name: str) -> Message:
-    """Return AVAILABLE_MODES of one mode; indices begin at 1.
+    """Return AVAILABLE_MODES of one mode; indices start at 1.
 
     Args:
         count: Number of modes.
-        index: Index of this one.
+        index: Index of this mode.
         standard: MAV_STANDARD_MODE, 0 for a mode that is not standard.
         custom: Custom mode of HEARTBEAT.
-        name: Name to show.
+        name: Display name.
     """
     payload = struct.pack("<IIBBB35s", custom, 0, count, index, standard, name.encode("ascii"))
     return _RawMessage(AVAILABLE_MODES, "AVAILABLE_MODES", payload, 134)
@@ -93,27 +93,27 @@ def ekf_status_report(flags: int) -> Message:
 
 
 def read(datagram: bytes) -> Iterator[Message]:
-    """Yield the messages in a datagram; other bytes and incomplete frames are left out.
+    """Yield the messages in a datagram; other bytes and incomplete frames are skipped.
 
-    Each datagram is parsed separately: an incomplete one does not affect the next.
+    Each datagram is parsed separately, so that an incomplete frame does not affect the next datagram.
     """
     parser = dialect.MAVLink(None)
-    parser.robust_parsing = True  # bad data is a message of its own, not an error
+    parser.robust_parsing = True  # bad data becomes a message instead of an error
     for message in parser.parse_buffer(datagram) or ():
         if message.get_type() != "BAD_DATA" and not message.get_type().startswith("UNKNOWN"):
             yield message
 
 
 def addressee(message: Message) -> tuple[int, int]:
-    """Return target system and component of a message; 0 is a broadcast, as is a message without these fields."""
+    """Return target system and component of a message; 0, also without these fields, is a broadcast."""
     return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
 
 
 class Writer:
-    """Makes the frames of one port, with their sequence numbers.
+    """Packs the frames of one port, with their sequence numbers.
 
     Args:
-        system: Id of the system that sends them.
+        system: Id of the sending system.
     """
 
     def __init__(self, system: int) -> None:

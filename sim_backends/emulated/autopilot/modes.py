@@ -5,10 +5,10 @@ from typing import Final
 
 
 class Mode(Enum):
-    """A flight mode; each family has its own names: OFFBOARD is PX4's, which ArduCopter calls GUIDED.
+    """A flight mode; each firmware has its own names: ArduCopter's GUIDED is PX4's OFFBOARD.
 
-    The last four are a pilot's modes. There are no sticks: the drone stays at its place in the air as with centred
-    sticks, and on the ground as with the throttle closed.
+    The last four are a pilot's modes. There are no sticks: in the air the drone holds its position, as with centred
+    sticks, and on the ground it stays, as with the throttle closed.
     """
 
     TAKEOFF = auto()

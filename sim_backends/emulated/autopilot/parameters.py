@@ -1,4 +1,4 @@
-"""Parameters of the emulated autopilot: with the names and units of its family, read in SI units by PX4's names."""
+"""Parameters of the emulated autopilots: with names and units of the firmware, read in SI units by PX4's names."""
 
 import math
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ class Parameter:
     """One parameter.
 
     Attributes:
-        name: Name in its family; empty for an internal constant that is not listed.
+        name: Name in the firmware; empty for an internal constant that is not listed.
         value: Value at power-on.
-        least: Smallest value that is accepted.
-        most: Largest value that is accepted.
-        key: PX4's name for it, by which the vehicle reads it; empty where that is `name`.
-        scale: This many of its units are one of SI.
-        integer: Whether it is an integer (MAV_PARAM_TYPE_INT32), else a float (REAL32).
+        least: Minimum.
+        most: Maximum.
+        key: PX4's name, by which the vehicle reads it; empty if it equals `name`.
+        scale: Number of its units per SI unit.
+        integer: True if it is an integer (MAV_PARAM_TYPE_INT32); otherwise a float (REAL32).
     """
 
     name: str
@@ -30,8 +30,8 @@ class Parameter:
     integer: bool = False
 
 
-USUAL_M: Final = 30.0, 100.0
-"""Height and fence of a drone whose profile does not have them."""
+DEFAULT_M: Final = 30.0, 100.0
+"""Height and distance limits of a drone whose profile has none."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class FlightLimits:
     """Limits of a drone's profile; no parameter can exceed them.
 
     Attributes:
-        speed_m_s: Over the ground.
-        height_m: Above home.
-        fence_m: From home, over the ground.
+        speed_m_s: Ground speed.
+        height_m: Height above home.
+        fence_m: Horizontal distance from home.
     """
 
     speed_m_s: float
@@ -50,12 +50,12 @@ class FlightLimits:
 
 
 def of_profile(name: str, most: float, *, least: float, key: str = "", scale: float = 1.0) -> Parameter:
-    """Return a parameter whose value is its maximum, which a profile gives in SI units."""
+    """Return a parameter whose value is its maximum, given by a profile in SI units."""
     return Parameter(name, most * scale, min(least, most) * scale, most * scale, key, scale)
 
 
 def fixed(name: str, value: float, key: str = "") -> Parameter:
-    """Return a float that has one value."""
+    """Return a float parameter with a constant value."""
     return Parameter(name, value, value, value, key)
 
 
@@ -65,7 +65,7 @@ def integer(name: str, value: int, least: int, most: int, key: str = "") -> Para
 
 
 def stored(**values: float) -> tuple[Parameter, ...]:
-    """Return parameters that ground stations read and write, and that change nothing in the emulated vehicle."""
+    """Return parameters that ground stations read and write, without effect on the emulated vehicle."""
     big = 1e9
     return tuple(
         Parameter(name, value, -big, big, integer=isinstance(value, int)) for name, value in sorted(values.items())
@@ -73,10 +73,10 @@ def stored(**values: float) -> tuple[Parameter, ...]:
 
 
 class Parameters:
-    """The current values.
+    """Current values of the parameters.
 
     Args:
-        declared: All parameters; they are listed by name.
+        declared: All parameters; they are listed in the order of their names.
     """
 
     def __init__(self, declared: tuple[Parameter, ...]) -> None:
@@ -94,26 +94,26 @@ class Parameters:
         return self._values[key] / self._by_key[key].scale
 
     def __contains__(self, key: str) -> bool:
-        """Return whether there is a parameter of this key."""
+        """Return True if there is a parameter of this key."""
         return key in self._values
 
     def listed(self, name: str) -> float:
-        """Return a value in the units of the family, by the family's name."""
+        """Return a value in the units of the firmware, by the firmware's name."""
         return self._values[self._key_of[name]]
 
     def is_integer(self, name: str) -> bool:
-        """Return whether the parameter of the family's name is an integer."""
+        """Return True if the parameter of this firmware name is an integer."""
         return self._by_key[self._key_of[name]].integer
 
     def set(self, name: str, value: float) -> bool:
-        """Set a parameter by the family's name; return whether it exists and accepts this value."""
-        return name in self._key_of and self._put(self._key_of[name], value)
+        """Set a parameter by the firmware's name; return True if it exists and accepts the value."""
+        return name in self._key_of and self._store(self._key_of[name], value)
 
     def change(self, key: str, value: float) -> bool:
-        """Set a parameter in SI units, by PX4's name; return whether it accepts this value."""
-        return self._put(key, value * self._by_key[key].scale)
+        """Set a parameter in SI units, by PX4's name; return True if it accepts the value."""
+        return self._store(key, value * self._by_key[key].scale)
 
-    def _put(self, key: str, value: float) -> bool:
+    def _store(self, key: str, value: float) -> bool:
         parameter = self._by_key[key]
         if not math.isfinite(value) or not parameter.least <= value <= parameter.most:
             return False

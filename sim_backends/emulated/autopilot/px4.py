@@ -19,7 +19,7 @@ from sim_backends.emulated.autopilot.parameters import (
 
 _d = dialect
 _CRITICAL: Final = 0.07
-"""BAT_CRIT_THR, the arming limit where COM_ARM_BAT_MIN is negative."""
+"""BAT_CRIT_THR, which is the arming limit if COM_ARM_BAT_MIN is negative."""
 
 
 def _custom(main: int, sub: int = 0) -> int:
@@ -94,7 +94,7 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
     )
 
 
-def _unfit(parameters: Parameters, battery: Battery) -> list[str]:
+def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
     least = parameters["COM_ARM_BAT_MIN"]
     return ["Low battery"] if battery.left < (least if least >= 0 else _CRITICAL) else []
 
@@ -135,7 +135,7 @@ PX4: Final = Firmware(
     unknown_rate=_d.MAV_RESULT_FAILED,
     unknown_message=_d.MAV_RESULT_DENIED,
     prearm=("Preflight Fail: ", "Preflight Fail: "),
-    unfit=_unfit,
+    arming_errors=_arming_errors,
     parameters=_declared,
     failsafes=Px4Failsafes,
     # MAVLINK_MODE_NORMAL, of a telemetry radio and of port 14550 (mavlink_main.cpp), as far as emulated.

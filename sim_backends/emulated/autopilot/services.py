@@ -16,7 +16,7 @@ _FTP_HEADER: Final = struct.Struct("<HBBBBBxI")
 _FTP_BYTES: Final = 251
 _ACK, _NAK = 128, 129
 _OPENS: Final = frozenset({4, 11, 14})
-"""Opcodes that open a file, or compute its checksum: OpenFileRO, OpenFileWO, CalcFileCRC32."""
+"""Opcodes that open a file or compute its checksum: OpenFileRO, OpenFileWO, CalcFileCRC32."""
 _CLOSES: Final = frozenset({1, 2})
 """TerminateSession, ResetSessions."""
 _LISTS: Final = 3
@@ -27,13 +27,13 @@ class ParameterService:
     """Lists, reads and sets parameters (https://mavlink.io/en/services/parameter.html).
 
     PX4 encodes integers bytewise and reports an unknown name by a text. ArduPilot encodes them by a C cast, ignores
-    the type that a client gives, and does not answer for an unknown name.
+    the type in the client's message, and does not answer for an unknown name.
 
     Args:
         firmware: Family of the autopilot.
         parameters: Its parameters.
         changed: Called with the name of a parameter that was set.
-        say: Called with severity and text for people.
+        report: Called with the severity and a text for people.
     """
 
     def __init__(
@@ -41,12 +41,12 @@ class ParameterService:
         firmware: Firmware,
         parameters: Parameters,
         changed: Callable[[str], None],
-        say: Callable[[int, str], None],
+        report: Callable[[int, str], None],
     ) -> None:
         self._firmware = firmware
         self._parameters = parameters
         self._changed = changed
-        self._say = say
+        self._report = report
 
     def handle(self, message: Message) -> Iterator[Message]:
         """Yield the answers to PARAM_REQUEST_LIST, PARAM_REQUEST_READ or PARAM_SET."""
@@ -60,7 +60,7 @@ class ParameterService:
                 name = names[number] if 0 <= number < len(names) else ""
             if name not in names:
                 if not self._firmware.is_ardupilot and name:
-                    self._say(dialect.MAV_SEVERITY_INFO, f"[pm] unknown param: {name}")
+                    self._report(dialect.MAV_SEVERITY_INFO, f"[pm] unknown param: {name}")
                 return
             if kind == "PARAM_SET":
                 self._set(name, message)
@@ -71,7 +71,7 @@ class ParameterService:
         if not self._firmware.is_ardupilot:
             expected = _INT if self._parameters.is_integer(name) else _FLOAT
             if message.param_type != expected:
-                self._say(dialect.MAV_SEVERITY_INFO, f"[pm] param types mismatch param: {name}")
+                self._report(dialect.MAV_SEVERITY_INFO, f"[pm] param types mismatch param: {name}")
                 return
             if expected == _INT:
                 (value,) = struct.unpack("<i", struct.pack("<f", value))
@@ -96,14 +96,14 @@ class ParameterService:
 def answers(message: Message, now_ns: int) -> Iterator[Message]:
     """Yield the answers to TIMESYNC, PING, LOG_REQUEST_LIST and FILE_TRANSFER_PROTOCOL.
 
-    There are no logs and no files: a list is empty, and a file is not found.
+    There are no logs and no files: lists are empty, and files are not found.
     """
     kind = message.get_type()
     if kind == "TIMESYNC" and message.tc1 == 0:
         yield dialect.MAVLink_timesync_message(now_ns, message.ts1)
     elif kind == "PING" and message.target_system == message.target_component == 0:
-        asker = message.get_srcSystem(), message.get_srcComponent()
-        yield dialect.MAVLink_ping_message(message.time_usec, message.seq, *asker)
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        yield dialect.MAVLink_ping_message(message.time_usec, message.seq, *sender)
     elif kind == "LOG_REQUEST_LIST":
         yield dialect.MAVLink_log_entry_message(0, 0, 0, 0, 0)
     elif kind == "FILE_TRANSFER_PROTOCOL":
@@ -129,7 +129,7 @@ def _file_answer(message: Message) -> Message:
 
 
 def text(name: str | bytes) -> str:
-    """Return a name of a message, which may contain any bytes, and ends at the first zero."""
+    """Return a name in a message: it ends at the first zero byte, and bytes that are not printable become "?"."""
     raw = name if isinstance(name, bytes) else name.encode("utf-8", "replace")
     return "".join(
         letter if letter.isprintable() else "?" for letter in raw.split(b"\0")[0].decode("ascii", "replace")

@@ -1,4 +1,4 @@
-"""Messages with the state of the vehicle."""
+"""Telemetry: messages with the state of the vehicle."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ from sim_backends.physics.body import GRAVITY_M_S2
 _UNKNOWN_CELL: Final = 0xFFFF
 _NAN: Final = math.nan
 _METADATA: Final = "mftp:///etc/extras/component_general.json.xz"
-"""Where PX4 has its metadata; file transfer is refused here."""
+"""Location of PX4's metadata; the emulated file transfer refuses it."""
 _MAGNET_GAUSS: Final = 0.21, 0.0, 0.42
 """Magnetic field north, east, down in gauss; typical for middle latitudes."""
 _SEA_HPA: Final = 1013.25
@@ -35,7 +35,7 @@ _SENSORS: Final = (
 
 
 class Telemetry:
-    """Makes messages of the state of a vehicle.
+    """Makes messages with the state of a vehicle.
 
     Args:
         vehicle: The vehicle.
@@ -64,20 +64,20 @@ class Telemetry:
             d.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             d.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.PROTOCOL_VERSION: mavlink.protocol_version,
-            **(self._of_ardupilot() if ardupilot else self._of_px4()),
+            **(self._ardupilot_makers() if ardupilot else self._px4_makers()),
         }
-        """By message id; a maker returns None for a message that it cannot make yet."""
+        """Maker per message id; a maker returns None while its message is not available."""
         self.streamed_only: Final = frozenset({mavlink.EKF_STATUS_REPORT})
         """Messages that have a rate, but are not sent on request."""
 
-    def _of_ardupilot(self) -> dict[int, Callable[[], Message | None]]:
+    def _ardupilot_makers(self) -> dict[int, Callable[[], Message | None]]:
         return {
             dialect.MAVLINK_MSG_ID_RAW_IMU: self._raw_imu,
             dialect.MAVLINK_MSG_ID_TIMESYNC: self._timesync,
             mavlink.EKF_STATUS_REPORT: lambda: mavlink.ekf_status_report(self._vehicle.estimate.flags),
         }
 
-    def _of_px4(self) -> dict[int, Callable[[], Message | None]]:
+    def _px4_makers(self) -> dict[int, Callable[[], Message | None]]:
         return {
             dialect.MAVLINK_MSG_ID_ALTITUDE: self._altitude,
             dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._estimator_status,
@@ -88,7 +88,7 @@ class Telemetry:
         }
 
     def available_modes(self, index: float) -> list[Message]:
-        """Return AVAILABLE_MODES of one mode, or of all for index 0; empty for an index that does not exist."""
+        """Return AVAILABLE_MODES of one mode, or of all modes for index 0; empty for an unknown index."""
         firmware = self._vehicle.firmware
         count = len(firmware.names)
         return [
@@ -115,15 +115,15 @@ class Telemetry:
         vehicle, firmware = self._vehicle, self._vehicle.firmware
         base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | firmware.base
         px4 = not firmware.is_ardupilot
-        by_itself = vehicle.mode not in {Mode.OFFBOARD, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD}
-        base |= dialect.MAV_MODE_FLAG_AUTO_ENABLED if px4 and by_itself else 0
+        is_automatic = vehicle.mode not in {Mode.OFFBOARD, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD}
+        base |= dialect.MAV_MODE_FLAG_AUTO_ENABLED if px4 and is_automatic else 0
         base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0
         return dialect.MAVLink_heartbeat_message(
             dialect.MAV_TYPE_QUADROTOR, firmware.autopilot, base, firmware.modes[vehicle.mode], self._state(), 3
         )
 
     def _state(self) -> int:
-        """Return MAV_STATE: ArduCopter is ACTIVE once it lifts off, PX4 while it is armed."""
+        """Return MAV_STATE: ArduCopter is ACTIVE after it lifts off, PX4 while it is armed."""
         vehicle = self._vehicle
         ardupilot = vehicle.firmware.is_ardupilot
         if vehicle.failsafes.active and (ardupilot or vehicle.armed):
@@ -133,9 +133,9 @@ class Telemetry:
 
     def _sys_status(self) -> Message:
         battery = self._vehicle.battery
-        ill = dialect.MAV_SYS_STATUS_PREARM_CHECK if self._vehicle.unfit else 0
+        failed = dialect.MAV_SYS_STATUS_PREARM_CHECK if self._vehicle.arming_errors else 0
         return dialect.MAVLink_sys_status_message(
-            *(_SENSORS, _SENSORS, _SENSORS & ~ill),
+            *(_SENSORS, _SENSORS, _SENSORS & ~failed),
             *(200, _u16(battery.voltage_v * 1e3), round(battery.current_a * 1e2), math.ceil(battery.left * 100)),
             *(0,) * 6,
         )
@@ -171,7 +171,7 @@ class Telemetry:
 
     @property
     def _heading_rad(self) -> float:
-        """From north to the right, as in MAVLink."""
+        """Heading from north clockwise, as in MAVLink."""
         return math.remainder(math.pi / 2 - self._vehicle.body.yaw_rad, math.tau)
 
     @property
@@ -180,7 +180,7 @@ class Telemetry:
 
     @property
     def _quaternion(self) -> tuple[float, float, float, float]:
-        """From NED to the body, forward-right-down: w, x, y, z."""
+        """Rotation from NED to the body axes (forward, right, down): w, x, y, z."""
         (roll, pitch), yaw = self._vehicle.body.tilt_rad, self._heading_rad
         (cr, sr), (cp, sp), (cy, sy) = ((math.cos(half / 2), math.sin(half / 2)) for half in (roll, pitch, yaw))
         return (
@@ -191,7 +191,7 @@ class Telemetry:
         )
 
     def _in_body(self, vector: Vector) -> Vector:
-        """Return a vector of NED along the axes of the body, forward, right, down."""
+        """Return a vector in NED along the axes of the body: forward, right, down."""
         w, x, y, z = self._quaternion
         north, east, down = vector
         return (
@@ -296,7 +296,7 @@ class Telemetry:
         )
 
     def mission_current(self) -> Message:
-        """Return MISSION_CURRENT, which also answers questions."""
+        """Return MISSION_CURRENT, which is also sent as an answer."""
         mission = self._vehicle.mission
         return dialect.MAVLink_mission_current_message(mission.current, len(mission.items))
 

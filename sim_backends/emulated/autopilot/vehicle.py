@@ -31,13 +31,13 @@ _CRITICAL: Final = dialect.MAV_SEVERITY_CRITICAL
 _PREARM_NS: Final = 30_000_000_000
 """ArduPilot repeats the reasons why it cannot be armed at this interval (AP_Arming)."""
 _OFFBOARD_LOST: Final = {3: Mode.RTL, 4: Mode.LAND}
-"""Mode without set-points, by COM_OBL_RC_ACT; a pilot's modes need sticks, so that PX4 holds instead."""
+"""Mode when set-points are missing, by COM_OBL_RC_ACT; PX4 holds instead of a pilot's mode, which needs sticks."""
 _STARTING_FLAGS: Final = {True: 0xA7, False: 0xA5}
-"""Flags of an estimate without an origin: whether it is ArduPilot's."""
+"""Flags of an estimate without an origin; the key is True for ArduPilot."""
 
 
 class Refused(Exception):  # noqa: N818 (an answer of the autopilot, not an error)
-    """The vehicle does not do it now; the text is for people, and empty where the firmware sends none."""
+    """The vehicle refuses a command; the text is for people, and empty if the firmware sends none."""
 
 
 class Remark(NamedTuple):
@@ -52,33 +52,33 @@ class Vehicle:
 
     Args:
         firmware: Family of its autopilot.
-        parameters: Its parameters; it reads the current values.
-        can: What its body can do.
-        around: Obstacles in the world, including the floor.
-        now_ns: When it is switched on.
+        parameters: Its parameters; the vehicle reads the current values.
+        limits: Limits of its airframe.
+        obstacles: Obstacles in the world, including the floor.
+        now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
 
     Attributes:
-        body: Place and motion, relative to home.
-        armed: Whether its motors turn.
-        landed: Whether it has detected that it is on the ground.
+        body: Position and motion, relative to home.
+        armed: True if its motors turn.
+        landed: True if it has detected that it is on the ground.
         mode: Its flight mode.
         mission: The mission of mode MISSION.
         battery: Its battery.
         estimate: Its position estimate.
-        fence: Its own fence.
-        guidance: What it flies to.
-        home_m: Home in the world, metres east, north, up: where it was armed last, before that where it booted.
+        fence: Its fence.
+        guidance: Its goal and set-points.
+        home_m: Home in the world, metres east, north, up: where it was armed last, or else where it booted.
         failsafes: Its fail-safes.
-        remarks: Texts that were not sent yet; the reader takes them out.
+        remarks: Texts that are not sent yet; the reader clears the list.
     """
 
     def __init__(
         self,
         firmware: Firmware,
         parameters: Parameters,
-        can: QuadrotorLimits,
-        around: Sequence[Footprint],
+        limits: QuadrotorLimits,
+        obstacles: Sequence[Footprint],
         now_ns: int,
         *,
         boot_s: float = 0.0,
@@ -86,8 +86,8 @@ class Vehicle:
         self.firmware = firmware
         self.battery = Battery(now_ns)
         self._parameters = parameters
-        self._can = can
-        self._around = around
+        self._limits = limits
+        self._obstacles = obstacles
         self.estimate = PositionEstimate(boot_s, _STARTING_FLAGS[firmware.is_ardupilot])
         self.fence = Fence(parameters)
         self.guidance = Guidance(firmware, parameters)
@@ -98,7 +98,7 @@ class Vehicle:
         self.boot(now_ns)
 
     def boot(self, now_ns: int) -> None:
-        """Boot: the mode is that after power-on, fail-safes and the origin are reset."""
+        """Boot: set the mode after power-on, and reset fail-safes and origin."""
         self.estimate.boot(now_ns)
         self._prearm_ns = now_ns
         self.mode = self.firmware.boot_mode
@@ -106,26 +106,26 @@ class Vehicle:
         self.failsafes = self.firmware.failsafes(self._parameters)
 
     def place(self, place_m: Vector, facing_rad: float, now_ns: int) -> None:
-        """Put it on the ground at another place in the world, as a person who carries it. Its mode stays."""
-        self.body = Airframe(self._can, place_m, facing_rad, self._around, now_ns)
+        """Put it on the ground at another place in the world, as if a person carried it. Its mode stays."""
+        self.body = Airframe(self._limits, place_m, facing_rad, self._obstacles, now_ns)
         if self.estimate.origin_m is None:
             self.home_m = place_m
         self.body.home_m = self.home_m
         self.armed = False
         self.landed = True
         self.guidance.hold(self.body.position_m)
-        self.guidance.led_ns = None
+        self.guidance.set_point_ns = None
         self.fence.reset()
         self._flew = False
-        self._stands_ns = self._armed_ns = now_ns
+        self._grounded_ns = self._armed_ns = now_ns
 
     @property
     def local_m(self) -> Vector | None:
-        """Place relative to the origin of its local frame, east, north, up; None before there is one."""
+        """Position relative to the origin of its local frame, east, north, up; None before there is an origin."""
         return self.estimate.to_local(self.body.place_m)
 
     def from_local(self, place_m: Vector) -> Vector | None:
-        """Return a place of its local frame relative to home; None before there is such a frame."""
+        """Return the position of a point of its local frame relative to home; None before there is an origin."""
         world_m = self.estimate.to_world(place_m)
         if world_m is None:
             return None
@@ -133,11 +133,11 @@ class Vehicle:
         return east, north, up
 
     @property
-    def can(self) -> QuadrotorLimits:
-        """What its body can do, within its parameters."""
+    def limits(self) -> QuadrotorLimits:
+        """Limits of its airframe, within its parameters."""
         get = self._parameters
         return replace(
-            self._can,
+            self._limits,
             speed_m_s=get["MPC_XY_VEL_MAX"],
             climb_m_s=(get["MPC_Z_VEL_MAX_DN"], get["MPC_Z_VEL_MAX_UP"]),
             acceleration_m_s2=get["MPC_ACC_HOR"],
@@ -145,78 +145,78 @@ class Vehicle:
         )
 
     @property
-    def unfit(self) -> list[str]:
+    def arming_errors(self) -> list[str]:
         """Reasons why it cannot be armed; empty if it can."""
-        found = self.firmware.unfit(self._parameters, self.battery) + self.failsafes.unfit
+        reasons = self.firmware.arming_errors(self._parameters, self.battery) + self.failsafes.arming_errors
         if self.estimate.origin_m is None:
-            found.append("Need Position Estimate" if self.firmware.is_ardupilot else "ekf2 missing data")
-        return found
+            reasons.append("Need Position Estimate" if self.firmware.is_ardupilot else "ekf2 missing data")
+        return reasons
 
-    def say(self, severity: int, text: str) -> None:
+    def report(self, severity: int, text: str) -> None:
         """Add a text for people."""
         self.remarks.append(Remark(severity, text))
 
     def check(self) -> None:
-        """Report why it cannot be armed.
+        """Report the reasons why it cannot be armed.
 
         Raises:
             Refused: It is armed.
         """
         if self.armed:
             raise self._refusal("Prearm checks denied: armed")
-        for why in self.unfit:
-            self.say(_CRITICAL, self.firmware.prearm[0] + why)
+        for reason in self.arming_errors:
+            self.report(_CRITICAL, self.firmware.prearm[0] + reason)
 
     def arm(self) -> None:
         """Start the motors; does nothing if they run.
 
         Raises:
-            Refused: It falls, or cannot be armed now.
+            Refused: It is falling, or cannot be armed now.
         """
         if self.armed:
             return
         if not self.body.on_ground:
             raise self._refusal("Arming denied: it falls")
-        unfit = self.unfit
+        reasons = self.arming_errors
         if self.mode in self.firmware.unarmable:
-            unfit.append(f"{self.firmware.names[_shown(self.mode)]} mode not armable")
-        for why in unfit:
-            self.say(_CRITICAL, self.firmware.prearm[1] + why)
-        if unfit:
+            reasons.append(f"{self.firmware.names[_shown(self.mode)]} mode not armable")
+        for reason in reasons:
+            self.report(_CRITICAL, self.firmware.prearm[1] + reason)
+        if reasons:
             raise self._refusal("Arming denied: Resolve system health failures first")
         self.home_m = self.body.home_m = self.body.place_m
         self.armed, self._flew = True, False
         self.fence.reset()
-        self._stands_ns = self._armed_ns = self.body.now_ns
+        self._grounded_ns = self._armed_ns = self.body.now_ns
         self.guidance.hold(self.body.position_m)
-        self.say(_INFO, "Arming motors" if self.firmware.is_ardupilot else "Armed by external command")
+        self.report(_INFO, "Arming motors" if self.firmware.is_ardupilot else "Armed by external command")
 
     def disarm(self, *, force: bool = False) -> None:
         """Stop the motors.
 
         Args:
-            force: Also in the air: it falls.
+            force: Also in the air, where it falls.
 
         Raises:
-            Refused: It flies.
+            Refused: It is flying.
         """
         if self.armed and not self.body.on_ground and not force:
             raise self._refusal("Disarming denied: not landed")
         if self.armed and self.firmware.is_ardupilot:
-            self.say(_INFO, "Disarming motors")
+            self.report(_INFO, "Disarming motors")
         self.armed = False
         self.failsafes.mode_changed(self.body.now_ns)
         if not self.firmware.is_ardupilot:  # ArduCopter's mode stays
             self.mode = Mode.LOITER
 
     def take_off(self, height_m: float | None = None) -> None:
-        """Rise; a repeated command, as after a lost answer, has no further effect until it lifts off.
+        """Take off; a repeated command, as after a lost answer, has no further effect until it lifts off.
 
         Args:
-            height_m: Above home; None for the parameter's.
+            height_m: Height above home; None for that of the parameter.
 
         Raises:
-            Refused: The motors are off, it flies already, or the height is not allowed.
+            Refused: The motors are off, it is flying, or the height is not allowed.
         """
         if self.mode is Mode.TAKEOFF and (self.landed or not self.firmware.is_ardupilot):
             return
@@ -233,21 +233,22 @@ class Vehicle:
         """Fly to a point relative to home, and stay there.
 
         Raises:
-            Refused: It does not fly, or the point is not allowed.
+            Refused: It is not flying, or the point is not allowed.
         """
         if self.body.on_ground:
             raise self._refusal("Reposition denied: not in the air")
         if self.firmware.is_ardupilot:
             self.change_mode(Mode.OFFBOARD)
-            self.lead(SetPoint(goal_m, is_place=True))
+            self.accept_set_point(SetPoint(goal_m, is_place=True))
         else:
             self._go(Mode.LOITER, goal_m)
             self.failsafes.mode_changed(self.body.now_ns)
 
-    def lead(self, set_point: SetPoint) -> None:
-        """Take a set-point for mode OFFBOARD.
+    def accept_set_point(self, set_point: SetPoint) -> None:
+        """Accept a set-point for mode OFFBOARD.
 
-        ArduCopter takes none in another mode, none on the ground, and no place beyond its fence; one ends a take-off.
+        ArduCopter ignores set-points in other modes and on the ground, and positions outside its fence; an accepted
+        one ends a take-off.
         """
         if self.firmware.is_ardupilot:
             if self.mode not in {Mode.OFFBOARD, Mode.TAKEOFF} or self.body.on_ground:
@@ -255,25 +256,25 @@ class Vehicle:
             if set_point.is_place and not self.fence.contains(set_point.vector):
                 return
             self.mode = Mode.OFFBOARD
-        self.guidance.set_point, self.guidance.led_ns = set_point, self.body.now_ns
+        self.guidance.set_point, self.guidance.set_point_ns = set_point, self.body.now_ns
 
     def change_mode(self, mode: Mode) -> None:
-        """Change the mode as a client asks; the current mode goes on.
+        """Change the mode at the request of a client; the current mode is kept if it is requested again.
 
         Raises:
-            Refused: There is nothing to fly: no mission, no set-points, no position, or it is on the ground.
+            Refused: The mode needs a mission, set-points or flight, which are missing.
         """
         self._switch(mode)
         self.failsafes.mode_changed(self.body.now_ns)
 
     def load(self, items: tuple[Item, ...]) -> None:
-        """Take a new mission; a mission in flight is given up, and the vehicle waits at its place."""
+        """Load a new mission; a mission in flight is aborted, and the vehicle holds its position."""
         if self.mode is Mode.MISSION and self.armed:
             self._switch(Mode.LOITER)
         self.mission.load(items)
 
     def advance(self, now_ns: int) -> None:
-        """Fly until this time, by whole steps."""
+        """Fly until this time, in whole steps."""
         get = self._parameters
         battery = self.battery
         battery.full_v, battery.flight_s = get["SIM_BATT_VOLTAGE"], get["SIM_BAT_DRAIN"]
@@ -284,15 +285,15 @@ class Vehicle:
                 self.body.now_ns += (now_ns - self.body.now_ns) // STEP_NS * STEP_NS
                 self.landed = True
                 break
-            self._watch()
+            self._update_ground_state()
             self.body.driven = self.armed
-            wanted_m_s = self._wanted_m_s()  # it may change the mode
-            self.body.step(wanted_m_s, self.can, self.guidance.yaw_rad(self.mode, self.body))
+            target_m_s = self._target_m_s()  # it may change the mode
+            self.body.step(target_m_s, self.limits, self.guidance.yaw_rad(self.mode, self.body))
         self._watch_boot()
         self._watch_failsafes()
 
     def _watch_boot(self) -> None:
-        """Set the origin once the position estimate is good; until then report why it cannot be armed."""
+        """Set the origin once the position estimate is good; until then report the reasons against arming."""
         now_ns, estimate = self.body.now_ns, self.estimate
         if self.firmware.is_ardupilot and not self.armed and now_ns >= self._prearm_ns:
             self._prearm_ns = now_ns + _PREARM_NS
@@ -304,8 +305,8 @@ class Vehicle:
             self.home_m = self.body.home_m = self.body.place_m
             self.guidance.hold(self.body.position_m)
         if self.firmware.is_ardupilot and not estimate.is_instant:
-            self.say(_INFO, "EKF3 IMU0 origin set")
-            self.say(_INFO, "EKF3 IMU0 is using GPS")
+            self.report(_INFO, "EKF3 IMU0 origin set")
+            self.report(_INFO, "EKF3 IMU0 is using GPS")
 
     @property
     def _state(self) -> VehicleState:
@@ -317,14 +318,14 @@ class Vehicle:
 
     def _react(self, reaction: Reaction) -> None:
         if reaction.text:
-            self.say(reaction.severity, reaction.text)
+            self.report(reaction.severity, reaction.text)
         if reaction.disarm:
             self.disarm(force=True)
         if reaction.mode is not None:
-            self._switch_itself(reaction.mode)
+            self._switch_automatically(reaction.mode)
 
-    def _switch_itself(self, mode: Mode) -> None:
-        """Change the mode without a client; where it cannot, on the ground for example, the mode stays."""
+    def _switch_automatically(self, mode: Mode) -> None:
+        """Change the mode without a client's request; if it cannot change, the mode stays."""
         with suppress(Refused):
             self._switch(mode)
 
@@ -336,9 +337,9 @@ class Vehicle:
             self.take_off()
             return
         if self.firmware.is_ardupilot:
-            self._demand_copter(mode)
+            self._check_copter_mode(mode)
         else:
-            self._demand_px4(mode)
+            self._check_px4_mode(mode)
         if mode is Mode.MISSION:
             self.mission.begin()
         self.guidance.goal_m = self._rest_m()
@@ -346,26 +347,26 @@ class Vehicle:
             self.guidance.hold(self.guidance.goal_m)
         self.mode = mode
 
-    def _demand_copter(self, mode: Mode) -> None:
-        """Raise `Refused` if ArduCopter does not change to a mode now; unarmed it accepts any (Copter::set_mode)."""
+    def _check_copter_mode(self, mode: Mode) -> None:
+        """Raise `Refused` if ArduCopter refuses a mode now; unarmed it accepts any (Copter::set_mode)."""
         if not self.armed:
             return
         items, first = self.mission.items, self.firmware.first_item
         if mode is Mode.MISSION and len(items) <= first:
             raise self._failed_mode(mode)
         if mode is Mode.MISSION and self.landed and items[first].command != dialect.MAV_CMD_NAV_TAKEOFF:
-            self.say(_CRITICAL, "Auto: Missing Takeoff Cmd")
+            self.report(_CRITICAL, "Auto: Missing Takeoff Cmd")
             raise self._failed_mode(mode)
 
     def _failed_mode(self, mode: Mode) -> Refused:
         return Refused(f"Mode change to {self.firmware.names[mode]} failed: init failed")
 
-    def _demand_px4(self, mode: Mode) -> None:
-        """Raise `Refused` if PX4 does not change to a mode now."""
-        stands = not self.armed or self.body.on_ground
-        if mode in {Mode.LAND, Mode.RTL} and stands:
+    def _check_px4_mode(self, mode: Mode) -> None:
+        """Raise `Refused` if PX4 refuses a mode now."""
+        grounded = not self.armed or self.body.on_ground
+        if mode in {Mode.LAND, Mode.RTL} and grounded:
             raise self._refusal(f"{mode.name} denied: not in the air")
-        if mode is Mode.OFFBOARD and not self.guidance.is_led(self.body.now_ns):
+        if mode is Mode.OFFBOARD and not self.guidance.has_recent_set_point(self.body.now_ns):
             raise self._refusal("OFFBOARD denied: no set-points")
         if mode is Mode.MISSION and not self.mission.items:
             raise self._refusal("MISSION denied: no mission")
@@ -376,19 +377,19 @@ class Vehicle:
         self.mode, self.guidance.goal_m = mode, goal_m
 
     def _refusal(self, why: str) -> Refused:
-        """Return what is raised when it does not do something; ArduCopter answers without a text."""
+        """Return the exception for a refused command; ArduCopter answers without a text."""
         return Refused("" if self.firmware.is_ardupilot else why)
 
-    def _watch(self) -> None:
-        """Detect take-off and landing; stop motors that idle; react to missing set-points and to the fence."""
+    def _update_ground_state(self) -> None:
+        """Detect take-off and landing; stop idle motors; react to missing set-points and to the fence."""
         now_ns, ardupilot = self.body.now_ns, self.firmware.is_ardupilot
         if not self.body.on_ground:
-            self._flew, self.landed, self._stands_ns = True, False, now_ns
-        elif now_ns - self._stands_ns >= self.firmware.landed_s * 1e9:
+            self._flew, self.landed, self._grounded_ns = True, False, now_ns
+        elif now_ns - self._grounded_ns >= self.firmware.landed_s * 1e9:
             self.landed = True
-        if self.armed and now_ns - self._stands_ns > self._idle_s() * 1e9:
+        if self.armed and now_ns - self._grounded_ns > self._idle_s() * 1e9:
             if not ardupilot:
-                self.say(_INFO, "Disarmed by landing" if self._flew else "Disarmed by auto preflight disarming")
+                self.report(_INFO, "Disarmed by landing" if self._flew else "Disarmed by auto preflight disarming")
             self.disarm()
         if ardupilot and (breach := self.fence.advance(self._state, self.body.position_m)):
             self._react(breach)
@@ -396,54 +397,54 @@ class Vehicle:
             self._watch_set_points()
 
     def _idle_s(self) -> float:
-        """Return after which time on the ground its motors stop; ArduCopter stops them soon in landing modes only."""
-        ends = self.mode is Mode.MISSION or not self.firmware.is_ardupilot
-        landed = (self._flew and ends) or self.mode in LANDING
+        """Return the time on the ground after which its motors stop; ArduCopter stops them early in landing modes."""
+        stops = self.mode is Mode.MISSION or not self.firmware.is_ardupilot
+        landed = (self._flew and stops) or self.mode in LANDING
         return self._parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]
 
     def _watch_set_points(self) -> None:
-        """Hold, or do what COM_OBL_RC_ACT requires, without set-points; hold if they lead beyond PX4's fence."""
-        is_led = self.guidance.is_led(self.body.now_ns)
+        """React to missing set-points (hold, or COM_OBL_RC_ACT), and hold if they lead outside PX4's fence."""
+        has_recent_set_point = self.guidance.has_recent_set_point(self.body.now_ns)
         if self.firmware.is_ardupilot:
-            if not self.guidance.set_point.is_place and not is_led:
+            if not self.guidance.set_point.is_place and not has_recent_set_point:
                 self.guidance.set_point = SetPoint(self._rest_m(), is_place=True)
-        elif not is_led:
-            self.say(_CRITICAL, "Failsafe activated")
-            self._switch_itself(_OFFBOARD_LOST.get(int(self._parameters["COM_OBL_RC_ACT"]), Mode.LOITER))
+        elif not has_recent_set_point:
+            self.report(_CRITICAL, "Failsafe activated")
+            self._switch_automatically(_OFFBOARD_LOST.get(int(self._parameters["COM_OBL_RC_ACT"]), Mode.LOITER))
             self.failsafes.set_points_lost()
-        elif self.fence.is_crossed(self.body.position_m, stop_m(self.body, self.can)):
-            self.say(_CRITICAL, "Geofence: hold")
-            self._switch_itself(Mode.LOITER)
+        elif self.fence.is_crossed(self.body.position_m, stop_m(self.body, self.limits)):
+            self.report(_CRITICAL, "Geofence: hold")
+            self._switch_automatically(Mode.LOITER)
 
     def _rest_m(self) -> Vector:
-        """Return where it comes to rest if it brakes now, moved to the fence if that is beyond it."""
-        return self.fence.nearest_inside(stop_m(self.body, self.can))
+        """Return where it comes to rest if it brakes now, or the nearest point inside the fence."""
+        return self.fence.nearest_inside(stop_m(self.body, self.limits))
 
     def _stays_down(self) -> bool:
-        """Return whether nothing can make it lift off now: its motors spool up, or its mode does not."""
-        spools = self.body.now_ns - self._armed_ns < self.firmware.spool_s * 1e9
-        led = self.mode is Mode.OFFBOARD and not self.firmware.lifts_off
-        return self.body.on_ground and (spools or led or self.mode in PILOTED)
+        """Return True if it cannot lift off now: its motors spool up, or its mode does not lift off."""
+        spools_up = self.body.now_ns - self._armed_ns < self.firmware.spool_s * 1e9
+        follows_set_points = self.mode is Mode.OFFBOARD and not self.firmware.lifts_off
+        return self.body.on_ground and (spools_up or follows_set_points or self.mode in PILOTED)
 
-    def _wanted_m_s(self) -> Vector:
-        """Return the velocity that it wants now, after the changes of mode that are due."""
+    def _target_m_s(self) -> Vector:
+        """Return the target velocity, after the changes of mode that are due."""
         if not self._stays_down():
             self._advance_mode()
         if self._stays_down():
             return 0.0, 0.0, 0.0
-        can = self.can
+        limits = self.limits
         if self.mode is Mode.MISSION:
-            can = replace(can, speed_m_s=min(can.speed_m_s, self.mission.speed_m_s or can.speed_m_s))
-        return self.guidance.velocity_m_s(self.mode, self.body, can, self.fence.limits_m[1])
+            limits = replace(limits, speed_m_s=min(limits.speed_m_s, self.mission.speed_m_s or limits.speed_m_s))
+        return self.guidance.velocity_m_s(self.mode, self.body, limits, self.fence.limits_m[1])
 
     def _advance_mode(self) -> None:
-        """Go on to the next item of a mission, and to the mode that follows a take-off, a mission or a way home."""
+        """Proceed to the next item of a mission, and to the mode after a take-off, a mission or a return."""
         if self.mode is Mode.MISSION:
-            order = self.mission.fly(self.body, self.home_m, self._parameters["NAV_ACC_RAD"])
-            if isinstance(order, str):
-                self._switch_itself(Mode[order])
+            action = self.mission.fly(self.body, self.home_m, self._parameters["NAV_ACC_RAD"])
+            if isinstance(action, str):
+                self._switch_automatically(Mode[action])
             else:
-                self.guidance.goal_m = order
+                self.guidance.goal_m = action
         if self.mode is Mode.RTL and self.guidance.is_home(self.body):
             self.mode, self.guidance.goal_m = Mode.HOMECOMING, (0.0, 0.0, 0.0)
         if self.mode is Mode.TAKEOFF and math.dist(self.body.position_m, self.guidance.goal_m) < NEAR_M:
@@ -452,5 +453,5 @@ class Vehicle:
 
 
 def _shown(mode: Mode) -> Mode:
-    """Return the mode that a phase belongs to."""
+    """Return the mode that is reported for a mode, which may be a phase of another one."""
     return Mode.RTL if mode is Mode.HOMECOMING else mode

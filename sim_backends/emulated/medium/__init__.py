@@ -1,1 +1,1 @@
-"""The medium: the process that carries packets between robots, and the lab's handle on it."""
+"""The medium: the process that carries packets between robots, and the lab's client of it."""

@@ -1,10 +1,10 @@
-"""Log of what goes over the air, attempt by attempt: a record in `air.pcap` and a line in `air.csv` for each.
+"""Log of the radio transmissions: one record in `air.pcap` and one line in `air.csv` per attempt.
 
-An ACK is an attempt, too, whose number is 0.
+An ACK is an attempt with the number 0.
 
-The capture has link type 105, IEEE 802.11 without FCS (https://www.tcpdump.org/linktypes.html), and nanoseconds.
-Stations have the addresses 02:00:00:00:00:01 and so on, in the order of their names; where packets come in Ethernet
-frames, these name the packet's type.
+The capture has link type 105, IEEE 802.11 without FCS (https://www.tcpdump.org/linktypes.html), and time stamps in
+nanoseconds. Stations have the addresses 02:00:00:00:00:01 and so on, in the order of their names. If packets are in
+Ethernet frames, the packet type is taken from these.
 """
 
 import os
@@ -19,20 +19,20 @@ from sim_backends.radio.frames import TransmissionAttempt
 PCAP: Final = "air.pcap"
 CSV: Final = "air.csv"
 LIMIT_BYTES: Final = 64 << 20
-"""Of both files together; what comes after that is left out."""
+"""Maximum size of both files together; later attempts are left out."""
 
 _SNAP_BYTES: Final = 160
 _PCAP_HEADER: Final = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, _SNAP_BYTES, 105)
 _RECORD: Final = struct.Struct("<IIII")
-# Frame control, duration, receiver, transmitter, cell, sequence control: as in a cell without an access point.
+# Frame control, duration, receiver, transmitter, BSSID, sequence control: as in an ad hoc network (IBSS).
 _MAC: Final = struct.Struct("<BBH6s6s6sH")
 _DATA, _RETRY = 0x08, 0x08
-# Frame control, duration (none in an ACK to the last fragment), receiver: 9.3.1.4.
+# Frame control, duration (0 in an ACK of the last fragment), receiver: IEEE 802.11-2016, 9.3.1.4.
 _ACK: Final = struct.Struct("<BBH6s")
 _ACK_CONTROL: Final = 0xD4
-_CELL: Final = b"\x02" + bytes(5)
-_EVERYONE: Final = b"\xff" * 6
-# LLC and SNAP in front of the packet's type: RFC 1042.
+_BSSID: Final = b"\x02" + bytes(5)
+_BROADCAST: Final = b"\xff" * 6
+# LLC and SNAP headers before the packet's type: RFC 1042.
 _LLC: Final = bytes.fromhex("aaaa03000000")
 _COLUMNS: Final = b"start_ns,end_ns,transmitter,receiver,mode,size_bytes,attempt,received\n"
 
@@ -41,10 +41,10 @@ class AirLog:
     """Writes attempts to two files.
 
     Args:
-        descriptors: Of the capture and of the table; they are closed with it.
-        names: The stations.
-        limit_bytes: How large both may become together.
-        framing: What it is given as payloads.
+        descriptors: Descriptors of the capture and of the table, closed by `close`.
+        names: Names of the stations.
+        limit_bytes: Maximum size of both files together.
+        framing: Framing of the payloads.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class AirLog:
         self._pcap = os.fdopen(pcap, "wb", 1 << 16)
         self._table = os.fdopen(table, "wb", 1 << 16)
         self._addresses = {
-            name: _CELL[:4] + struct.pack(">H", number) for number, name in enumerate(sorted(names), 1)
+            name: _BSSID[:4] + struct.pack(">H", number) for number, name in enumerate(sorted(names), 1)
         }
         self._utc_ns = time.time_ns() - time.monotonic_ns()
         self._left_bytes = limit_bytes - len(_PCAP_HEADER) - len(_COLUMNS)
@@ -68,7 +68,7 @@ class AirLog:
         self._table.write(_COLUMNS)
 
     def write(self, attempt: TransmissionAttempt) -> None:
-        """Take in an attempt."""
+        """Write one attempt."""
         record, line = self._record(attempt), self._line(attempt)
         self._left_bytes -= len(record) + len(line)
         if self._left_bytes >= 0:
@@ -76,20 +76,20 @@ class AirLog:
             self._table.write(line)
 
     def close(self) -> None:
-        """Write out what is left, and close the files."""
+        """Write buffered data and close the files."""
         self._pcap.close()
         self._table.close()
 
     def _record(self, attempt: TransmissionAttempt) -> bytes:
-        to = _EVERYONE if attempt.receiver is None else self._addresses[attempt.receiver]
-        frame = self._data(attempt, to) if attempt.number else _ACK.pack(_ACK_CONTROL, 0, 0, to)
+        receiver = _BROADCAST if attempt.receiver is None else self._addresses[attempt.receiver]
+        frame = self._data(attempt, receiver) if attempt.number else _ACK.pack(_ACK_CONTROL, 0, 0, receiver)
         seconds, rest_ns = divmod(attempt.start_ns + self._utc_ns, 1_000_000_000)
-        kept = frame[:_SNAP_BYTES]
-        return _RECORD.pack(seconds, rest_ns, len(kept), len(frame)) + kept
+        snapshot = frame[:_SNAP_BYTES]
+        return _RECORD.pack(seconds, rest_ns, len(snapshot), len(frame)) + snapshot
 
-    def _data(self, attempt: TransmissionAttempt, to: bytes) -> bytes:
+    def _data(self, attempt: TransmissionAttempt, receiver: bytes) -> bytes:
         retry = _RETRY if attempt.number > 1 else 0
-        mac = _MAC.pack(_DATA, retry, 0, to, self._addresses[attempt.transmitter], _CELL, 0)
+        mac = _MAC.pack(_DATA, retry, 0, receiver, self._addresses[attempt.transmitter], _BSSID, 0)
         packet = attempt.payload[self._framing.header_bytes :]
         frame: bytes = mac + _LLC + self._framing.ether_type(attempt.payload) + packet
         return frame

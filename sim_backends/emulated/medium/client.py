@@ -1,4 +1,4 @@
-"""The lab's handle on the medium process."""
+"""The lab's client of the medium process."""
 
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -20,16 +20,16 @@ from sim_backends.world.world import World
 
 
 class MediumClient:
-    """Gives the medium the robots' TUN or TAP devices and tells it where they stand; use as a context manager.
+    """Starts the medium and sends it the robots' TUN or TAP devices and places; use as a context manager.
 
-    The medium ends as a `Worker` does, and is made in a thread as that wants it. It is made at once; the first
-    request waits until it is up.
+    The process starts when the object is made, and the first request waits until it is up. It stops as a `Worker`
+    does, so make the object in a thread that lives as long as the lab.
 
     Args:
-        options: The radio.
-        world: What stands between the robots; None for open ground.
-        seed: Seed of everything random in it.
-        framing: What the devices carry.
+        options: Options of the radio.
+        world: The world with the obstacles between the robots; None for open ground.
+        seed: Seed of all random numbers of the medium.
+        framing: Framing of the devices.
 
     Raises:
         ConfigurationError: A program of util-linux is missing.
@@ -40,7 +40,7 @@ class MediumClient:
     ) -> None:
         self._options = options
         self._world = world
-        self._told = False
+        self._configured = False
         self._worker = Worker("medium", "sim_backends.emulated.medium.process", words=(str(seed), framing.name))
         self._robots: set[str] = set()
 
@@ -56,21 +56,21 @@ class MediumClient:
         return self._worker.pid
 
     def attach(self, name: str, address: str, radio: Radio, fd: int) -> None:
-        """Connect a robot.
+        """Attach a robot to the medium.
 
         Args:
             name: The robot's name.
-            address: Its IPv4 address on the radio with the length of the network, `10.42.0.1/24`.
+            address: Its IPv4 address on the radio with the prefix length, `10.42.0.1/24`.
             radio: Its radio.
-            fd: Descriptor of its device, or another of which each read gives one packet as framed and each write
-                takes one, as of a socket of packets; the medium gets a copy, the caller closes this one.
+            fd: Descriptor of its device, or of a packet socket: each read returns one framed packet, and each write
+                accepts one. The medium gets a copy; the caller closes this descriptor.
 
         Raises:
             LinkError: The medium ended or did not answer.
-            RobotError: It has that name or address already.
+            RobotError: A robot with that name or address is attached already.
         """
         antenna = asdict(antenna_of(radio))
-        self._worker.ask({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[fd])
+        self._worker.request({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[fd])
         self._robots.add(name)
 
     def place(
@@ -80,17 +80,17 @@ class MediumClient:
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
     ) -> None:
-        """Put the robots in their places; packets from now on meet what stands between them.
+        """Place the robots; later packets cross the obstacles between these places.
 
-        A place holds until the next call: a velocity moves nobody, it makes the fading as fast as a moving robot's.
+        Places stay until the next call. A velocity moves no robot; it only sets the speed of the fading.
 
         Args:
-            positions_m: Where each robot's antenna is, metres east, north, up. Robots not named are out of the game.
-            relay: The robot whose access point relays between the others; None where they talk directly.
-            velocities_m_s: How fast robots move, metres per second east, north, up; those not named stand.
+            positions_m: Position of each antenna, metres east, north, up. Robots that are not named are off the air.
+            relay: The robot whose access point relays between the others; None if they communicate directly.
+            velocities_m_s: Velocities, metres per second east, north, up; 0 for robots that are not named.
 
         Raises:
-            ConfigurationError: A robot is named that is not attached, or a relay that has no place.
+            ConfigurationError: A named robot is not attached, or the relay has no place.
             LinkError: The medium ended or did not answer.
         """
         unknown = (positions_m.keys() - self._robots) | ({relay} - {None} - positions_m.keys())
@@ -99,36 +99,36 @@ class MediumClient:
                 f"robots without a radio or a place: {', '.join(sorted(map(str, unknown)))}",
                 remedy="attach every robot, and give the relay a position",
             )
-        if not self._told:
+        if not self._configured:
             world = None if self._world is None else self._world.model_dump(mode="json")
-            self._worker.ask({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
-            self._told = True
+            self._worker.request({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
+            self._configured = True
         velocities = dict(velocities_m_s)
-        self._worker.ask({"do": "place", "positions": positions_m, "relay": relay, "velocities": velocities})
+        self._worker.request({"do": "place", "positions": positions_m, "relay": relay, "velocities": velocities})
 
     def record(self, folder: Path | None) -> None:
-        """Write what goes over the air from now on to files in `folder` (see `air_log`), or no longer with None.
+        """Record transmissions to files in `folder` from now on (see `air_log`), or stop recording with None.
 
         Raises:
             LinkError: The medium ended or did not answer.
-            OSError: The files cannot be made.
+            OSError: The files cannot be created.
         """
         with ExitStack() as stack:
             names = () if folder is None else (folder / air_log.PCAP, folder / air_log.CSV)
             files = [stack.enter_context(name.open("wb")) for name in names]
-            self._worker.ask({"do": "record"}, descriptors=[file.fileno() for file in files])
+            self._worker.request({"do": "record"}, descriptors=[file.fileno() for file in files])
 
     def stats(self) -> MediumStats:
-        """Return what the medium did so far.
+        """Return the statistics of the medium.
 
         Raises:
             LinkError: The medium ended or did not answer.
         """
-        reply, _ = self._worker.ask({"do": "stats"})
+        reply, _ = self._worker.request({"do": "stats"})
         return unpack_stats(reply)
 
     def delays(self, source: str, destination: str, protocol: int, port: int) -> DelayParts:
-        """Return what the packets of one flow that were delivered were delayed by since this was asked first.
+        """Return the delays of the delivered packets of one flow, summed since the first call for this flow.
 
         Args:
             source: The robot that sends.
@@ -138,28 +138,28 @@ class MediumClient:
 
         Raises:
             LinkError: The medium ended or did not answer.
-            RobotError: It has no such robot.
+            RobotError: No robot of that name is attached.
         """
         request = {"do": "delays", "source": source, "destination": destination, "protocol": protocol, "port": port}
-        reply, _ = self._worker.ask(request)
+        reply, _ = self._worker.request(request)
         return DelayParts(**reply)
 
     def links(self, *, go_on: bool) -> dict[str, list[LinkSample]]:
-        """Return what the radios told of their links since this was asked last, by robot, and now.
+        """Return the link samples of each robot since the last call, including one taken now.
 
         Args:
-            go_on: Whether to sample them from now on.
+            go_on: True to continue sampling.
 
         Raises:
             LinkError: The medium ended or did not answer.
         """
-        reply, _ = self._worker.ask({"do": "links", "go_on": go_on})
+        reply, _ = self._worker.request({"do": "links", "go_on": go_on})
         return unpack_links(reply)
 
     def demand_up(self) -> None:
-        """Return if the medium runs; raises as `Worker.demand_up`."""
+        """Raise the errors of `Worker.demand_up` if the medium does not run."""
         self._worker.demand_up()
 
     def close(self) -> None:
-        """End the medium and wait until it is gone; does nothing the second time."""
+        """Stop the medium and wait until it has exited; a second call does nothing."""
         self._worker.close()

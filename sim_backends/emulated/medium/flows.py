@@ -1,4 +1,4 @@
-"""Delays of single flows: of the packets from one address to one port of another, fragments too."""
+"""Delays of single flows: the packets from one address to one port of another, including fragments."""
 
 from ipaddress import IPv4Address
 from typing import Final
@@ -10,53 +10,53 @@ _MORE_FRAGMENTS: Final = 0x20
 _OFFSET: Final = 0x1F
 
 FlowKey = bytes
-"""Protocol, source and destination address of an IPv4 header, and the destination port behind it."""
+"""Protocol, source and destination address from the IPv4 header, and the destination port."""
 
 
 class FlowDelays:
-    """Sums over the packets of each flow that somebody has asked for, from when that was first.
+    """Delay sums of the flows that were requested, each since its first request.
 
-    Others cost a look at `counted`, which is empty as long as nobody has asked.
+    For other flows the cost is one look-up in `counted`, which is empty until the first request.
 
     Attributes:
-        counted: What the packets of each flow were delayed by.
+        counted: Sum of the delays of each requested flow.
     """
 
     def __init__(self) -> None:
         self.counted: dict[FlowKey, Delay] = {}
-        # Later fragments have no port: whose they are tells the first one, by the identification in front of its key.
+        # Only the first fragment has a port: it maps the identification of its datagram to the flow.
         self._datagrams: dict[bytes, FlowKey] = {}
 
-    def told(self, source: IPv4Address, destination: IPv4Address, protocol: int, port: int) -> DelayParts:
-        """Return what the packets of a flow were delayed by since this was asked first.
+    def delay_parts(self, source: IPv4Address, destination: IPv4Address, protocol: int, port: int) -> DelayParts:
+        """Return the delays of the packets of a flow, summed since the first call for this flow.
 
         Args:
-            source: From where.
-            destination: To where.
+            source: Source address.
+            destination: Destination address.
             protocol: IP protocol number, of TCP or UDP.
-            port: To which port.
+            port: Destination port.
         """
         key = bytes((protocol,)) + source.packed + destination.packed + port.to_bytes(2, "big")
         return parts(self.counted.setdefault(key, 0))
 
-    def see_leave(self, packet: bytes) -> None:
-        """Take note of whose fragments those behind a first one are; to be called with each as it is sent.
+    def note_first_fragment(self, packet: bytes) -> None:
+        """Remember the flow of a datagram when its first fragment is sent; other packets are ignored.
 
-        The first one may never arrive.
+        Call it for each packet when it is sent, because the first fragment may be lost.
         """
         if packet[6] & _MORE_FRAGMENTS and not (packet[6] & _OFFSET or packet[7]):
             key, datagram = _key(packet), _datagram(packet)
             if key in self.counted:
                 self._datagrams[datagram] = key
             else:
-                # An identification comes again after 65,536 datagrams.
+                # The identification is reused after 65,536 datagrams.
                 self._datagrams.pop(datagram, None)
 
     def count(self, packet: bytes, delay: Delay, receiver: bytes) -> None:
-        """Count a packet that crossed the air, where it is of a flow that somebody has asked for.
+        """Add the delay of a packet that crossed the radio, if its flow was requested.
 
-        It counts as one packet where `receiver`, an address, is its destination. Who is not will forward it: its time
-        on that hop counts, also if it is lost on a later one.
+        The packet is counted if `receiver`, an address, is its destination. Any other receiver forwards it: the delay
+        of that hop is added, also if the packet is lost on a later hop.
         """
         is_later = packet[6] & _OFFSET or packet[7]
         key = self._datagrams.get(_datagram(packet)) if is_later else _key(packet)

@@ -1,7 +1,7 @@
-"""Framing of packets on robots' devices: bare IP (TUN), or Ethernet (TAP), which names the next hop.
+"""Framing of packets on robots' devices: bare IP (TUN), or Ethernet (TAP), whose header names the next hop.
 
-Where robots talk directly, the address of an IP packet says who gets it. Where they forward for each other it does
-not: the next hop is whom the routing table names, and on the air, as in Ethernet, it is the MAC address of the frame.
+If robots communicate directly, the destination address of an IP packet identifies the receiver. If they forward for
+each other, the receiver is the next hop of the routing table, which the MAC address of the frame identifies.
 """
 
 from collections.abc import Callable, Mapping
@@ -9,29 +9,29 @@ from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Interface
 from typing import Final
 
-NOBODY: Final = ""
+NO_ROBOT: Final = ""
 
 Routes = Mapping[bytes, str | None]
-"""Destination address -> robot, None for everyone; empty for a robot without a place."""
+"""Robot per destination address, None for broadcast; empty for a robot without a place."""
 
 _ETHERNET_BYTES: Final = 14
 _IPV4_TYPE: Final = b"\x08\x00"
 _GROUP_BIT: Final = 0x01
-# Locally administered, not of a group: IEEE 802-2014, 8.2.
+# Locally administered, not a group address: IEEE 802-2014, 8.2.
 _MAC_PREFIX: Final = b"\x02\x00"
 _LIMITED_BROADCAST: Final = b"\xff\xff\xff\xff"
 
 
 @dataclass(frozen=True)
 class Framing:
-    """One way to carry packets over a device.
+    """One encoding of packets on a device.
 
     Attributes:
         name: `ip` or `ethernet`.
-        header_bytes: What stands before the packet; the radio's own MAC header takes its place on the air.
-        carries: Whether the radio carries this; raises IndexError for an empty one.
-        destination: Robot to whom it goes on this hop, None for everyone, `NOBODY` for nobody there.
-        routes: Routes of a robot to others, by name.
+        header_bytes: Length of the header before the packet; on the air the radio's MAC header replaces it.
+        carries: Returns True if the radio carries this packet; raises IndexError if it is empty.
+        destination: Returns the receiver of this hop, None for broadcast, `NO_ROBOT` if no robot has the address.
+        routes: Returns the routes of a robot to others, by destination address.
     """
 
     name: str
@@ -41,11 +41,11 @@ class Framing:
     routes: Callable[[IPv4Interface, Mapping[str, IPv4Interface]], Routes]
 
     def ether_type(self, packet: bytes) -> bytes:
-        """Return the type of what is carried, as Ethernet and SNAP have it (RFC 1042)."""
+        """Return the EtherType of the payload, as in Ethernet and SNAP headers (RFC 1042)."""
         return packet[12:_ETHERNET_BYTES] if self.header_bytes else _IPV4_TYPE
 
     def ipv4(self, packet: bytes) -> bytes | None:
-        """Return the IPv4 packet in it, if there is one."""
+        """Return the IPv4 packet in a frame, or None if the frame carries another protocol."""
         if not self.header_bytes:
             return packet
         return packet[_ETHERNET_BYTES:] if packet[12:_ETHERNET_BYTES] == _IPV4_TYPE else None
@@ -62,9 +62,9 @@ def _is_ipv4(packet: bytes) -> bool:
 
 def _by_ip(packet: bytes, routes: Routes) -> str | None:
     address = packet[16:20]
-    found = routes.get(address, NOBODY)
-    # Multicast, RFC 5771.
-    return None if found == NOBODY and address[0] >> 4 == 0xE and routes else found
+    robot = routes.get(address, NO_ROBOT)
+    # Multicast: 224.0.0.0/4, RFC 5771.
+    return None if robot == NO_ROBOT and address[0] >> 4 == 0xE and routes else robot
 
 
 def _ip_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Routes:
@@ -82,11 +82,11 @@ def _is_frame(frame: bytes) -> bool:
 
 def _by_mac(frame: bytes, routes: Routes) -> str | None:
     if frame[0] & _GROUP_BIT:
-        return None if routes else NOBODY
-    return routes.get(frame[:6], NOBODY)
+        return None if routes else NO_ROBOT
+    return routes.get(frame[:6], NO_ROBOT)
 
 
-def _mac_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Routes:  # noqa: ARG001 (as `_ip_routes`)
+def _mac_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Routes:  # noqa: ARG001 (same signature as `_ip_routes`)
     return {mac_of(address.ip): name for name, address in others.items()}
 
 

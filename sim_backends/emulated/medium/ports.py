@@ -1,4 +1,4 @@
-"""Ports of the medium, and its statistics: what robots sent and were given, how late, and what delayed it."""
+"""Ports of the medium, and its statistics: packets sent and delivered, their lateness and their delays."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -17,14 +17,14 @@ _KEPT_BITS: Final = 4
 
 @dataclass(frozen=True)
 class PortCounters:
-    """What crossed the device of one robot.
+    """Packet counters of the device of one robot.
 
     Attributes:
         read: Packets that the robot sent.
-        written: Packets that the robot was given.
-        refused: Packets that arrived and that the robot's kernel did not take.
-        unroutable: Packets to an address that no robot has, or of or to a robot that is off the air.
-        not_ipv4: Packets of another protocol than IPv4, which a medium of bare IP packets does not carry.
+        written: Packets delivered to the robot.
+        refused: Packets that arrived but that the robot's kernel refused.
+        unroutable: Packets to an address that no robot has, or from or to a robot that is off the air.
+        not_ipv4: Packets of other protocols than IPv4, which a medium of bare IP packets does not carry.
     """
 
     read: int
@@ -36,16 +36,16 @@ class PortCounters:
 
 @dataclass(frozen=True)
 class MediumStats:
-    """What the medium did so far.
+    """Statistics of the medium since its start.
 
     Attributes:
-        scheduling: `fifo 1`, or why the process runs without real-time priority.
-        late: How many packets were so many ns late, as `lateness.rounded_up` has it: the time that they waited to be
-            read, at most, and the time between their arrival by the model and their handing over.
+        scheduling: `fifo 1`, or the reason why the process has no real-time priority.
+        late: Number of packets per lateness in ns, rounded by `rounded_up`. Lateness is the longest time that the
+            packet can have waited to be read, plus the time from its arrival by the model until it was written.
         links: Counters per directed link.
         ports: Counters per robot.
-        delays: What the packets written to a robot were delayed by, per pair of who sent them and that robot; the
-            time by which the medium was late is processing.
+        delays: Delays of the packets written to a robot, per pair of sender and receiver; lateness is counted as
+            processing delay.
     """
 
     scheduling: str
@@ -56,7 +56,7 @@ class MediumStats:
 
 
 def pack_stats(stats: MediumStats) -> Message:
-    """Return `stats` as a message."""
+    """Return the message for `stats`."""
     return {
         "scheduling": stats.scheduling,
         "late": [*stats.late.items()],
@@ -67,7 +67,7 @@ def pack_stats(stats: MediumStats) -> Message:
 
 
 def unpack_stats(message: Message) -> MediumStats:
-    """Return what `pack_stats` packed."""
+    """Return the statistics from a message of `pack_stats`."""
     return MediumStats(
         scheduling=message["scheduling"],
         late=dict(message["late"]),
@@ -78,32 +78,32 @@ def unpack_stats(message: Message) -> MediumStats:
 
 
 def pack_links(sampled: Iterable[Mapping[str, LinkSample]]) -> Message:
-    """Return samples of links, each by robot, as a message."""
+    """Return the message for link samples, each a mapping by robot."""
     return {"links": [[name, astuple(sample)] for samples in sampled for name, sample in samples.items()]}
 
 
 def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
-    """Return the samples of each robot that `pack_links` packed, in their order."""
+    """Return the samples of each robot from a message of `pack_links`, in their order."""
     links: dict[str, list[LinkSample]] = {}
     for name, (utc_ns, stations, *radio) in message["links"]:
-        known = tuple(StationSample(*station) for station in stations)
-        links.setdefault(name, []).append(LinkSample(utc_ns, known, *radio))
+        station_samples = tuple(StationSample(*station) for station in stations)
+        links.setdefault(name, []).append(LinkSample(utc_ns, station_samples, *radio))
     return links
 
 
 def rounded_up(late_ns: int) -> int:
-    """Return the least number above `late_ns` of which all but the first four bits are 0: at most 1/8 more."""
+    """Return the least number above `late_ns` with only its first four bits set: at most 1/8 more."""
     shift = late_ns.bit_length() - _KEPT_BITS
     return late_ns + 1 if shift <= 0 else ((late_ns >> shift) + 1) << shift
 
 
 class Port:
-    """One robot's TUN or TAP device, or what carries its packets in place of one; counters; and where packets go.
+    """TUN or TAP device of one robot, or another packet descriptor; its counters and routes.
 
     Args:
-        name: The robot.
+        name: Name of the robot.
         address: Its address.
-        fd: The device.
+        fd: Descriptor of the device.
     """
 
     def __init__(self, name: str, address: IPv4Interface, fd: int) -> None:
@@ -114,19 +114,19 @@ class Port:
         self.refused = 0
         self.unroutable = 0
         self.not_ipv4 = 0
-        # So many of the packets that are read next may have waited in the device since then.
+        # Number of packets, of those read next, that may have waited in the device since `backlog_since_ns`.
         self.backlog = 0
         self.backlog_since_ns = 0
-        # Of what was written, by the robot that sent it; what was not written is counted by `refused`.
+        # Delays of the written packets, by the robot that sent them; packets not written are counted by `refused`.
         self.delays: defaultdict[str, Delay] = defaultdict(int)
         self.routes: Routes = {}
 
     def delay_parts(self) -> dict[str, DelayParts]:
-        """Return what the packets written were delayed by, per robot that sent them."""
+        """Return the delays of the written packets, per robot that sent them."""
         return {source: parts(delay) for source, delay in self.delays.items()}
 
     @property
     def counters(self) -> PortCounters:
-        """What crossed the device so far."""
+        """The counters so far."""
         written = sum(delay.packets for delay in self.delay_parts().values())
         return PortCounters(self.read, written, self.refused, self.unroutable, self.not_ipv4)

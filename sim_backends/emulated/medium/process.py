@@ -1,7 +1,7 @@
 """The medium: one process that carries every packet between the robots' TUN or TAP devices through the radio model.
 
-Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED FRAMING`, FD being one end of a socket
-pair. It ends by itself when the other end closes, and with it all devices end: their descriptors are held here.
+Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED FRAMING`; FD is one end of a socket pair.
+The process exits when the other end closes. The devices then vanish, because only it holds their descriptors.
 """
 
 import gc
@@ -20,7 +20,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.flows import FlowDelays
-from sim_backends.emulated.medium.framing import FRAMINGS, NOBODY, Framing
+from sim_backends.emulated.medium.framing import FRAMINGS, NO_ROBOT, Framing
 from sim_backends.emulated.medium.ports import MediumStats, Port, pack_links, pack_stats, rounded_up
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import ipc
@@ -32,31 +32,31 @@ from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.world import World
 
-# Packets read from one robot before the others and the timer get their turn: 64 take about half a millisecond.
+# Packets read from one robot before other robots and the timer are served: 64 take about half a millisecond.
 _BURST: Final = 64
 # Longer than any packet of an interface with the MTU 1500 of Wi-Fi; each read allocates this much.
 _READ_BYTES: Final = 2048
 # A TUN device holds this many packets: its default queue length, TUN_READQ_SIZE of the kernel's tun.c.
 _DEVICE_PACKETS: Final = 500
-# Asleep, the medium wakes so often, and what comes after a longer sleep may have waited for the rest of it.
-_BEAT_NS: Final = 10_000_000
+# Longest sleep of the medium. After a longer sleep, packets may have waited for the excess.
+_MAX_SLEEP_NS: Final = 10_000_000
 _OWNER_TIMEOUT_S: Final = 5.0
-# How often the medium looks whose interface is up; 0.6 us for three robots.
-_LOOK_NS: Final = 1_000_000
-# A robot's own sampler looks as often.
+# Polling interval of the robots' interfaces; a poll takes 0.6 us for three robots.
+_INTERFACE_POLL_NS: Final = 1_000_000
+# The sampling interval of a robot's own link sampler.
 _SAMPLE_NS: Final = 200_000_000
-_MOST_SAMPLED: Final = 10_000
-"""Moments: half an hour."""
+_MAX_SAMPLES: Final = 10_000
+"""Samples kept per robot: half an hour."""
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Places of the robots, as the lab told them last.
+    """Places of the robots in the last request of the lab.
 
     Attributes:
-        positions_m: Where each is, metres east, north, up; nobody is anywhere at first.
-        velocities_m_s: How fast each moves.
-        relay: Whose access point relays between the others; None where they talk directly.
+        positions_m: Position of each robot, metres east, north, up; empty before the first request.
+        velocities_m_s: Velocity of each robot.
+        relay: The robot whose access point relays between the others; None if they communicate directly.
     """
 
     positions_m: dict[str, Vector] = field(default_factory=dict)
@@ -65,19 +65,19 @@ class _Layout:
 
     @classmethod
     def from_message(cls, message: Message) -> Self:
-        """Return the layout that a request to place everybody has."""
+        """Return the layout from a request to place the robots."""
         positions_m = {name: tuple(place_m) for name, place_m in message["positions"].items()}
         velocities_m_s = {name: tuple(velocity) for name, velocity in message["velocities"].items()}
         return cls(positions_m, velocities_m_s, message["relay"])
 
 
 class Medium:
-    """Moves packets between ports; time is `time.monotonic_ns`.
+    """Moves packets between ports; times are those of `time.monotonic_ns`.
 
     Args:
         seed: Seed of the radio model.
-        framing: What the devices carry.
-        channel: Where the owner's requests come from.
+        framing: Framing of the devices.
+        channel: Socket of the owner's requests.
     """
 
     def __init__(self, seed: int, framing: Framing, channel: socket.socket) -> None:
@@ -88,38 +88,38 @@ class Medium:
         self._world: World | None = None
         self._antennas: dict[str, Antenna] = {}
         self._model: RadioModel[bytes] = UniformLinks(seed, self._options)
-        self._placed = 0
+        self._modelled_ports = 0
         self._routed: tuple[Set[str], int] = frozenset(), 0
         self._air_log: AirLog | None = None
-        # When links are sampled next, None for not at all; and what they were when they were.
+        # Time of the next link sample, None if links are not sampled; and the samples since the last request.
         self._sample_ns: int | None = None
-        self._sampled: deque[dict[str, LinkSample]] = deque(maxlen=_MOST_SAMPLED)
+        self._sampled: deque[dict[str, LinkSample]] = deque(maxlen=_MAX_SAMPLES)
         self._layout = _Layout()
-        self._on: set[str] = set()
-        self._looked_ns = 0
+        self._on_air_robots: set[str] = set()
+        self._polled_ns = 0
         self._ports: dict[str, Port] = {}
         self._by_fd: dict[int, Port] = {}
         self._late: Counter[int] = Counter()
         self._flows = FlowDelays()
-        # A device that is found with packets now had none then, if the round before read all of them.
-        self._since_ns = self._before_ns = time.monotonic_ns()
+        # A device with packets was empty at the earlier time, if the round before read all of them.
+        self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
         self._armed_ns: int | None = None
         self._scheduling = _raise_priority()
         self._timer = Timer()
         self._epoll = select.epoll()
         self._epoll.register(self._timer.fd, select.EPOLLIN | select.EPOLLET)
         self._epoll.register(channel.fileno(), select.EPOLLIN)
-        # A TUN device can be written to as long as its interface is up.
+        # A TUN device is writable while its interface is up.
         self._writable = select.epoll()
 
     def run(self) -> None:
-        """Carry packets and answer requests until the owner is gone."""
+        """Carry packets and answer requests until the owner closes the socket."""
         by_fd = self._by_fd
         control = self._channel.fileno()
         while True:
             ready = self._wait()
-            if time.monotonic_ns() - self._looked_ns > _LOOK_NS:
-                self._look()
+            if time.monotonic_ns() - self._polled_ns > _INTERFACE_POLL_NS:
+                self._update_interfaces()
             for fd, _ in ready:
                 if fd in by_fd:
                     self._read(by_fd[fd])
@@ -130,29 +130,29 @@ class Medium:
                 self._sample()
 
     def _wait(self) -> list[tuple[int, int]]:
-        """Wait for packets, requests or the timer, and note since when the packets may have been there.
+        """Wait for packets, requests or the timer, and note the earliest time at which the packets can have arrived.
 
-        Those that came while the medium was at work have waited since it looked before, at most. Those that wake it
-        have not, unless it slept longer than it wanted to.
+        Packets that are ready immediately arrived after the previous poll. Packets that wake the process have not
+        waited, unless it slept longer than the poll's timeout.
         """
-        looked_ns = time.monotonic_ns()
+        polled_ns = time.monotonic_ns()
         ready = self._epoll.poll(0)
         if ready:
-            self._since_ns, self._before_ns = self._before_ns, looked_ns
+            self._arrived_after_ns, self._previous_poll_ns = self._previous_poll_ns, polled_ns
             return ready
-        ready = self._epoll.poll(_BEAT_NS / 1e9)
-        self._since_ns = self._before_ns = min(time.monotonic_ns(), looked_ns + _BEAT_NS)
+        ready = self._epoll.poll(_MAX_SLEEP_NS / 1e9)
+        self._arrived_after_ns = self._previous_poll_ns = min(time.monotonic_ns(), polled_ns + _MAX_SLEEP_NS)
         return ready
 
     def _read(self, port: Port) -> None:
-        """Give the packets that wait at `port` to the model."""
+        """Send the packets that wait at `port` to the model."""
         fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._model.send, time.monotonic_ns
         if port.backlog <= 0:
-            port.backlog, port.backlog_since_ns = _DEVICE_PACKETS, self._since_ns
-        flows, asked_for = self._flows, self._flows.counted
+            port.backlog, port.backlog_since_ns = _DEVICE_PACKETS, self._arrived_after_ns
+        flows, requested = self._flows, self._flows.counted
         framing = self._framing
         carries, destination_of, header_bytes = framing.carries, framing.destination, framing.header_bytes
-        # A delay of one packet that waited since then, but for the moment of its reading.
+        # Added to the time of reading, this is the delay of one packet that has waited since `backlog_since_ns`.
         waited = PACKET - port.backlog_since_ns
         for _ in range(_BURST):
             try:
@@ -162,7 +162,7 @@ class Medium:
                 port.backlog = 0
                 return
             except (OSError, IndexError):
-                # The robot's namespace is gone, and its device with it; a socket then gives no byte.
+                # The robot's namespace and its device no longer exist; a socket returns no bytes in this case.
                 self._epoll.unregister(fd)
                 return
             port.read += 1
@@ -170,33 +170,33 @@ class Medium:
                 port.not_ipv4 += 1
                 continue
             destination = destination_of(packet, routes)
-            if destination == NOBODY:
+            if destination == NO_ROBOT:
                 port.unroutable += 1
                 continue
-            if asked_for and (inner := framing.ipv4(packet)) is not None:
-                flows.see_leave(inner)
+            if requested and (inner := framing.ipv4(packet)) is not None:
+                flows.note_first_fragment(inner)
             now_ns = clock_ns()
             send(now_ns, name, packet, len(packet) - header_bytes, destination, before=waited + now_ns)
         port.backlog -= _BURST
 
     def _hand_over(self) -> None:
-        """Write to the robots what has arrived, and set the timer for what arrives next."""
+        """Write arrived packets to the robots, and set the timer to the next arrival."""
         now_ns = time.monotonic_ns()
         arrived = self._model.deliveries(now_ns)
         if arrived:
             ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._late
-            flows, asked_for = self._flows, self._flows.counted
+            flows, requested = self._flows, self._flows.counted
             for at_ns, name, packet, source, delayed in arrived:
                 port = ports[name]
                 try:
                     write(port.fd, packet)
                 except OSError:
-                    # The interface is down, or gone with its robot.
+                    # The interface is down, or the robot has stopped.
                     port.refused += 1
                     continue
                 late_ns = clock_ns() - at_ns
                 port.delays[source] += delayed + late_ns
-                if asked_for and (inner := self._framing.ipv4(packet)) is not None:
+                if requested and (inner := self._framing.ipv4(packet)) is not None:
                     flows.count(inner, delayed + late_ns, port.address.packed)
                 late[rounded_up(late_ns + processing_ns(delayed))] += 1
         next_ns = self._model.next_event_ns()
@@ -205,7 +205,7 @@ class Medium:
             self._armed_ns = next_ns
 
     def _serve(self) -> bool:
-        """Answer one request; return whether the owner is still there."""
+        """Answer one request; return False if the owner has closed the socket."""
         deadline = Deadline.after(_OWNER_TIMEOUT_S)
         received = ipc.receive(self._channel, deadline)
         if received is None:
@@ -231,7 +231,7 @@ class Medium:
                 return {}
             case "place":
                 self._layout = _Layout.from_message(request)
-                self._on = self._on_the_air()
+                self._on_air_robots = self._robots_with_interface_up()
                 self._place()
                 return {}
             case "record":
@@ -239,8 +239,8 @@ class Medium:
                 return {}
             case "links":
                 return self._links(go_on=request["go_on"])
-            case "delays" | "stats" as what:
-                return self._delays(request) if what == "delays" else pack_stats(self._stats())
+            case "delays" | "stats" as topic:
+                return self._delays(request) if topic == "delays" else pack_stats(self._stats())
             case other:
                 raise ValueError(f"unknown request {other!r}")
 
@@ -253,27 +253,27 @@ class Medium:
         self._epoll.register(fd, select.EPOLLIN)
         self._writable.register(fd, select.EPOLLOUT)
 
-    def _on_the_air(self) -> set[str]:
-        """Return the robots whose interface is up; what takes it down (`ip link`, a lost battery) tells nobody."""
-        self._looked_ns = time.monotonic_ns()
+    def _robots_with_interface_up(self) -> set[str]:
+        """Return the robots whose interface is up; a change (`ip link`, an empty battery) sends no event."""
+        self._polled_ns = time.monotonic_ns()
         return {self._by_fd[fd].name for fd, events in self._writable.poll(0) if events & select.EPOLLOUT}
 
-    def _look(self) -> None:
-        """Take off the air whose interface has gone down, and back on it whose is up again."""
-        on = self._on_the_air()
-        if on != self._on and self._layout.positions_m:
-            self._on = on
+    def _update_interfaces(self) -> None:
+        """Update the set of robots on the air from the state of their interfaces."""
+        on_air = self._robots_with_interface_up()
+        if on_air != self._on_air_robots and self._layout.positions_m:
+            self._on_air_robots = on_air
             self._place()
 
     def _place(self) -> None:
-        """Let those on the air stand where they were placed; stations whose access point is off it hear nobody."""
-        positions_m = {name: at for name, at in self._layout.positions_m.items() if name in self._on}
+        """Place the robots that are on the air; if the access point is off the air, no station has a place."""
+        positions_m = {name: at for name, at in self._layout.positions_m.items() if name in self._on_air_robots}
         relay = self._layout.relay
         if relay is not None and relay not in positions_m:
             positions_m, relay = {}, None
-        if len(self._ports) != self._placed:
-            # Who joins later finds a new model; what was on the air of the old one is lost.
-            self._placed = len(self._ports)
+        if len(self._ports) != self._modelled_ports:
+            # A robot that is attached later gets a new model; packets on the air of the old model are lost.
+            self._modelled_ports = len(self._ports)
             self._model = self._new_model()
             self._model.use_meter()
             self._model.log_attempts(None if self._air_log is None else self._air_log.write)
@@ -282,11 +282,11 @@ class Medium:
             self._route(positions_m.keys())
 
     def _route(self, present: Set[str]) -> None:
-        """Let each of those present have a way to each other one, and nobody else."""
+        """Give each robot that is present routes to the others, and other robots none."""
         self._routed = frozenset(present), len(self._ports)
         for port in self._ports.values():
-            here = port.name in present
-            others = [name for name in present if name != port.name] if here else []
+            is_present = port.name in present
+            others = [name for name in present if name != port.name] if is_present else []
             port.routes = self._framing.routes(port.address, {name: self._ports[name].address for name in others})
 
     def _new_model(self) -> RadioModel[bytes]:
@@ -295,20 +295,20 @@ class Medium:
         return WifiInWorld(self._seed, self._options, self._antennas, self._world)
 
     def _record(self, descriptors: list[int]) -> None:
-        """Write what goes over the air to a new pair of files, or to none."""
+        """Record transmissions to a new pair of files, or stop recording if there are no descriptors."""
         if self._air_log is not None:
             self._air_log.close()
         self._air_log = AirLog(descriptors, tuple(self._ports), framing=self._framing) if descriptors else None
         self._model.log_attempts(None if self._air_log is None else self._air_log.write)
 
     def _sample(self) -> None:
-        """Note what the radios tell of their links; what arrives meanwhile is handed over in the next round."""
+        """Sample the links of all radios; packets that arrive meanwhile are delivered in the next round."""
         now_ns = time.monotonic_ns()
         self._sample_ns = now_ns + _SAMPLE_NS
         self._sampled.append(self._model.sample(now_ns, time.time_ns()))
 
     def _links(self, *, go_on: bool) -> Message:
-        """Return what was noted of links since this was asked last, and of now."""
+        """Return the link samples since the last request, including one taken now."""
         self._sample()
         reply = pack_links(self._sampled)
         self._sampled.clear()
@@ -317,9 +317,9 @@ class Medium:
         return reply
 
     def _delays(self, request: Message) -> Message:
-        """Return what the packets of one flow were delayed by."""
-        source, destination = (self._ports[request[end]].address.ip for end in ("source", "destination"))
-        return vars(self._flows.told(source, destination, request["protocol"], request["port"]))
+        """Return the delays of the packets of one flow."""
+        source, destination = (self._ports[request[key]].address.ip for key in ("source", "destination"))
+        return vars(self._flows.delay_parts(source, destination, request["protocol"], request["port"]))
 
     def _stats(self) -> MediumStats:
         ports = {name: port.counters for name, port in self._ports.items()}
@@ -332,9 +332,10 @@ class Medium:
 
 
 def _raise_priority() -> str:
-    """Ask for the lowest real-time priority, so that a busy machine delays no packet; return what came of it.
+    """Request the lowest real-time priority, so that other processes delay no packet; return the result as text.
 
-    A medium that fills its core is paused by the kernel for 50 ms a second (sched_rt_runtime_us); the lateness tells.
+    The kernel pauses a medium that fills its core for 50 ms per second (sched_rt_runtime_us), which increases the
+    lateness.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
@@ -344,10 +345,10 @@ def _raise_priority() -> str:
 
 
 def main() -> None:
-    """Run the medium on the socket, with the seed and the framing named on the command line."""
+    """Run the medium; the command line has the descriptor of the socket, the seed and the framing."""
     channel = socket.socket(fileno=int(sys.argv[1]))
     medium = Medium(int(sys.argv[2]), FRAMINGS[sys.argv[3]], channel)
-    # Carrying packets makes no reference cycles, and a collection in the middle would delay them.
+    # Carrying packets makes no reference cycles, and a garbage collection would delay packets.
     gc.disable()
     medium.run()
 

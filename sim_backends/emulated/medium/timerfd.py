@@ -1,4 +1,4 @@
-"""Linux timerfd with absolute deadlines on the monotonic clock; Python has it only from 3.13 on."""
+"""Linux timerfd with absolute deadlines on the monotonic clock; Python itself has timerfd only since 3.13."""
 
 import ctypes
 import os
@@ -24,13 +24,13 @@ class _Itimerspec(ctypes.Structure):
 
 
 class Timer:
-    """A one-shot timer whose descriptor becomes readable at a moment of `time.monotonic_ns`.
+    """A one-shot timer whose descriptor becomes readable at a time of `time.monotonic_ns`.
 
-    epoll's own time-out counts whole milliseconds, too coarse for a link's delay. Setting the timer makes the
-    descriptor unreadable again, so with EPOLLET nobody needs to read it.
+    The timeout of epoll has a resolution of 1 ms, too coarse for the delay of a link. Setting the timer makes the
+    descriptor unreadable again, so that with EPOLLET it need not be read.
 
     Raises:
-        OSError: The kernel gives no timer.
+        OSError: The kernel cannot create a timer.
     """
 
     def __init__(self) -> None:
@@ -41,12 +41,12 @@ class Timer:
         self._spec_address = ctypes.byref(self._spec)
 
     def set(self, at_ns: int) -> None:
-        """Fire at `at_ns`, at once if that has passed; replaces the moment set before.
+        """Fire at `at_ns`, or immediately if that has passed; replaces the time set before.
 
         Raises:
             OSError: The descriptor is closed.
         """
-        # A value of zero would disarm the timer; the clock counts from boot, so 1 ns is long past.
+        # A value of 0 would disarm the timer. The clock counts from boot, so 1 ns is in the past.
         self._spec.value_s, self._spec.value_ns = divmod(max(at_ns, 1), 1_000_000_000)
         if _libc.timerfd_settime(self.fd, _TFD_TIMER_ABSTIME, self._spec_address, None):
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))

@@ -1,1 +1,1 @@
-"""Processes of an emulated lab, seen from outside: their start, the requests to them, their end."""
+"""Processes of an emulated lab: start, requests, stop."""

@@ -1,4 +1,4 @@
-"""The Python that runs modules of this package, for the lab's processes and for commands on a robot."""
+"""The Python interpreter that runs modules of this package, in the lab's processes and in commands on robots."""
 
 import sys
 from pathlib import Path
@@ -11,6 +11,6 @@ PROJECT: Final = Path(__file__).resolve().parents[3]
 def command(module: str) -> list[str]:
     """Return the command that runs a module of this package, with `PYTHONPATH` set to `PROJECT`.
 
-    Neither the working directory nor a user's site-packages can put another module in its way.
+    Neither the working directory nor the user's site-packages can shadow modules of this package.
     """
     return [sys.executable, "-P", "-s", "-m", module]

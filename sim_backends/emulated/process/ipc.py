@@ -1,4 +1,4 @@
-"""Messages between the lab and its processes: one JSON line each way, strictly in turn, over a socket pair."""
+"""Messages between the lab and its processes over a socket pair: one JSON line per request and one per reply."""
 
 import array
 import json
@@ -10,17 +10,17 @@ from fieldkit.core.deadline import Deadline
 
 LINE_LIMIT_BYTES: Final = 8 << 20
 DESCRIPTORS: Final = 2
-"""The most that come with one message."""
+"""Maximum number of file descriptors in one message."""
 
 Message = dict[str, Any]
 
 
 def send(channel: socket.socket, message: Message, deadline: Deadline, descriptors: Sequence[int] = ()) -> None:
-    """Send one message, and with it copies of file descriptors.
+    """Send one message, with copies of file descriptors.
 
     Raises:
-        OSError: The other side is gone, or did not take it before the deadline.
-        ValueError: The message is longer than a line may be.
+        OSError: The peer has closed the socket, or did not receive the message before the deadline.
+        ValueError: The message is longer than `LINE_LIMIT_BYTES`.
     """
     line = json.dumps(message).encode() + b"\n"
     if len(line) > LINE_LIMIT_BYTES:
@@ -33,11 +33,11 @@ def send(channel: socket.socket, message: Message, deadline: Deadline, descripto
 
 
 def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[int]] | None:
-    """Return the next message and the file descriptors that came with it; None when the other side is gone.
+    """Return the next message and its file descriptors, or None if the peer has closed the socket.
 
     Raises:
-        OSError: The message was not there by the deadline, or the connection broke.
-        ValueError: The line is too long or no JSON.
+        OSError: The message was not complete by the deadline, or the connection broke.
+        ValueError: The line is too long or not JSON.
     """
     line = bytearray()
     descriptors: list[int] = []

@@ -1,4 +1,4 @@
-"""The namespaces of a node: the command that makes them, and what an ordinary user needs to be allowed to."""
+"""Linux namespaces of a node: the command that creates them, and the permissions that an ordinary user needs."""
 
 import os
 import pwd
@@ -12,26 +12,26 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.process.worker import PATH
 
 _NAMESPACES: Final = ("--net", "--mount", "--propagation", "private", "--pid", "--uts", "--ipc")
-# Root inside is this user outside; the other accounts inside, which sshd and tcpdump change to, are its subordinates.
+# Root inside is this user outside; other accounts inside (of sshd and tcpdump) are the user's subordinate ids.
 _AS_ROOT_INSIDE: Final = ("--user", "--map-root-user", "--map-auto")
-# Without the subordinates first: where the kernel refuses, unshare would leave the process behind that maps them.
+# First without subordinate ids: if the kernel refuses, unshare leaves a process behind that maps these ids.
 _PROBES: Final = (("--user", "--map-root-user"), _AS_ROOT_INSIDE)
 
 _SUBORDINATES: Final = 65534
-"""Ids that a node needs beside root's: up to that of `nobody`."""
+"""Subordinate ids that a node needs: those of all accounts up to `nobody`."""
 _USUAL_SUBORDINATES: Final = 65536
 _FIRST_SUBORDINATE: Final = 100_000
-"""The first that useradd gives (SUB_UID_MIN of login.defs)."""
+"""The first subordinate id that useradd assigns (SUB_UID_MIN of login.defs)."""
 
 _OPTION_OF: Final = {"/etc/subuid": "--add-subuids", "/etc/subgid": "--add-subgids"}
-"""Option of usermod per file that says whose the subordinate ids are."""
+"""Option of usermod for each file of subordinate ids."""
 
 _SWITCHES: Final = {
     "kernel.unprivileged_userns_clone": ("0", "1"),
     "kernel.apparmor_restrict_unprivileged_userns": ("1", "0"),
     "user.max_user_namespaces": ("0", "10000"),
 }
-"""Settings of a kernel (Debian's, Ubuntu's, any) by which it forbids user namespaces, and by which it allows them."""
+"""Kernel settings of Debian, of Ubuntu and of any system: the value that forbids user namespaces, one that allows."""
 
 _TIMEOUT_S: Final = 10.0
 
@@ -41,9 +41,9 @@ class IdRange:
     """A line of `/etc/subuid` or `/etc/subgid`.
 
     Attributes:
-        owner: Name or id of the user whose they are.
+        owner: Name or id of the user who owns the ids.
         first: The first id.
-        count: How many there are.
+        count: Number of ids.
     """
 
     owner: str
@@ -52,20 +52,20 @@ class IdRange:
 
 
 def command() -> tuple[str, ...]:
-    """Return the command that runs another as root in namespaces of its own, which end with it."""
+    """Return the prefix that runs a command as root in new namespaces, whose processes stop with the command."""
     return _command(() if is_root() else _AS_ROOT_INSIDE)
 
 
 def is_root() -> bool:
-    """Return whether this user needs nobody's leave."""
+    """Return True if this user is root, who needs no permission from anyone."""
     return os.geteuid() == 0
 
 
 def check() -> None:
-    """Check that this ordinary user can have namespaces, by making them.
+    """Check that this ordinary user can create namespaces, by creating them.
 
     Raises:
-        ConfigurationError: It has no subordinate ids, or the kernel forbids it.
+        ConfigurationError: The user has no subordinate ids, or the kernel forbids namespaces.
     """
     uid = os.geteuid()
     try:
@@ -75,40 +75,40 @@ def check() -> None:
     _check_subordinates(user, uid)
     for as_root in _PROBES:
         argv = _command(as_root, "true")
-        done = subprocess.run(
+        result = subprocess.run(
             argv, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False, env={"PATH": PATH}
         )
-        if done.returncode != 0:
-            raise _refused(user, done.stderr.strip())
+        if result.returncode != 0:
+            raise _refusal(user, result.stderr.strip())
 
 
-def forbidding(settings: Path) -> dict[str, str]:
-    """Return the kernel settings below `settings` that forbid user namespaces, as `name = value`, with the remedy."""
-    found = {}
+def forbidding_settings(settings: Path) -> dict[str, str]:
+    """Return the remedy for each kernel setting below `settings` that forbids user namespaces, as `name = value`."""
+    remedies = {}
     for name, (forbids, allows) in _SWITCHES.items():
         path = settings / name.replace(".", "/")
         if path.exists() and path.read_text(encoding="ascii").strip() == forbids:
-            found[f"{name} = {forbids}"] = f"sudo sysctl {name}={allows}"
-    return found
+            remedies[f"{name} = {forbids}"] = f"sudo sysctl {name}={allows}"
+    return remedies
 
 
 def id_ranges(text: str) -> list[IdRange]:
-    """Return the ranges in the text of a file of subordinate ids; a line that is none gives nobody anything."""
+    """Return the ranges in the text of a file of subordinate ids; malformed lines are ignored."""
     lines = re.findall(r"^([^:\n]+):(\d+):(\d+)$", text, re.MULTILINE | re.ASCII)
     return [IdRange(owner, int(first), int(count)) for owner, first, count in lines]
 
 
 def _check_subordinates(user: str, uid: int) -> None:
-    given = {path: id_ranges(_text(Path(path))) for path in _OPTION_OF}
-    enough = {
+    ranges_by_file = {path: id_ranges(_text(Path(path))) for path in _OPTION_OF}
+    has_enough = {
         path: any(ids.owner in {user, str(uid)} and ids.count >= _SUBORDINATES for ids in ranges)
-        for path, ranges in given.items()
+        for path, ranges in ranges_by_file.items()
     }
-    if all(enough.values()):
+    if all(has_enough.values()):
         return
-    lacking = [path for path in given if not enough[path]]
-    taken = (ids.first + ids.count for ranges in given.values() for ids in ranges)
-    first = max((_FIRST_SUBORDINATE, *taken))
+    lacking = [path for path in ranges_by_file if not has_enough[path]]
+    next_free = (ids.first + ids.count for ranges in ranges_by_file.values() for ids in ranges)
+    first = max((_FIRST_SUBORDINATE, *next_free))
     options = " ".join(f"{_OPTION_OF[path]} {first}-{first + _USUAL_SUBORDINATES - 1}" for path in lacking)
     raise ConfigurationError(
         f"{user} has no {_SUBORDINATES} subordinate ids in {' and '.join(lacking)}",
@@ -116,10 +116,12 @@ def _check_subordinates(user: str, uid: int) -> None:
     )
 
 
-def _refused(user: str, cause: str) -> ConfigurationError:
-    for name, remedy in forbidding(Path("/proc/sys")).items():
+def _refusal(user: str, cause: str) -> ConfigurationError:
+    for name, remedy in forbidding_settings(Path("/proc/sys")).items():
         return ConfigurationError(f"the kernel forbids user namespaces: {name}", remedy=remedy)
-    return ConfigurationError(f"{user} gets no namespaces: {cause}", remedy="run it by sudo, or see man newuidmap")
+    return ConfigurationError(
+        f"{user} cannot create namespaces: {cause}", remedy="run fieldkit with sudo, or see man newuidmap"
+    )
 
 
 def _command(as_root: tuple[str, ...], *words: str) -> tuple[str, ...]:

@@ -1,1 +1,1 @@
-"""Inside of an emulated robot: its first process, file system, network and services."""
+"""Inside of an emulated robot: its init process, file system, network and services."""

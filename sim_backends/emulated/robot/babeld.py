@@ -1,4 +1,4 @@
-"""The routing daemon of robots that forward for each other, and of the laptop: Debian's babeld (Babel, RFC 8966)."""
+"""Routing daemon of robots that forward for each other, and of the laptop: Debian's babeld (Babel, RFC 8966)."""
 
 import shutil
 from ipaddress import IPv4Interface
@@ -8,36 +8,36 @@ from typing import Final
 from sim_backends.emulated.robot.spec import STATE
 
 PID: Final = Path(STATE, "babeld.pid")
-"""Written when it has its socket and its interface, before its first hello."""
+"""Written when the daemon has its socket and its interface, before its first hello."""
 
 _LONG_TERM_STATE: Final = f"{STATE}/babel-state"
 
 
 def command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
-    """Return the command that routes over the radio; all else is as babeld has it by default.
+    """Return the command of the routing daemon of a robot; other settings are babeld's defaults.
 
     Args:
-        interface: The radio, which babeld cannot know for one: a TAP device tells nothing of wireless extensions.
-        address: The robot's address with the length of the network; each robot announces its own, as a host's.
-        hello_s: How often it says hello to its neighbours.
+        interface: The radio interface. It is declared wireless, because a TAP device has no wireless extensions.
+        address: The robot's address with the prefix length; each robot announces its own address as a host route.
+        hello_s: Hello interval.
     """
-    return (*_program(str(PID), _LONG_TERM_STATE), *_said(interface, address, hello_s), interface)
+    return (*_program(str(PID), _LONG_TERM_STATE), *_settings(interface, address, hello_s), interface)
 
 
 def guest_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
-    """Return the command of who finds its way over others, and announces no way but the one to itself.
+    """Return the command of a node that uses the robots' routes, and announces only the route to itself.
 
-    It leaves no file behind. Arguments as `command`.
+    The daemon writes no files. Arguments as `command`.
     """
-    announced = (f"out ip {IPv4Interface(address).ip}/32 allow", "out deny")
-    return (*_program("", ""), *_said(interface, address, hello_s, *announced), interface)
+    filters = (f"out ip {IPv4Interface(address).ip}/32 allow", "out deny")
+    return (*_program("", ""), *_settings(interface, address, hello_s, *filters), interface)
 
 
 def _program(pid: str, long_term_state: str) -> tuple[str, ...]:
     return (shutil.which("babeld") or "/usr/sbin/babeld", "-I", pid, "-S", long_term_state)
 
 
-def _said(interface: str, address: str, hello_s: float, *more: str) -> tuple[str, ...]:
+def _settings(interface: str, address: str, hello_s: float, *more: str) -> tuple[str, ...]:
     settings = (
         f"interface {interface} type wireless hello-interval {hello_s:g}",
         f"redistribute local ip {IPv4Interface(address).network} allow",

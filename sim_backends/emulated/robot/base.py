@@ -1,4 +1,4 @@
-"""The base of an emulated ground robot at its socket: the process that drives it as it is told, while it is told."""
+"""Process of the base of an emulated ground robot: receives velocities at a socket and drives the robot."""
 
 import contextlib
 import select
@@ -18,49 +18,49 @@ _TICK_S: Final = 0.02
 
 
 def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
-    """Serve for ever; a robot that stands takes no time.
+    """Serve forever; while the robot is idle, the process sleeps.
 
     Args:
-        base: The robot's base.
-        motion: The file in which the lab says where it has put the robot (`own_motion.say`).
-        steered: The file in which the robot says where it drives (`helm.Helm`).
-        ready: Made when it serves.
+        base: Settings of the robot's base.
+        motion: The file of the paths that the lab assigns (`own_motion.append_path`).
+        steered: The file in which the robot records its motion (`helm.Helm`).
+        ready: Created when the base serves.
 
     Raises:
-        OSError: The socket cannot be made.
+        OSError: The socket cannot be created.
     """
-    twists.CHANNEL.unlink(missing_ok=True)  # left by one that was killed
+    twists.CHANNEL.unlink(missing_ok=True)  # left by a process that was killed
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
         channel.bind(str(twists.CHANNEL))
         channel.setblocking(False)
         helm = Helm(motion, steered, time.monotonic_ns())
         ready.touch()
         select.select([channel], [], [])
-        # The physics take numpy, 20 MB and a moment: most robots of most trials are never driven.
+        # The physics need numpy, which takes 20 MB; most robots of most trials are never driven.
         from sim_backends.emulated.robot.base_controller import BaseController  # noqa: PLC0415
 
         controller = BaseController(base, time.monotonic_ns())
         while True:
-            select.select([channel], [], [], None if controller.stands else _TICK_S)
+            select.select([channel], [], [], None if controller.is_idle else _TICK_S)
             now_ns = time.monotonic_ns()
-            if (where := helm.put(now_ns)) is not None:
-                controller.put(where)
-            _take(channel, controller, now_ns)
+            if (placement := helm.poll_placement(now_ns)) is not None:
+                controller.reset(placement)
+            _receive_velocities(channel, controller, now_ns)
             controller.advance(now_ns)
-            _say(helm, controller, now_ns)
+            _write_motion(helm, controller, now_ns)
 
 
-def _take(channel: socket.socket, controller: "BaseController", now_ns: int) -> None:
-    """Take the velocities that have come; the last one counts."""
+def _receive_velocities(channel: socket.socket, controller: "BaseController", now_ns: int) -> None:
+    """Receive the pending velocities; the last one is used."""
     with contextlib.suppress(BlockingIOError):
         while True:
-            if (said := twists.unpack(channel.recv(twists.BYTES + 1))) is not None:
-                controller.hear(now_ns, *said)
+            if (velocity := twists.unpack(channel.recv(twists.BYTES + 1))) is not None:
+                controller.set_velocity(now_ns, *velocity)
 
 
-def _say(helm: Helm, controller: "BaseController", now_ns: int) -> None:
+def _write_motion(helm: Helm, controller: "BaseController", now_ns: int) -> None:
     pose = controller.pose
-    helm.say(
+    helm.write(
         now_ns,
         pose.place_m,
         pose.velocity_m_s,

@@ -1,8 +1,7 @@
-"""The base controller of an emulated ground robot: velocities in, a pose out, within limits.
+"""Base controller of an emulated ground robot: computes its pose from commanded velocities, within limits.
 
-It takes velocities as ROS's `diff_drive_controller` and the firmware of a TurtleBot3 do, and stands where none came
-for `TIMEOUT_NS`. What it drives is a differential drive of the co-simulation's physics; it pushes nothing over and
-runs into nothing, as the lab knows no collisions.
+It treats velocities as ROS's `diff_drive_controller` and the firmware of a TurtleBot3 do, and stops if none arrived
+for `TIMEOUT_NS`. The robot is a differential drive of the co-simulation's physics, without collisions.
 """
 
 import math
@@ -14,19 +13,19 @@ from sim_backends.physics.body import Twist
 from sim_backends.physics.differential_drive import DifferentialDrive, DriveLimits, DrivePose
 
 TIMEOUT_NS: Final = 500_000_000
-"""Without a velocity for so long it stands: CONTROL_MOTOR_TIMEOUT of OpenCR's turtlebot3_core, and ROS's default."""
+"""The base stops this long after a velocity: CONTROL_MOTOR_TIMEOUT of OpenCR's turtlebot3_core, and ROS's default."""
 
 STEP_NS: Final = 10_000_000
-_TURNS_UP_S: Final = 0.5
-"""How long its turning takes to come up to its limit."""
+_TURN_RISE_S: Final = 0.5
+"""Time in which the turn rate rises from 0 to its limit."""
 
 
 class BaseController:
-    """One robot's base; it knows of no clock and no socket.
+    """Base of one robot; the caller provides the time and the velocities.
 
     Args:
-        base: Its limits.
-        now_ns: When it is made, by the monotonic clock, as all times that it is told.
+        base: Limits of the base.
+        now_ns: Time of creation; all times are those of the monotonic clock.
     """
 
     def __init__(self, base: Base, now_ns: int) -> None:
@@ -34,57 +33,57 @@ class BaseController:
             base.speed_m_s,
             base.acceleration_m_s2,
             base.turn_rad_s,
-            base.turn_rad_s / _TURNS_UP_S,
+            base.turn_rad_s / _TURN_RISE_S,
             radius_m=0.0,
             height_m=0.0,
         )
         self._drive = DifferentialDrive(limits, (0.0, 0.0))
         self._now_ns = now_ns
-        self._heard_ns: int | None = None
-        self._wanted = Twist()
-        self.put(AT_REST)
+        self._commanded_ns: int | None = None
+        self._command = Twist()
+        self.reset(AT_REST)
 
     @property
     def pose(self) -> DrivePose:
-        """Where it is, and how it moves."""
+        """Pose and speeds of the robot."""
         return self._pose
 
     @property
-    def stands(self) -> bool:
-        """Whether it stands, and nobody wants it to drive."""
-        return self._heard_ns is None and not (self._pose.speed_m_s or self._pose.turn_rad_s)
+    def is_idle(self) -> bool:
+        """True if the robot is at rest and no velocity is in force."""
+        return self._commanded_ns is None and not (self._pose.speed_m_s or self._pose.turn_rad_s)
 
     @property
     def wheels(self) -> tuple[float, float, float]:
-        """What its odometry has counted; see `Steered.wheels`."""
-        began, (east_m, north_m, _) = self._began, self._pose.place_m
-        x_m, y_m = east_m - began.place_m[0], north_m - began.place_m[1]
-        turned_rad = began.yaw_rad - began.heading_rad
+        """Odometry; see `Steered.wheels`."""
+        start, (east_m, north_m, _) = self._start, self._pose.place_m
+        x_m, y_m = east_m - start.place_m[0], north_m - start.place_m[1]
+        turned_rad = start.yaw_rad - start.heading_rad
         cos, sin = math.cos(turned_rad), math.sin(turned_rad)
-        yaw_rad = began.yaw_rad + self._pose.heading_rad - began.heading_rad
-        return began.x_m + cos * x_m - sin * y_m, began.y_m + sin * x_m + cos * y_m, yaw_rad
+        yaw_rad = start.yaw_rad + self._pose.heading_rad - start.heading_rad
+        return start.x_m + cos * x_m - sin * y_m, start.y_m + sin * x_m + cos * y_m, yaw_rad
 
-    def put(self, where: OwnMotion) -> None:
-        """Begin anew where it was put; it stands there, whatever it was told before."""
-        self._began = where
-        self._pose = DrivePose(where.place_m, where.heading_rad)
-        self._heard_ns = None
+    def reset(self, motion: OwnMotion) -> None:
+        """Start again at the place where the lab put the robot; it is at rest, and earlier velocities are dropped."""
+        self._start = motion
+        self._pose = DrivePose(motion.place_m, motion.heading_rad)
+        self._commanded_ns = None
 
-    def hear(self, now_ns: int, ahead_m_s: float, turn_rad_s: float) -> None:
-        """Take a velocity; what is no number is not heard."""
+    def set_velocity(self, now_ns: int, ahead_m_s: float, turn_rad_s: float) -> None:
+        """Set the commanded velocity; values that are not finite are ignored."""
         if math.isfinite(ahead_m_s) and math.isfinite(turn_rad_s):
-            if self.stands:
+            if self.is_idle:
                 self._now_ns = now_ns
-            self._wanted, self._heard_ns = Twist(ahead_m_s, turn_rad_s), now_ns
+            self._command, self._commanded_ns = Twist(ahead_m_s, turn_rad_s), now_ns
 
     def advance(self, now_ns: int) -> None:
-        """Drive until this moment, as far as whole steps go."""
+        """Advance the pose to this time, in whole steps."""
         while self._now_ns + STEP_NS <= now_ns:
-            if self.stands:
+            if self.is_idle:
                 self._now_ns += (now_ns - self._now_ns) // STEP_NS * STEP_NS
                 return
             self._now_ns += STEP_NS
-            if self._heard_ns is not None and self._now_ns - self._heard_ns > TIMEOUT_NS:
-                self._heard_ns = None
-            wanted = Twist() if self._heard_ns is None else self._wanted
-            self._pose = self._drive.course(self._pose, wanted, STEP_NS / 1e9).at(1)
+            if self._commanded_ns is not None and self._now_ns - self._commanded_ns > TIMEOUT_NS:
+                self._commanded_ns = None
+            command = Twist() if self._commanded_ns is None else self._command
+            self._pose = self._drive.course(self._pose, command, STEP_NS / 1e9).at(1)

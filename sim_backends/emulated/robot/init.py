@@ -1,7 +1,8 @@
-"""The first process of an emulated robot, or of the laptop: PID 1 in its namespaces, which end with it.
+"""Init process of an emulated robot, or of the laptop: PID 1 in its namespaces.
 
-It does what the lab asks over the control socket it inherited: one JSON line each way, strictly in turn. When the
-lab is gone, the socket reaches its end, this process exits, and the kernel ends everything in the namespaces.
+It executes the lab's requests from the control socket that it inherits: one JSON line per request and one per reply,
+in strict alternation. When the lab exits, the socket reaches its end, this process exits, and the kernel kills all
+processes in the namespaces.
 """
 
 import os
@@ -24,23 +25,23 @@ from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
 from sim_backends.emulated.robot.supervisor import Supervisor
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.neighbours import Neighbourhood
-from sim_backends.emulated.ros.own_motion import OwnWay
+from sim_backends.emulated.ros.own_motion import AssignedPath
 
 START_S: Final = 30.0
-"""How long a robot's programs may take to get up; Debian's ROS on a busy machine takes a few seconds."""
+"""Timeout for the start of a robot's programs; Debian's ROS takes a few seconds on a busy machine."""
 
 _MESSAGE_S: Final = 10.0
 
 VOLATILE: Final = ("/tmp", "/run", "/dev/shm")  # noqa: S108 (the robot's own)
-"""Folders that a robot holds in memory; the others lie on its SD card."""
+"""Folders in the robot's memory; all other folders are on its SD card."""
 
 
 class Init:
-    """Serves the lab until it hangs up.
+    """Serves the lab until it closes the control socket.
 
     Args:
         channel: Control socket.
-        wake_fd: Readable after a child has ended.
+        wake_fd: Descriptor that is readable after a child has exited.
     """
 
     def __init__(self, channel: socket.socket, wake_fd: int) -> None:
@@ -50,53 +51,53 @@ class Init:
         self._neighbourhood: Neighbourhood | None = None
 
     def run(self) -> None:
-        """Return when the lab has hung up."""
-        lab_is_there = True
-        while lab_is_there:
+        """Serve requests; return when the lab has closed the control socket."""
+        is_connected = True
+        while is_connected:
             watched = [self._channel.fileno(), self._wake_fd]
             readable, _, _ = select.select(watched, [], [], self._supervisor.restart())
             if self._wake_fd in readable:
                 os.read(self._wake_fd, 4096)
                 self._supervisor.reap()
             if self._channel.fileno() in readable:
-                lab_is_there = self._serve()
+                is_connected = self._serve()
 
     def _serve(self) -> bool:
         received = ipc.receive(self._channel, Deadline.after(_MESSAGE_S))
         if received is None:
             return False
-        request, handed = received
+        request, received_fds = received
         descriptors: list[int] = []
         try:
-            descriptors = self._answer(request, handed)
+            descriptors = self._answer(request, received_fds)
             reply: Message = {}
         except FieldkitError as error:
             reply = {"error": error.what, "remedy": error.remedy}
         except (OSError, subprocess.SubprocessError) as error:
             reply = {"error": f"{request['do']}: {error}", "remedy": ""}
         ipc.send(self._channel, reply, Deadline.after(_MESSAGE_S), descriptors)
-        for fd in (*handed, *descriptors):
+        for fd in (*received_fds, *descriptors):
             os.close(fd)
         return True
 
-    def _answer(self, request: Message, handed: Sequence[int]) -> list[int]:
-        """Do what `request` asks, with the descriptors that came with it; return those to hand over."""
+    def _answer(self, request: Message, received_fds: Sequence[int]) -> list[int]:
+        """Execute `request` with its descriptors; return the descriptors for the reply."""
         match request["do"]:
             case "build":
                 spec = RobotSpec.from_json(request["robot"])
                 _build(spec)
-                # The sensors process is a fork of this one: it inherits the memory, and no descriptor.
-                self._neighbourhood = Neighbourhood(handed[0], len(spec.hosts)) if handed else None
+                # The sensors process is forked from this one: it inherits the mapping, but no descriptor.
+                self._neighbourhood = Neighbourhood(received_fds[0], len(spec.hosts)) if received_fds else None
                 return [os.open(services.STEERED, os.O_RDONLY | os.O_CREAT, 0o600)]
             case "open radio":
                 return [_open_radio(request)]
             case "start":
                 self._start(RobotSpec.from_json(request["robot"]))
-            case "switch off" | "switch on" as what:
-                switch = network.switch_on if what == "switch on" else network.switch_off
+            case "switch off" | "switch on" as action:
+                switch = network.switch_on if action == "switch on" else network.switch_off
                 switch(request["interface"])
             case "move":
-                own_motion.say(services.MOTION, OwnWay(**request["way"]))
+                own_motion.append_path(services.MOTION, AssignedPath(**request["way"]))
             case "kill":
                 kill_processes(request["process"])
             case "halt":
@@ -116,22 +117,22 @@ class Init:
             self._supervisor.wait_ready(service, deadline)
 
     def _halt(self, interface: str) -> None:
-        # Off the air first: a robot without power says no goodbye to its peers.
+        # First off the air: a robot that loses power closes no connection.
         network.switch_off(interface)
         self._supervisor.halt()
         lose_memory()
 
     def _spawn(self, spec: RobotSpec) -> list[Service]:
-        """Start the robot's services without waiting for them: requests are served strictly in turn."""
+        """Start the robot's services without waiting for them, because requests are served one at a time."""
         Path(services.READY_FOLDER).mkdir(exist_ok=True)
-        found = services.services(spec, self._neighbourhood)
-        for service in found:
+        started = services.services(spec, self._neighbourhood)
+        for service in started:
             self._supervisor.start(service)
-        return found
+        return started
 
 
 def _open_radio(request: Message) -> int:
-    """Bring up the radio interface, and what a guest of a mesh routes with; return the device's descriptor."""
+    """Bring up the radio interface, and the routing daemon of a mesh guest; return the device's descriptor."""
     interface, address, hello_s = request["interface"], request["address"], request["guest_hello_s"]
     fd = network.bring_up(interface, address, mesh=request["mesh"])
     if hello_s is not None:
@@ -142,19 +143,19 @@ def _open_radio(request: Message) -> int:
 def _build(spec: RobotSpec) -> None:
     socket.sethostname(spec.name)
     mounts.isolate(replaced=spec.setup)
-    rootfs.furnish(spec)
+    rootfs.write_files(spec)
     os.chdir(HOME)
 
 
 def _reset_signals() -> None:
-    """Undo what this process inherited, so that nothing in the robot ignores or blocks a signal."""
+    """Restore default signal handling, so that no program of the robot ignores or blocks a signal."""
     for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, [])
 
 
 def _wake_on_children() -> int:
-    """Return a descriptor that is readable after a child has ended."""
+    """Return a descriptor that is readable after a child has exited."""
     wake_fd, signal_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.set_wakeup_fd(signal_fd, warn_on_full_buffer=False)
     signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
@@ -162,20 +163,20 @@ def _wake_on_children() -> int:
 
 
 def kill_processes(process: str) -> None:
-    """End every process of the robot that has this name, but the first one, without warning.
+    """Kill every process of the robot that has this name, except init.
 
     Raises:
         RobotError: There is none.
     """
-    found = [pid for pid in _pids() if pid != os.getpid() and _process_name(pid) == process]
-    if not found:
+    pids = [pid for pid in _pids() if pid != os.getpid() and _process_name(pid) == process]
+    if not pids:
         raise RobotError(f"no process named {process} runs", remedy="on the robot: cat /proc/[0-9]*/comm | sort -u")
-    for pid in found:
+    for pid in pids:
         os.kill(pid, signal.SIGKILL)
 
 
 def lose_memory() -> None:
-    """Lose what a robot loses with its power: what lies in memory, and the name of this boot."""
+    """Discard the state that a robot loses with its power: the content of its memory, and its boot id."""
     for folder in VOLATILE:
         mounts.clear(Path(folder), keep=(STATE, rootfs.SSHD_FOLDER))
     mounts.clear(Path(services.READY_FOLDER))
@@ -190,11 +191,11 @@ def _process_name(pid: int) -> str:
     try:
         return Path(f"/proc/{pid}/comm").read_text(encoding="utf-8", errors="replace").rstrip("\n")
     except OSError:
-        return ""  # it ended meanwhile
+        return ""  # the process has exited
 
 
 def main() -> None:
-    """Be PID 1, on the control socket whose number the command line gives."""
+    """Run as PID 1 on the control socket whose descriptor number is on the command line."""
     os.umask(0o022)
     _reset_signals()
     Init(socket.socket(fileno=int(sys.argv[1])), _wake_on_children()).run()

@@ -1,4 +1,4 @@
-"""Network of an emulated robot: loopback, and a TUN or TAP interface named as its radio, which the medium holds."""
+"""Network of an emulated robot: loopback, and a TUN or TAP interface with the radio's name, served by the medium."""
 
 import errno
 import fcntl
@@ -36,16 +36,16 @@ _TIMEOUT_S: Final = 5.0
 def open_tun(name: str, *, ethernet: bool = False) -> int:
     """Create the TUN interface `name` in this process's network namespace; return its non-blocking descriptor.
 
-    The interface carries bare IP packets, or Ethernet frames (TAP), and lives as long as the descriptor, in whichever
-    process. It queues up to 4096 packets for the medium, so that a pause of the medium is no loss.
+    The interface carries bare IP packets, or Ethernet frames (TAP), and exists as long as a process has the
+    descriptor open. Its queue holds 4096 packets, so that a pause of the medium loses none.
 
     Raises:
-        ConfigurationError: The device is missing or closed to this user, or the namespace gives no right.
+        ConfigurationError: The device is missing, or this user may not open it or create an interface.
         FieldkitError: The interface exists already or the kernel refuses its name.
     """
     if not 0 < len(name.encode()) <= _NAME_BYTES:
         raise ConfigurationError(
-            f"{name!r} is no name for an interface", remedy=f"use 1 to {_NAME_BYTES} letters, for example wlan0"
+            f"{name!r} is not a valid interface name", remedy=f"use 1 to {_NAME_BYTES} letters, for example wlan0"
         )
     fd = open_device()
     try:
@@ -62,7 +62,7 @@ def open_device() -> int:
     """Open the TUN device and return its non-blocking descriptor, which has no interface yet.
 
     Raises:
-        ConfigurationError: The device is missing or closed to this user.
+        ConfigurationError: The device is missing, or this user may not open it.
     """
     try:
         return os.open(DEVICE, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -71,7 +71,7 @@ def open_device() -> int:
 
 
 def _set_queue(index: int) -> None:
-    # By netlink: the ioctl for it, and so busybox's ip, asks for a right that a user namespace never gives.
+    # By netlink: the ioctl, which busybox's ip uses too, needs a capability that a user namespace never grants.
     link = struct.pack("=BxHiII", socket.AF_UNSPEC, 0, index, 0, 0)
     length = struct.pack("=HHI", 8, _IFLA_TXQLEN, QUEUE_PACKETS)
     size_bytes = _HEADER_BYTES + len(link) + len(length)
@@ -94,33 +94,33 @@ def _cannot_open(error: OSError) -> ConfigurationError:
 def _cannot_create(name: str, error: OSError) -> FieldkitError:
     if error.errno == errno.EPERM:
         return ConfigurationError(
-            "no right to create a TUN interface",
+            "no permission to create a TUN interface",
             where=name,
             remedy="run as root, or in a user namespace that owns the network namespace (CAP_NET_ADMIN)",
         )
-    remedy = "end the process that holds it, or use another name" if error.errno == errno.EBUSY else ""
+    remedy = "stop the process that has it open, or use another name" if error.errno == errno.EBUSY else ""
     return FieldkitError(f"cannot create the TUN interface: {error.strerror}", where=name, remedy=remedy)
 
 
 def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
     """Bring up loopback and the radio interface in this process's network namespace.
 
-    Multicast and limited broadcast leave by the radio, as on a robot whose only network it is.
+    Multicast and limited broadcast use the radio interface, as on a robot that has no other network.
 
     Args:
-        interface: Its name.
-        address: Its address with the length of the network.
-        mesh: Whether robots forward for each other: the interface then has a MAC address, by which frames name the
+        interface: Name of the interface.
+        address: Its address with the prefix length.
+        mesh: True if robots forward for each other; the interface then has a MAC address, by which frames name the
             next hop, and IPv6, whose link-local addresses the routing daemon uses (RFC 8966, section 4).
 
     Returns:
         The device's descriptor, for the medium.
 
     Raises:
-        FieldkitError: The interface cannot be made.
-        RobotError: `ip` refused a setting.
+        FieldkitError: The interface cannot be created.
+        RobotError: `ip` rejected a setting.
     """
-    _no_ipv6()
+    _disable_ipv6()
     fd = open_tun(interface, ethernet=mesh)
     if mesh:
         _prepare_mesh(interface)
@@ -144,32 +144,32 @@ def switch_on(interface: str) -> None:
     """Bring the radio interface up again.
 
     Raises:
-        RobotError: `ip` refused.
+        RobotError: `ip` rejected a setting.
     """
     _ip(f"link set {interface} up", *_routes(interface))
 
 
 def _routes(interface: str) -> tuple[str, ...]:
-    # Lost with every link that goes down, unlike the route that comes with the address.
+    # These routes vanish whenever the link goes down, unlike the route that comes with the address.
     return (f"route replace 224.0.0.0/4 dev {interface}", f"route replace 255.255.255.255/32 dev {interface}")
 
 
 def _ip(*commands: str) -> None:
     for command in commands:
-        # One by one: busybox's ip, which a robot may have, takes no batch.
-        done = subprocess.run(
+        # Command by command, because busybox's ip, which a robot may have, has no batch mode.
+        result = subprocess.run(
             ["ip", *command.split()],  # noqa: S607 (found on the robot's own PATH)
             capture_output=True,
             text=True,
             timeout=_TIMEOUT_S,
             check=False,
         )
-        if done.returncode != 0:
-            raise RobotError(f"ip refused a setting: {done.stderr.strip()}", remedy="update iproute2")
+        if result.returncode != 0:
+            raise RobotError(f"ip rejected a setting: {result.stderr.strip()}", remedy="update iproute2")
 
 
 def listens(port: int) -> bool:
-    """Return whether a TCP socket listens on `port`; asks the kernel, so that no server sees a connection."""
+    """Return True if a TCP socket listens on `port`; reads the kernel's table, so the server gets no connection."""
     local = f":{port:04X} "
     listening = "0A"
     lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]
@@ -177,10 +177,10 @@ def listens(port: int) -> bool:
 
 
 def _prepare_mesh(interface: str) -> None:
-    """Let the robot forward, and have link-local addresses at once: no other robot has one made of the same MAC."""
+    """Enable forwarding, and link-local addresses without duplicate detection, since no other robot has this MAC."""
     settings = {
         "ipv4/conf/all/forwarding": 1,
-        # Every packet leaves by the radio that it came by, which is no reason to send its source another way.
+        # Every packet leaves by the interface it came from; that must not cause ICMP redirects.
         "ipv4/conf/all/send_redirects": 0,
         f"ipv4/conf/{interface}/send_redirects": 0,
         f"ipv6/conf/{interface}/disable_ipv6": 0,
@@ -192,8 +192,8 @@ def _prepare_mesh(interface: str) -> None:
         Path("/proc/sys/net", name).write_text(str(value), encoding="ascii")
 
 
-def _no_ipv6() -> None:
-    """Keep the kernel's own neighbour discovery off the air: fieldkit measures what robots send."""
+def _disable_ipv6() -> None:
+    """Disable IPv6, so that the kernel's neighbour discovery adds no packets to those of the robot's programs."""
     for scope in ("all", "default"):
         switch = Path(f"/proc/sys/net/ipv6/conf/{scope}/disable_ipv6")
         if switch.exists():

@@ -1,4 +1,4 @@
-"""Root file system of an emulated robot: accounts, host names, keys, ROS setup files, and its choice of programs."""
+"""Root file system of an emulated robot: accounts, host names, keys, ROS setup files, and its tool variants."""
 
 import os
 import shlex
@@ -17,13 +17,13 @@ from sim_backends.emulated.robot.spec import HOME, STATE, Netcat, RobotSpec
 
 SSHD_FOLDER: Final = "/run/sshd"
 BOOT_ID: Final = f"{STATE}/boot_id"
-"""Stands over the kernel's own, which all robots of this machine share and no reboot of one changes."""
+"""Mounted over the kernel's boot id, which all robots of this machine share and a robot's reboot does not change."""
 
 _RECORDERS: Final = {
     1: ("rosbag", "sim_backends.emulated.ros.rosbag"),
     2: ("ros2", "sim_backends.emulated.ros.ros2_bag"),
 }
-"""Built-in recorder per ROS version: its name on the robot, and the module behind it."""
+"""Built-in recorder per ROS version: name of the program on the robot, and module that implements it."""
 
 _ACCOUNTS: Final = """\
 root:x:0:0:root:/root:{shell}
@@ -32,11 +32,11 @@ sshd:x:100:65534::/run/sshd:/usr/sbin/nologin
 tcpdump:x:101:101::/nonexistent:/usr/sbin/nologin
 """
 _GROUPS: Final = "root:x:0:\ntty:x:5:\nnogroup:x:65534:\ntcpdump:x:101:\n"
-# `*` is no password; the account is open to keys. `!` would lock it, and sshd without PAM refuses locked accounts.
+# `*` matches no password; keys still log in. `!` would lock the account, which sshd without PAM refuses.
 _PASSWORDS: Final = "root:*:20000:0:99999:7:::\n"
 
 OWN_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
-"""Files of the system that a robot has its own of."""
+"""System files that each robot has separately."""
 
 NETCATS: Final[dict[Netcat, str]] = {
     "traditional": "nc.traditional",
@@ -44,10 +44,10 @@ NETCATS: Final[dict[Netcat, str]] = {
     "ncat": "ncat",
     "busybox": "busybox",
 }
-"""Debian's program per netcat."""
+"""Debian's program for each netcat."""
 
-# On a real robot `python3` is Debian's own, which has these behind PYTHONPATH. Appended, so that the packages of the
-# Python that runs fieldkit come first.
+# On a real robot `python3` is Debian's, which searches this folder after PYTHONPATH. It is appended, so that the
+# packages of the Python that runs fieldkit come first.
 _SITE_CUSTOMIZE: Final = """\
 import sys
 
@@ -59,21 +59,31 @@ BUSYBOX: Final = "/usr/bin/busybox"
 SFTP_FOLDER: Final = "/usr/lib/openssh"
 
 _BIN: Final = "/usr/bin"
-_KERNELS: Final = ("/proc/", "/sys/", "/dev/")
-_FOLDERS: Final = (_BIN, "/usr/sbin")
+_KERNEL_FOLDERS: Final = ("/proc/", "/sys/", "/dev/")
+_PROGRAM_FOLDERS: Final = (_BIN, "/usr/sbin")
 
 _ANY_NETCAT: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
-# What a robot with a busybox userland has beside it: bash sources ROS's setup files, Python runs its recorder, and a
-# router with OpenWrt has babeld from a package.
-_BESIDE_BUSYBOX: Final = ("babeld", "bash", "busybox", "dropbear", "iperf3", "python3*", "ros*", "sshd*", "tcpdump")
+# Programs that a robot with a busybox userland keeps: bash sources ROS's setup files, Python runs its recorder, and
+# OpenWrt routers have a package of babeld.
+_KEPT_WITH_BUSYBOX: Final = (
+    "babeld",
+    "bash",
+    "busybox",
+    "dropbear",
+    "iperf3",
+    "python3*",
+    "ros*",
+    "sshd*",
+    "tcpdump",
+)
 _TIMEOUT_S: Final = 5.0
 
 Layer = dict[str, str | None]
-"""Names in a folder with where each links to; None for a gap."""
+"""Link target per name in a folder of programs; None for a name that is removed."""
 
 
-def furnish(spec: RobotSpec) -> None:
-    """Write the robot's files; its mount namespace is isolated already.
+def write_files(spec: RobotSpec) -> None:
+    """Write the robot's files; its mount namespace must be isolated already.
 
     Raises:
         OSError: A file could not be written, or the kernel refused a mount.
@@ -85,26 +95,26 @@ def furnish(spec: RobotSpec) -> None:
     (state / "etc").mkdir(mode=0o755, parents=True)
     _write(Path(ssh_server.HOST_KEY), spec.host_key, mode=0o600)
     _write(Path(HOME, ".ssh", "authorized_keys"), f"{spec.authorized_key}\n", mode=0o600)
-    own = _etc(spec)
-    for name, content in own.items():
+    files = _etc(spec)
+    for name, content in files.items():
         _write(state / "etc" / name, content, mode=0o640 if name == "shadow" else 0o644)
-    # One by one, because a user namespace may lay nothing over a folder with mounts in it, as Docker has; over the
-    # folder where this machine lacks one of them, as a bare Debian lacks hosts.
+    # Mounted file by file, because a user namespace may not mount over a folder with mounts in it, as Docker has. If
+    # this machine lacks one of the files, as a bare Debian lacks hosts, an overlay of the whole folder adds them.
     if all(Path(path).exists() for path in OWN_FILES):
-        for name in own:
+        for name in files:
             mounts.bind(state / "etc" / name, Path("/etc", name))
     else:
-        mounts.lay_over(state / "etc", Path("/etc"))
+        mounts.mount_overlay(state / "etc", Path("/etc"))
     ssh_server.convert_key(spec)
-    lay_programs(spec)
+    mount_programs(spec)
     new_boot_id()
     mounts.bind(Path(BOOT_ID), Path("/proc/sys/kernel/random/boot_id"))
 
 
 def write_setup(spec: RobotSpec) -> None:
-    """Write the ROS setup files wherever they are to lie, and the built-in recorder beside them.
+    """Write the ROS setup files at their paths, and the built-in recorder beside them.
 
-    Where the deepest folder that is there is this machine's, they stand in it beside what it has.
+    If the deepest existing folder of a path belongs to this machine, the files are added to a mirror of that folder.
 
     Raises:
         OSError: A file could not be written, or the kernel refused a mount.
@@ -113,44 +123,44 @@ def write_setup(spec: RobotSpec) -> None:
     files = {}
     for path in map(Path, spec.setup):
         files[path] = setup_script(spec, path), 0o644
-        # A robot with ROS has its middlewares: here those of the Python that runs fieldkit.
+        # A robot with ROS has middlewares; here they are those of the Python that runs fieldkit.
         files[_ros_programs(path) / "python3"] = f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n', 0o755
         files[_ros_programs(path) / "fieldkit"] = module_command("fieldkit"), 0o755
         if spec.ros == "builtin":
             files[_ros_programs(path) / program] = module_command(module), 0o755
         else:
             files[_ros_packages(path) / "sitecustomize.py"] = _SITE_CUSTOMIZE, 0o644
-    beside: dict[Path, list[Path]] = {}
+    paths_by_folder: dict[Path, list[Path]] = {}
     for path in files:
         folder = next(parent for parent in path.parents if parent.is_dir())
-        beside.setdefault(folder, []).append(path)
-    for folder, paths in beside.items():
-        with _writable(folder, {path.relative_to(folder).parts[0] for path in paths}) as place:
+        paths_by_folder.setdefault(folder, []).append(path)
+    for folder, paths in paths_by_folder.items():
+        with _writable(folder, {path.relative_to(folder).parts[0] for path in paths}) as writable:
             for path in paths:
                 content, mode = files[path]
-                _write(place / path.relative_to(folder), content, mode=mode)
+                _write(writable / path.relative_to(folder), content, mode=mode)
 
 
 @contextmanager
 def _writable(folder: Path, replaced: set[str]) -> Iterator[Path]:
-    """Yield where to write what is to stand in `folder`: there, or in a copy of what is the host's."""
+    """Yield where files for `folder` must be written: the folder itself, or a mirror of a folder of the host."""
     if os.access(folder, os.W_OK):
         yield folder
         return
-    place = Path(STATE, "copy")
-    place.mkdir(parents=True)
-    with mounts.remade(folder, place, without=replaced):
-        yield place
-    place.rmdir()
+    mirror = Path(STATE, "copy")
+    mirror.mkdir(parents=True)
+    with mounts.rewritten(folder, mirror, without=replaced):
+        yield mirror
+    mirror.rmdir()
 
 
 def new_boot_id() -> None:
-    """Write another id of the boot where `/proc/sys/kernel/random/boot_id` shows it."""
+    """Generate a new boot id, visible at `/proc/sys/kernel/random/boot_id`."""
     Path(BOOT_ID).write_bytes(Path("/proc/sys/kernel/random/uuid").read_bytes())
 
 
 def setup_script(spec: RobotSpec, path: Path) -> str:
-    """Return the ROS setup file `path`: the variables that a session needs to find ROS."""
+    """Return the content of the ROS setup file `path`: the variables that ROS programs need."""
     variables = {"ROS_DISTRO": spec.distribution, "ROS_VERSION": str(spec.ros_version)}
     if spec.ros_version == 1:
         variables |= spec.ros1_environment
@@ -162,7 +172,7 @@ def setup_script(spec: RobotSpec, path: Path) -> str:
 
 
 def module_command(module: str) -> str:
-    """Return the script that runs a module as a command of the robot; `exec` keeps signals and process id its own."""
+    """Return the script that runs a module as a command of the robot; `exec` keeps the process id for signals."""
     command = shlex.join(interpreter.command(module))
     return f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(interpreter.PROJECT))} exec {command} "$@"\n'
 
@@ -172,7 +182,7 @@ def _ros_programs(setup: Path) -> Path:
 
 
 def _ros_packages(setup: Path) -> Path:
-    """Return the folder of Python packages beside a setup file, as Noetic has it."""
+    """Return the folder of Python packages beside a setup file, as in Noetic."""
     return setup.parent / "lib" / "python3" / "dist-packages"
 
 
@@ -193,57 +203,57 @@ def _write(path: Path, content: str, *, mode: int = 0o644) -> None:
     path.write_text(content, encoding="utf-8")
 
 
-def not_to_be_held(paths: Iterable[str]) -> list[str]:
-    """Return those of `paths` at which no robot can have a file: the kernel's folders, and the root itself."""
-    return [path for path in paths if path.startswith(_KERNELS) or path.count("/") == 1]
+def unsupported_paths(paths: Iterable[str]) -> list[str]:
+    """Return those of `paths` at which a robot cannot have a file: in kernel folders or in the root directory."""
+    return [path for path in paths if path.startswith(_KERNEL_FOLDERS) or path.count("/") == 1]
 
 
-def lay_programs(spec: RobotSpec) -> None:
-    """Give the robot its own choice of programs; its mount namespace is isolated already.
+def mount_programs(spec: RobotSpec) -> None:
+    """Mount the robot's tool variants; its mount namespace must be isolated already.
 
     Raises:
-        OSError: A link could not be made, or the kernel refused a mount.
-        SubprocessError: busybox does not say what it has.
+        OSError: A link could not be created, or the kernel refused a mount.
+        SubprocessError: busybox did not list its applets.
     """
     for number, (folder, layer) in enumerate(program_layers(spec).items()):
         source = Path(STATE, f"programs-{number}")
         source.mkdir(mode=0o755)
         for name, target in layer.items():
             if target is None:
-                # How an overlay file system writes that a name of the lower folder is gone.
+                # A character device 0/0 in an overlay removes the name of the lower folder (a whiteout).
                 os.mknod(source / name, stat.S_IFCHR, os.makedev(0, 0))
             else:
                 (source / name).symlink_to(target)
-        mounts.lay_over(source, Path(folder))
+        mounts.mount_overlay(source, Path(folder))
 
 
 def program_layers(spec: RobotSpec) -> dict[str, Layer]:
-    """Return what differs from this machine, per folder of programs; nothing for a robot that is like it."""
+    """Return the changes to each folder of programs; empty for a robot with the tools of this machine."""
     busybox = spec.userland == "busybox"
-    found = {folder: _gaps(folder) if busybox else {} for folder in _FOLDERS}
-    programs = found[_BIN]
+    layers = {folder: _removed(folder) if busybox else {} for folder in _PROGRAM_FOLDERS}
+    programs = layers[_BIN]
     if busybox:
         programs |= dict.fromkeys(_applets(), BUSYBOX)
     if spec.netcat is not None:
-        own = NETCATS[spec.netcat]
+        program = NETCATS[spec.netcat]
         programs |= dict.fromkeys((name for name in _ANY_NETCAT if Path(_BIN, name).exists()), None)
-        programs.pop(own, None)
-        programs["nc"] = f"{_BIN}/{own}"
+        programs.pop(program, None)
+        programs["nc"] = f"{_BIN}/{program}"
     if spec.ping == "busybox":
         programs["ping"] = BUSYBOX
     elif spec.ping == "iputils":
         programs.pop("ping", None)
     if not spec.sftp:
-        found[SFTP_FOLDER] = {"sftp-server": None}
-    return {folder: layer for folder, layer in found.items() if layer}
+        layers[SFTP_FOLDER] = {"sftp-server": None}
+    return {folder: layer for folder, layer in layers.items() if layer}
 
 
-def _gaps(folder: str) -> Layer:
-    """Return a gap for each program that is no part of a busybox robot."""
-    names = os.listdir(folder)  # noqa: PTH208 (names are what is wanted)
-    return {name: None for name in names if not any(fnmatch(name, kept) for kept in _BESIDE_BUSYBOX)}
+def _removed(folder: str) -> Layer:
+    """Return the removal of each program that a robot with a busybox userland does not have."""
+    names = os.listdir(folder)  # noqa: PTH208 (only names are needed)
+    return {name: None for name in names if not any(fnmatch(name, pattern) for pattern in _KEPT_WITH_BUSYBOX)}
 
 
 def _applets() -> list[str]:
-    done = subprocess.run((BUSYBOX, "--list"), capture_output=True, text=True, timeout=_TIMEOUT_S, check=True)
-    return done.stdout.split()
+    result = subprocess.run((BUSYBOX, "--list"), capture_output=True, text=True, timeout=_TIMEOUT_S, check=True)
+    return result.stdout.split()

@@ -1,10 +1,10 @@
-"""Publishes an emulated robot's sensors over DDS or Zenoh, as nodes of ROS 2 do; or routes for those of Zenoh.
+"""Publishes an emulated robot's sensors over DDS or Zenoh, as nodes of ROS 2 do; or runs a Zenoh router.
 
-Its words are `route` and the robot's address; or `relay`, that, the node's name, the topic of velocities that its
-base listens to, which may be empty, and as JSON how it takes part, and the type of each topic. The sensors process
-makes each message; here it is turned into CDR as the robot's distribution defines the type, and published while it
-has subscribers anywhere on the radio; `/tf_static` always, for those that come later. Velocities
-go the other way. The node logs on `/rosout`.
+Arguments: `route` and the robot's address; or `relay`, the address, the node's name, the topic of velocities for the
+base (may be empty), and as JSON the ROS 2 settings (`Ros2Spec`) and the type of each topic. The sensors process makes
+each message. The relay converts it to CDR as the robot's distribution defines the type, and publishes it while the
+topic has subscribers anywhere on the radio; `/tf_static` always, for late subscribers. Velocities go in the other
+direction. The node logs on `/rosout`.
 """
 
 import contextlib
@@ -29,8 +29,8 @@ from sim_backends.emulated.robot.spec import Ros2Spec
 from sim_backends.emulated.ros import offered_qos, static_frames
 from sim_backends.emulated.ros.listener import Listener
 
-_LOOKS_S: Final = 0.1
-"""How often the relay looks who subscribes; ROS 2's own recorder looks as often for new publishers."""
+_POLL_S: Final = 0.1
+"""Polling interval for subscribers; ROS 2's own recorder polls for new publishers as often."""
 
 
 _LOG: Final = "rcl_interfaces/msg/Log"
@@ -39,24 +39,24 @@ _INFO: Final = 20
 
 
 class Ros2Relay:
-    """Hands on what the sensors say.
+    """Publishes the messages of the sensors process.
 
     Args:
-        network: How the robot takes part.
+        network: How the robot takes part in the ROS 2 network.
         over: `dds` or `zenoh`.
-        distribution: Of ROS 2.
+        distribution: ROS 2 distribution.
         types: ROS 1 type of each topic, by its name.
     """
 
     def __init__(self, network: Network, over: str, distribution: Distribution, types: Mapping[str, str]) -> None:
-        self._known = MessageTypes(distribution)
+        self._types = MessageTypes(distribution)
         self._network = network
         self._listener = Listener()
         self._middleware = middleware.adapter(over)(network)
         self._publishers: dict[str, Publisher] = {}
         self._conversions: dict[str, Callable[[bytes], bytes]] = {}
-        self._ends = 0
-        self._heard: set[str] = set()
+        self._endpoints = 0
+        self._subscribed: set[str] = set()
         self._rosout = self._middleware.publisher(self._topic("/rosout", _LOG, offered_qos.ROSOUT))
         for topic, kind in types.items():
             described = self._topic(topic, kind, offered_qos.of_topic(topic, kind))
@@ -64,85 +64,90 @@ class Ros2Relay:
             self._conversions[topic] = self._conversion(described.type)
 
     def _topic(self, name: str, kind: str, quality: QosProfile) -> Topic:
-        """Return a topic by all its names, with the number of its end."""
-        self._ends += 1
+        """Return the description of a topic, with the number of this endpoint."""
+        self._endpoints += 1
         domain, node = self._network.domain, self._network.node
-        described = topics.describe(self._known, name, kind, quality, domain=domain, node=node, number=self._ends)
-        return Topic.from_json(described)
+        description = topics.describe(
+            self._types, name, kind, quality, domain=domain, node=node, number=self._endpoints
+        )
+        return Topic.from_json(description)
 
     def log(self, text: str) -> None:
         """Publish a line of level INFO on `/rosout`, as rclcpp and rclpy do; file, function and line are empty."""
-        known, now_ns = self._known.ros2, time.time_ns()
-        stamp = known.types["builtin_interfaces/msg/Time"](*divmod(now_ns, 10**9))
-        line = known.types[_LOG](
+        typestore, now_ns = self._types.ros2, time.time_ns()
+        stamp = typestore.types["builtin_interfaces/msg/Time"](*divmod(now_ns, 10**9))
+        line = typestore.types[_LOG](
             stamp=stamp, level=_INFO, name=self._network.node, msg=text, file="", function="", line=0
         )
-        self._rosout.write(bytes(known.serialize_cdr(line, _LOG)))
+        self._rosout.write(bytes(typestore.serialize_cdr(line, _LOG)))
 
     def _conversion(self, kind: str) -> Callable[[bytes], bytes]:
         defaults: dict[str, Any] = {}
-        known = self._known
+        types = self._types
         return lambda data: bytes(
-            migrate_bytes(known.ros1, known.ros2, kind, kind, defaults, data, src_is2=False, dst_is2=True)
+            migrate_bytes(types.ros1, types.ros2, kind, kind, defaults, data, src_is2=False, dst_is2=True)
         )
 
-    def hear_velocities(self, topic: str) -> None:
-        """Hand each `geometry_msgs/Twist` of a topic on to the base, which may be on its way back."""
+    def relay_velocities(self, topic: str) -> None:
+        """Send each `geometry_msgs/Twist` of a topic to the base; messages are dropped while the base restarts."""
         kind, channel = "geometry_msgs/msg/Twist", socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        known = self._known
+        types = self._types
 
-        def hand_on(data: bytes, _: int) -> None:
-            with contextlib.suppress(OSError, SerdeError):  # nobody listens; or it is none
-                channel.sendto(bytes(known.ros2.cdr_to_ros1(data, kind)), str(twists.CHANNEL))
+        def send(data: bytes, _: int) -> None:
+            with contextlib.suppress(OSError, SerdeError):  # no process receives it, or it is not a Twist
+                channel.sendto(bytes(types.ros2.cdr_to_ros1(data, kind)), str(twists.CHANNEL))
 
-        self._middleware.subscribe(self._topic(topic, kind, PROFILES["default"]), hand_on)
+        self._middleware.subscribe(self._topic(topic, kind, PROFILES["default"]), send)
 
     def run(self) -> None:
-        """Hand on until a signal ends it."""
-        listener, next_look_s = self._listener, 0.0
+        """Relay messages until a signal stops the process."""
+        listener, next_poll_s = self._listener, 0.0
         while listener.stopped_by is None:
-            if time.monotonic() >= next_look_s:
-                next_look_s = time.monotonic() + _LOOKS_S
-                self._look()
-            for header, message in listener.events(_LOOKS_S):
+            if time.monotonic() >= next_poll_s:
+                next_poll_s = time.monotonic() + _POLL_S
+                self._update_subscriptions()
+            for header, message in listener.events(_POLL_S):
                 if message is not None:
                     self._publishers[header["topic"]].write(self._conversions[header["topic"]](message))
         self._middleware.close()
 
-    def _look(self) -> None:
-        """Receive the topics that have subscribers, and `/tf_static`; the others are not made."""
+    def _update_subscriptions(self) -> None:
+        """Request from the sensors process the topics that have subscribers, and `/tf_static`."""
         listener = self._listener
         for topic, publisher in self._publishers.items():
-            heard = publisher.matched() > 0
-            if heard != (topic in self._heard):
-                self.log(f"{topic} has {'a subscriber' if heard else 'no subscriber any more'}")
-                self._heard ^= {topic}
-            if topic == static_frames.TOPIC or heard:
+            has_subscriber = publisher.matched() > 0
+            if has_subscriber != (topic in self._subscribed):
+                self.log(f"{topic} has {'a subscriber' if has_subscriber else 'no subscribers'}")
+                self._subscribed ^= {topic}
+            if topic == static_frames.TOPIC or has_subscriber:
                 listener.wanted.add(topic)
             else:
                 listener.wanted.discard(topic)
-                listener.leave(topic)
+                listener.unsubscribe(topic)
         listener.subscribe()
 
 
-def _network(address: str, node: str, how: Ros2Spec) -> Network:
-    """Return how a node of a robot takes part."""
-    # With peers its port is known to the others; else another program of the robot's may have it.
-    own = {"listen/endpoints": json.dumps([f"tcp/{address}:0"])} if how.over == "zenoh" and not how.peers else {}
+def _network(address: str, node: str, spec: Ros2Spec) -> Network:
+    """Return the settings by which a robot's node takes part in the ROS 2 network."""
+    # With peers the node must use the default port, which the peers know. Otherwise it uses any free port, because
+    # another program of the robot may have the default one.
+    settings = (
+        {"listen/endpoints": json.dumps([f"tcp/{address}:0"])} if spec.over == "zenoh" and not spec.peers else {}
+    )
     return Network(
         address,
-        discovery=how.discovery,
-        peers=how.peers,
-        server=how.router,
-        domain=how.domain,
+        discovery=spec.discovery,
+        peers=spec.peers,
+        server=spec.router,
+        domain=spec.domain,
         node=node,
-        gid_bytes=Distribution.of(how.distribution).gid_bytes,
-        settings=own,
+        gid_bytes=Distribution.of(spec.distribution).gid_bytes,
+        settings=settings,
     )
 
 
 def _route(address: str) -> None:
-    from fieldkit.agent import zenoh  # noqa: PLC0415 (only where it is asked for)
+    from fieldkit.agent import zenoh  # noqa: PLC0415 (only this command needs it)
 
     services.name_process(services.ZENOH_ROUTER)
     running = zenoh.route(Network(address, discovery="none"))
@@ -151,20 +156,20 @@ def _route(address: str) -> None:
     running.close()
 
 
-def _relay(address: str, node: str, velocities: str, *told: str) -> None:
+def _relay(address: str, node: str, velocities: str, ros2_json: str, types_json: str) -> None:
     services.name_process(services.ROS2_RELAY)
-    how, types = map(json.loads, told)
-    spec = Ros2Spec.from_json(how)
+    types = json.loads(types_json)
+    spec = Ros2Spec.from_json(json.loads(ros2_json))
     relay = Ros2Relay(_network(address, node, spec), spec.over, Distribution.of(spec.distribution), types)
     if velocities:
-        relay.hear_velocities(velocities)
+        relay.relay_velocities(velocities)
     relay.log(f"publishing {', '.join(types)}" + (f"; driven by {velocities}" if velocities else ""))
     services.ready_file(services.ROS2_RELAY).touch()
     relay.run()
 
 
 def main(argv: Sequence[str]) -> None:
-    """Route at an address, or relay topics; for ever."""
+    """Run a Zenoh router, or relay topics; returns only after a signal."""
     verb, *words = argv
     if verb == "route":
         _route(*words)

@@ -1,8 +1,8 @@
-"""Publishes an emulated robot's sensors to its ROS master; runs under Debian's own Python, which has rospy.
+"""Publishes an emulated robot's sensors to its ROS master; runs under Debian's Python, which has rospy.
 
-Its words are the node's name, the topic of velocities that its base listens to, which may be empty, and the topics
-that it publishes. The master may be another robot's, over the radio. The sensors process makes and serializes each
-message; here it is handed on as it is, while somebody subscribes. So are velocities, to the base.
+Arguments: the node's name, the topic of velocities for the base (may be empty), and the topics to publish. The master
+may run on another robot, over the radio. The sensors process makes and serializes each message; the relay publishes
+it unchanged while the topic has subscribers. It also sends received velocities to the base.
 """
 
 import contextlib
@@ -30,24 +30,24 @@ _CHUNK: Final = 1 << 16
 
 
 class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no types
-    """Publishes one topic of the sensors process: while it has subscribers, or always where it is latched.
+    """Publishes one topic of the sensors process: while it has subscribers, or always if it is latched.
 
     Args:
-        topic: Its name.
+        topic: Name of the topic.
     """
 
     def __init__(self, topic: str) -> None:
         super().__init__()
         self._topic = topic
         self._stream: socket.socket | None = None
-        # A subscriber that waits for the topic comes while the publisher is being made.
-        self._busy = threading.Lock()
+        # rospy calls `peer_subscribe` in its own threads, possibly before the publisher has been assigned.
+        self._lock = threading.Lock()
         stream, packets = _subscribe(topic)
         with stream:
-            header = tcpros.unpack_header(_next(stream, packets))
+            header = tcpros.unpack_header(_next_packet(stream, packets))
         self._message = _message_class(header)
         self._latched = header["latching"] == "1"
-        with self._busy:
+        with self._lock:
             self._publisher = rospy.Publisher(
                 topic, self._message, subscriber_listener=self, queue_size=_QUEUE_MESSAGES, latch=self._latched
             )
@@ -55,53 +55,55 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
             self._start()
 
     def peer_subscribe(self, *_: object) -> None:
-        """Begin with the first subscriber."""
+        """Start with the first subscriber; called by rospy."""
         self._start()
 
     def _start(self) -> None:
-        with self._busy:
+        with self._lock:
             if self._stream is None:
                 self._stream, packets = _subscribe(self._topic)
-                threading.Thread(target=self._hand_on_for_ever, args=(self._stream, packets), daemon=True).start()
+                threading.Thread(
+                    target=self._relay_until_unsubscribed, args=(self._stream, packets), daemon=True
+                ).start()
 
     def peer_unsubscribe(self, _topic: str, subscribers: int) -> None:
-        """End with the last; rospy keeps the message of a latched topic, whose subscribers come and go."""
-        with self._busy:
+        """Stop with the last subscriber, except for a latched topic, whose message rospy keeps; called by rospy."""
+        with self._lock:
             if subscribers == 0 and self._stream is not None and not self._latched:
-                with contextlib.suppress(OSError):  # the sensors ended
+                with contextlib.suppress(OSError):  # the sensors process has exited
                     self._stream.shutdown(socket.SHUT_RDWR)
                 self._stream = None
 
-    def _hand_on_for_ever(self, stream: socket.socket, packets: tcpros.PacketSplitter) -> None:
-        """Hand on until nobody listens; sensors that ended come back."""
+    def _relay_until_unsubscribed(self, stream: socket.socket, packets: tcpros.PacketSplitter) -> None:
+        """Relay messages until the last subscriber leaves; reconnect if the sensors process restarts."""
         while True:
-            self._hand_on(stream, packets)
-            with self._busy:
+            self._relay(stream, packets)
+            with self._lock:
                 if self._stream is not stream:
                     return
                 stream, packets = _subscribe(self._topic)
                 self._stream = stream
 
-    def _hand_on(self, stream: socket.socket, packets: tcpros.PacketSplitter) -> None:
+    def _relay(self, stream: socket.socket, packets: tcpros.PacketSplitter) -> None:
         with stream:
-            _next(stream, packets)  # the connection header
-            while payload := _next(stream, packets):
+            _next_packet(stream, packets)  # the connection header
+            while payload := _next_packet(stream, packets):
                 message = self._message()
                 message.deserialize(payload)
                 self._publisher.publish(message)
 
 
-def _hand_velocities_on(topic: str) -> None:
-    """Hand each `geometry_msgs/Twist` on to the base, which may be on its way back."""
+def _relay_velocities(topic: str) -> None:
+    """Send each `geometry_msgs/Twist` to the base; messages are dropped while the base restarts."""
     channel = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
 
-    def hand_on(message: Any) -> None:  # noqa: ANN401 (rospy has no types)
+    def send(message: Any) -> None:  # noqa: ANN401 (rospy has no types)
         linear, angular = message.linear, message.angular
         words = twists.pack(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
         with contextlib.suppress(OSError):
             channel.sendto(words, str(twists.CHANNEL))
 
-    rospy.Subscriber(topic, roslib.message.get_message_class("geometry_msgs/Twist"), hand_on, queue_size=1)
+    rospy.Subscriber(topic, roslib.message.get_message_class("geometry_msgs/Twist"), send, queue_size=1)
 
 
 def _subscribe(topic: str) -> tuple[socket.socket, tcpros.PacketSplitter]:
@@ -111,7 +113,7 @@ def _subscribe(topic: str) -> tuple[socket.socket, tcpros.PacketSplitter]:
 
 
 def _connect(path: str) -> socket.socket:
-    """Connect to the sensors, which may be on their way back."""
+    """Connect to the sensors process; wait if it is restarting."""
     deadline = Deadline.after(_SENSORS_S)
     while True:
         stream = socket.socket(socket.AF_UNIX)
@@ -126,8 +128,8 @@ def _connect(path: str) -> socket.socket:
             return stream
 
 
-def _next(stream: socket.socket, packets: tcpros.PacketSplitter) -> bytes:
-    """Return the next packet, empty at the end."""
+def _next_packet(stream: socket.socket, packets: tcpros.PacketSplitter) -> bytes:
+    """Return the next packet, or b"" at the end of the stream."""
     while True:
         for payload in packets:
             return payload
@@ -141,29 +143,29 @@ def _next(stream: socket.socket, packets: tcpros.PacketSplitter) -> bytes:
 
 
 def _message_class(header: dict[str, str]) -> Any:  # noqa: ANN401 (rospy has no types)
-    """Return a message type whose content stays serialized.
+    """Return a message class whose content stays serialized.
 
-    Where ROS's own class is installed, its definition is announced: it carries the comments, as on a real robot.
+    If ROS's own class of that type is installed, its definition is announced, with comments, as on a real robot.
     """
-    known = roslib.message.get_message_class(header["type"])
+    installed = roslib.message.get_message_class(header["type"])
     attributes = {
         "_type": header["type"],
         "_md5sum": header["md5sum"],
-        "_full_text": known._full_text if known else header["message_definition"],  # noqa: SLF001 (ROS's own name)
+        "_full_text": installed._full_text if installed else header["message_definition"],  # noqa: SLF001 (ROS's own name)
     }
     return type("Relayed", (rospy.AnyMsg,), attributes)
 
 
-def _wait(what: str, condition: Callable[[], bool]) -> None:
+def _wait(error_text: str, condition: Callable[[], bool]) -> None:
     deadline = Deadline.after(_MASTER_S)
     while not condition():
         if deadline.expired:
-            raise TimeoutError(what)
+            raise TimeoutError(error_text)
         time.sleep(0.01)
 
 
 def master_answers() -> bool:
-    """Return whether somebody listens where the robot's master is to be."""
+    """Return True if a process listens at the address of the robot's master."""
     uri = urlsplit(os.environ["ROS_MASTER_URI"])
     with contextlib.suppress(OSError), socket.create_connection((uri.hostname, uri.port), timeout=_CONNECT_S):
         return True
@@ -171,7 +173,7 @@ def master_answers() -> bool:
 
 
 def main() -> None:
-    """Relay topics of the robot for ever."""
+    """Relay the robot's topics; does not return."""
     services.name_process("ros_relay")
     node, velocities, *topics = sys.argv[1:]
     _wait("the sensors do not publish", services.ready_file("sensors").exists)
@@ -179,7 +181,7 @@ def main() -> None:
     rospy.init_node(node, disable_signals=True)
     relays = [Relay(topic) for topic in topics]
     if velocities:
-        _hand_velocities_on(velocities)
+        _relay_velocities(velocities)
     services.ready_file("ros_relay").touch()
     rospy.spin()
     del relays

@@ -1,4 +1,4 @@
-"""Services of an emulated robot: which ones there are, and how they start, by a program or a fork."""
+"""Services of an emulated robot, and how they are started: as a program or as a fork of init."""
 
 import gc
 import json
@@ -24,10 +24,10 @@ _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 _LOG_MODE: Final = 0o600
 
 MOTION: Final = Path(STATE, "motion")
-"""The file in which the lab says how the robot moves."""
+"""The file of the paths on which the lab moves the robot."""
 
 STEERED: Final = Path(STATE, "steered")
-"""The file in which a robot that steers itself says how it moves."""
+"""The file in which a robot that steers itself records its motion."""
 
 READY_FOLDER: Final = f"{STATE}/ready"
 
@@ -42,7 +42,7 @@ _ROS2: Final = "sim_backends.emulated.robot.ros2_relay"
 
 
 def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> int:
-    """Start a program in a session of its own, its output in `log`; return its process id.
+    """Start a program in a new session, with its output in `log`; return its process id.
 
     Raises:
         OSError: The program is missing.
@@ -63,11 +63,11 @@ def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> i
 
 
 def fork(name: str, work: Callable[[], None], log: Path) -> int:
-    """Do `work` in a process of this name and a session of its own, its output in `log`; return its process id.
+    """Call `work` in a forked process of this name, in a new session, its output in `log`; return the process id.
 
-    It shares the memory of this process, and no descriptor. Call it from a process of one thread.
+    The fork inherits the memory of this process, but no descriptors. Call it from a process with one thread.
     """
-    gc.freeze()  # a collection in the fork would write to, and so copy, every page of objects from here
+    gc.freeze()  # a garbage collection in the fork would write to, and so copy, every page of inherited objects
     pid = os.fork()
     if pid == 0:
         os._exit(_run(name, work, log))
@@ -75,7 +75,7 @@ def fork(name: str, work: Callable[[], None], log: Path) -> int:
 
 
 def name_process(name: str) -> None:
-    """Give this process a name that people find: an interpreter's says nothing."""
+    """Set the name of this process in `ps`, which would otherwise show the interpreter."""
     Path("/proc/self/comm").write_text(name, encoding="ascii")
 
 
@@ -84,7 +84,7 @@ def _run(name: str, work: Callable[[], None], log: Path) -> int:
         name_process(name)
         _detach(log)
         work()
-    except BaseException:  # noqa: BLE001 (whatever it is ends this process, not the one that it was forked from)
+    except BaseException:  # noqa: BLE001 (every error must end this process, not return into the code of its parent)
         sys.excepthook(*sys.exc_info())
         return 1
     finally:
@@ -94,7 +94,7 @@ def _run(name: str, work: Callable[[], None], log: Path) -> int:
 
 
 def _detach(log: Path) -> None:
-    """Leave the session, the descriptors and the signal handling of the process that this one was forked from."""
+    """Detach from the session, the descriptors and the signal handling of the parent process."""
     os.setsid()
     signal.set_wakeup_fd(-1)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -106,12 +106,12 @@ def _detach(log: Path) -> None:
 
 @dataclass(frozen=True)
 class Service:
-    """What runs for as long as the robot does.
+    """Program or forked process that runs as long as the robot.
 
     Attributes:
-        name: Of its log in `/run/robot`.
-        launch: Starts it, its output in that log; returns its process id.
-        ready: Whether it serves.
+        name: Name, also of its log in `/run/robot`.
+        launch: Starts it with its output in a log; returns its process id.
+        ready: Returns True if it serves.
     """
 
     name: str
@@ -120,53 +120,53 @@ class Service:
 
 
 def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> list[Service]:
-    """Return what runs in the robot that `spec` describes.
+    """Return the services of the robot that `spec` describes.
 
     Args:
         spec: The robot.
-        neighbourhood: Where the lab's robots are; None for a robot that is alone.
+        neighbourhood: Positions of the lab's robots; None for a robot without neighbours.
     """
     frames = static_frames.links(spec.sensors)
     publish = partial(sensors.publish, spec.sensors, spec.definitions, frames=frames, targets=spec.laser_targets)
     if neighbourhood is not None and spec.neighbours:
         publish = partial(publish, moving=partial(neighbourhood.targets, spec.neighbours))
-    found = [
+    result = [
         _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
-        _moving("sensors", publish),
+        _motion_service("sensors", publish),
     ]
     if spec.mavlink_port is not None:
-        found.append(_moving("autopilot", partial(autopilot.serve, _drone(spec, spec.mavlink_port))))
+        result.append(_motion_service("autopilot", partial(autopilot.serve, _drone(spec, spec.mavlink_port))))
     if spec.base is not None:
-        found.append(_moving("base", partial(base.serve, spec.base)))
+        result.append(_motion_service("base", partial(base.serve, spec.base)))
     if spec.mesh_hello_s is not None:
         argv = babeld.command(spec.interface, spec.address, spec.mesh_hello_s)
-        found.append(_program("babeld", argv, {}, babeld.PID.exists))
+        result.append(_program("babeld", argv, {}, babeld.PID.exists))
     if spec.ros == "debian":
-        found += _debian_ros(spec, (*spec.registered, *([static_frames.TOPIC] if frames else [])))
+        result += _debian_ros(spec, (*spec.registered, *([static_frames.TOPIC] if frames else [])))
     if spec.bridge:
         argv = ("/usr/bin/env", *with_environment(spec.bridge, setup=spec.setup))
-        found.append(_program(BRIDGE, argv, {}, _bridge_is_up))
+        result.append(_program(BRIDGE, argv, {}, _bridge_is_up))
     if spec.routes_zenoh:
-        found.append(_ros2_program(ZENOH_ROUTER, "route", spec.ip))
+        result.append(_ros2_program(ZENOH_ROUTER, "route", spec.ip))
     if spec.ros2 is not None:
         types = {sensor.topic: sensor.type for sensor in spec.sensors}
         if frames:
             types[static_frames.TOPIC] = static_frames.TYPE
         words = (spec.ip, ros_node(spec), _velocities(spec), json.dumps(asdict(spec.ros2)), json.dumps(types))
-        found.append(_ros2_program(ROS2_RELAY, "relay", *words))
-    return found
+        result.append(_ros2_program(ROS2_RELAY, "relay", *words))
+    return result
 
 
-def _moving(name: str, serve: Callable[..., None]) -> Service:
-    """Return a service that is told how the robot moves, or tells it: a fork of this process."""
+def _motion_service(name: str, serve: Callable[..., None]) -> Service:
+    """Return a service that reads or records the robot's motion; it is a fork of this process."""
     ready = ready_file(name)
     work = partial(serve, motion=MOTION, steered=STEERED, ready=ready)
     return Service(name, partial(fork, name, work), ready.exists)
 
 
 def _debian_ros(spec: RobotSpec, topics: Sequence[str]) -> Iterator[Service]:
-    """Yield the robot's ROS master, if it has one of its own, and the node that publishes `topics` there."""
-    # Python as a script would find it: rospy is made for Debian's own interpreter.
+    """Yield the robot's ROS master, if it runs one, and the node that publishes `topics` there."""
+    # Debian's interpreter, because rospy is installed for it.
     variables = spec.ros1_environment | {"PYTHONPATH": str(interpreter.PROJECT)}
     if spec.runs_master:
         yield _master(spec, variables)
@@ -175,7 +175,7 @@ def _debian_ros(spec: RobotSpec, topics: Sequence[str]) -> Iterator[Service]:
 
 
 def _velocities(spec: RobotSpec) -> str:
-    """Return the topic of velocities that the robot's base listens to, empty without a base."""
+    """Return the topic of velocities that the robot's base subscribes to, empty without a base."""
     return spec.base.topic if spec.base else ""
 
 
@@ -197,14 +197,14 @@ def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:
 def ros_node(spec: RobotSpec) -> str:
     """Return the name of the node that publishes the sensors.
 
-    A master ends the older of two with the same name, and ROS 2 knows no two of one name apart.
+    A ROS master shuts down the older of two nodes of one name, and ROS 2 cannot distinguish them.
     """
     name = tcpros.CALLER.strip("/")
     return f"{name}_{spec.name.replace('-', '_')}" if spec.shares_master or spec.ros2 is not None else name
 
 
 def _master(spec: RobotSpec, variables: Mapping[str, str]) -> Service:
-    """Return the robot's ROS master: for others too with all that roscore starts, else as little as serves it."""
+    """Return the robot's ROS master: roscore if it serves other robots too, otherwise only the master process."""
     port = ("-p", str(ROS_MASTER_PORT))
     name, argv = ("roscore", (ROSCORE, *port)) if spec.shares_master else ("rosmaster", (_ROSMASTER, "--core", *port))
     return _program(name, argv, variables, lambda: network.listens(ROS_MASTER_PORT))
@@ -226,5 +226,5 @@ def _ros2_program(name: str, *words: str) -> Service:
 
 
 def ready_file(name: str) -> Path:
-    """Return the file that the service `name` makes when it serves."""
+    """Return the file that the service `name` creates when it serves."""
     return Path(READY_FOLDER, name)

@@ -1,4 +1,4 @@
-"""Specification of an emulated robot: plain data that crosses from the lab to its init process as JSON."""
+"""Specification of an emulated robot: plain data that the lab sends to the robot's init process as JSON."""
 
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
@@ -16,7 +16,7 @@ Ping = Literal["iputils", "busybox"]
 USER: Final = "root"
 HOME: Final = "/root"
 STATE: Final = "/run/robot"
-"""Folder in the robot of what its init process writes: files bound over `/etc`, logs, marks of readiness."""
+"""Folder in the robot that its init process writes to: files mounted over `/etc`, logs, readiness files."""
 
 LOOPBACK: Final = "127.0.0.1"
 
@@ -24,18 +24,18 @@ ANTENNA_M: Final = 0.2
 """Height of an antenna over the ground: a TurtleBot3 Burger is 0.19 m high (ROBOTIS e-Manual)."""
 
 HELLO_S: Final = 4.0
-"""How often babeld says hello on wireless interfaces by its own default."""
+"""Default hello interval of babeld on wireless interfaces."""
 
 
 @dataclass(frozen=True)
 class Base:
-    """What a base controller of a ground robot is told.
+    """Settings of the base controller of a ground robot.
 
     Attributes:
-        topic: ROS topic that it listens to, of velocities.
-        speed_m_s: Most that it drives.
-        acceleration_m_s2: Most that its speed changes per second.
-        turn_rad_s: Most that it turns.
+        topic: ROS topic of velocities that it subscribes to.
+        speed_m_s: Maximum speed.
+        acceleration_m_s2: Maximum acceleration.
+        turn_rad_s: Maximum turn rate.
     """
 
     topic: str
@@ -46,11 +46,11 @@ class Base:
 
 @dataclass(frozen=True)
 class Ros2Spec:
-    """How a robot with ROS 2 speaks over the radio.
+    """ROS 2 of a robot over the radio.
 
     Attributes:
-        over: `dds` or `zenoh`.
-        distribution: Of ROS 2, whose types and habits it has.
+        over: Middleware, `dds` or `zenoh`.
+        distribution: ROS 2 distribution, which determines types and default behaviour.
         discovery: `multicast`, `peers` or `router`.
         peers: Addresses of the other robots, for `peers`.
         router: Address of the robot that runs the router, for `router`.
@@ -66,7 +66,7 @@ class Ros2Spec:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
-        """Return what `dataclasses.asdict` and JSON made of it."""
+        """Return the specification from the JSON of its `dataclasses.asdict`."""
         return cls(**{**data, "peers": tuple(data["peers"])})
 
 
@@ -77,7 +77,7 @@ class RobotSpec:
     Attributes:
         name: Its name in the lab, and its host name.
         interface: Name of its radio interface.
-        address: Its IPv4 address on the radio with the length of the network, `10.42.0.1/24`.
+        address: Its IPv4 address on the radio with the prefix length, `10.42.0.1/24`.
         hosts: Addresses of all robots of the lab by name.
         host_key: Private host key of its SSH server, OpenSSH PEM.
         authorized_key: Public key that may log in.
@@ -85,31 +85,31 @@ class RobotSpec:
         ros_version: 1 or 2.
         distribution: ROS distribution that its profile names.
         setup: Setup files that its profile names.
-        ros_master: Where its ROS master runs: `LOOPBACK`, or an address on the radio, its own or another robot's.
-        sensors: What it publishes.
-        registered: The topics of those that it publishes to that master.
-        definitions: Those of its sensors' message types.
-        mavlink_port: UDP port of its autopilot; None without.
-        autopilot: `px4` or `ardupilot`, as which that answers.
+        ros_master: Address of its ROS master: `LOOPBACK`, or a radio address, its own or another robot's.
+        sensors: Its sensors, one per published topic.
+        registered: The topics of these that it registers at that master.
+        definitions: Definitions of the message types of its sensors.
+        mavlink_port: UDP port of its autopilot; None without an autopilot.
+        autopilot: Firmware that the autopilot emulates, `px4` or `ardupilot`.
         system: MAVLink system id of that autopilot.
         boot_s: Boot time of that autopilot.
-        max_speed_m_s: How fast it is at most.
-        max_height_m: How high it may fly; None where its profile does not say.
-        fence_m: How far from home it may fly; None as above.
-        profile: The name of its profile, by which its body is known.
-        world: What a drone flies in, as JSON; empty for any other robot.
-        laser_targets: What its laser sees of its world; empty without a laser.
+        max_speed_m_s: Maximum speed.
+        max_height_m: Maximum height of flight; None if its profile does not limit it.
+        fence_m: Maximum distance from home in flight; None if its profile does not limit it.
+        profile: Name of its profile, which determines its body.
+        world: World that a drone flies in, as JSON; empty for other robots.
+        laser_targets: What its laser detects of its world; empty without a laser.
         neighbours: The bodies of the other robots, which reflect its laser; empty without a laser.
-        base: Its base controller; None where nothing in it drives it.
+        base: Its base controller; None if no program in it drives it.
         ssh: Its SSH server.
-        sftp: Whether that server offers SFTP.
-        userland: Where `sh`, `tar`, `ip` and their like come from.
-        netcat: Its only netcat, as `nc` and by its own name; None for what this machine or the userland has.
+        sftp: True if that server offers SFTP.
+        userland: Source of `sh`, `tar`, `ip` and similar tools.
+        netcat: Its only netcat, as `nc` and by its full name; None for those of this machine or of the userland.
         ping: Its `ping`; None as for `netcat`.
-        mesh_hello_s: How often its routing daemon says hello; None for a robot that does not forward.
-        ros2: How it speaks ROS 2; None for a robot that does not.
-        routes_zenoh: Whether it runs the router of those that speak over Zenoh.
-        bridge: The command that carries its topics from ROS 1 to another middleware; empty where none runs by itself.
+        mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward.
+        ros2: Its ROS 2 over the radio; None for a robot without.
+        routes_zenoh: True if it runs the Zenoh router.
+        bridge: Command that bridges its topics from ROS 1 to another middleware; empty if none runs automatically.
     """
 
     name: str
@@ -150,38 +150,38 @@ class RobotSpec:
 
     @property
     def ip(self) -> str:
-        """The address without the length of the network."""
+        """The address without the prefix length."""
         return self.address.partition("/")[0]
 
     @property
     def shares_master(self) -> bool:
-        """Whether one ROS master serves it and other robots."""
+        """True if its ROS master also serves other robots."""
         return self.ros_master != LOOPBACK
 
     @property
     def runs_master(self) -> bool:
-        """Whether it runs its ROS master itself."""
+        """True if its ROS master runs on the robot itself."""
         return self.ros_master in {LOOPBACK, self.ip}
 
     @property
     def steers(self) -> bool:
-        """Whether something in it may steer it."""
+        """True if a program in it may steer it."""
         return self.mavlink_port is not None or self.base is not None
 
     @property
     def waits_for_another(self) -> bool:
-        """Whether it is not up before another robot is: one with its ROS master, or with the router of its Zenoh."""
+        """True if its startup waits for another robot, which runs its ROS master or its Zenoh router."""
         return self.shares_master or bool(self.ros2 and self.ros2.router)
 
     @property
     def ros1_environment(self) -> dict[str, str]:
-        """The variables by which ROS 1 programs find the master, and peers find them."""
-        own = self.ip if self.shares_master else LOOPBACK
-        return {"ROS_MASTER_URI": f"http://{self.ros_master}:{ROS_MASTER_PORT}", "ROS_IP": own}
+        """The environment variables by which ROS 1 programs reach the master, and peers reach them."""
+        address = self.ip if self.shares_master else LOOPBACK
+        return {"ROS_MASTER_URI": f"http://{self.ros_master}:{ROS_MASTER_PORT}", "ROS_IP": address}
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:
-        """Return what `dataclasses.asdict` and JSON made of a specification."""
+        """Return the specification from the JSON of its `dataclasses.asdict`."""
         sensors = tuple(_sensor(sensor) for sensor in data["sensors"])
         definitions = {kind: Definition(**definition) for kind, definition in data["definitions"].items()}
         words = {name: tuple(data[name]) for name in ("setup", "registered", "bridge")}

@@ -13,7 +13,7 @@ _TIMEOUT_S: Final = 5.0
 
 
 def convert_key(spec: RobotSpec) -> None:
-    """Give the robot's server its host key in its own format, from the file `HOST_KEY`.
+    """Convert the host key in the file `HOST_KEY` to the format of the robot's SSH server.
 
     Raises:
         SubprocessError: The key could not be converted.
@@ -24,7 +24,7 @@ def convert_key(spec: RobotSpec) -> None:
 
 
 def command(spec: RobotSpec) -> tuple[str, ...]:
-    """Return the command line of the robot's SSH server, in the foreground, its log on standard error."""
+    """Return the command line of the robot's SSH server, which runs in the foreground and logs to standard error."""
     addresses = [f"{address}:{SSH_PORT}" for address in ("127.0.0.1", spec.ip)]
     return _dropbear(addresses) if spec.ssh == "dropbear" else _sshd(addresses, sftp=spec.sftp)
 

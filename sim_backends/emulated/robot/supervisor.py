@@ -1,4 +1,4 @@
-"""The supervisor of a robot's services: the duty of its namespace's first process."""
+"""Supervisor of a robot's services, part of its init process."""
 
 import contextlib
 import os
@@ -13,7 +13,7 @@ from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import STATE
 
 RESTART_S: Final = 0.1
-"""How long a service that ended stays away; systemd's own RestartSec."""
+"""Delay before a service that exited is restarted; the default of systemd's RestartSec."""
 
 _POLL_S: Final = 0.005
 _HALT_S: Final = 5.0
@@ -21,11 +21,11 @@ _LOG_TAIL: Final = 3
 
 
 class Supervisor:
-    """Starts services, and again when they end; collects every orphan."""
+    """Starts services, restarts them when they exit, and reaps all children, including orphans."""
 
     def __init__(self) -> None:
         self._running: dict[int, Service] = {}
-        self._ended: dict[str, int] = {}
+        self._exit_codes: dict[str, int] = {}
         self._due: list[tuple[float, Service]] = []
 
     def start(self, service: Service) -> None:
@@ -37,21 +37,23 @@ class Supervisor:
         self._running[service.launch(_log(service))] = service
 
     def wait_ready(self, service: Service, deadline: Deadline) -> None:
-        """Return when a service serves.
+        """Return when a service is ready.
 
         Raises:
-            RobotError: It ended, or did not serve by the deadline; the message has the end of its log.
+            RobotError: It exited, or was not ready by the deadline; the message has the end of its log.
         """
         while not service.ready():
             self.reap()
-            if service.name in self._ended:
-                raise RobotError(f"{service.name} ended with status {self._ended[service.name]}: {_tail(service)}")
+            if service.name in self._exit_codes:
+                raise RobotError(
+                    f"{service.name} exited with status {self._exit_codes[service.name]}: {_tail(service)}"
+                )
             if deadline.expired:
-                raise RobotError(f"{service.name} was not up in time: {_tail(service)}")
+                raise RobotError(f"{service.name} was not ready in time: {_tail(service)}")
             time.sleep(_POLL_S)
 
     def reap(self) -> None:
-        """Collect every child that has ended, the robot's orphans among them."""
+        """Reap every child that has exited, including orphans."""
         while True:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)
@@ -61,11 +63,11 @@ class Supervisor:
                 return
             service = self._running.pop(pid, None)
             if service is not None:
-                self._ended[service.name] = os.waitstatus_to_exitcode(status)
+                self._exit_codes[service.name] = os.waitstatus_to_exitcode(status)
                 self._due.append((time.monotonic() + RESTART_S, service))
 
     def restart(self) -> float | None:
-        """Start each service again whose time has come; return in how many seconds the next is due, None if none is.
+        """Restart each service that is due; return the seconds until the next one is due, or None.
 
         Raises:
             OSError: The program is missing.
@@ -75,20 +77,20 @@ class Supervisor:
         return max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
 
     def halt(self) -> None:
-        """End every process of the robot but this one, at once; services stay ended until they are started.
+        """Kill every process of the robot except this one; services are not restarted.
 
         Raises:
-            RobotError: One does not end.
+            RobotError: A process does not exit.
         """
-        with contextlib.suppress(ProcessLookupError):  # nobody is there
+        with contextlib.suppress(ProcessLookupError):  # there are no other processes
             os.kill(-1, signal.SIGKILL)
         deadline = Deadline.after(_HALT_S)
         while _has_children():
             self.reap()
             if deadline.expired:
-                raise RobotError("a process does not end", remedy="start the lab again")
+                raise RobotError("a process does not exit", remedy="start the lab again")
             time.sleep(_POLL_S)
-        self._ended.clear()
+        self._exit_codes.clear()
         self._due.clear()
 
 

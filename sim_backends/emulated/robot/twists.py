@@ -1,6 +1,6 @@
-"""Velocities on their way to the base of an emulated robot: datagrams of six doubles, as in ROS's `Twist`.
+"""Velocities for the base of an emulated robot: datagrams of six doubles, as in ROS's `Twist`.
 
-Standard library alone: Debian's own Python imports it too.
+Imports only the standard library, because Debian's Python imports it too.
 """
 
 import struct
@@ -10,19 +10,19 @@ from typing import Final
 from sim_backends.emulated.robot.spec import STATE
 
 CHANNEL: Final = Path(STATE, "velocities")
-"""Socket at which the base hears them."""
+"""Socket at which the base receives velocities."""
 
 _TWIST: Final = struct.Struct("<6d")
 BYTES: Final = _TWIST.size
 
 
 def pack(*values: float) -> bytes:
-    """Return metres per second along x, y, z, and radians per second about them."""
+    """Return the datagram for metres per second along x, y, z, and radians per second about them."""
     return _TWIST.pack(*values)
 
 
 def unpack(words: bytes) -> tuple[float, float] | None:
-    """Return how fast to drive ahead and to turn to the left; None where that is not said."""
+    """Return forward speed and turn rate to the left, or None if the datagram has the wrong length."""
     if len(words) != BYTES:
         return None
     ahead_m_s, _, _, _, _, turn_rad_s = _TWIST.unpack(words)

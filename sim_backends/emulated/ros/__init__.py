@@ -1,1 +1,1 @@
-"""ROS inside of an emulated robot: sensors that publish, commands that record."""
+"""ROS inside an emulated robot: sensors that publish, commands that record."""

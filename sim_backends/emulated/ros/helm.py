@@ -1,8 +1,8 @@
-"""The helm of an emulated robot: how what steers it, a base controller or an autopilot, moves it in the lab.
+"""Helm of an emulated robot: moves the robot for the process that steers it, a base controller or an autopilot.
 
-Whoever is at the helm asks where the robot was put, works out where its own power takes it from there, and says so;
-the lab tells the medium, and the robot's sensors follow. Carrying it elsewhere is the lab's, at any time: what the
-helm says of a way that is over is not heard any more.
+The process reads where the lab put the robot, computes the motion from there, and writes it to a record, which the
+lab passes to the medium and the robot's sensors read. The lab may put the robot elsewhere at any time; records that
+refer to an earlier path are then ignored.
 """
 
 from pathlib import Path
@@ -14,37 +14,37 @@ from sim_backends.world.motion import STILL
 
 
 class Helm:
-    """Steers one robot; one process of a robot has it.
+    """Steers one robot; only one process of a robot may have it.
 
     Args:
-        ways: The file in which the lab says how it moves the robot (`own_motion.say`).
-        record: The file in which the robot says how it moves itself.
-        now_ns: When it is made, by the monotonic clock.
+        paths: The file of the paths that the lab assigns (`own_motion.append_path`).
+        record: The file in which the robot records its motion.
+        now_ns: Time of creation, by the monotonic clock.
 
     Raises:
-        OSError: The record cannot be made.
+        OSError: The record cannot be created.
     """
 
-    def __init__(self, ways: Path, record: Path, now_ns: int) -> None:
+    def __init__(self, paths: Path, record: Path, now_ns: int) -> None:
         self._record = SteeredRecord.open(record)
-        self._odometer = Odometer(ways, now_ns, record)
-        self._way_ns: int | None = None
+        self._odometer = Odometer(paths, now_ns, record)
+        self._path_start_ns: int | None = None
 
-    def put(self, now_ns: int) -> OwnMotion | None:
-        """Return where the lab has put the robot since this was asked last; None if it has not.
+    def poll_placement(self, now_ns: int) -> OwnMotion | None:
+        """Return where the lab has put the robot since the last call, or None if it has not.
 
-        The first time it is where the robot is, also after the process at the helm has ended and begun again.
+        The first call returns where the robot is, also after the process has been restarted.
 
         Args:
-            now_ns: When that is; never before what was asked last.
+            now_ns: Time by the monotonic clock; must not decrease from call to call.
         """
         here = self._odometer.at(now_ns)
-        if self._odometer.way_ns == self._way_ns:
+        if self._odometer.path_start_ns == self._path_start_ns:
             return None
-        self._way_ns = self._odometer.way_ns
+        self._path_start_ns = self._odometer.path_start_ns
         return here
 
-    def say(
+    def write(
         self,
         now_ns: int,
         place_m: Vector,
@@ -54,13 +54,13 @@ class Helm:
         turn_rad_s: float = 0.0,
         wheels: Vector = (0.0, 0.0, 0.0),
     ) -> None:
-        """Say where the robot is by its own power and how it moves; see `Steered`.
+        """Record the robot's position and motion; see `Steered`.
 
-        While it moves this is to be said often, ten times a second or more: one that is silent for
-        `steered.SILENT_NS` stands. Once it stands, say so once.
+        Call it ten times a second or more while the robot moves, because a robot without a record for
+        `steered.SILENT_NS` stops; and once after it has stopped.
 
         Raises:
-            OSError: There is no room for it.
+            OSError: There is no space for it.
         """
-        way_ns = self._way_ns or 0
-        self._record.write(Steered(now_ns, way_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, wheels))
+        path_start_ns = self._path_start_ns or 0
+        self._record.write(Steered(now_ns, path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, wheels))

@@ -1,7 +1,7 @@
-"""Ranges of a planar laser scanner: level beams that end at the first surface of the world.
+"""Ranges of a planar laser scanner: horizontal beams that end at the first surface.
 
-Standard library alone, as all that the sensors process imports. Of each surface only the beams towards it are
-calculated, so a scan costs about as much as its noise.
+Only the standard library is used, as in all modules of the sensors process. Each surface is intersected only with the
+beams in its direction, so a scan costs about as much as its noise.
 """
 
 import math
@@ -13,18 +13,18 @@ from typing import Final
 from fieldkit.core.model import Vector
 
 _SLACK_BEAMS: Final = 1e-9
-"""A beam that meets a corner is not lost by a rounding."""
+"""Tolerance in beams, so that rounding does not lose a beam that hits a corner."""
 
 
 @dataclass(frozen=True)
 class LaserTarget:
-    """An upright solid that ends beams.
+    """An upright solid that reflects beams.
 
     Attributes:
-        outline_m: Corners of its outline from above in their order, metres east and north; of a cylinder its centre.
-        radius_m: Radius of a cylinder, 0 of any other.
-        base_m: Height of its underside.
-        top_m: Height of its upper face.
+        outline_m: Corners of the outline from above, in order, metres east and north; the centre of a cylinder.
+        radius_m: Radius of a cylinder, 0 for other solids.
+        base_m: Height of the bottom.
+        top_m: Height of the top.
     """
 
     outline_m: tuple[tuple[float, float], ...]
@@ -33,7 +33,7 @@ class LaserTarget:
     top_m: float
 
     def edges_m(self) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
-        """Yield the ends of each edge of the outline."""
+        """Yield the two ends of each edge of the outline."""
         yield from pairwise((*self.outline_m, self.outline_m[0]))
 
 
@@ -43,11 +43,11 @@ def ranges_m(
     """Return the distance to the first surface along each beam, infinite beyond `reach_m`.
 
     Args:
-        targets: What is in the world.
-        place_m: Where the scanner is, metres east, north, up.
+        targets: Solids in the world.
+        place_m: Position of the scanner, metres east, north, up.
         heading_rad: Direction of beam 0, from east towards north; the others follow counter-clockwise.
-        beams: How many there are.
-        reach_m: How far they go.
+        beams: Number of beams.
+        reach_m: Maximum range.
     """
     scan = _Scan(place_m, heading_rad, beams, reach_m)
     for target in targets:
@@ -56,13 +56,13 @@ def ranges_m(
         if target.radius_m:
             scan.add_circle(target.outline_m[0], target.radius_m)
         else:
-            for begin, end in target.edges_m():
-                scan.add_edge(begin, end)
+            for start, end in target.edges_m():
+                scan.add_edge(start, end)
     return [range_m if range_m <= reach_m else math.inf for range_m in scan.ranges_m]
 
 
 class _Scan:
-    """The nearest surface of those added so far, per beam; arguments as `ranges_m`."""
+    """Distance to the nearest surface added so far, per beam; arguments as `ranges_m`."""
 
     def __init__(self, place_m: Vector, heading_rad: float, beams: int, reach_m: float) -> None:
         self.ranges_m = [math.inf] * beams
@@ -71,45 +71,45 @@ class _Scan:
         self._step_rad = 2 * math.pi / beams
         self._reach_m = reach_m
 
-    def add_edge(self, begin: tuple[float, float], end: tuple[float, float]) -> None:
-        """Add a straight surface: beam t u meets line p + s q where t = (p x q) / (u x q)."""
-        x, y = begin[0] - self._east_m, begin[1] - self._north_m
-        along_x, along_y = end[0] - begin[0], end[1] - begin[1]
+    def add_edge(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Add a straight surface: beam t u hits the line p + s q at t = (p x q) / (u x q)."""
+        x, y = start[0] - self._east_m, start[1] - self._north_m
+        along_x, along_y = end[0] - start[0], end[1] - start[1]
         length_m = math.hypot(along_x, along_y)
         across = x * along_y - y * along_x
         if across == 0.0 or abs(across) > self._reach_m * length_m:
-            return  # seen edge-on, or farther away than the scanner reaches, even where the line is nearest
+            return  # edge-on, or the whole line is out of range
         if (x * x + y * y) ** 0.5 > self._reach_m + length_m:
             return
         first_rad = math.atan2(y, x)
-        # An edge that does not lie in the scanner covers less than half a turn.
+        # An edge that does not contain the scanner covers less than half a turn.
         covers_rad = math.remainder(math.atan2(y + along_y, x + along_x) - first_rad, 2 * math.pi)
         for beam, angle_rad in self._beams(min(first_rad, first_rad + covers_rad), abs(covers_rad)):
             divisor = math.cos(angle_rad) * along_y - math.sin(angle_rad) * along_x
             if divisor:
-                self._meet(beam, across / divisor)
+                self._hit(beam, across / divisor)
 
     def add_circle(self, centre: tuple[float, float], radius_m: float) -> None:
-        """Add an upright cylinder: t = m - sqrt(r^2 - d^2), its centre m along and d beside the beam."""
+        """Add an upright cylinder: t = m - sqrt(r^2 - d^2), if its centre is m along the beam and d beside it."""
         x, y = centre[0] - self._east_m, centre[1] - self._north_m
-        away_m = math.hypot(x, y)
-        if away_m <= radius_m or away_m - radius_m > self._reach_m:
+        distance_m = math.hypot(x, y)
+        if distance_m <= radius_m or distance_m - radius_m > self._reach_m:
             return
-        half_rad = math.asin(radius_m / away_m)
+        half_rad = math.asin(radius_m / distance_m)
         centre_rad = math.atan2(y, x)
         for beam, angle_rad in self._beams(centre_rad - half_rad, 2 * half_rad):
-            off_m = away_m * math.sin(angle_rad - centre_rad)
-            nearest_m = away_m * math.cos(angle_rad - centre_rad)
-            self._meet(beam, nearest_m - math.sqrt(max(radius_m**2 - off_m**2, 0.0)))
+            off_m = distance_m * math.sin(angle_rad - centre_rad)
+            nearest_m = distance_m * math.cos(angle_rad - centre_rad)
+            self._hit(beam, nearest_m - math.sqrt(max(radius_m**2 - off_m**2, 0.0)))
 
     def _beams(self, from_rad: float, covers_rad: float) -> Iterator[tuple[int, float]]:
-        """Yield the beams within an arc with their directions."""
-        begin = (from_rad - self._heading_rad) / self._step_rad
-        first = math.ceil(begin - _SLACK_BEAMS)
-        last = math.floor(begin + covers_rad / self._step_rad + _SLACK_BEAMS)
+        """Yield number and direction of each beam within an arc."""
+        start = (from_rad - self._heading_rad) / self._step_rad
+        first = math.ceil(start - _SLACK_BEAMS)
+        last = math.floor(start + covers_rad / self._step_rad + _SLACK_BEAMS)
         for number in range(first, last + 1):
             yield number % len(self.ranges_m), self._heading_rad + number * self._step_rad
 
-    def _meet(self, beam: int, range_m: float) -> None:
+    def _hit(self, beam: int, range_m: float) -> None:
         if 0.0 <= range_m < self.ranges_m[beam]:
             self.ranges_m[beam] = range_m

@@ -1,4 +1,4 @@
-"""Listener of a recorder, whatever it writes: hears topics until a signal ends it."""
+"""Subscriber to topics of the sensors process, used by the recorders and by the ROS 2 relay, until a signal."""
 
 import contextlib
 import re
@@ -15,12 +15,12 @@ _CHUNK: Final = 1 << 16
 _TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
 
 Header = Mapping[str, str]
-"""What a publisher says of itself: `topic`, `type`, `md5sum`, `message_definition`, `callerid`, `latching`."""
+"""Connection header of a publisher: `topic`, `type`, `md5sum`, `message_definition`, `callerid`, `latching`."""
 
 
 @dataclass
 class _Subscription:
-    """One topic that is being heard."""
+    """Connection to the publisher of one topic."""
 
     topic: str
     stream: socket.socket
@@ -29,72 +29,72 @@ class _Subscription:
 
 
 class Listener:
-    """Hears the topics that it wants from when they are published; SIGINT and SIGTERM end its waits.
+    """Subscribes to wanted topics once they are published; SIGINT and SIGTERM interrupt its waits.
 
-    Who speaks something else than TCPROS is heard no more; the others are.
+    A publisher that violates TCPROS is disconnected for good; the other topics continue.
 
     Attributes:
-        wanted: Topics to hear.
-        stopped_by: The signal that came, if one has.
+        wanted: Topics to subscribe to.
+        stopped_by: The signal that was received, or None.
     """
 
     def __init__(self) -> None:
         self.wanted: set[str] = set()
         self.stopped_by: int | None = None
-        self._heard: dict[str, _Subscription] = {}
-        self._garbled: set[str] = set()
+        self._subscriptions: dict[str, _Subscription] = {}
+        self._invalid: set[str] = set()
         self._selector = selectors.DefaultSelector()
         self._stop_on_signals()
 
     def subscribe(self) -> None:
-        """Connect to every wanted topic that has a publisher by now."""
-        for topic in sorted(self.wanted - self._heard.keys() - self._garbled):
+        """Connect to every wanted topic that has a publisher now."""
+        for topic in sorted(self.wanted - self._subscriptions.keys() - self._invalid):
             stream = socket.socket(socket.AF_UNIX)
             try:
                 stream.connect(str(tcpros.socket_path(topic)))
             except OSError:
-                stream.close()  # nobody publishes it yet
+                stream.close()  # it has no publisher yet
                 continue
-            with contextlib.suppress(OSError):  # one that has left by now is left when it is read
+            with contextlib.suppress(OSError):  # a publisher that has exited is noticed when the stream is read
                 stream.sendall(tcpros.request("/record", topic))
-            self._heard[topic] = _Subscription(topic, stream)
-            self._selector.register(stream, selectors.EVENT_READ, self._heard[topic])
+            self._subscriptions[topic] = _Subscription(topic, stream)
+            self._selector.register(stream, selectors.EVENT_READ, self._subscriptions[topic])
 
-    def leave(self, topic: str) -> None:
-        """Hear a topic no more until the next `subscribe`; its publisher may have ended already."""
-        if topic in self._heard:
-            stream = self._heard.pop(topic).stream
+    def unsubscribe(self, topic: str) -> None:
+        """Disconnect from a topic until the next `subscribe`; does nothing if it is not connected."""
+        if topic in self._subscriptions:
+            stream = self._subscriptions.pop(topic).stream
             self._selector.unregister(stream)
             stream.close()
 
     def events(self, within_s: float) -> Iterator[tuple[Header, bytes | None]]:
-        """Yield what arrives next, nothing when it takes longer: None once per publisher, then its messages."""
+        """Yield what arrives within a time: (header, None) once per publisher, then (header, message)."""
         for key, _ in self._selector.select(within_s):
             if isinstance(key.data, _Subscription):
-                yield from self._take(key.data)
+                yield from self._read(key.data)
 
-    def _take(self, subscription: _Subscription) -> Iterator[tuple[Header, bytes | None]]:
+    def _read(self, subscription: _Subscription) -> Iterator[tuple[Header, bytes | None]]:
         data = b""
         with contextlib.suppress(ConnectionResetError):
             data = subscription.stream.recv(_CHUNK)
         if not data:
-            self.leave(subscription.topic)
+            self.unsubscribe(subscription.topic)
             return
         subscription.packets.feed(data)
         try:
             yield from self._packets(subscription)
         except ValueError:
-            self._garbled.add(subscription.topic)
-            self.leave(subscription.topic)
+            self._invalid.add(subscription.topic)
+            self.unsubscribe(subscription.topic)
 
     def _packets(self, subscription: _Subscription) -> Iterator[tuple[Header, bytes | None]]:
-        """Yield what whole packets say.
+        """Yield the content of complete packets.
 
         Raises:
-            ValueError: One is none, or no header of this topic.
+            ValueError: A packet is malformed, or the header is not that of this topic.
         """
         for payload in subscription.packets:
-            if subscription.topic not in self._heard:
+            if subscription.topic not in self._subscriptions:
                 return
             if subscription.header is None:
                 subscription.header = _header(payload, subscription.topic)
@@ -103,10 +103,10 @@ class Listener:
                 yield subscription.header, payload
 
     def _stop_on_signals(self) -> None:
-        ours, signals = socket.socketpair()
+        receiver, signals = socket.socketpair()
         signals.setblocking(False)
         signal.set_wakeup_fd(signals.detach())
-        self._selector.register(ours, selectors.EVENT_READ)
+        self._selector.register(receiver, selectors.EVENT_READ)
 
         def stop(number: int, _: object) -> None:
             self.stopped_by = number
@@ -117,15 +117,15 @@ class Listener:
 
 
 def _header(payload: bytes, topic: str) -> Header:
-    """Return what a publisher says of itself.
+    """Return the connection header of a publisher.
 
     Raises:
-        ValueError: It lacks what every publisher says, or is one of another topic.
+        ValueError: A required field is missing, or the header is that of another topic.
     """
     header = tcpros.unpack_header(payload)
-    lacking = {"topic", "type", "md5sum", "message_definition"} - header.keys()
-    if lacking or header["topic"] != topic or not _TYPE.fullmatch(header["type"]):
-        raise ValueError(f"no publisher of {topic} says so")
+    missing = {"topic", "type", "md5sum", "message_definition"} - header.keys()
+    if missing or header["topic"] != topic or not _TYPE.fullmatch(header["type"]):
+        raise ValueError(f"not the header of a publisher of {topic}")
     latching = header.get("latching", "0")
     if latching not in {"0", "1"}:
         raise ValueError(f"latching is {latching!r}")
@@ -133,5 +133,5 @@ def _header(payload: bytes, topic: str) -> Header:
 
 
 def type_of(header: Header) -> str:
-    """Return the message type of a publisher as rosbags and ROS 2 write it, `package/msg/Name`."""
+    """Return the message type of a publisher in the notation of rosbags, `package/msg/Name`."""
     return header["type"].replace("/", "/msg/")

@@ -1,13 +1,13 @@
-"""Messages of the emulated sensors: one small generator per ROS message type, serialized as ROS 1 does.
+"""Messages of the emulated sensors: one small generator per ROS message type, in ROS 1 serialization.
 
-ROS 1 writes a message's fields one after the other without padding, little-endian; a string or a sequence has its
-length in 4 bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type in their order, by the
-standard library alone: the libraries that know every type would take each robot 20 MB.
+ROS 1 serializes a message's fields in order without padding, little-endian; a string or sequence has its length in 4
+bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type with the standard library alone,
+because the libraries that know all types would cost each robot 20 MB of memory.
 
-The robot goes its way through the world (`own_motion`). Frames and units are those of REP 103 and REP 105: metres,
-radians, x ahead, y to the left; what is fixed to the world has x east and y north, as the orientation of an IMU has
-by REP 145. Covariances are those that the driver of such a robot states. The laser casts its beams at the world.
-Numbers that a real sensor would jitter carry noise, so that nothing compresses better than it would in the field.
+The motion of the robot comes from `own_motion`. Frames and units follow REP 103 and REP 105: metres, radians, x
+ahead, y to the left; in frames fixed to the world x is east and y north, as in the orientation of an IMU by REP 145.
+Covariances are those that the drivers of such robots report. The laser casts its beams at the world. Numbers that
+vary in a real sensor carry noise, so that they compress no better than real ones.
 """
 
 import math
@@ -27,41 +27,41 @@ GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
 LASER_SCAN: Final = "sensor_msgs/LaserScan"
 LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
-# Of x, y, z (m^2) and of turns about them (rad^2), of the pose and per second: as a Husky's controller states them
-# (husky_control/config/control.yaml of github.com/husky/husky).
+# Variances of x, y, z (m^2) and of rotations about them (rad^2), for pose and, per second, twist: those of a Husky's
+# controller (husky_control/config/control.yaml of github.com/husky/husky).
 ODOMETRY_VARIANCES: Final = (0.001, 0.001, 0.001, 0.001, 0.001, 0.03)
-# Of orientation (rad^2), turning (rad^2/s^2) and acceleration (m^2/s^4), as a TurtleBot3 states them: constants, far
-# above its noise (ROBOTIS OpenCR, turtlebot3_sensor.cpp).
+# Variances of orientation (rad^2), angular velocity (rad^2/s^2) and acceleration (m^2/s^4) that a TurtleBot3 reports:
+# constants, far above its noise (ROBOTIS OpenCR, turtlebot3_sensor.cpp).
 IMU_VARIANCES: Final = (0.0025, 0.02, 0.04)
 LASER_INTENSITIES: Final = range(1_000, 12_000)
 
 STANDING_M: Final = 0.1
-"""What a range sensor that looks down sees of the ground under a robot that stands on it."""
+"""Reading of a downward range sensor on a robot that is on the ground."""
 
 FIELD_T: Final = (20e-6, -44e-6)
-"""Magnetic field to the north, and up: about 48 uT that dips, as in mid-latitudes (IGRF)."""
+"""Magnetic field to the north and up: about 48 uT, inclined as in mid-latitudes (IGRF)."""
 
 FIX_NOISE_M: Final = (0.1, 0.5)
-"""Deviation of a fix along the ground, and up: a receiver that averages."""
+"""Standard deviation of a GNSS fix, horizontal and vertical, of a receiver that averages."""
 
-# The world's origin lies where the equator crosses the meridian of Greenwich; there WGS 84 has these radii.
+# The world's origin is at latitude 0, longitude 0, where WGS 84 has these radii.
 EAST_RADIUS_M: Final = 6_378_137.0
 NORTH_RADIUS_M: Final = 6_335_439.327
 
-_FLOATS_BYTES: Final = 16  # of a point, so that x stays x
+_FLOATS_BYTES: Final = 16  # the size of a point, so that the fields of points stay aligned
 _ONE_TRANSFORM: Final = struct.pack("<I", 1)
 
 
 @dataclass(frozen=True)
 class Template:
-    """What messages of a type without a generator are made of.
+    """Serialized parts of messages of a type without a generator.
 
     Attributes:
-        stamped: Whether they begin with a header.
-        head: What stands after that, before the list that is filled, serialized, in hexadecimal digits.
-        tail: What stands after the list.
-        size_bytes: How large the list is.
-        floats: Whether it holds 4-byte floats, else any bytes.
+        stamped: True if the message starts with a header.
+        head: Content between the header and the list that is filled, serialized, in hexadecimal digits.
+        tail: Content after the list, in the same form.
+        size_bytes: Size of the list.
+        floats: True if the list holds 4-byte floats; otherwise any bytes.
     """
 
     stamped: bool
@@ -81,7 +81,7 @@ class Sensor:
         rate_hz: Messages per second.
         frame: `frame_id` of the header.
         points: For a laser scan, beams per turn.
-        template: For a type without a generator, what its messages are made of.
+        template: Parts of the messages of a type without a generator.
         child_frame: Frame of the robot, for odometry and transforms; REP 105 calls it `base_link`.
     """
 
@@ -96,11 +96,11 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Definition:
-    """What a publisher announces of its message type.
+    """Message definition that a publisher announces.
 
     Attributes:
-        text: Fields of the type and of all the types in it.
-        md5: Their sum, by which ROS compares types.
+        text: Fields of the type and of all types in it.
+        md5: MD5 sum of the definition, by which ROS compares types.
     """
 
     text: str
@@ -112,15 +112,15 @@ Generator = Callable[[Sensor, Random, OwnMotion], bytes]
 
 
 class Source:
-    """Makes the messages of one sensor.
+    """Generates the messages of one sensor.
 
     Args:
-        sensor: Which.
-        targets: What is in the robot's world, for a laser.
-        moving: Returns what else is there at this moment: other robots.
+        sensor: The sensor.
+        targets: Laser targets in the robot's world.
+        moving: Returns the laser targets that move: other robots, where they are now.
 
     Raises:
-        ConfigurationError: There is no generator for its type, or it lacks what its type needs.
+        ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
     """
 
     def __init__(
@@ -133,11 +133,11 @@ class Source:
             self._generate = partial(_laser_scan, targets=targets, moving=moving)
         self._stamped = sensor.template is None or sensor.template.stamped
         self._lead = _ONE_TRANSFORM if sensor.type == "tf2_msgs/TFMessage" else b""
-        # Equal robots say equal things, whenever they start.
+        # Seeded by the topic, so that equal robots publish equal values whenever they start.
         self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
 
     def message(self, number: int, stamp_ns: int, now: OwnMotion = AT_REST) -> bytes:
-        """Return message `number` of a robot that moves so, stamped in nanoseconds since the epoch, serialized."""
+        """Return message `number`, serialized, for a motion and a time stamp in nanoseconds since the epoch."""
         if not self._stamped:
             return self._generate(self._sensor, self._noise, now)
         stamp = struct.pack("<3I", number & 0xFFFFFFFF, *divmod(stamp_ns, 10**9))
@@ -148,18 +148,18 @@ def check(sensor: Sensor) -> None:
     """Check that an emulated robot can publish `sensor`.
 
     Raises:
-        ConfigurationError: There is no generator for its type, or it lacks what its type needs.
+        ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
     """
     if sensor.type not in GENERATORS and sensor.template is None:
-        known = nearest(sensor.type, GENERATORS, f"known types: {', '.join(GENERATORS)}")
+        hint = nearest(sensor.type, GENERATORS, f"known types: {', '.join(GENERATORS)}")
         raise ConfigurationError(
             f"an emulated robot cannot publish {sensor.type}",
             where=f"topic {sensor.topic}",
-            remedy=f"{known} Or add a generator to sim_backends/emulated/ros/messages.py",
+            remedy=f"{hint} Or add a generator to sim_backends/emulated/ros/messages.py",
         )
     if sensor.rate_hz <= 0:
         raise ConfigurationError(
-            "a topic with rate 0Hz says nothing", where=f"topic {sensor.topic}", remedy="write 5Hz"
+            "a topic with rate 0Hz publishes nothing", where=f"topic {sensor.topic}", remedy="write 5Hz"
         )
     if sensor.type == LASER_SCAN and sensor.points is None:
         raise ConfigurationError(
@@ -168,7 +168,7 @@ def check(sensor: Sensor) -> None:
 
 
 def _filled(template: Template) -> Generator:
-    """Return a generator that fills the list: with noise that nothing compresses, or with numbers of a normal law."""
+    """Return a generator that fills the list with incompressible noise, or with normally distributed floats."""
     head, tail, size_bytes = bytes.fromhex(template.head), bytes.fromhex(template.tail), template.size_bytes
     pool = b""
 
@@ -176,16 +176,16 @@ def _filled(template: Template) -> Generator:
         nonlocal pool
         if not template.floats:
             return head + noise.randbytes(size_bytes) + tail
-        if not pool:  # made once, and begun elsewhere in each message: a large cloud takes longer than its turn
+        if not pool:  # drawn once and read from varying offsets, because a large cloud takes longer than its period
             pool = 2 * struct.pack(f"<{size_bytes // 4}f", *_around(noise, 1.0, *[0.0] * (size_bytes // 4)))
-        begin = _FLOATS_BYTES * noise.randrange(max(1, size_bytes // _FLOATS_BYTES))
-        return head + pool[begin : begin + size_bytes] + tail
+        start = _FLOATS_BYTES * noise.randrange(max(1, size_bytes // _FLOATS_BYTES))
+        return head + pool[start : start + size_bytes] + tail
 
     return generate
 
 
 def packed_string(text: str) -> bytes:
-    """Return a string as ROS 1 serializes it: behind its length."""
+    """Return a string in ROS 1 serialization: its length, then its bytes."""
     data = text.encode()
     return struct.pack("<I", len(data)) + data
 
@@ -195,7 +195,7 @@ def _float32s(values: Sequence[float]) -> bytes:
 
 
 def _float64s(*parts: Sequence[float]) -> bytes:
-    """Return fields of fixed length, which need none written before them."""
+    """Return fields of fixed length, which have no length before them."""
     return b"".join(struct.pack(f"<{len(part)}d", *part) for part in parts)
 
 
@@ -212,12 +212,12 @@ def _around(noise: Random, deviation: float, *means: float) -> list[float]:
 
 
 def _heading(yaw_rad: float) -> tuple[float, float, float, float]:
-    """Return the quaternion x, y, z, w of a turn to the left."""
+    """Return the quaternion x, y, z, w of a rotation to the left."""
     return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
 
 
 def _within(value_m: float, low_m: float, high_m: float) -> float:
-    """Return a distance as a sensor of this reach tells it (REP 117)."""
+    """Return a distance as a sensor of this range reports it (REP 117)."""
     if value_m < low_m:
         return -math.inf
     return math.inf if value_m > high_m else value_m
@@ -244,7 +244,7 @@ def _laser_scan(
 
 
 def _imu(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
-    # Who is led along a way turns at once, and has its speed at once: no gyroscope and no accelerometer sees that.
+    # On an assigned path the robot turns and accelerates in zero time, which gyroscope and accelerometer cannot show.
     of_orientation, of_turning, of_acceleration = (_diagonal(*[variance] * 3) for variance in IMU_VARIANCES)
     orientation = _float64s(_heading(now.heading_rad), of_orientation)
     angular_velocity = _float64s(_around(noise, 0.002, 0.0, 0.0, now.turn_rad_s), of_turning)
@@ -265,7 +265,7 @@ def _odometry(sensor: Sensor, noise: Random, now: OwnMotion) -> bytes:
 
 
 def _transforms(sensor: Sensor, _: Random, now: OwnMotion) -> bytes:
-    """Return one transform, from odometry's frame to the robot's, which is its pose in that frame (REP 105)."""
+    """Return one transform, from the odometry frame to the robot's frame: the robot's pose in odometry (REP 105)."""
     return _child(sensor) + _float64s((now.x_m, now.y_m, 0.0), _heading(now.yaw_rad))
 
 
@@ -314,7 +314,7 @@ def _temperature(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
 
 
 def _pose_stamped(_: Sensor, __: Random, now: OwnMotion) -> bytes:
-    return _float64s(now.place_m, _heading(now.heading_rad))  # in the world's own frame, REP 105's `map`
+    return _float64s(now.place_m, _heading(now.heading_rad))  # in the world's frame, `map` of REP 105
 
 
 GENERATORS: Final[dict[str, Generator]] = {

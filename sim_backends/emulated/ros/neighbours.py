@@ -1,7 +1,7 @@
-"""Places of all robots of a lab, for the lasers of each.
+"""Positions of all robots of a lab in shared memory, for the laser of each robot.
 
 The lab writes them to anonymous shared memory, which each robot maps read-only before it starts its programs. Two
-slots are written in turn, each with its CRC, so that a reader finds a complete one at any time.
+slots are written in turn, each with its CRC, so that a reader always finds a complete one.
 """
 
 import math
@@ -22,7 +22,7 @@ _ABSENT: Final = (math.nan, math.nan, math.nan)
 
 
 class Neighbour(NamedTuple):
-    """The body of another robot: an upright cylinder around its antenna.
+    """Body of another robot: an upright cylinder around its antenna.
 
     Attributes:
         number: Its position among the robots of the lab, from 0.
@@ -47,13 +47,13 @@ class _Slots:
 
 
 class PlacesWriter:
-    """The lab's end; use `close` when every robot has ended.
+    """The lab's end of the memory; call `close` when every robot has stopped.
 
     Args:
         names: Names of all robots, in the order of `Neighbour.number`.
 
     Raises:
-        OSError: There is no memory.
+        OSError: The memory cannot be allocated.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -64,7 +64,7 @@ class PlacesWriter:
         os.ftruncate(self.fd, 2 * self._slots.slot_bytes)
 
     def write(self, positions_m: Mapping[str, Vector]) -> None:
-        """Write where each antenna is, metres east, north, up; robots that are not named have no place.
+        """Write the position of each antenna, metres east, north, up; robots that are not named have no place.
 
         Raises:
             OSError: The memory cannot be written.
@@ -75,7 +75,7 @@ class PlacesWriter:
         os.pwrite(self.fd, body + _CRC.pack(zlib.crc32(body)), self._number % 2 * self._slots.slot_bytes)
 
     def close(self) -> None:
-        """Release the descriptor; memory that is mapped remains."""
+        """Close the descriptor; mapped memory remains."""
         os.close(self.fd)
 
 
@@ -98,20 +98,20 @@ class Neighbourhood:
         self._places_m = [_ABSENT] * robots
 
     def targets(self, neighbours: Sequence[Neighbour]) -> list[LaserTarget]:
-        """Return what a laser detects of other robots where they are now; those without a place are left out."""
+        """Return the laser targets of other robots at their current positions; those without a place are left out."""
         self._read()
-        found = []
+        targets = []
         for body in neighbours:
             east_m, north_m, up_m = self._places_m[body.number]
             if not math.isnan(up_m):
                 outline_m = ((east_m, north_m),)
-                found.append(LaserTarget(outline_m, body.radius_m, up_m - body.below_m, up_m + body.above_m))
-        return found
+                targets.append(LaserTarget(outline_m, body.radius_m, up_m - body.below_m, up_m + body.above_m))
+        return targets
 
     def _read(self) -> None:
-        """Take the newest complete slot; the one read before remains where none is newer."""
-        for begin in (0, self._slots.slot_bytes):
-            slot = self._memory[begin : begin + self._slots.slot_bytes]
+        """Read the newest complete slot; without a newer one the last positions remain."""
+        for start in (0, self._slots.slot_bytes):
+            slot = self._memory[start : start + self._slots.slot_bytes]
             body, crc = slot[: self._slots.body_bytes], slot[self._slots.body_bytes :]
             (number,) = _NUMBER.unpack_from(body)
             if number > self._number and _CRC.unpack(crc)[0] == zlib.crc32(body):

@@ -1,4 +1,4 @@
-"""Quality of service that an emulated robot with ROS 2 offers per topic: its publishers and its bags agree in it."""
+"""Quality of service that an emulated robot with ROS 2 offers per topic, used by its publishers and in its bags."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,18 +11,18 @@ BY_TYPE: Final[Mapping[str, QosProfile]] = {
     f"sensor_msgs/{name}": PROFILES["sensor_data"]
     for name in ("LaserScan", "Image", "CompressedImage", "PointCloud2")
 }
-"""By ROS 1 type, where it is not ROS 2's default: as drivers publish large messages."""
+"""QoS by ROS 1 type if it is not ROS 2's default: that of drivers with large messages."""
 
 LATCHED: Final = replace(PROFILES["default"], depth=1, durability=Durability.TRANSIENT_LOCAL)
-"""That of `/tf_static` (tf2_ros, qos.hpp, StaticBroadcasterQoS)."""
+"""QoS of `/tf_static` (tf2_ros, qos.hpp, StaticBroadcasterQoS)."""
 
 
 ROSOUT: Final = replace(
     PROFILES["default"], depth=1000, durability=Durability.TRANSIENT_LOCAL, lifespan_ns=10_000_000_000
 )
-"""That of `/rosout` (rcl, logging_rosout.h, rcl_qos_profile_rosout_default)."""
+"""QoS of `/rosout` (rcl, logging_rosout.h, rcl_qos_profile_rosout_default)."""
 
 
 def of_topic(topic: str, kind: str) -> QosProfile:
-    """Return what the publisher of a topic of the ROS 1 type `package/Name` offers."""
+    """Return the QoS that the publisher of a topic of the ROS 1 type `package/Name` offers."""
     return LATCHED if topic == static_frames.TOPIC else BY_TYPE.get(kind, PROFILES["default"])

@@ -1,8 +1,8 @@
-"""The `rosbag` command of an emulated robot without ROS: `record` and `info` as ROS's own (1.15) does them.
+"""The `rosbag` command of an emulated robot without ROS: `record` and `info`, with the behaviour of ROS's own (1.15).
 
-Like the original it is a wrapper around a recorder process: the wrapper refuses wrong options with code 2, passes
-SIGINT and SIGTERM on, and returns 0 whatever became of the recorder; SIGKILL to the wrapper alone leaves the
-recorder recording. Options of the original that no trial uses are refused as unknown.
+Like the original it is a wrapper around a recorder process: the wrapper rejects wrong options with exit code 2,
+forwards SIGINT and SIGTERM, and always returns 0; after SIGKILL of the wrapper alone the recorder continues. Options
+of the original that no trial uses are rejected as unknown.
 """
 
 import errno
@@ -22,8 +22,8 @@ from rosbags.typesys.msg import denormalize_msgtype
 
 from sim_backends.emulated.ros.rosbag_record import Options, RecorderError, Rosbag1Recorder
 
-# How long the original waits for its recorder after it passed a signal on: subprocess.Popen.wait in Python 3 gives
-# a child a quarter of a second after KeyboardInterrupt.
+# Time that the original waits for its recorder after it forwarded a signal: subprocess.Popen.wait in Python 3 waits a
+# quarter of a second for a child after KeyboardInterrupt.
 _AFTER_SIGNAL_S: Final = 0.25
 
 _SECONDS: Final = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -32,14 +32,14 @@ _SECONDS: Final = {"s": 1.0, "m": 60.0, "h": 3600.0}
 def record(argv: Sequence[str]) -> int:
     """Record a bag."""
     options = _record_options(argv)
-    handed_on = {signal.SIGINT, signal.SIGTERM}
-    signal.pthread_sigmask(signal.SIG_BLOCK, {*handed_on, signal.SIGCHLD})
+    forwarded = {signal.SIGINT, signal.SIGTERM}
+    signal.pthread_sigmask(signal.SIG_BLOCK, {*forwarded, signal.SIGCHLD})
     sys.stdout.flush()
     recorder = os.fork()
     if recorder == 0:
         os._exit(_record_in_child(options))
-    number = signal.sigwait({*handed_on, signal.SIGCHLD})
-    if number in handed_on:
+    number = signal.sigwait({*forwarded, signal.SIGCHLD})
+    if number in forwarded:
         os.kill(recorder, number)
         signal.sigtimedwait({signal.SIGCHLD}, _AFTER_SIGNAL_S)
     return 0
@@ -75,7 +75,7 @@ def _record_options(argv: Sequence[str]) -> optparse.Values:
     )
     parser.add_option("-a", "--all", default=False, action="store_true", help="record every topic")
     parser.add_option(
-        "-q", "--quiet", default=False, action="store_true", help="accepted; the original talks on, too"
+        "-q", "--quiet", default=False, action="store_true", help="accepted without effect, as in the original"
     )
     parser.add_option("-o", "--output-prefix", dest="prefix", help="name the bag PREFIX_DATE.bag")
     parser.add_option("-O", "--output-name", dest="name", help="name the bag NAME.bag")
@@ -92,7 +92,7 @@ def _record_options(argv: Sequence[str]) -> optparse.Values:
 
 
 def _seconds(text: str | None) -> float | None:
-    """Return a duration; its complaints come from the recorder, as the original's do."""
+    """Return a duration in seconds; errors are those of the original's recorder."""
     if text is None:
         return None
     number = text.rstrip("abcdefghijklmnopqrstuvwxyz")
@@ -125,7 +125,7 @@ def info(bags: Sequence[str]) -> int:
         try:
             reader = _open(name)
         except (FileNotFoundError, ReaderError) as error:
-            sys.stderr.write(f"{_complaint(name, error)}\n")
+            sys.stderr.write(f"{_error_text(name, error)}\n")
             return 1
         sys.stdout.write(("---\n" if number else "") + _summary(reader, name))
         reader.close()
@@ -140,7 +140,7 @@ def _open(name: str) -> Reader:
     return reader
 
 
-def _complaint(name: str, error: Exception) -> str:
+def _error_text(name: str, error: Exception) -> str:
     if "not indexed" in str(error):
         return f"ERROR bag unindexed: {name}.  Run rosbag reindex."
     if "magic is invalid" in str(error):
@@ -151,7 +151,7 @@ def _complaint(name: str, error: Exception) -> str:
 def _summary(reader: Reader, name: str) -> str:
     blocks: dict[str, list[str]] = {"path": [name], "version": ["2.0"]}
     if reader.message_count:
-        # rosbags adds 1 ns to the last stamp, so that an interval of stamps includes it.
+        # rosbags adds 1 ns to the last stamp, so that an interval of stamps includes that message.
         first_ns, last_ns = reader.start_time, reader.end_time - 1
         blocks["duration"] = [_duration((last_ns - first_ns) / 1e9)]
         blocks["start"], blocks["end"] = [_stamp(first_ns)], [_stamp(last_ns)]
@@ -225,18 +225,18 @@ _COMMANDS: Final[dict[str, Callable[[Sequence[str]], int]]] = {"info": _info, "r
 
 
 def main() -> int:
-    """Run the command line; like the original, an unknown command is told so and is no failure."""
+    """Run the command line; like the original, print an error for an unknown command and return 0."""
     command = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if command in _COMMANDS:
         return _COMMANDS[command](sys.argv[2:])
-    known = "".join(f"   {name}  \t{run.__doc__}\n" for name, run in _COMMANDS.items())
+    commands = "".join(f"   {name}  \t{run.__doc__}\n" for name, run in _COMMANDS.items())
     if command in {"-h", "--help", "help"}:
         sys.stdout.write(
             "This is fieldkit's own rosbag, not that of ROS (emulated: ros: builtin).\n"
-            f"Usage: rosbag <subcommand> [options] [args]\n\nAvailable subcommands:\n{known}\n"
+            f"Usage: rosbag <subcommand> [options] [args]\n\nAvailable subcommands:\n{commands}\n"
         )
     else:
-        sys.stderr.write(f"Unknown command: {command!r}\nAvailable subcommands:\n{known}\n")
+        sys.stderr.write(f"Unknown command: {command!r}\nAvailable subcommands:\n{commands}\n")
     return 0
 
 

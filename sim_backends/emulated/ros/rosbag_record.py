@@ -1,4 +1,4 @@
-"""Recording topics to a ROS 1 bag: what `rosbag record` does after its options are understood."""
+"""Recorder of topics to a ROS 1 bag: the part of `rosbag record` after the command line is parsed."""
 
 import sys
 import time
@@ -14,21 +14,21 @@ from rosbags.rosbag1 import Writer
 from sim_backends.emulated.ros import tcpros
 from sim_backends.emulated.ros.listener import Header, Listener, type_of
 
-# The original looks this often for its end and for new publishers.
+# Polling interval of the original for its end and for new publishers.
 _TICK_S: Final = 0.25
 
 
 @dataclass(frozen=True)
 class Options:
-    """What to record.
+    """Options of a recording.
 
     Attributes:
-        topics: Names.
-        all_topics: Record every topic that is published.
-        prefix: Name the bag by this and the date.
-        name: Name the bag; without either, by the date alone.
+        topics: Names of the topics.
+        all_topics: Record every published topic.
+        prefix: Prefix of the bag's name, before the date.
+        name: Name of the bag; without prefix and name it is the date.
         duration_s: Stop after this time.
-        limit: Stop each topic after so many messages; 0 is no limit.
+        limit: Stop each topic after this number of messages; 0 for no limit.
         chunk_bytes: Size of a chunk of the bag.
     """
 
@@ -41,7 +41,7 @@ class Options:
     chunk_bytes: int
 
     def bag(self) -> Path:
-        """Return the file to write."""
+        """Return the path of the bag."""
         if self.name is not None:
             return Path(self.name.removesuffix(".bag") + ".bag")
         date = datetime.now().astimezone().strftime("%Y-%m-%d-%H-%M-%S")
@@ -49,22 +49,22 @@ class Options:
 
 
 class RecorderError(Exception):
-    """The recorder cannot go on.
+    """The recorder cannot continue.
 
     Args:
-        what: What the original would say.
+        text: The error message of the original.
     """
 
-    def __init__(self, what: str) -> None:
-        super().__init__(what)
-        self.line = _console("\x1b[31m[ERROR]", what)
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.line = _console("\x1b[31m[ERROR]", text)
 
 
 class Rosbag1Recorder:
-    """Records until its duration, its limit, or SIGINT or SIGTERM; the bag is `.active` until it is whole.
+    """Records until its duration, its limit, SIGINT or SIGTERM; the suffix `.active` marks an incomplete bag.
 
     Args:
-        options: What to record.
+        options: Options of the recording.
     """
 
     def __init__(self, options: Options) -> None:
@@ -80,17 +80,17 @@ class Rosbag1Recorder:
             RecorderError: The bag cannot be written.
         """
         for topic in self._options.topics:
-            self._want(topic)
+            self._add_topic(topic)
         bag = self._options.bag()
         active = bag.with_name(f"{bag.name}.active")
         writer = self._open(active)
-        _say(f"Recording to '{bag}'.")
+        _print(f"Recording to '{bag}'.")
         start_ns = time.time_ns()
         while not self._is_over(start_ns):
             if self._options.all_topics:
                 for topic in tcpros.topics():
                     if topic not in self._listener.wanted | self._exhausted:
-                        self._want(topic)
+                        self._add_topic(topic)
             self._listener.subscribe()
             self._write(writer, start_ns)
         writer.close()
@@ -114,12 +114,12 @@ class Rosbag1Recorder:
         duration_s = self._options.duration_s
         return duration_s is not None and now_ns - start_ns > duration_s * 1e9
 
-    def _want(self, topic: str) -> None:
+    def _add_topic(self, topic: str) -> None:
         self._listener.wanted.add(topic)
-        _say(f"Subscribing to {topic}")
+        _print(f"Subscribing to {topic}")
 
     def _write(self, writer: Writer, start_ns: int) -> None:
-        """Write what arrives next."""
+        """Write the messages that arrive within one tick."""
         for header, message in self._listener.events(_TICK_S):
             connection = _connection(writer, header)
             if message is None:
@@ -132,14 +132,14 @@ class Rosbag1Recorder:
             if self._messages[topic] == self._options.limit:
                 self._exhausted.add(topic)
                 self._listener.wanted.discard(topic)
-                self._listener.leave(topic)
+                self._listener.unsubscribe(topic)
 
 
 def _connection(writer: Writer, header: Header) -> Connection:
-    """Return the bag's connection for a publisher; the same again after it came back."""
-    for known in writer.connections:
-        if known.topic == header["topic"]:
-            return known
+    """Return the bag's connection of a topic; a publisher that returns gets the same one."""
+    for connection in writer.connections:
+        if connection.topic == header["topic"]:
+            return connection
     return writer.add_connection(
         header["topic"],
         type_of(header),
@@ -150,11 +150,11 @@ def _connection(writer: Writer, header: Header) -> Connection:
     )
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     sys.stdout.write(_console("\x1b[0m[ INFO]", text))
 
 
 def _console(level: str, text: str) -> str:
-    """Return a line as ROS's console writes it: coloured, off a terminal too."""
+    """Return a line in the format of ROS's console: coloured, even if the output is not a terminal."""
     seconds, nanoseconds = divmod(time.time_ns(), 10**9)
     return f"{level} [{seconds}.{nanoseconds:09d}]: {text}\x1b[0m\n"

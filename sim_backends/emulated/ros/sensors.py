@@ -1,7 +1,7 @@
-"""The process in an emulated robot that publishes its sensors, each at its true rate.
+"""Process of an emulated robot that publishes its sensors, each at its rate.
 
-Message `n` of a topic is due at `start + n / rate` on the monotonic clock, so rates do not drift. A topic that nobody
-hears is not made: a robot at rest costs no time.
+Message `n` of a topic is due at `start + n / rate` on the monotonic clock, so rates do not drift. A topic without
+subscribers is not generated, so that an idle robot uses no processor time.
 """
 
 import contextlib
@@ -19,26 +19,26 @@ from sim_backends.emulated.ros.messages import Definition, Sensor, Source
 from sim_backends.emulated.ros.own_motion import Odometer
 
 QUEUE_BYTES: Final = 4 << 20
-"""What a slow subscriber may leave unread; beyond it messages are dropped for it, as from a ROS publisher's queue."""
+"""Maximum unsent data of a slow subscriber; further messages are dropped for it, as by a ROS publisher's queue."""
 
 _CHUNK_BYTES: Final = 1 << 16
 
 
 class Subscriber:
-    """One subscriber, from its connection to its end.
+    """One subscriber, from its connection until it disconnects.
 
     Args:
         stream: Its socket.
-        greeting: Packets that every subscriber gets first: the connection header, and the message of a latched topic.
-        selector: Waits for the socket; it is told to call `serve` with the events.
+        greeting: First packets for every subscriber: the connection header, and the message of a latched topic.
+        selector: Selector of the process; the key's data is the function to call with the events, `serve`.
 
     Attributes:
-        hears: Whether it has asked for the topic.
-        gone: Whether it has left, which one that breaks off or speaks another protocol has.
+        is_subscribed: True if it has requested the topic.
+        gone: True if it has disconnected, or was disconnected because it violates the protocol.
     """
 
     def __init__(self, stream: socket.socket, greeting: bytes, selector: selectors.BaseSelector) -> None:
-        self.hears = False
+        self.is_subscribed = False
         self.gone = False
         self._stream = stream
         self._greeting = greeting
@@ -49,13 +49,13 @@ class Subscriber:
         selector.register(stream, selectors.EVENT_READ, self.serve)
 
     def send(self, packet: bytes) -> None:
-        """Send a packet as soon as there is room for it; drop it where too much waits already."""
+        """Send a packet as soon as the socket is writable; drop it if too much data is unsent."""
         if not self.gone and len(self._unsent) < QUEUE_BYTES:
             self._unsent += packet
             self._flush()
 
     def serve(self, events: int) -> None:
-        """Do what the socket is ready for."""
+        """Handle the events of the socket."""
         if events & selectors.EVENT_WRITE:
             self._flush()
         if events & selectors.EVENT_READ and not self.gone:
@@ -66,16 +66,16 @@ class Subscriber:
             with contextlib.suppress(BlockingIOError):
                 del self._unsent[: self._stream.send(self._unsent)]
         except OSError:
-            self._leave()
+            self._disconnect()
             return
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._unsent else 0)
-        if self._selector.get_key(self._stream).events != wanted:
-            self._selector.modify(self._stream, wanted, self.serve)
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._unsent else 0)
+        if self._selector.get_key(self._stream).events != events:
+            self._selector.modify(self._stream, events, self.serve)
 
     def _read(self) -> None:
         try:
             data = self._stream.recv(_CHUNK_BYTES)
-            if not self.hears:
+            if not self.is_subscribed:
                 self._packets.feed(data)
                 self._answer()
         except BlockingIOError:
@@ -83,17 +83,17 @@ class Subscriber:
         except (OSError, ValueError):
             data = b""
         if not data and not self.gone:
-            self._leave()
+            self._disconnect()
 
     def _answer(self) -> None:
-        """Answer its connection header once that is whole; whatever comes after it says nothing."""
+        """Answer the connection header once it is complete; anything after it is ignored."""
         for packet in self._packets:
             tcpros.unpack_header(packet)
-            self.hears = True
+            self.is_subscribed = True
             self.send(self._greeting)
             return
 
-    def _leave(self) -> None:
+    def _disconnect(self) -> None:
         self.gone = True
         self._selector.unregister(self._stream)
         self._stream.close()
@@ -105,11 +105,11 @@ class TopicSocket:
     Args:
         topic: Name of the topic.
         header: Fields of the connection header.
-        selector: Waits for its sockets, each with the function to call with what one is ready for.
-        latched: The message that each new subscriber gets at once; empty for a topic that is not latched.
+        selector: Selector of the process; each key's data is the function to call with the events.
+        latched: The message for each new subscriber; empty for a topic that is not latched.
 
     Raises:
-        OSError: The socket cannot be made.
+        OSError: The socket cannot be created.
     """
 
     def __init__(
@@ -119,34 +119,34 @@ class TopicSocket:
         self._selector = selector
         self._subscribers: list[Subscriber] = []
         path = tcpros.socket_path(topic)
-        path.unlink(missing_ok=True)  # left by sensors that were killed
+        path.unlink(missing_ok=True)  # left by a process that was killed
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.bind(str(path))
         self._socket.listen()
-        selector.register(self._socket, selectors.EVENT_READ, self._welcome)
+        selector.register(self._socket, selectors.EVENT_READ, self._accept)
 
     def subscribers(self) -> list[Subscriber]:
         """Return the subscribers that have requested the topic and are still connected."""
         self._subscribers = [subscriber for subscriber in self._subscribers if not subscriber.gone]
-        return [subscriber for subscriber in self._subscribers if subscriber.hears]
+        return [subscriber for subscriber in self._subscribers if subscriber.is_subscribed]
 
-    def _welcome(self, _events: int) -> None:
+    def _accept(self, _events: int) -> None:
         stream, _ = self._socket.accept()
         self._subscribers = [subscriber for subscriber in self._subscribers if not subscriber.gone]
         self._subscribers.append(Subscriber(stream, self._greeting, self._selector))
 
 
 class Publication:
-    """One topic at its socket.
+    """One published topic.
 
     Args:
-        sensor: What is published.
-        definition: That of its message type.
-        start_s: When message 0 was due, on the monotonic clock.
-        odometer: Says how the robot moves.
-        selector: Waits for its sockets, each with the function to call with what one is ready for.
-        targets: What is in the robot's world, for a laser.
-        moving: Returns what else is there at this moment: other robots.
+        sensor: The sensor.
+        definition: Definition of its message type.
+        start_s: Time at which message 0 was due, on the monotonic clock.
+        odometer: Source of the robot's motion.
+        selector: Selector of the process; each key's data is the function to call with the events.
+        targets: Laser targets in the robot's world.
+        moving: Returns the laser targets that move: other robots, where they are now.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class Publication:
         self._topic_socket = TopicSocket(sensor.topic, _header(sensor.topic, sensor.type, definition), selector)
 
     def publish(self) -> float:
-        """Publish the next message if it is due; return in how many seconds the one after it is, never if unheard."""
+        """Publish the next message if it is due; return the seconds until the next one, infinite if unsubscribed."""
         subscribers = self._topic_socket.subscribers()
         if not subscribers:
             self._number = None
@@ -196,20 +196,20 @@ def publish(
     steered: Path,
     ready: Path,
 ) -> None:
-    """Publish for ever.
+    """Publish forever.
 
     Args:
-        sensors: What is published.
-        definitions: Those of its message types, and of `static_frames.TYPE` where there are frames.
-        frames: What `/tf_static` joins, published once and latched; empty for a robot without it.
-        targets: What is in the robot's world, for its laser.
-        moving: Returns what else is there at this moment: other robots.
-        motion: The file in which the lab says how the robot moves (`own_motion.say`).
-        steered: The file in which the robot says how it steers itself (`helm.Helm`).
-        ready: Made when every topic can be subscribed to.
+        sensors: The sensors.
+        definitions: Definitions of their message types, and of `static_frames.TYPE` if there are frames.
+        frames: Links in `/tf_static`, published once and latched; empty for a robot without them.
+        targets: Laser targets in the robot's world.
+        moving: Returns the laser targets that move: other robots, where they are now.
+        motion: The file of the paths that the lab assigns (`own_motion.append_path`).
+        steered: The file in which the robot records how it steers itself (`helm.Helm`).
+        ready: Created when every topic can be subscribed to.
 
     Raises:
-        OSError: A socket cannot be made.
+        OSError: A socket cannot be created.
     """
     start_s = time.monotonic()
     Path(tcpros.FOLDER).mkdir(exist_ok=True)

@@ -1,6 +1,6 @@
 """Static transforms of an emulated robot: the content of `/tf_static` (REP 105, tf2_ros.StaticTransformBroadcaster).
 
-Its sensors measure from the robot's own position, whatever their frame is called: every transform is the identity.
+All its sensors measure at the robot's position, whatever their frame is called, so every transform is the identity.
 """
 
 import struct
@@ -13,33 +13,33 @@ TOPIC: Final = "/tf_static"
 TYPE: Final = "tf2_msgs/TFMessage"
 BASE: Final = "base_link"
 _WORLDS: Final = frozenset({"", "map", "odom", "earth"})
-"""Those of REP 105 that lie in the world; a battery has none at all."""
+"""Frames of REP 105 that are fixed to the world, and the empty frame of a battery."""
 
 Link = tuple[str, str]
-"""A frame and one that lies in it."""
+"""Parent frame and child frame."""
 
 _IN_PLACE: Final = struct.pack("<7d", *[0.0] * 6, 1.0)
 
 
 def links(sensors: Iterable[Sensor]) -> tuple[Link, ...]:
-    """Return the links from the frames of sensors to the child frame of odometry, by way of `base_link`.
+    """Return the links from the child frame of odometry over `base_link` to the frames of the sensors.
 
-    Nothing for a robot whose profile lists `/tf_static` among its topics.
+    Empty for a robot whose profile lists `/tf_static` among its topics.
     """
     sensors = tuple(sensors)
     if any(sensor.topic == TOPIC for sensor in sensors):
         return ()
     moving = [sensor.child_frame for sensor in sensors if sensor.child_frame]
     base = moving[0] if moving else BASE
-    known = {base, BASE, *_WORLDS, *(sensor.frame for sensor in sensors if sensor.child_frame)}
-    frames = dict.fromkeys(sensor.frame for sensor in sensors if sensor.frame not in known)
+    excluded = {base, BASE, *_WORLDS, *(sensor.frame for sensor in sensors if sensor.child_frame)}
+    frames = dict.fromkeys(sensor.frame for sensor in sensors if sensor.frame not in excluded)
     joined = [(base, BASE)] if base != BASE else []
     return (*joined, *((BASE, frame) for frame in frames))
 
 
-def message(found: Sequence[Link], stamp_ns: int) -> bytes:
-    """Return a `tf2_msgs/TFMessage` with these links, as ROS 1 serializes it, stamped in ns since the epoch."""
+def message(links: Sequence[Link], stamp_ns: int) -> bytes:
+    """Return a `tf2_msgs/TFMessage` with these links in ROS 1 serialization, stamped in ns since the epoch."""
     stamp = struct.pack("<3I", 0, *divmod(stamp_ns, 10**9))
-    return struct.pack("<I", len(found)) + b"".join(
-        stamp + packed_string(parent) + packed_string(child) + _IN_PLACE for parent, child in found
+    return struct.pack("<I", len(links)) + b"".join(
+        stamp + packed_string(parent) + packed_string(child) + _IN_PLACE for parent, child in links
     )

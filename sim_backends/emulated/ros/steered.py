@@ -1,9 +1,9 @@
-"""Record of the motion of a robot that steers itself, small, for its sensors and the lab to read.
+"""Record of the motion of a robot that steers itself, read by its sensors and by the lab.
 
-One process of a robot writes: its base controller, or its autopilot. It says where the robot is and how it moves,
-with the moment by the monotonic clock, which all processes of a machine share; readers reckon on from there. The
-record lies in two slots that are written in turn, each with its sum, so that whoever reads while it is written, or
-after its writer was killed, finds the one before.
+One process of a robot writes it: its base controller, or its autopilot. Each record has the position and velocity
+and a time of the monotonic clock, which all processes of a machine share; readers extrapolate from there. Two slots
+are written in turn, each with a CRC, so that a reader finds a complete record while one is being written, and after
+the writer was killed.
 """
 
 import math
@@ -17,30 +17,30 @@ from fieldkit.core.model import Vector
 from sim_backends.world.motion import STILL, State
 
 SILENT_NS: Final = 500_000_000
-"""A robot that moves says so many times within this; one that says nothing for so long stands."""
+"""Timeout: a robot that moves writes much more often than this, and one that has not written for this long stops."""
 
 _SLOT: Final = struct.Struct("<Q2q11d")
-_SUM: Final = struct.Struct("<I")
-_SLOT_BYTES: Final = _SLOT.size + _SUM.size
+_CRC: Final = struct.Struct("<I")
+_SLOT_BYTES: Final = _SLOT.size + _CRC.size
 
 
 class Steered(NamedTuple):
-    """Motion of a robot that steers itself, at one moment.
+    """Motion of a robot that steers itself, at one time.
 
     Attributes:
-        time_ns: The moment, by the monotonic clock.
-        way_ns: When the way began (`OwnWay.began_ns`) by which the lab put it where it set out; 0 where it never did.
-            What was said of another way is over: the robot was carried off since.
-        place_m: Where it is, metres east, north, up.
-        velocity_m_s: How it moves, east, north, up.
-        heading_rad: Where it faces, from east towards north.
-        turn_rad_s: How fast it turns to the left.
-        wheels: What its odometry has counted: metres ahead of where it was switched on, metres to the left of that,
-            and how far it turned to the left since, in radians.
+        time_ns: The time, by the monotonic clock.
+        path_start_ns: Start of the assigned path (`AssignedPath.began_ns`) that put the robot where it set out; 0
+            without one. If the lab has assigned another path since, the record is void.
+        place_m: Position, metres east, north, up.
+        velocity_m_s: Velocity, east, north, up.
+        heading_rad: Heading, from east towards north.
+        turn_rad_s: Turn rate to the left.
+        wheels: Odometry: metres ahead from where the robot was switched on, metres to the left of that, and the angle
+            turned to the left since, in radians.
     """
 
     time_ns: int
-    way_ns: int
+    path_start_ns: int
     place_m: Vector
     velocity_m_s: Vector = STILL
     heading_rad: float = 0.0
@@ -49,44 +49,44 @@ class Steered(NamedTuple):
 
     @property
     def speed_m_s(self) -> float:
-        """How fast it drives ahead, below 0 for backwards."""
+        """Forward speed, below 0 if the robot drives backwards."""
         east, north, _ = self.velocity_m_s
         return east * math.cos(self.heading_rad) + north * math.sin(self.heading_rad)
 
     @property
     def state(self) -> State:
-        """Its place and velocity as the lab knows them."""
+        """Position, velocity and heading as the lab uses them."""
         return State(self.place_m, self.velocity_m_s, self.heading_rad)
 
     @property
     def moves(self) -> bool:
-        """Whether it moves or turns."""
+        """True if the robot moves or turns."""
         return self.velocity_m_s != STILL or self.turn_rad_s != 0.0
 
     def at(self, now_ns: int) -> "Steered":
-        """Return its motion at a moment after this one by dead reckoning; one that is silent stands."""
-        silent = now_ns - self.time_ns >= SILENT_NS
-        left_s = min(max(now_ns - self.time_ns, 0), SILENT_NS) / 1e9
+        """Return the motion at a later time by dead reckoning; a robot stops `SILENT_NS` after its last record."""
+        is_silent = now_ns - self.time_ns >= SILENT_NS
+        elapsed_s = min(max(now_ns - self.time_ns, 0), SILENT_NS) / 1e9
         x_m, y_m, yaw_rad = self.wheels
-        ahead_m = self.speed_m_s * left_s
-        gone = self._replace(
+        ahead_m = self.speed_m_s * elapsed_s
+        later = self._replace(
             time_ns=max(now_ns, self.time_ns),
-            place_m=_along(self.place_m, self.velocity_m_s, left_s),
-            heading_rad=self.heading_rad + self.turn_rad_s * left_s,
+            place_m=_along(self.place_m, self.velocity_m_s, elapsed_s),
+            heading_rad=self.heading_rad + self.turn_rad_s * elapsed_s,
             wheels=(
                 x_m + ahead_m * math.cos(yaw_rad),
                 y_m + ahead_m * math.sin(yaw_rad),
-                yaw_rad + self.turn_rad_s * left_s,
+                yaw_rad + self.turn_rad_s * elapsed_s,
             ),
         )
-        return gone._replace(velocity_m_s=STILL, turn_rad_s=0.0) if silent else gone
+        return later._replace(velocity_m_s=STILL, turn_rad_s=0.0) if is_silent else later
 
 
 class SteeredRecord:
-    """The record, in a file that has one writer and any number of readers.
+    """The record in a file, with one writer and any number of readers.
 
     Args:
-        fd: Descriptor of the file, which is this object's from now on.
+        fd: Descriptor of the file, which this object closes.
     """
 
     def __init__(self, fd: int) -> None:
@@ -97,55 +97,56 @@ class SteeredRecord:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Return the record in a file, which is made where there is none.
+        """Return the record in a file, which is created if it is missing.
 
         Raises:
-            OSError: It cannot be made.
+            OSError: It cannot be created.
         """
         return cls(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
 
     def write(self, motion: Steered) -> None:
-        """Say how the robot moves.
+        """Write the robot's motion.
 
         Raises:
-            OSError: There is no room for it.
+            OSError: There is no space for it.
         """
         self._number, self._last = self._number + 1, motion
         slot = _SLOT.pack(
             self._number,
             motion.time_ns,
-            motion.way_ns,
+            motion.path_start_ns,
             *motion.place_m,
             *motion.velocity_m_s,
             motion.heading_rad,
             motion.turn_rad_s,
             *motion.wheels,
         )
-        os.pwrite(self._fd, slot + _SUM.pack(zlib.crc32(slot)), self._number % 2 * _SLOT_BYTES)
+        os.pwrite(self._fd, slot + _CRC.pack(zlib.crc32(slot)), self._number % 2 * _SLOT_BYTES)
 
     def read(self) -> Steered | None:
-        """Return what was said last; None if the robot never steered itself.
+        """Return the newest motion, or None if the robot never steered itself.
 
         Raises:
             OSError: The file cannot be read.
         """
-        said = os.pread(self._fd, 2 * _SLOT_BYTES, 0)
-        for begin in (0, _SLOT_BYTES):
-            slot, total = said[begin : begin + _SLOT.size], said[begin + _SLOT.size : begin + _SLOT_BYTES]
-            if len(total) == _SUM.size and _SUM.unpack(total)[0] == zlib.crc32(slot):
-                self._take(*_SLOT.unpack(slot))
+        data = os.pread(self._fd, 2 * _SLOT_BYTES, 0)
+        for start in (0, _SLOT_BYTES):
+            slot, crc = data[start : start + _SLOT.size], data[start + _SLOT.size : start + _SLOT_BYTES]
+            if len(crc) == _CRC.size and _CRC.unpack(crc)[0] == zlib.crc32(slot):
+                self._accept(*_SLOT.unpack(slot))
         return self._last
 
     def close(self) -> None:
         """Close the file."""
         os.close(self._fd)
 
-    def _take(self, number: int, time_ns: int, way_ns: int, *values: float) -> None:
+    def _accept(self, number: int, time_ns: int, path_start_ns: int, *values: float) -> None:
+        """Store a slot if it is newer than the last one."""
         if number > self._number:
             place, velocity, wheels = (_vector(values[at : at + 3]) for at in (0, 3, 8))
             heading_rad, turn_rad_s = values[6:8]
             self._number = number
-            self._last = Steered(time_ns, way_ns, place, velocity, heading_rad, turn_rad_s, wheels)
+            self._last = Steered(time_ns, path_start_ns, place, velocity, heading_rad, turn_rad_s, wheels)
 
 
 def _along(place_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:

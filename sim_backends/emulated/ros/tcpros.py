@@ -1,8 +1,8 @@
-"""The framing that ROS 1 nodes speak (wiki.ros.org/ROS/TCPROS), here over one Unix socket per topic in the robot.
+"""Framing of TCPROS, the protocol of ROS 1 nodes (wiki.ros.org/ROS/TCPROS), here over a Unix socket per topic.
 
-Every packet is its length in 4 bytes, little-endian, and that many bytes. The first each way is the connection
-header, a sequence of fields `name=value`, each with its own length; each later one is one serialized message.
-Standard library alone: Debian's own Python imports it too.
+Every packet is its length in 4 bytes, little-endian, and its payload. The first packet in each direction is the
+connection header, a sequence of fields `name=value`, each with its length; each later one is a serialized message.
+Only the standard library is imported, because Debian's Python imports this module too.
 """
 
 import struct
@@ -19,12 +19,12 @@ LENGTH_BYTES: Final = _LENGTH.size
 
 
 def socket_path(topic: str) -> Path:
-    """Return the socket at which `topic` is published; `.` is in no topic's name."""
+    """Return the socket path of `topic`; `.` replaces `/`, since topic names contain no `.`."""
     return Path(FOLDER, topic.strip("/").replace("/", "."))
 
 
 def topics() -> list[str]:
-    """Return the topics that are published, sorted."""
+    """Return the published topics, sorted."""
     folder = Path(FOLDER)
     return sorted("/" + path.name.replace(".", "/") for path in folder.iterdir()) if folder.is_dir() else []
 
@@ -35,15 +35,15 @@ def pack(payload: bytes) -> bytes:
 
 
 def request(caller: str, topic: str) -> bytes:
-    """Return what a subscriber says first: that it wants `topic`, of whatever type."""
+    """Return the connection header by which a subscriber requests `topic`, of any type."""
     return pack(pack_header({"callerid": caller, "topic": topic, "md5sum": "*", "type": "*"}))
 
 
 def unpack_length(data: bytes) -> int:
-    """Return the length that a packet begins with.
+    """Return the length at the start of a packet.
 
     Raises:
-        ValueError: It is longer than any message here.
+        ValueError: It exceeds `MAX_BYTES`.
     """
     (length,) = _LENGTH.unpack(data)
     if length > MAX_BYTES:
@@ -66,27 +66,27 @@ def unpack_header(payload: bytes) -> dict[str, str]:
     packets.feed(payload)
     fields = dict(field.decode().split("=", 1) for field in packets)
     if packets.pending:
-        raise ValueError("a connection header ends in the middle of a field")
+        raise ValueError("a connection header ends within a field")
     return fields
 
 
 class PacketSplitter:
-    """Cuts a stream into packets; iterate after each `feed`."""
+    """Splits a stream into packets; iterate after each `feed`."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     @property
     def pending(self) -> int:
-        """Bytes of a packet that is not whole yet."""
+        """Number of bytes of an incomplete packet."""
         return len(self._buffer)
 
     def feed(self, data: bytes) -> None:
-        """Take what arrived."""
+        """Add received data."""
         self._buffer += data
 
     def __iter__(self) -> Iterator[bytes]:
-        """Return and forget each whole packet's payload.
+        """Yield and remove the payload of each complete packet.
 
         Raises:
             ValueError: As `unpack_length`.

@@ -1,8 +1,8 @@
-"""Messages of any ROS 1 type by its definition: what stands in each, and where its one large list is.
+"""Messages of any ROS 1 type from its definition: constant bytes, and the position of the one large list.
 
-The lab reads the definition, by rosbags; a robot gets bytes alone, and fills the list anew in each message. Numbers
-are 0 and texts empty, but a quaternion is the one that turns nothing. An image, a compressed image and a point cloud
-say of themselves what they hold.
+The lab parses the definition with rosbags; a robot gets only bytes, and fills the list in each message. Numbers are 0
+and strings empty; quaternions are the identity. The fields that describe an image, a compressed image or a point
+cloud are set.
 """
 
 import struct
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _HEADER: Final = "std_msgs/msg/Header"
 _QUATERNION: Final = "geometry_msgs/msg/Quaternion"
-# As in `struct`; a time has two numbers, and is a type with fields for rosbags.
+# Format characters of `struct`; times have two fields, and rosbags treats them as types with fields.
 _FORMS: Final = {
     "bool": "?",
     "byte": "B",
@@ -40,33 +40,33 @@ _POINT_BYTES: Final = 16
 _FLOAT32: Final = 7  # sensor_msgs/PointField.FLOAT32
 
 Values = Mapping[str, bytes]
-"""Serialized fields of a message that are not as the others, by name."""
+"""Serialized values of fields that are not zero or empty, by name."""
 
 
 def definition_of(kind: str, text: str) -> Definition:
-    """Return what a publisher announces of the type `package/Name`, which `text` defines where ROS does not.
+    """Return the definition that a publisher of the type `package/Name` announces; if ROS has none it is `text`.
 
-    Errors as `template_of`, which refuses first what has no definition.
+    Errors as `template_of`, which first rejects types without a definition.
     """
-    return Definition(*_types(kind, text).generate_msgdef(_long(kind), ros_version=1))
+    return Definition(*_types(kind, text).generate_msgdef(_full_name(kind), ros_version=1))
 
 
 def template_of(topic: PublishedTopic) -> Template:
-    """Return what the messages of a topic are made of.
+    """Return the template of a topic's messages.
 
     Raises:
-        ConfigurationError: The definition cannot be read, or nobody gave one; or it has no list to be of the size.
+        ConfigurationError: The definition is missing or cannot be parsed, or no list can have the required size.
     """
     packed = _Packed(_types(topic.type, topic.definition), topic.payload_bytes, _values(topic))
     try:
-        stamped = packed.add_message(_long(topic.type))
+        stamped = packed.add_message(_full_name(topic.type))
     except KeyError as error:
         raise _unknown(topic) from error
     if topic.payload_bytes and packed.filling is None:
         raise ConfigurationError(
-            f"{topic.type} has no list of numbers that could have {topic.payload_bytes} bytes",
+            f"{topic.type} has no list of numbers whose size can be {topic.payload_bytes} bytes",
             where=f"topic {topic.name}",
-            remedy="leave size out, or make it a multiple of a number's bytes",
+            remedy="remove size, or make it a multiple of a number's bytes",
         )
     floats = packed.filling == "float32" or topic.type == "sensor_msgs/PointCloud2"
     head, tail = (part.hex() for part in packed.parts)
@@ -74,17 +74,17 @@ def template_of(topic: PublishedTopic) -> Template:
 
 
 def _values(topic: PublishedTopic) -> Values:
-    given = _VALUES.get(topic.type)
-    return given(topic) if given else {}
+    make_values = _VALUES.get(topic.type)
+    return make_values(topic) if make_values else {}
 
 
-def _long(kind: str) -> str:
+def _full_name(kind: str) -> str:
     return kind.replace("/", "/msg/")
 
 
 @cache
 def _types(kind: str, definition: str) -> "Typestore":
-    """Return ROS 1's types and those of a definition: fields of the type, then `MSG: package/Name` and its fields."""
+    """Return ROS 1's types and those of a definition: fields of the type, then `MSG: package/Name` and fields."""
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (50 ms)
 
     from fieldkit.ros.types import LACKING  # noqa: PLC0415 (as above)
@@ -94,8 +94,8 @@ def _types(kind: str, definition: str) -> "Typestore":
         store.register(get_types_from_msg(text, name))
     if definition:
         try:
-            found = get_types_from_msg(definition, _long(kind))
-            store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
+            types = get_types_from_msg(definition, _full_name(kind))
+            store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
         except TypesysError as error:
             raise ConfigurationError(
                 f"the definition of {kind} cannot be read: {error}",
@@ -107,19 +107,19 @@ def _types(kind: str, definition: str) -> "Typestore":
 def _unknown(topic: PublishedTopic) -> ConfigurationError:
     remedy = f"write what `rosmsg show -r {topic.type}` prints under definition: of the topic"
     return ConfigurationError(
-        f"an emulated robot cannot publish {topic.type}: neither it nor all in it are types of ROS 1 itself",
+        f"an emulated robot cannot publish {topic.type}: ROS 1 itself has no definition of it, or of a type in it",
         where=f"topic {topic.name}",
         remedy=f"{nearest(topic.type, GENERATORS, remedy)}",
     )
 
 
 class _Packed:
-    """Fields one after the other, and a gap for the first list of numbers.
+    """Serialized fields in order, with a gap for the first list of numbers.
 
     Args:
-        store: Knows the types.
-        size_bytes: How large the list is; 0 for an empty one.
-        values: Fields of the outermost message that are given.
+        store: Type definitions.
+        size_bytes: Size of the list; 0 for an empty one.
+        values: Values of fields of the outermost message.
     """
 
     def __init__(self, store: "Typestore", size_bytes: int, values: Values) -> None:
@@ -130,7 +130,7 @@ class _Packed:
         self._values = values
 
     def add_message(self, kind: str) -> bool:
-        """Add every field of the outermost message but its header; return whether it has one."""
+        """Add every field of the outermost message except its header; return True if it has a header."""
         _, fields = self._store.fielddefs[kind]
         stamped = bool(fields) and fields[0][1][1] == _HEADER
         for name, field in fields[1:] if stamped else fields:
@@ -185,8 +185,8 @@ def _point_cloud(topic: PublishedTopic) -> Values:
     names = ("x", "y", "z", "intensity")
     fields = [packed_string(name) + struct.pack("<IBI", 4 * at, _FLOAT32, 1) for at, name in enumerate(names)]
     numbers = {"height": 1, "width": points, "point_step": _POINT_BYTES, "row_step": _POINT_BYTES * points}
-    told = {name: struct.pack("<I", value) for name, value in numbers.items()}
-    return told | {"fields": struct.pack("<I", len(fields)) + b"".join(fields), "is_dense": b"\x01"}
+    values = {name: struct.pack("<I", value) for name, value in numbers.items()}
+    return values | {"fields": struct.pack("<I", len(fields)) + b"".join(fields), "is_dense": b"\x01"}
 
 
 _VALUES: Final = {

@@ -1,4 +1,4 @@
-"""Reads a bag as users of bagpy do: `bagpy_client.py BAG TOPIC` prints its topics, and the rows of one, as JSON."""
+"""Reads a bag with bagpy: `bagpy_client.py BAG TOPIC` prints the topics, and the rows of one topic, as JSON."""
 
 import json
 import sys
@@ -9,9 +9,9 @@ from bagpy import bagreader
 bag, topic = sys.argv[1:]
 reader = bagreader(bag, verbose=False)
 rows = pd.read_csv(reader.message_by_topic(topic))
-told = {
+content = {
     "topics": {row["Topics"]: [row["Types"], row["Message Count"]] for _, row in reader.topic_table.iterrows()},
     "columns": list(rows.columns),
     "rows": rows.astype(str).to_numpy().tolist(),
 }
-sys.stdout.write(json.dumps(told) + "\n")
+sys.stdout.write(json.dumps(content) + "\n")

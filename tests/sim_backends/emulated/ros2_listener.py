@@ -1,6 +1,6 @@
-"""A node of a real ROS 2, by a Python that has rclpy: hears topics, drives, and tells what it saw.
+"""A node of a real ROS 2, run with a Python that has rclpy: receives topics, drives the robot, and prints a report.
 
-Usage: python ros2_listener.py COUNT TOPIC=TYPE...; it ends after so many messages of each, and prints JSON.
+Usage: python ros2_listener.py COUNT TOPIC=TYPE...; it stops after COUNT messages of each topic, and prints JSON.
 """
 
 import importlib
@@ -17,67 +17,69 @@ DRIVEN_M = 0.1
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401 (of rclpy)
-    """Return a message as JSON can have it."""
+    """Return a message as values that JSON can represent."""
     if hasattr(value, "get_fields_and_field_types"):
         return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
     if isinstance(value, (str, int, float)):
         return value
-    return [plain(one) for one in value.tolist()] if hasattr(value, "tolist") else [plain(one) for one in value]
+    return [plain(item) for item in value.tolist()] if hasattr(value, "tolist") else [plain(item) for item in value]
 
 
-def drive(node: Any, heard: list[Any]) -> None:  # noqa: ANN401 (of rclpy)
-    """Tell the robot to drive ahead until its odometry says that it has."""
+def drive(node: Any, received: list[Any]) -> None:  # noqa: ANN401 (of rclpy)
+    """Command the robot to drive ahead until its odometry shows it."""
     twist = importlib.import_module("geometry_msgs.msg").Twist
     publisher, ahead = node.create_publisher(twist, "/cmd_vel", 10), twist()
     ahead.linear.x = 0.2
     deadline_s = time.monotonic() + LIMIT_S
-    while heard[-1]["pose"]["pose"]["position"]["x"] < DRIVEN_M and time.monotonic() < deadline_s:
+    while received[-1]["pose"]["pose"]["position"]["x"] < DRIVEN_M and time.monotonic() < deadline_s:
         publisher.publish(ahead)
         rclpy.spin_once(node, timeout_sec=0.05)
 
 
 def main(count: int, kinds: dict[str, str]) -> None:
-    """Hear so many messages of each topic, and print them."""
+    """Receive this number of messages of each topic, and print a report."""
     rclpy.init()
     node = rclpy.create_node("listener")
-    heard: dict[str, list[Any]] = {topic: [] for topic in kinds}
+    received: dict[str, list[Any]] = {topic: [] for topic in kinds}
     for topic, kind in kinds.items():
         package, _, name = kind.split("/")
         message_type = getattr(importlib.import_module(f"{package}.msg"), name)
 
-        def take(message: object, into: list[Any] = heard[topic]) -> None:
+        def append(message: object, into: list[Any] = received[topic]) -> None:
             into.append(plain(message))
 
-        node.create_subscription(message_type, topic, take, qos_profile_sensor_data)
+        node.create_subscription(message_type, topic, append, qos_profile_sensor_data)
     logged: list[Any] = []
     log_type = importlib.import_module("rcl_interfaces.msg").Log
     node.create_subscription(log_type, "/rosout", lambda line: logged.append(plain(line)), qos_profile_rosout_default)
     deadline_s = time.monotonic() + LIMIT_S
 
     def missing() -> bool:
-        about = {line["msg"] for line in logged}
+        texts = {line["msg"] for line in logged}
         lines = {f"{topic} has a subscriber" for topic in kinds}
-        return min(map(len, heard.values())) < count or len(node.get_node_names()) < 2 or not lines <= about
+        return min(map(len, received.values())) < count or len(node.get_node_names()) < 2 or not lines <= texts
 
     while missing() and time.monotonic() < deadline_s:
         rclpy.spin_once(node, timeout_sec=0.1)
-    drive(node, heard["/odom"])
+    drive(node, received["/odom"])
     nodes = [name for name in node.get_node_names() if name != "listener"]
     types = dict(node.get_topic_names_and_types())
-    told = {
+    report = {
         "logged": logged,
         "rosout": [
-            (end.qos_profile.durability.name, end.qos_profile.lifespan.nanoseconds)
-            for end in node.get_publishers_info_by_topic("/rosout")
+            (publisher.qos_profile.durability.name, publisher.qos_profile.lifespan.nanoseconds)
+            for publisher in node.get_publishers_info_by_topic("/rosout")
         ],
-        "heard": {topic: found[:count] for topic, found in heard.items()},
+        "heard": {topic: messages[:count] for topic, messages in received.items()},
         "types": types,
         "hashes": {
-            topic: [str(one.topic_type_hash) for one in node.get_publishers_info_by_topic(topic)]
+            topic: [str(publisher.topic_type_hash) for publisher in node.get_publishers_info_by_topic(topic)]
             for topic in (*kinds, "/tf", "/tf_static")
         },
-        "latched": [one.qos_profile.durability.name for one in node.get_publishers_info_by_topic("/tf_static")],
-        "driven_m": heard["/odom"][-1]["pose"]["pose"]["position"]["x"],
+        "latched": [
+            publisher.qos_profile.durability.name for publisher in node.get_publishers_info_by_topic("/tf_static")
+        ],
+        "driven_m": received["/odom"][-1]["pose"]["pose"]["position"]["x"],
         "nodes": nodes,
         "services_of_node": {
             name: [service for service, _ in node.get_service_names_and_types_by_node(name, "/")]
@@ -86,7 +88,7 @@ def main(count: int, kinds: dict[str, str]) -> None:
         "own_topics": [topic for topic, _ in node.get_publisher_names_and_types_by_node("listener", "/")],
         "of_node": {name: node.get_publisher_names_and_types_by_node(name, "/") for name in nodes},
     }
-    sys.stdout.write(json.dumps(told) + "\n")
+    sys.stdout.write(json.dumps(report) + "\n")
     sys.stdout.flush()
     node.destroy_node()
     rclpy.shutdown()

@@ -1,4 +1,4 @@
-"""A robot publishes an image and a type of its lab's own, and either rosbag records them at their rates and sizes."""
+"""A robot publishes an image and a custom type; both rosbag programs record them with their rates and sizes."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,20 +53,20 @@ def shell(request: pytest.FixtureRequest) -> Iterator[Shell]:
         yield up.shells[Role.SENDER]
 
 
-def test_both_are_recorded_whole_at_their_rates(shell: Shell, tmp_path: Path) -> None:
+def test_both_topics_are_recorded_completely_at_their_rates(shell: Shell, tmp_path: Path) -> None:
     record = ("rosbag", "record", "--duration=3", "-O", "all", "/camera/image_raw", "/lidar/packets")
     argv = with_environment(record, setup=["/opt/ros/noetic/setup.bash"])
     shell.run(argv, deadline=Deadline.after(LONG_S))
     bag = tmp_path / "all.bag"
     shell.fetch(("cat", "all.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 24)
-    came: dict[str, list[Any]] = {"/camera/image_raw": [], "/lidar/packets": []}
+    messages: dict[str, list[Any]] = {"/camera/image_raw": [], "/lidar/packets": []}
     with AnyReader([bag]) as reader:
         for connection, _, data in reader.messages():
-            came[connection.topic].append(reader.deserialize(data, connection.msgtype))
-    images, packets = came.values()
+            messages[connection.topic].append(reader.deserialize(data, connection.msgtype))
+    images, packets = messages.values()
     assert {(image.width, image.height, len(image.data)) for image in images} == {(320, 240, 320 * 240 * 3)}
     numbers = [image.header.seq for image in images]
     assert numbers == list(range(numbers[0], numbers[0] + len(images))), "none is lost"
-    assert {len(one.packet.data) for one in packets} == {12_000}
-    assert 10 <= len(images) <= 31, "3 s of 10 Hz, less what it takes to subscribe"
+    assert {len(message.packet.data) for message in packets} == {12_000}
+    assert 10 <= len(images) <= 31, "3 s of 10 Hz, less the time to subscribe"
     assert 20 <= len(packets) <= 62

@@ -1,4 +1,4 @@
-"""Faults of emulated robots are real: the kernel, the processes and the files say so."""
+"""Faults of emulated robots have real effects in the kernel, the processes and the files."""
 
 import os
 import re
@@ -45,16 +45,16 @@ def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
         yield robots
 
 
-def said(shell: Shell, *argv: str) -> str:
+def output_of(shell: Shell, *argv: str) -> str:
     return shell.run(argv, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
-def healed(shell: Shell, condition: Callable[[], bool] = lambda: True) -> None:
-    """Return when the robot answers and `condition` holds."""
+def wait_healed(shell: Shell, condition: Callable[[], bool] = lambda: True) -> None:
+    """Return when the robot is reachable and `condition` holds."""
     deadline = Deadline.after(LONG_S)
     while True:
         try:
-            said(shell, "true")
+            output_of(shell, "true")
             if condition():
                 return
         except (LinkError, RobotError):
@@ -63,47 +63,45 @@ def healed(shell: Shell, condition: Callable[[], bool] = lambda: True) -> None:
         time.sleep(0.01)
 
 
-def hears(up: EmulatedTestbed, role: Role, of: Role, *, within_s: float = 10.0) -> bool:
-    """Return whether one robot gets an answer from another over the radio."""
+def reaches(up: EmulatedTestbed, role: Role, of: Role, *, within_s: float = 10.0) -> bool:
+    """Return True if one robot gets an answer from another over the radio."""
     argv = ("ping", "-c", "1", "-W", f"{within_s:g}", up.robots[of].spec.ip)
     return up.shells[role].run(argv, deadline=Deadline.after(LONG_S), check=False).exit_code == 0
 
 
 def names(shell: Shell) -> list[str]:
-    return said(shell, "sh", "-c", "cat /proc/[0-9]*/comm 2>/dev/null || true").split()  # some end meanwhile
+    return output_of(shell, "sh", "-c", "cat /proc/[0-9]*/comm 2>/dev/null || true").split()  # some exit meanwhile
 
 
 def test_a_link_goes_down_and_comes_up_with_all_its_routes(up: EmulatedTestbed) -> None:
     sender = up.shells[Role.SENDER]
-    routes = said(sender, "ip", "route")
+    routes = output_of(sender, "ip", "route")
     assert "224.0.0.0/4" in routes
     with lasting(up, Fault(FaultKind.LINK_DOWN, Role.SENDER, 1.0)):
-        assert "state DOWN" in said(sender, "ip", "link", "show", "wlan0")
-    assert said(sender, "ip", "route") == routes
-    assert hears(up, Role.RECEIVER, Role.SENDER)
+        assert "state DOWN" in output_of(sender, "ip", "link", "show", "wlan0")
+    assert output_of(sender, "ip", "route") == routes
+    assert reaches(up, Role.RECEIVER, Role.SENDER)
 
 
-def test_the_time_that_a_fault_lasted_is_told(up: EmulatedTestbed) -> None:
+def test_the_duration_of_a_fault_is_returned(up: EmulatedTestbed) -> None:
     lasted_s = up.inject(Fault(FaultKind.LINK_DOWN, Role.RECEIVER, 0.3))
     assert lasted_s is not None
     assert 0.3 <= lasted_s < LONG_S
     assert up.inject(Fault(FaultKind.KILL, Role.RECEIVER, process="sensors")) == 0.0
-    healed(up.shells[Role.RECEIVER], lambda: "sensors" in names(up.shells[Role.RECEIVER]))
+    wait_healed(up.shells[Role.RECEIVER], lambda: "sensors" in names(up.shells[Role.RECEIVER]))
 
 
-@pytest.mark.parametrize("gone", FIXED_ROLES)
-def test_nobody_hears_a_robot_out_of_range_and_without_the_relay_nobody_hears_anybody(
-    up: EmulatedTestbed, gone: Role
-) -> None:
-    assert hears(up, Role.SENDER, Role.RECEIVER)
-    with lasting(up, Fault(FaultKind.OUT_OF_RANGE, gone, 1.5)):
-        wait_until(lambda: not hears(up, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
-    assert hears(up, Role.SENDER, Role.RECEIVER), "back in its place"
+@pytest.mark.parametrize("away", FIXED_ROLES)
+def test_a_robot_out_of_range_is_unreachable_and_without_the_relay_all_are(up: EmulatedTestbed, away: Role) -> None:
+    assert reaches(up, Role.SENDER, Role.RECEIVER)
+    with lasting(up, Fault(FaultKind.OUT_OF_RANGE, away, 1.5)):
+        wait_until(lambda: not reaches(up, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
+    assert reaches(up, Role.SENDER, Role.RECEIVER), "back in its place"
 
 
-def test_a_reboot_ends_every_process_and_keeps_the_sd_card_alone(up: EmulatedTestbed) -> None:
+def test_a_reboot_kills_every_process_and_keeps_only_the_sd_card(up: EmulatedTestbed) -> None:
     sender = up.shells[Role.SENDER]
-    said(
+    output_of(
         sender,
         "sh",
         "-c",
@@ -112,49 +110,49 @@ def test_a_reboot_ends_every_process_and_keeps_the_sd_card_alone(up: EmulatedTes
         *VOLATILE,
         *KEPT,
     )
-    boot_id = said(sender, "cat", BOOT_ID)
-    began_s = time.monotonic()
+    boot_id = output_of(sender, "cat", BOOT_ID)
+    start_s = time.monotonic()
     assert up.inject(Fault(FaultKind.REBOOT, Role.SENDER)) == 0.0
-    assert time.monotonic() - began_s >= BOOT_S
-    healed(sender, lambda: {"sshd", "sensors"} <= set(names(sender)))
+    assert time.monotonic() - start_s >= BOOT_S
+    wait_healed(sender, lambda: {"sshd", "sensors"} <= set(names(sender)))
     assert "sleep" not in names(sender)
     assert re.fullmatch(r"[0-9a-f-]{36}\n", boot_id)
-    assert said(sender, "cat", BOOT_ID) not in {boot_id, said(up.shells[Role.RECEIVER], "cat", BOOT_ID)}
-    left = said(sender, "sh", "-c", 'ls -d "$@" /tmp/deep 2>/dev/null; true', "sh", *VOLATILE, *KEPT).split()
+    assert output_of(sender, "cat", BOOT_ID) not in {boot_id, output_of(up.shells[Role.RECEIVER], "cat", BOOT_ID)}
+    left = output_of(sender, "sh", "-c", 'ls -d "$@" /tmp/deep 2>/dev/null; true', "sh", *VOLATILE, *KEPT).split()
     assert sorted(left) == sorted(KEPT)
-    assert "224.0.0.0/4" in said(sender, "ip", "route")
-    assert hears(up, Role.RECEIVER, Role.SENDER)
+    assert "224.0.0.0/4" in output_of(sender, "ip", "route")
+    assert reaches(up, Role.RECEIVER, Role.SENDER)
 
 
 def test_a_robot_records_again_after_a_reboot_and_after_its_sensors_died(up: EmulatedTestbed) -> None:
     sender = up.shells[Role.SENDER]
     up.inject(Fault(FaultKind.REBOOT, Role.SENDER))
-    healed(sender, lambda: _records(sender, "after-reboot"))
+    wait_healed(sender, lambda: _records(sender, "after-reboot"))
     up.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
-    healed(sender, lambda: _records(sender, "after-kill"))
+    wait_healed(sender, lambda: _records(sender, "after-kill"))
 
 
 def _records(shell: Shell, name: str) -> bool:
-    done = shell.run(("bash", "-c", RECORD, name), deadline=Deadline.after(LONG_S), check=False)
-    return done.stdout.decode().endswith(f"{name}.bag\n")
+    result = shell.run(("bash", "-c", RECORD, name), deadline=Deadline.after(LONG_S), check=False)
+    return result.stdout.decode().endswith(f"{name}.bag\n")
 
 
-def test_a_robot_without_power_answers_nobody(up: EmulatedTestbed) -> None:
+def test_a_robot_without_power_is_unreachable(up: EmulatedTestbed) -> None:
     robot = up.robots[Role.RECEIVER]
     robot.halt()
     with pytest.raises(ConnectionError, match="refused"):
         robot.connect(5.0)
-    wait_until(lambda: not hears(up, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
+    wait_until(lambda: not reaches(up, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
     robot.boot()
-    healed(up.shells[Role.RECEIVER])
+    wait_healed(up.shells[Role.RECEIVER])
 
 
-def test_a_killed_server_comes_back_under_another_process_id(up: EmulatedTestbed) -> None:
+def test_a_killed_server_restarts_with_another_process_id(up: EmulatedTestbed) -> None:
     sender = up.shells[Role.SENDER]
     listener = ("sh", "-c", "cd /proc; for p in [0-9]*; do echo sshd | cmp -s - $p/comm && echo $p && break; done")
-    before = said(sender, *listener)
+    before = output_of(sender, *listener)
     up.inject(Fault(FaultKind.KILL, Role.SENDER, process="sshd"))
-    healed(sender, lambda: said(sender, *listener) != before)
+    wait_healed(sender, lambda: output_of(sender, *listener) != before)
 
 
 def test_a_process_that_does_not_run_cannot_be_killed(up: EmulatedTestbed) -> None:
@@ -163,8 +161,8 @@ def test_a_process_that_does_not_run_cannot_be_killed(up: EmulatedTestbed) -> No
     assert "/proc/[0-9]*/comm" in caught.value.remedy
 
 
-def test_who_is_in_a_hurry_does_not_break_a_robot_for_the_others(up: EmulatedTestbed) -> None:
-    _, descriptors = up.robots[Role.SENDER]._worker.ask({"do": "socket"}, timeout_s=1e-6)
+def test_a_request_with_a_short_timeout_does_not_affect_later_ones(up: EmulatedTestbed) -> None:
+    _, descriptors = up.robots[Role.SENDER]._worker.request({"do": "socket"}, timeout_s=1e-6)
     for fd in descriptors:
         os.close(fd)
-    said(up.shells[Role.SENDER], "true")
+    output_of(up.shells[Role.SENDER], "true")

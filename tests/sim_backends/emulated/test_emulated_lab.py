@@ -1,4 +1,4 @@
-"""Emulated robots, up, with real tools; and their end."""
+"""Running emulated robots with real tools, and their shutdown."""
 
 import json
 import os
@@ -45,7 +45,7 @@ pytestmark = pytest.mark.emulated
 SETUP: Final = "/opt/ros/noetic/setup.bash"
 LOS: Final = Placement(Scenario.LOS, Topology.MASTER, parse_distance("30ft"))
 
-# Brings up the default lab, says which processes it has, and waits to be killed.
+# Brings up the default lab, prints its process ids, and waits to be killed.
 OWNER: Final = """
 import json, os, sys
 from fieldkit.core.model import Topology
@@ -81,48 +81,48 @@ def sender(up: EmulatedTestbed) -> Shell:
     return up.shells[Role.SENDER]
 
 
-def said(shell: Shell, *argv: str, seconds: float = 30.0) -> str:
+def output_of(shell: Shell, *argv: str, seconds: float = 30.0) -> str:
     return shell.run(argv, deadline=Deadline.after(seconds)).stdout.decode()
 
 
 def in_ros(shell: Shell, *argv: str) -> str:
-    return said(shell, *with_environment(argv, setup=[SETUP]), seconds=60)
+    return output_of(shell, *with_environment(argv, setup=[SETUP]), seconds=60)
 
 
 def messages_in(bag: Path, topic: str) -> list[Any]:
     store = shipped().ros1
     with Reader(bag) as reader:
-        chosen = [one for one in reader.connections if one.topic == topic]
-        return [store.deserialize_ros1(data, one.msgtype) for one, _, data in reader.messages(chosen)]
+        chosen = [connection for connection in reader.connections if connection.topic == topic]
+        return [store.deserialize_ros1(data, connection.msgtype) for connection, _, data in reader.messages(chosen)]
 
 
 def namespaces_of(pid: int) -> set[str]:
-    """Return the namespaces of a process; of one that ended meanwhile none, or some."""
-    found: set[str] = set()
+    """Return the namespaces of a process; a process that has exited has none, or some."""
+    result: set[str] = set()
     for name in ("net", "mnt", "pid", "uts", "ipc"):
         with suppress(OSError):
-            found.add(str(Path(f"/proc/{pid}/ns/{name}").readlink()))
-    return found
+            result.add(str(Path(f"/proc/{pid}/ns/{name}").readlink()))
+    return result
 
 
-def test_a_robot_has_its_own_name_home_and_hosts(sender: Shell) -> None:
-    assert said(sender, "hostname") == "turtlebot-1\n"
-    assert said(sender, "pwd") == "/root\n"
-    assert said(sender, "getent", "hosts", "turtlebot-2").split() == ["10.42.0.2", "turtlebot-2"]
-    assert ".bashrc" not in said(sender, "ls", "-a", "/root")
+def test_a_robot_has_a_separate_name_home_and_hosts_file(sender: Shell) -> None:
+    assert output_of(sender, "hostname") == "turtlebot-1\n"
+    assert output_of(sender, "pwd") == "/root\n"
+    assert output_of(sender, "getent", "hosts", "turtlebot-2").split() == ["10.42.0.2", "turtlebot-2"]
+    assert ".bashrc" not in output_of(sender, "ls", "-a", "/root")
     assert socket.gethostname() != "turtlebot-1"
 
 
 def test_a_robot_changes_nothing_on_the_host(sender: Shell) -> None:
-    said(sender, "touch", "/root/mine", "/tmp/mine", "/run/mine", "/opt/mine", "/var/log/mine", "/home/mine")
+    output_of(sender, "touch", "/root/mine", "/tmp/mine", "/run/mine", "/opt/mine", "/var/log/mine", "/home/mine")
     for path in ("/root/mine", "/tmp/mine", "/run/mine", "/opt/mine", "/var/log/mine", "/home/mine"):
         assert not Path(path).exists()
     for folder in ("/usr", "/etc", "/var/lib", str(ROOT)):
-        done = sender.run(("touch", f"{folder}/mine"), deadline=Deadline.after(30), check=False)
-        assert b"Read-only file system" in done.stderr
+        result = sender.run(("touch", f"{folder}/mine"), deadline=Deadline.after(30), check=False)
+        assert b"Read-only file system" in result.stderr
 
 
-def test_nothing_of_a_lab_is_seen_on_the_host(untouched: Untouched) -> None:
+def test_a_lab_leaves_no_trace_on_the_host(untouched: Untouched) -> None:
     with testbed.bring_up(
         master_cast(), options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
     ):
@@ -130,18 +130,18 @@ def test_nothing_of_a_lab_is_seen_on_the_host(untouched: Untouched) -> None:
 
 
 def test_robots_reach_each_other_over_the_medium(up: EmulatedTestbed) -> None:
-    output = said(up.shells[Role.SENDER], "ping", "-c", "3", "-i", "0.01", "turtlebot-2")
+    output = output_of(up.shells[Role.SENDER], "ping", "-c", "3", "-i", "0.01", "turtlebot-2")
     assert "3 received" in output
     assert up.medium.stats().ports["turtlebot-1"].read >= 3
 
 
 @pytest.mark.parametrize("destination", ["10.42.0.255", "255.255.255.255", "239.1.1.1"])
 def test_broadcast_and_multicast_leave_by_the_radio(sender: Shell, destination: str) -> None:
-    assert "dev wlan0" in said(sender, "ip", "route", "get", destination)
+    assert "dev wlan0" in output_of(sender, "ip", "route", "get", destination)
 
 
-def test_the_kernel_sends_nothing_by_itself(sender: Shell) -> None:
-    assert said(sender, "ip", "-6", "address") == ""
+def test_the_kernel_sends_nothing_unasked(sender: Shell) -> None:
+    assert output_of(sender, "ip", "-6", "address") == ""
 
 
 def test_tcpdump_writes_where_root_does(up: EmulatedTestbed) -> None:
@@ -150,27 +150,27 @@ def test_tcpdump_writes_where_root_does(up: EmulatedTestbed) -> None:
         "{ timeout 10 tcpdump -n -i wlan0 -c 2 -w x.pcap & } && "
         "until [ -e x.pcap ]; do sleep 0.01; done && ping -q -c 5 -i 0.05 10.42.0.3 && wait && stat -c %s x.pcap"
     )
-    size_bytes = int(said(up.shells[Role.SENDER], "bash", "-c", script).splitlines()[-1])
+    size_bytes = int(output_of(up.shells[Role.SENDER], "bash", "-c", script).splitlines()[-1])
     # A file header of 24 bytes, and per packet 16 and a ping of 84 bytes.
     assert size_bytes == 24 + 2 * (16 + 84)
 
 
 def test_no_signal_is_ignored_or_blocked_in_a_session(sender: Shell) -> None:
     status = dict(
-        line.split(":\t", 1) for line in said(sender, "cat", "/proc/self/status").splitlines() if ":\t" in line
+        line.split(":\t", 1) for line in output_of(sender, "cat", "/proc/self/status").splitlines() if ":\t" in line
     )
-    # Without the real-time signals: glibc's posix_spawn leaves its own two of them ignored.
+    # Without the real-time signals: glibc's posix_spawn leaves two of them ignored.
     standard = (1 << 31) - 1
     assert int(status["SigIgn"], 16) & standard == 0
     assert int(status["SigBlk"], 16) & standard == 0
 
 
-def test_only_the_lab_s_key_opens_a_robot(up: EmulatedTestbed) -> None:
+def test_only_the_lab_s_key_logs_in(up: EmulatedTestbed) -> None:
     robot = up.robots[Role.SENDER]
     # OpenSSH 9.9 prints its comments to standard output, too.
-    printed = said(up.shells[Role.SENDER], "ssh-keyscan", "127.0.0.1").splitlines()
+    printed = output_of(up.shells[Role.SENDER], "ssh-keyscan", "127.0.0.1").splitlines()
     _, host_key = next(line for line in printed if not line.startswith("#")).split(maxsplit=1)
-    stranger = SshShell(
+    other_login = SshShell(
         robot.name,
         connect=robot.connect,
         user=USER,
@@ -178,12 +178,12 @@ def test_only_the_lab_s_key_opens_a_robot(up: EmulatedTestbed) -> None:
         private_key=KeyPair.make().private,
     )
     with pytest.raises(RobotError, match="refused the login"):
-        stranger.run(["true"], deadline=Deadline.after(30))
-    stranger.close()
+        other_login.run(["true"], deadline=Deadline.after(30))
+    other_login.close()
 
 
 def rate_of(times_s: list[float]) -> float:
-    """Return the messages per second, of which one that came late at either end changes nothing."""
+    """Return the messages per second, insensitive to one late message at either end."""
     half = len(times_s) // 2
     return half / median(later - sooner for sooner, later in zip(times_s[:half], times_s[half:], strict=False))
 
@@ -197,12 +197,12 @@ def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, 
     stamps_s = [scan.header.stamp.sec + scan.header.stamp.nanosec / 1e9 for scan in scans]
     sequence = [scan.header.seq for scan in scans]
     assert sequence == list(range(sequence[0], sequence[0] + len(scans)))
-    assert 15 <= len(scans) <= 25, "5 s of a 5 Hz laser, less what it takes to subscribe"
+    assert 15 <= len(scans) <= 25, "5 s of a 5 Hz laser, less the time to subscribe"
     assert rate_of(stamps_s) == pytest.approx(5.0, rel=0.01)
     assert {scan.header.frame_id for scan in scans} == {"base_scan"}
     assert all(len(scan.ranges) == len(scan.intensities) == 360 for scan in scans)
     # facts, section 1, with a frame of 9 letters: 57 + 4 + 8 * 360 bytes a message and 58 of the bag, 9,063 in all.
-    # Without ROS the message definition, which stands in a bag twice, has no comments: 5,387 in all.
+    # Without ROS the message definition, which is in a bag twice, has no comments: 5,387 in all.
     assert bag.stat().st_size - len(scans) * (57 + 4 + 8 * 360 + 58) in {9_063, 5_387}
 
 
@@ -213,14 +213,16 @@ def test_all_topics_keep_their_rates(sender: Shell, tmp_path: Path) -> None:
     bag = tmp_path / "all.bag"
     sender.fetch(("cat", "all.bag"), bag, deadline=Deadline.after(30), limit_bytes=8 << 20)
     for topic, rate_hz in rates_hz.items():
-        found = messages_in(bag, topic)
-        stamps = [one.transforms[0].header.stamp if topic == "/tf" else one.header.stamp for one in found]
+        messages = messages_in(bag, topic)
+        stamps = [
+            message.transforms[0].header.stamp if topic == "/tf" else message.header.stamp for message in messages
+        ]
         times_s = [stamp.sec + stamp.nanosec / 1e9 for stamp in stamps]
         assert rate_of(times_s) == pytest.approx(rate_hz, rel=0.02), topic
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
-def test_a_lab_ends_whatever_ends_its_use(error: type[BaseException]) -> None:
+def test_a_lab_stops_after_any_error(error: type[BaseException]) -> None:
     processes: set[int] = set()
 
     def use() -> None:
@@ -238,7 +240,7 @@ def test_a_lab_ends_whatever_ends_its_use(error: type[BaseException]) -> None:
 
 
 def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
-    """Start a process that holds a lab; `folder` is the clone that it runs from."""
+    """Start a process that owns a lab; `folder` is the clone that it runs from."""
     process = subprocess.Popen(
         [sys.executable, "-c", OWNER],
         cwd=folder,
@@ -251,16 +253,16 @@ def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
     return process, json.loads(process.stdout.readline())
 
 
-def test_sigkill_of_the_owner_leaves_nothing(untouched: Untouched) -> None:
+def test_sigkill_of_the_owner_leaves_no_processes(untouched: Untouched) -> None:
     process, pids = owner(ROOT)
-    ours = {pid for root in (*pids["robots"], pids["medium"]) for pid in (root, *descendants(root))}
-    spaces = set().union(*(namespaces_of(pid) for robot in pids["robots"] for pid in descendants(robot)))
-    spaces -= namespaces_of(os.getpid())
-    assert len(spaces) == 5 * 3
+    lab_pids = {pid for root in (*pids["robots"], pids["medium"]) for pid in (root, *descendants(root))}
+    namespaces = set().union(*(namespaces_of(pid) for robot in pids["robots"] for pid in descendants(robot)))
+    namespaces -= namespaces_of(os.getpid())
+    assert len(namespaces) == 5 * 3
     process.send_signal(signal.SIGKILL)
     process.wait()
-    wait_for_end(ours, within_s=60.0)
-    # A namespace lives as long as a process or a mount holds it. Its number proves nothing: the kernel gives it anew.
+    wait_for_end(lab_pids, within_s=60.0)
+    # A namespace exists as long as a process or a mount uses it. The kernel reuses its number, so `untouched` checks.
     untouched()
 
 
@@ -283,17 +285,17 @@ def lone_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
     return stack.enter_context(EmulatedRobot(replace(spec, **changes)))  # type: ignore[arg-type]
 
 
-def test_a_server_that_does_not_start_is_named_with_its_own_words() -> None:
+def test_a_server_that_does_not_start_is_named_with_its_output() -> None:
     with ExitStack() as stack:
         robot = lone_robot(stack, host_key="no key")
         robot.build()
         robot.open_radio()
-        with pytest.raises(RobotError, match=r"turtlebot-1: sshd ended with status 1: .*no hostkeys available"):
+        with pytest.raises(RobotError, match=r"turtlebot-1: sshd exited with status 1: .*no hostkeys available"):
             robot.start()
 
 
 def test_a_robot_takes_less_than_15_mb_beyond_shared_pages() -> None:
-    """There are two, so that the pages of programs are shared whatever else runs on this machine."""
+    """Two robots run, so that the pages of programs are shared whatever else runs on this machine."""
     with ExitStack() as stack:
         robots = [lone_robot(stack) for _ in range(2)]
         for robot in robots:
@@ -303,22 +305,22 @@ def test_a_robot_takes_less_than_15_mb_beyond_shared_pages() -> None:
         assert Memory.of(robots[0].pid).own < 15e6
 
 
-def test_a_refused_address_is_named() -> None:
+def test_a_rejected_address_is_reported() -> None:
     with ExitStack() as stack:
         robot = lone_robot(stack, address="10.42.0.1/99")
         robot.build()
-        with pytest.raises(RobotError, match="turtlebot-1: ip refused a setting"):
+        with pytest.raises(RobotError, match="turtlebot-1: ip rejected a setting"):
             robot.open_radio()
 
 
-def test_a_robot_that_ended_says_so() -> None:
+def test_a_killed_robot_is_reported() -> None:
     with ExitStack() as stack:
         robot = lone_robot(stack)
         robot.build()
         os.kill(robot.pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match=r"turtlebot-1, pid .* does not answer: it was killed by SIGKILL"):
             robot.start()
-        # An OSError would be a link that may come back, and is tried again.
+        # An OSError would mean a link that may recover, and would be retried.
         with pytest.raises(TestbedLostError, match=r"turtlebot-1, pid .* does not answer: it was killed by SIGKILL"):
             robot.connect(1.0)
         robot.close()

@@ -1,4 +1,4 @@
-"""The parts of an emulated robot that need no namespace."""
+"""Parts of an emulated robot that need no namespace."""
 
 import math
 import shlex
@@ -79,7 +79,7 @@ FIELDS = (
     ("geometry_msgs/PoseStamped.pose.position.x", 0.0),
     ("geometry_msgs/PoseStamped.pose.orientation.w", 1.0),
 )
-"""What a robot at rest says of itself, noise of up to a hundredth aside."""
+"""Values that a robot at rest publishes, with noise of at most 1 %."""
 
 SITE = """\
 backend: emulated
@@ -108,7 +108,7 @@ def read_back(data: bytes, kind: str) -> Any:  # noqa: ANN401 (rosbags makes its
 
 
 class TestBackend:
-    def test_default_lab_is_the_paper_s(self) -> None:
+    def test_the_default_lab_is_that_of_the_paper(self) -> None:
         master, masterless = cast_for(Topology.MASTER), cast_for(Topology.MASTERLESS)
         assert {role: (robot.name, robot.address) for role, robot in master.items()} == {
             Role.SENDER: ("turtlebot-1", "10.42.0.1"),
@@ -134,7 +134,7 @@ class TestBackend:
         ("text", "lab_bytes"),
         [("", 0), ("record_air: true", LIMIT_BYTES), ("record_air: true\n  radio: {loss: 1%}", 0)],
     )
-    def test_only_a_lab_that_records_the_air_writes_anything_itself(self, text: str, lab_bytes: int) -> None:
+    def test_only_a_lab_that_records_the_air_writes_files(self, text: str, lab_bytes: int) -> None:
         document = parse(SITE + f"emulated:\n  boot: 2s\n  {text}\n", source="fieldkit.yaml")
         assert EmulatedBackend(validate(document, Site), document).lab_bytes == lab_bytes
 
@@ -147,13 +147,13 @@ class TestBackend:
             (("sensor_msgs/Imu", "sensor_msgs/Imi"), r"cannot publish sensor_msgs/Imi(.|\n)*'sensor_msgs/Imu'\?"),
             (
                 ("variant: ros1", "variant: ros2", "points: 360}", 'points: 360, definition: "int8 x"}'),
-                "runs ros2, whose emulated recorder knows ROS's own types alone",
+                "runs ros2, whose emulated recorder supports only ROS's own types",
             ),
-            (("/opt/ros/noetic/setup.bash", "/proc/ros/setup.bash"), "cannot have a setup file /proc/ros"),
-            (("/opt/ros/noetic/setup.bash", "/setup.bash"), "cannot have a setup file /setup.bash"),
+            (("/opt/ros/noetic/setup.bash", "/proc/ros/setup.bash"), "cannot have the setup file /proc/ros"),
+            (("/opt/ros/noetic/setup.bash", "/setup.bash"), "cannot have the setup file /setup.bash"),
         ],
     )
-    def test_what_it_cannot_emulate_is_refused_before_anything_starts(
+    def test_unsupported_profiles_are_rejected_before_startup(
         self, change: tuple[str, ...], complaint: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         text = changed(locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8"), *change)
@@ -179,18 +179,18 @@ class TestPlacement:
     def test_masterless_puts_sender_and_receiver_the_distance_apart(self) -> None:
         cast = cast_for(Topology.MASTERLESS)
         nlos = placed(Scenario.NLOS, Topology.MASTERLESS)
-        found = placement.positions_m(cast, nlos, self.LAWN)
-        assert found == {
+        positions = placement.positions_m(cast, nlos, self.LAWN)
+        assert positions == {
             "turtlebot-1": pytest.approx((3.0, 18.0, 0.2)),
             "duckiedrone-1": pytest.approx((13.0, 18.0, 0.2)),
         }
         assert placement.relay(cast, nlos) is None
-        ends = (np.array([found[name]]) for name in ("turtlebot-1", "duckiedrone-1"))
+        ends = (np.array([positions[name]]) for name in ("turtlebot-1", "duckiedrone-1"))
         assert self.LAWN.crossings(*ends) != [()], "the sender is behind the wall"
 
     def test_a_world_without_a_line_for_the_scenario_is_refused(self) -> None:
         bare = self.LAWN.model_copy(update={"lines": {}})
-        with pytest.raises(ConfigurationError, match="not where robots stand for the scenario los"):
+        with pytest.raises(ConfigurationError, match="no line for the places of robots in the scenario los"):
             placement.positions_m(cast_for(Topology.MASTER), placed(Scenario.LOS, Topology.MASTER), bare)
 
 
@@ -228,14 +228,14 @@ class TestMessages:
         assert bytes(STORE.serialize_ros1(message, kind.replace("/", "/msg/"))) == data
 
     @pytest.mark.parametrize(("path", "value"), FIELDS, ids=[path for path, _ in FIELDS])
-    def test_each_number_stands_in_the_field_that_it_is_of(self, path: str, value: float) -> None:
+    def test_each_number_is_in_its_field(self, path: str, value: float) -> None:
         kind, *names = path.split(".")
-        found = read_back(messages.Source(sensor(kind)).message(0, 0), kind)
+        value = read_back(messages.Source(sensor(kind)).message(0, 0), kind)
         for name in names:
-            found = found[int(name)] if name.isdecimal() else getattr(found, name)
-        assert found == pytest.approx(value, rel=0.01, nan_ok=True)
+            value = value[int(name)] if name.isdecimal() else getattr(value, name)
+        assert value == pytest.approx(value, rel=0.01, nan_ok=True)
 
-    def test_noise_is_of_the_sensor_s_size(self) -> None:
+    def test_noise_has_the_deviation_of_the_sensor(self) -> None:
         source = messages.Source(sensor("sensor_msgs/Imu"))
         imus = [read_back(source.message(number, 0), "sensor_msgs/Imu") for number in range(1000)]
         turns = [imu.angular_velocity.x for imu in imus]
@@ -243,13 +243,13 @@ class TestMessages:
         assert statistics.mean(turns) == pytest.approx(0.0, abs=0.0005)
         assert statistics.mean(imu.linear_acceleration.z for imu in imus) == pytest.approx(9.80665, abs=0.005)
 
-    def test_a_scan_is_of_the_walls_of_the_room(self) -> None:
+    def test_a_scan_shows_the_walls_of_the_room(self) -> None:
         source = messages.Source(sensor(points=4), [ROOM])
         scans = [read_back(source.message(number, 0), "sensor_msgs/LaserScan") for number in range(200)]
         means_m = [statistics.mean(float(scan.ranges[beam]) for scan in scans) for beam in range(4)]
         assert means_m == pytest.approx([2.0, 1.5, 2.0, 1.5], abs=0.01)
 
-    def test_definitions_are_ros_s_own(self) -> None:
+    def test_definitions_are_those_of_ros(self) -> None:
         """The sums are those that Debian's ROS 1 packages announce."""
         assert definition("sensor_msgs/LaserScan").md5 == "90c7ef2dc6895d81024acba2ac42f369"
         assert definition("nav_msgs/Odometry").md5 == "cd5e73d190d741a2f92e81eda573aca7"
@@ -260,7 +260,7 @@ class TestMessages:
         for topic in ros_of(load_profile(profile)).topics:
             messages.check(Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points))
 
-    def test_a_scan_is_of_the_real_size_and_within_the_laser_s_range(self) -> None:
+    def test_a_scan_has_the_real_size_and_is_within_the_laser_s_range(self) -> None:
         data = messages.Source(sensor(), [ROOM]).message(0, 0)
         assert len(data) == 57 + 4 + 8 * 360  # facts, section 1: 57 + 8 per beam with a frame of 5 letters
         scan = read_back(data, "sensor_msgs/LaserScan")
@@ -269,7 +269,7 @@ class TestMessages:
         assert scan.angle_max == pytest.approx(2 * math.pi * 359 / 360)
         assert scan.scan_time == pytest.approx(0.2)
 
-    def test_equal_robots_say_equal_things(self) -> None:
+    def test_equal_robots_publish_equal_messages(self) -> None:
         first, second = (messages.Source(sensor()).message(1, 2) for _ in range(2))
         assert first == second
 
@@ -280,7 +280,7 @@ class TestMessages:
 
 class TestTcpros:
     @given(fields=st.dictionaries(st.from_regex(r"[a-z_]{1,9}", fullmatch=True), st.text()), cut=st.integers(1, 50))
-    def test_a_header_survives_any_cutting(self, fields: dict[str, str], cut: int) -> None:
+    def test_a_header_is_read_from_chunks_of_any_size(self, fields: dict[str, str], cut: int) -> None:
         stream = tcpros.pack(tcpros.pack_header(fields)) + tcpros.pack(b"message")
         packets = tcpros.PacketSplitter()
         received: list[bytes] = []
@@ -291,17 +291,17 @@ class TestTcpros:
         assert received[1:] == [b"message"]
         assert packets.pending == 0
 
-    def test_a_cut_header_is_refused(self) -> None:
-        with pytest.raises(ValueError, match="middle of a field"):
+    def test_a_truncated_header_is_rejected(self) -> None:
+        with pytest.raises(ValueError, match="within a field"):
             tcpros.unpack_header(tcpros.pack_header({"topic": "/scan"})[:-1])
 
-    def test_a_length_beyond_reason_is_refused(self) -> None:
+    def test_an_excessive_length_is_rejected(self) -> None:
         packets = tcpros.PacketSplitter()
         packets.feed(b"\xff\xff\xff\xff")
         with pytest.raises(ValueError, match="longer than"):
             list(packets)
 
-    def test_topics_with_a_common_beginning_have_sockets_of_their_own(self) -> None:
+    def test_topics_with_a_common_prefix_have_separate_sockets(self) -> None:
         assert tcpros.socket_path("/a/b") != tcpros.socket_path("/a_b") != tcpros.socket_path("/a")
 
 
@@ -315,17 +315,17 @@ class TestSystem:
         )
         setup.write_text(rootfs.setup_script(spec, setup), encoding="utf-8")
         shown = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
-        done = subprocess.run(
+        result = subprocess.run(
             ["/bin/sh", "-c", shown], capture_output=True, text=True, check=True, env={"PATH": "/bin"}
         )
-        assert done.stdout == f"{setup.parent}/bin:/bin\nnoetic http://127.0.0.1:11311\n"
+        assert result.stdout == f"{setup.parent}/bin:/bin\nnoetic http://127.0.0.1:11311\n"
 
-    def test_own_folders_hold_only_what_lies_in_them(self) -> None:
-        kept = [Path("/opt/a/b"), Path("/opt/a"), Path("/usr/lib"), Path("/root"), Path("/root/.pyenv/x")]
-        assert set(mounts._outermost(kept)) == {Path("/opt/a"), Path("/root/.pyenv/x")}
+    def test_only_outermost_paths_inside_own_folders_are_bound(self) -> None:
+        paths = [Path("/opt/a/b"), Path("/opt/a"), Path("/usr/lib"), Path("/root"), Path("/root/.pyenv/x")]
+        assert set(mounts._outermost(paths)) == {Path("/opt/a"), Path("/root/.pyenv/x")}
 
-    def test_keys_are_openssh_s_and_new_each_time(self) -> None:
-        one, other = KeyPair.make(), KeyPair.make()
-        assert one.private.startswith("-----BEGIN OPENSSH PRIVATE KEY-----\n")
-        assert one.public.startswith("ssh-ed25519 AAAA")
-        assert one.public != other.public
+    def test_keys_are_in_openssh_format_and_new_each_time(self) -> None:
+        first, second = KeyPair.make(), KeyPair.make()
+        assert first.private.startswith("-----BEGIN OPENSSH PRIVATE KEY-----\n")
+        assert first.public.startswith("ssh-ed25519 AAAA")
+        assert first.public != second.public

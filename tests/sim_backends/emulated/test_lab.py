@@ -1,4 +1,4 @@
-"""Places of the robots of a lab, the drawing of them, and that outlines are those of the shapes."""
+"""Positions of the robots of a lab, its map, and the outlines of shapes."""
 
 import math
 import re
@@ -40,14 +40,14 @@ def backend(emulated: str = "") -> EmulatedBackend:
 
 
 @given(st.integers(1, 253), st.sampled_from(("lawn", "baylands", "open")))
-def test_robots_stand_apart_in_the_world(count: int, name: str) -> None:
+def test_robots_are_apart_inside_the_world(count: int, name: str) -> None:
     world = load_world(name)
     places = square_m([str(number) for number in range(count)], world)
     assert len(set(places.values())) == count
     for east_m, north_m, _ in places.values():
         assert 0 < east_m < world.area_m[0]
         assert 0 < north_m < world.area_m[1]
-    nearest = min((math.dist(one, other) for one, other in combinations(places.values(), 2)), default=5.0)
+    nearest = min((math.dist(first, second) for first, second in combinations(places.values(), 2)), default=5.0)
     assert 1 < nearest <= 5 + 1e-9
 
 
@@ -78,22 +78,22 @@ def test_a_robot_moves_over_the_ground(to: Destination, expected_m: Vector) -> N
 
 
 @pytest.mark.parametrize(
-    ("to", "said"),
+    ("to", "message"),
     [
         (Destination(20.1, 5, None, relative=False), "20.1 m east, 5 m north is outside of the world hill"),
         (Destination(0, 5.1, None, relative=True), "5 m east, 10.1 m north is outside"),
         (Destination(math.inf, 0, None, relative=False), "inf m east"),
-        (Destination(15, 5, 0.9, relative=False), "0.9 m up is no place: the ground is at 1 m"),
-        (Destination(0, 0, -0.6, relative=True), "-0.1 m up is no place"),
-        (Destination(5, 5, math.inf, relative=False), "inf m up is no place"),
+        (Destination(15, 5, 0.9, relative=False), "0.9 m up is not a valid height: the ground is at 1 m"),
+        (Destination(0, 0, -0.6, relative=True), "-0.1 m up is not a valid height"),
+        (Destination(5, 5, math.inf, relative=False), "inf m up is not a valid height"),
     ],
 )
-def test_a_robot_stays_in_the_world_and_above_its_ground(to: Destination, said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said):
+def test_a_robot_stays_in_the_world_and_above_its_ground(to: Destination, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
         moved_m((5, 5, 0.5), to, validate(parse(HILL, source="hill.yaml"), World))
 
 
-def test_a_lab_from_above_is_the_same_when_it_is_told() -> None:
+def test_an_overview_survives_packing_and_unpacking() -> None:
     above = backend("emulated: {world: baylands}\n").overview()
     assert above.outlines
     assert answers.overview(answers.pack_overview(above)) == above
@@ -108,7 +108,7 @@ def test_a_link_has_the_snr_of_its_closed_form() -> None:
     assert link.linked
 
 
-def test_a_link_knows_what_stands_in_its_way() -> None:
+def test_a_link_names_the_obstacles_that_it_crosses() -> None:
     lawn, site = load_world("lawn"), validate(parse(SITE, source="fieldkit.yaml"), Site)
     members = members_of(site, None, {"a": "10.42.0.1", "b": "10.42.0.2"})
     above = {
@@ -135,7 +135,7 @@ def test_shadowing_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("shape", [Box((3, 4, 1), (2, 6, 2), 0.7), Cylinder((-2, 5, 3), 1.5, 4)])
-def test_an_outline_is_where_the_shape_begins(shape: Box | Cylinder) -> None:
+def test_an_outline_is_the_edge_of_the_shape(shape: Box | Cylinder) -> None:
     """A vertical path just inside a corner crosses the whole shape, just outside it nothing."""
     centre = np.array(shape.centre_m[:2])
     for corner in shape.corners_m():

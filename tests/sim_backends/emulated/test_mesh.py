@@ -1,6 +1,6 @@
-"""Robots that forward for each other: six in a row of which only neighbours hear each other, with Debian's babeld.
+"""A mesh of six robots in a row, of which only neighbours are in range, with Debian's babeld.
 
-One of them has a busybox userland. The operator's laptop stands beside the first.
+One of them has a busybox userland. The operator's laptop is beside the first.
 """
 
 import re
@@ -33,9 +33,9 @@ from tests.helpers.sshd import wait_until
 NAMES = ("r1", "r2", "r3", "r4", "r5", "r6")
 ADDRESSES = {name: f"10.42.0.{number}" for number, name in enumerate(NAMES, 1)}
 HELLO_S = 0.5
-# 17 dBm less 40.2 dB for the first metre (2.437 GHz) and 53.3 dB up to 60 m arrive as -76.5 dBm, 6 dB above what the
-# radio detects at least; twice as far away 9 dB less, which is below it.
-APART_M = 60.0
+# 17 dBm less 40.2 dB for the first metre (2.437 GHz) and 53.3 dB up to 60 m arrive as -76.5 dBm, 6 dB above the
+# sensitivity of the radio; at twice the distance the signal is 9 dB weaker, which is below it.
+SPACING_M = 60.0
 FIRST_TTL = 64
 LONG_S = 60.0
 
@@ -57,14 +57,14 @@ def row() -> Iterator[Row]:
         running_robots(members, options=options, world=load_world("open"), ros=RosChoice.BUILTIN, seed=1) as up,
         laptop_on_air(up, options.mesh) as laptop,
     ):
-        places = {name: (APART_M * number, 0.0, 0.2) for number, name in enumerate(NAMES)}
+        places = {name: (SPACING_M * number, 0.0, 0.2) for number, name in enumerate(NAMES)}
         up.medium.place(places | {LAPTOP_NAME: (0.0, 2.0, 0.2)})
         yield Row(up, laptop)
 
 
 @pytest.fixture(scope="module")
 def first(row: Row) -> Iterator[SshShell]:
-    """The shell of the first robot, once its routing daemon has found the way to the last."""
+    """The shell of the first robot, once its routing daemon has found the route to the last one."""
     with ExitStack() as stack:
         shell = SshShell(
             "r1",
@@ -74,89 +74,89 @@ def first(row: Row) -> Iterator[SshShell]:
             private_key=row.up.private_key,
         )
         stack.callback(shell.close)
-        wait_until(lambda: by_neighbours(shell) and crossed(shell), Deadline.after(LONG_S))
+        wait_until(lambda: routes_over_neighbours(shell) and reaches_last(shell), Deadline.after(LONG_S))
         yield shell
 
 
-def by_neighbours(shell: SshShell) -> bool:
-    """Return whether the first robot's ways go by who stands beside it."""
-    routes = said(shell, "ip", "-4", "route", "show", "proto", "babel").splitlines()
-    beside_it = f"{LAPTOP_ADDRESS} via {LAPTOP_ADDRESS}"
+def routes_over_neighbours(shell: SshShell) -> bool:
+    """Return True if the first robot's routes lead over its neighbours."""
+    routes = output_of(shell, "ip", "-4", "route", "show", "proto", "babel").splitlines()
+    neighbours = f"{LAPTOP_ADDRESS} via {LAPTOP_ADDRESS}"
     over_r2 = {f"{ADDRESSES[name]} via 10.42.0.2" for name in NAMES[1:]}
-    return {line.split(" dev")[0] for line in routes} == {beside_it, *over_r2}
+    return {line.split(" dev")[0] for line in routes} == {neighbours, *over_r2}
 
 
-def crossed(shell: SshShell) -> bool:
-    """Return whether twenty packets to the last robot are answered, each over four that forwarded it."""
+def reaches_last(shell: SshShell) -> bool:
+    """Return True if twenty packets to the last robot are answered, each forwarded by four robots."""
     text = ping(shell, "r6", "-c", "20", "-i", "0.05")
     return re.findall(r"ttl=(\d+)", text) == [str(FIRST_TTL - 4)] * 20
 
 
-def said(shell: SshShell, *argv: str) -> str:
+def output_of(shell: SshShell, *argv: str) -> str:
     return shell.run(argv, deadline=Deadline.after(LONG_S), check=False).stdout.decode()
 
 
 def ping(shell: SshShell, name: str, *options: str) -> str:
-    return said(shell, "ping", "-n", "-W", "1", *options, ADDRESSES[name])
+    return output_of(shell, "ping", "-n", "-W", "1", *options, ADDRESSES[name])
 
 
 @pytest.mark.emulated
-def test_packets_cross_five_hops_each_of_which_takes_one_of_their_time_to_live(first: SshShell) -> None:
-    wait_until(lambda: crossed(first), Deadline.after(LONG_S))
+def test_each_of_five_hops_decrements_the_time_to_live(first: SshShell) -> None:
+    wait_until(lambda: reaches_last(first), Deadline.after(LONG_S))
 
 
 @pytest.mark.emulated
-def test_the_way_is_a_traceroute_along_the_row(first: SshShell) -> None:
+def test_a_traceroute_follows_the_row(first: SshShell) -> None:
     def expired_at(ttl: int) -> list[str]:
         return re.findall(
             r"From (\S+) icmp_seq=1 Time to live exceeded", ping(first, "r6", "-c", "1", "-t", str(ttl))
         )
 
     for ttl, (_, name) in enumerate(pairwise(NAMES[:-1]), 1):
-        wait_until(lambda: expired_at(ttl) == [ADDRESSES[name]], Deadline.after(LONG_S))  # noqa: B023 (called at once)
+        wait_until(lambda: expired_at(ttl) == [ADDRESSES[name]], Deadline.after(LONG_S))  # noqa: B023 (called immediately)
     wait_until(lambda: "ttl=60" in ping(first, "r6", "-c", "1", "-t", "5"), Deadline.after(LONG_S))
 
 
 @pytest.mark.emulated
-def test_only_neighbours_hear_each_other(row: Row, first: SshShell) -> None:
+def test_only_neighbours_receive_each_other(row: Row, first: SshShell) -> None:
     before = delivered(row)
-    wait_until(lambda: crossed(first), Deadline.after(LONG_S))
-    heard = {pair for pair, frames in delivered(row).items() if frames > before.get(pair, 0)}
-    assert heard == {*pairwise(NAMES), *pairwise(reversed(NAMES))}
+    wait_until(lambda: reaches_last(first), Deadline.after(LONG_S))
+    receivers = {pair for pair, frames in delivered(row).items() if frames > before.get(pair, 0)}
+    assert receivers == {*pairwise(NAMES), *pairwise(reversed(NAMES))}
 
 
 def delivered(row: Row) -> dict[tuple[str, str], int]:
-    """Return how many frames each robot has got from each other."""
+    """Return the number of frames that each robot has received from each other one."""
     links = row.up.medium.stats().links
     return {pair: link.delivered for pair, link in links.items() if LAPTOP_NAME not in pair}
 
 
 @pytest.mark.emulated
-def test_every_way_is_babels_and_goes_by_the_neighbour(first: SshShell) -> None:
-    wait_until(lambda: by_neighbours(first), Deadline.after(LONG_S))
+def test_every_route_is_from_babel_and_leads_over_the_neighbour(first: SshShell) -> None:
+    wait_until(lambda: routes_over_neighbours(first), Deadline.after(LONG_S))
 
 
 @pytest.mark.emulated
 def test_the_laptop_reaches_the_ssh_server_of_the_last_robot_over_all_others(row: Row, first: SshShell) -> None:
-    wait_until(lambda: crossed(first), Deadline.after(LONG_S))
-    # TCP asks again until r6 has found its way back, too.
+    wait_until(lambda: reaches_last(first), Deadline.after(LONG_S))
+    # TCP retries until r6 has found the reverse route too.
     with row.laptop.reach(ADDRESSES["r6"], LONG_S) as stream:
         assert stream.recv(4) == b"SSH-"
 
 
 @pytest.mark.emulated
 def test_a_multicast_reaches_neighbours_and_is_not_forwarded(first: SshShell) -> None:
-    beside_it = {"fe80::aff:fe2a:2", "fe80::aff:fe2a:fe"}
-    heard: set[str] = set()
+    neighbours = {"fe80::aff:fe2a:2", "fe80::aff:fe2a:fe"}
+    receivers: set[str] = set()
     deadline = Deadline.after(LONG_S)
-    # Their answers leave at the same moment, and may collide.
-    while not heard >= beside_it and not deadline.expired:
-        text = said(first, "ping", "-n", "-c", "2", "-i", "0.2", "-W", "1", "ff02::1%wlan0")
-        heard.update(re.findall(r"bytes from (\S+?)%wlan0:", text))
-    assert heard - {"fe80::aff:fe2a:1"} == beside_it
+    # Their answers leave at the same time, and may collide.
+    while not receivers >= neighbours and not deadline.expired:
+        text = output_of(first, "ping", "-n", "-c", "2", "-i", "0.2", "-W", "1", "ff02::1%wlan0")
+        receivers.update(re.findall(r"bytes from (\S+?)%wlan0:", text))
+    assert receivers - {"fe80::aff:fe2a:1"} == neighbours
 
 
-def test_the_laptop_announces_itself_alone() -> None:
+def test_the_laptop_announces_only_itself() -> None:
     settings = babeld.guest_command("wlan0", "10.42.0.254/24", HELLO_S)
     assert [word for word in settings if word.startswith("out ")] == ["out ip 10.42.0.254/32 allow", "out deny"]
 

@@ -1,6 +1,6 @@
-"""A mesh that loses its shorter way: packets take the longer detour, which babeld does not hold for feasible at once.
+"""A mesh that loses its shorter route: packets take the longer detour, which babeld first rejects as not feasible.
 
-Robots stand where the procedure `mesh_detour` puts them.
+Robots are at the places of the procedure `mesh_detour`.
 """
 
 import re
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.emulated
 
 OPTIONS = {"radio": {"fading": False}, "mesh": {"daemon": "babeld", "hello": "0.3s"}}
 FIRST_TTL = 64
-# A request for a sequence number that is lost is asked for again after 65 s only (docs/mesh.md).
+# babeld repeats a lost request for a sequence number only after 65 s (docs/mesh.md).
 LONG_S = 120.0
 
 
@@ -45,13 +45,13 @@ def up() -> Iterator[EmulatedTestbed]:
 
 
 def forwarded(up: EmulatedTestbed) -> list[int]:
-    """Return how many robots forwarded each of the answers that the sender gets to three pings."""
+    """Return the number of robots that forwarded each answer to three pings of the sender."""
     argv = ("ping", "-n", "-c", "3", "-i", "0.1", "-W", "1", up.robots[Role.RECEIVER].spec.ip)
     text = up.shells[Role.SENDER].run(argv, deadline=Deadline.after(LONG_S), check=False).stdout.decode()
     return [FIRST_TTL - int(ttl) for ttl in re.findall(r"ttl=(\d+)", text)]
 
 
-def test_packets_take_the_longer_detour_while_the_shorter_way_is_lost(up: EmulatedTestbed) -> None:
+def test_packets_take_the_longer_detour_while_the_shorter_route_is_lost(up: EmulatedTestbed) -> None:
     wait_until(lambda: forwarded(up) == [2, 2, 2], Deadline.after(LONG_S))
     up.robots[Role("first")].switch_off()
     wait_until(lambda: forwarded(up) == [3, 3, 3], Deadline.after(LONG_S))

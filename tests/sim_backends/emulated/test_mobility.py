@@ -1,4 +1,4 @@
-"""Mobility tells the medium where robots are while they move, and that they are back, whatever ended the move."""
+"""Mobility updates the medium while robots move, and puts them back at the end of a move, also after an error."""
 
 import math
 import threading
@@ -18,7 +18,7 @@ from fieldkit.core.units import parse_distance
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.mobility import STEP_M, Mobility
 from sim_backends.emulated.nodes import EmulatedRobot
-from sim_backends.emulated.ros.own_motion import OwnWay
+from sim_backends.emulated.ros.own_motion import AssignedPath
 from sim_backends.emulated.ros.steered import Steered
 from sim_backends.world.motion import STILL
 from sim_backends.world.world import load_world
@@ -30,40 +30,40 @@ FAR = Move(Role.SENDER, (Leg(away_m=1e5),), 5.0)
 
 
 @dataclass
-class Told:
-    """What a medium was told."""
+class RecordingMedium:
+    """A medium that records its calls."""
 
     calls: list[tuple[Mapping[str, Vector], Mapping[str, Vector]]] = field(default_factory=list)
-    gone: bool = False
+    fails: bool = False
 
     def place(
         self, positions_m: Mapping[str, Vector], *, relay: str | None, velocities_m_s: Mapping[str, Vector]
     ) -> None:
-        if self.gone:
+        if self.fails:
             raise LinkError("does not answer", where="medium", remedy="start the lab again")
         assert relay is None or relay in positions_m
         self.calls.append((dict(positions_m), dict(velocities_m_s)))
 
-    def of(self, role: Role) -> list[Vector | None]:
+    def positions_of(self, role: Role) -> list[Vector | None]:
         return [positions.get(CAST[role].name) for positions, _ in self.calls]
 
-    def now(self, role: Role) -> Vector | None:
-        return self.of(role)[-1]
+    def position_of(self, role: Role) -> Vector | None:
+        return self.positions_of(role)[-1]
 
 
 @pytest.fixture
-def told() -> Told:
-    return Told()
+def medium() -> RecordingMedium:
+    return RecordingMedium()
 
 
 @pytest.fixture
-def mobility(told: Told) -> Mobility:
-    mobility = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None)
+def mobility(medium: RecordingMedium) -> Mobility:
+    mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None)
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
     return mobility
 
 
-def in_motion() -> list[threading.Thread]:
+def motion_threads() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name == "motion"]
 
 
@@ -71,113 +71,129 @@ def wait(condition: Callable[[], bool]) -> None:
     wait_until(condition, Deadline.after(60))
 
 
-def test_a_robot_goes_its_way_stands_at_its_end_and_is_back(mobility: Mobility, told: Told) -> None:
-    place = told.now(Role.SENDER)
+def test_a_robot_moves_along_its_path_and_returns_to_its_place(mobility: Mobility, medium: RecordingMedium) -> None:
+    place = medium.position_of(Role.SENDER)
     assert place is not None
-    others = told.of(Role.RELAY) + told.of(Role.RECEIVER)
+    others = medium.positions_of(Role.RELAY) + medium.positions_of(Role.RECEIVER)
     with mobility.moving(AWAY):
-        wait(lambda: not in_motion())  # nobody is told any more of who stands
-        assert told.now(Role.SENDER) == pytest.approx((place[0] - 0.4, *place[1:]))
-        assert told.calls[-1][1][CAST[Role.SENDER].name] == (0.0, 0.0, 0.0)
-    assert told.now(Role.SENDER) == place
-    on_the_way = [at[0] for at in told.of(Role.SENDER)[1:-1] if at is not None]
+        wait(lambda: not motion_threads())  # there are no more updates after the end of the path
+        assert medium.position_of(Role.SENDER) == pytest.approx((place[0] - 0.4, *place[1:]))
+        assert medium.calls[-1][1][CAST[Role.SENDER].name] == (0.0, 0.0, 0.0)
+    assert medium.position_of(Role.SENDER) == place
+    on_the_way = [at[0] for at in medium.positions_of(Role.SENDER)[1:-1] if at is not None]
     assert on_the_way == sorted(on_the_way, reverse=True)
-    velocities = [velocity[CAST[Role.SENDER].name] for _, velocity in told.calls[1:-2]]
+    velocities = [velocity[CAST[Role.SENDER].name] for _, velocity in medium.calls[1:-2]]
     assert velocities
     assert all(velocity == pytest.approx((-2.0, 0.0, 0.0)) for velocity in velocities)
-    assert set(told.of(Role.RELAY) + told.of(Role.RECEIVER)) == set(others)
+    assert set(medium.positions_of(Role.RELAY) + medium.positions_of(Role.RECEIVER)) == set(others)
 
 
 @pytest.mark.parametrize("error", [RobotError("x", remedy="y"), KeyboardInterrupt()])
-def test_whatever_ends_it_it_is_back_and_nobody_goes_on(mobility: Mobility, told: Told, error: BaseException) -> None:
-    place = told.now(Role.SENDER)
+def test_after_an_error_the_robot_is_back_and_no_thread_runs(
+    mobility: Mobility, medium: RecordingMedium, error: BaseException
+) -> None:
+    place = medium.position_of(Role.SENDER)
 
-    def break_off() -> None:
+    def move_and_fail() -> None:
         with mobility.moving(FAR):
-            wait(lambda: len(told.calls) > 3)
-            assert told.now(Role.SENDER) != place
+            wait(lambda: len(medium.calls) > 3)
+            assert medium.position_of(Role.SENDER) != place
             raise error
 
     with pytest.raises(type(error)):
-        break_off()
-    assert in_motion() == []
-    assert told.now(Role.SENDER) == place
+        move_and_fail()
+    assert motion_threads() == []
+    assert medium.position_of(Role.SENDER) == place
 
 
-def test_a_medium_that_is_gone_is_told_of_at_the_end(mobility: Mobility, told: Told) -> None:
-    def break_off() -> None:
+def test_an_error_of_the_medium_is_raised_when_the_context_is_left(
+    mobility: Mobility, medium: RecordingMedium
+) -> None:
+    def move_and_fail() -> None:
         with mobility.moving(FAR):
-            told.gone = True
-            wait(lambda: not in_motion())
-            told.gone = False  # so that only that thread has met it
+            medium.fails = True
+            wait(lambda: not motion_threads())
+            medium.fails = False  # so that only the thread has the error
 
     with pytest.raises(LinkError):
-        break_off()
+        move_and_fail()
 
 
-def test_who_is_out_of_range_on_its_way_comes_back_where_it_is_by_then(mobility: Mobility, told: Told) -> None:
-    place = told.now(Role.SENDER)
+def test_a_moving_robot_that_returns_into_range_is_at_its_current_position(
+    mobility: Mobility, medium: RecordingMedium
+) -> None:
+    place = medium.position_of(Role.SENDER)
     with mobility.moving(FAR):
-        mobility.put_away(Role.SENDER)
-        calls = len(told.calls)
-        wait(lambda: len(told.calls) > calls + 2)
-        assert set(told.of(Role.SENDER)[calls - 1 :]) == {None}
-        mobility.put_away(None)
-        assert told.now(Role.SENDER) not in {None, place}
+        mobility.set_out_of_range(Role.SENDER)
+        calls = len(medium.calls)
+        wait(lambda: len(medium.calls) > calls + 2)
+        assert set(medium.positions_of(Role.SENDER)[calls - 1 :]) == {None}
+        mobility.set_out_of_range(None)
+        assert medium.position_of(Role.SENDER) not in {None, place}
     since_ns = 0
-    absent = [one for one in mobility.track(since_ns) if one.role is Role.SENDER and one.position_m is None]
-    assert len(absent) == 1, "who is nowhere is nowhere until it is back"
+    absent = [
+        whereabouts
+        for whereabouts in mobility.track(since_ns)
+        if whereabouts.role is Role.SENDER and whereabouts.position_m is None
+    ]
+    assert len(absent) == 1, "one entry without a position until it is back"
 
 
-def test_two_may_move_at_once(mobility: Mobility, told: Told) -> None:
+def test_two_robots_can_move_at_the_same_time(mobility: Mobility, medium: RecordingMedium) -> None:
     with mobility.moving(AWAY), mobility.moving(Move(Role.RECEIVER, (Leg(left_m=0.3), Leg(away_m=-0.2)), 2.0)):
-        wait(lambda: not in_motion())
-        sender, receiver = told.now(Role.SENDER), told.now(Role.RECEIVER)
+        wait(lambda: not motion_threads())
+        sender, receiver = medium.position_of(Role.SENDER), medium.position_of(Role.RECEIVER)
     assert sender is not None
     assert receiver is not None
-    (first, _), (last, _) = told.calls[0], told.calls[-1]
+    (first, _), (last, _) = medium.calls[0], medium.calls[-1]
     assert first == last
     assert sender[0] - first[CAST[Role.SENDER].name][0] == pytest.approx(-0.4)
     at = first[CAST[Role.RECEIVER].name]
     assert receiver == pytest.approx((at[0] - 0.2, at[1] + 0.3, at[2]))
 
 
-def test_the_track_says_what_the_medium_was_told_and_forgets_what_is_over(mobility: Mobility, told: Told) -> None:
+def test_the_track_equals_the_positions_of_the_medium_and_discards_old_ones(
+    mobility: Mobility, medium: RecordingMedium
+) -> None:
     with mobility.moving(AWAY):
-        wait(lambda: not in_motion())
+        wait(lambda: not motion_threads())
     track = mobility.track(0)
-    assert [one.position_m for one in track if one.role is Role.SENDER] == told.of(Role.SENDER)
-    assert all(one.utc_ns <= other.utc_ns for one, other in pairwise(track))
-    assert [one.role for one in track].count(Role.RELAY) == 1
-    kept = mobility.track(time.time_ns())
-    assert sorted(one.role for one in kept) == sorted(CAST)
-    assert mobility.track(0) == kept
+    assert [
+        whereabouts.position_m for whereabouts in track if whereabouts.role is Role.SENDER
+    ] == medium.positions_of(Role.SENDER)
+    assert all(whereabouts.utc_ns <= other.utc_ns for whereabouts, other in pairwise(track))
+    assert [whereabouts.role for whereabouts in track].count(Role.RELAY) == 1
+    last_known = mobility.track(time.time_ns())
+    assert sorted(whereabouts.role for whereabouts in last_known) == sorted(CAST)
+    assert mobility.track(0) == last_known
 
 
-def test_steps_are_as_short_as_the_speed_asks(mobility: Mobility, told: Told) -> None:
-    """By what the next step is due at: a busy machine makes each as long as it likes."""
+def test_the_update_period_depends_on_the_speed(mobility: Mobility, medium: RecordingMedium) -> None:
+    """Compares the period that each update returns, because a busy machine makes actual periods longer."""
     slow, fast = (Move(Role.SENDER, (Leg(away_m=1e5),), speed_m_s) for speed_m_s in (0.2, 50.0))
     due = []
     for move in (slow, Move(Role.SENDER, (Leg(away_m=1e5),), 2.0), fast):
         with mobility.moving(move):
-            wait(lambda: any(any(velocity.values()) for _, velocity in told.calls[-1:]))
-            due.append(mobility._tell())
+            wait(lambda: any(any(velocity.values()) for _, velocity in medium.calls[-1:]))
+            due.append(mobility._update_medium())
     assert due == [0.1, STEP_M / 2.0, 0.02]
 
 
-def test_nobody_moves_without_a_place(told: Told) -> None:
-    empty = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None)
+def test_moving_without_a_placement_is_an_error(medium: RecordingMedium) -> None:
+    empty = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None)
     with pytest.raises(RobotError, match="no places"), empty.moving(AWAY):
         raise AssertionError
 
 
 @pytest.mark.parametrize("role", FIXED_ROLES)
-def test_away_is_away_from_the_other_end(mobility: Mobility, told: Told, role: Role) -> None:
+def test_away_increases_the_distance_to_the_other_end(
+    mobility: Mobility, medium: RecordingMedium, role: Role
+) -> None:
     other = CAST[Role.RELAY if role is not Role.RELAY else Role.SENDER].name
-    before = told.calls[-1][0]
+    before = medium.calls[-1][0]
     with mobility.moving(Move(role, (Leg(away_m=0.1),), 2.0)):
-        wait(lambda: not in_motion())
-        after = told.calls[-1][0]
+        wait(lambda: not motion_threads())
+        after = medium.calls[-1][0]
     name = CAST[role].name
     assert math.dist(after[name], after[other]) == pytest.approx(math.dist(before[name], before[other]) + 0.1)
 
@@ -187,71 +203,71 @@ class Steering:
     """A robot that steers itself."""
 
     spec: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(steers=True))
-    ways: list[OwnWay] = field(default_factory=list)
-    said: Steered | None = None
+    paths: list[AssignedPath] = field(default_factory=list)
+    recorded: Steered | None = None
 
-    def move(self, way: OwnWay) -> None:
-        self.ways.append(way)
+    def move(self, path: AssignedPath) -> None:
+        self.paths.append(path)
 
     def steered(self) -> Steered | None:
-        return self.said
+        return self.recorded
 
-    def say(self, place_m: Vector, velocity_m_s: Vector = STILL) -> None:
-        self.said = Steered(time.monotonic_ns(), self.ways[-1].began_ns, place_m, velocity_m_s)
+    def record(self, place_m: Vector, velocity_m_s: Vector = STILL) -> None:
+        self.recorded = Steered(time.monotonic_ns(), self.paths[-1].began_ns, place_m, velocity_m_s)
 
 
 @pytest.fixture
-def flying(told: Told) -> tuple[Mobility, Steering]:
+def flying(medium: RecordingMedium) -> tuple[Mobility, Steering]:
     robot = Steering()
     robots = cast("Mapping[Role, EmulatedRobot]", {Role.RELAY: robot})
-    mobility = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None, robots)
+    mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None, robots)
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
     return mobility, robot
 
 
-def test_the_medium_follows_who_steers_itself_until_it_is_carried_off(
-    told: Told, flying: tuple[Mobility, Steering]
+def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
+    medium: RecordingMedium, flying: tuple[Mobility, Steering]
 ) -> None:
     mobility, robot = flying
-    place = told.now(Role.RELAY)
+    place = medium.position_of(Role.RELAY)
     with mobility.watching():
-        robot.say((7.0, 8.0, 9.0), (0.0, 0.0, 5.0))
-        wait(lambda: told.now(Role.RELAY) != place)
-        robot.say((7.0, 8.0, 12.0))
-        wait(lambda: told.now(Role.RELAY) == (7.0, 8.0, 12.0))
-        calls = len(told.calls)
-        mobility.put_away(Role.SENDER)  # whoever tells of something else tells of it, too
-        assert told.now(Role.RELAY) == (7.0, 8.0, 12.0)
+        robot.record((7.0, 8.0, 9.0), (0.0, 0.0, 5.0))
+        wait(lambda: medium.position_of(Role.RELAY) != place)
+        robot.record((7.0, 8.0, 12.0))
+        wait(lambda: medium.position_of(Role.RELAY) == (7.0, 8.0, 12.0))
+        calls = len(medium.calls)
+        mobility.set_out_of_range(Role.SENDER)  # an update for another reason includes its position
+        assert medium.position_of(Role.RELAY) == (7.0, 8.0, 12.0)
         mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
-        assert told.now(Role.RELAY) == place
-        robot.said = Steered(time.monotonic_ns(), robot.ways[0].began_ns, (1.0, 2.0, 3.0))
-        mobility.put_away(None)
-        assert told.now(Role.RELAY) == place, "what it says of where it was before is over"
-    assert len(told.calls) > calls
+        assert medium.position_of(Role.RELAY) == place
+        robot.recorded = Steered(time.monotonic_ns(), robot.paths[0].began_ns, (1.0, 2.0, 3.0))
+        mobility.set_out_of_range(None)
+        assert medium.position_of(Role.RELAY) == place, "motion from before the placement is ignored"
+    assert len(medium.calls) > calls
     assert not [thread for thread in threading.enumerate() if thread.name == "watch"]
-    track = [one.position_m for one in mobility.track(0) if one.role is Role.RELAY]
+    track = [whereabouts.position_m for whereabouts in mobility.track(0) if whereabouts.role is Role.RELAY]
     assert (7.0, 8.0, 12.0) in track
     assert track[0] == track[-1] == place
 
 
-def test_who_drives_stays_on_the_ground_and_one_that_is_silent_stands(told: Told) -> None:
+def test_a_driving_robot_stays_on_the_ground_and_a_silent_one_stops(medium: RecordingMedium) -> None:
     robot = Steering()
     robots = cast("Mapping[Role, EmulatedRobot]", {Role.SENDER: robot})
-    mobility = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None, robots)
+    mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None, robots)
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
-    place = told.now(Role.SENDER)
+    place = medium.position_of(Role.SENDER)
     assert place is not None
-    robot.say((7.0, 8.0, 55.0), (1.0, 0.0, 0.0))
+    robot.record((7.0, 8.0, 55.0), (1.0, 0.0, 0.0))
     with mobility.watching():
-        wait(lambda: told.now(Role.SENDER) == (7.5, 8.0, place[2]))
-    assert told.calls[-1][1][CAST[Role.SENDER].name] == STILL
+        wait(lambda: medium.position_of(Role.SENDER) == (7.5, 8.0, place[2]))
+    assert medium.calls[-1][1][CAST[Role.SENDER].name] == STILL
 
 
-def test_lasers_see_who_is_in_place_and_not_who_is_away(told: Told) -> None:
+def test_lasers_detect_robots_in_place_and_not_those_out_of_range(medium: RecordingMedium) -> None:
     shown: list[Mapping[str, Vector]] = []
-    mobility = Mobility(CAST, cast("MediumClient", told), load_world("lawn"), None, show=shown.append)
+    mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None, show=shown.append)
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
-    assert shown[-1] == told.calls[-1][0]
-    mobility.put_away(Role.RELAY)  # no radio reaches another one, but the others are where they were
-    assert told.calls[-1][0] == {}
+    assert shown[-1] == medium.calls[-1][0]
+    mobility.set_out_of_range(Role.RELAY)  # no radio reaches another one, but the others are where they were
+    assert medium.calls[-1][0] == {}
     assert shown[-1] == {name: place_m for name, place_m in shown[0].items() if name != CAST[Role.RELAY].name}

@@ -1,4 +1,4 @@
-"""Emulated robots with ROS 1 seen by other programs: a tf listener of rospy on the robot, and bagpy."""
+"""Emulated robots with ROS 1, read by other programs: a tf listener of rospy on the robot, and bagpy."""
 
 import json
 import math
@@ -29,7 +29,7 @@ from tests.helpers.sshd import wait_until
 LISTENER: Final = Path(__file__).with_name("tf_listener.py")
 BAGPY_CLIENT: Final = Path(__file__).with_name("bagpy_client.py")
 BAGPY: Final = ROOT / ".bagpy"
-"""Where `.ci/install --dev` puts bagpy and what it needs beside the packages of the tests."""
+"""Folder into which `.ci/install --dev` installs bagpy and its dependencies, separate from those of the tests."""
 LONG_S: Final = 120.0
 PLACED: Final = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("5m"))
 STAMPED: Final = ("/scan", "/odom", "/imu", "/battery_state")
@@ -49,33 +49,33 @@ def in_ros(up: EmulatedTestbed, *argv: str) -> str:
     return up.shells[Role.SENDER].run(command, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
-def listened(up: EmulatedTestbed) -> Any:  # noqa: ANN401 (of JSON)
+def tf_report(up: EmulatedTestbed) -> Any:  # noqa: ANN401 (of JSON)
     return json.loads(in_ros(up, "python3", str(LISTENER), "odom", *STAMPED))
 
 
 @pytest.mark.emulated
 def test_a_tf_listener_reaches_the_frame_of_every_header(up: EmulatedTestbed) -> None:
-    heard = listened(up)
-    assert heard["frames"] == {"/scan": "base_scan", "/odom": "odom", "/imu": "imu_link", "/battery_state": ""}
-    assert heard["reached"], heard["paths"]
-    assert heard["paths"]["base_scan"] == ["base_scan", "base_link", "base_footprint", "odom"]
-    assert heard["paths"]["imu_link"] == ["imu_link", "base_link", "base_footprint", "odom"]
-    assert heard["latched"] == {"/tf": False, "/tf_static": True}
-    assert heard["rospy"].startswith("/usr/lib/python3/dist-packages/"), "Debian's, behind PYTHONPATH"
+    report = tf_report(up)
+    assert report["frames"] == {"/scan": "base_scan", "/odom": "odom", "/imu": "imu_link", "/battery_state": ""}
+    assert report["reached"], report["paths"]
+    assert report["paths"]["base_scan"] == ["base_scan", "base_link", "base_footprint", "odom"]
+    assert report["paths"]["imu_link"] == ["imu_link", "base_link", "base_footprint", "odom"]
+    assert report["latched"] == {"/tf": False, "/tf_static": True}
+    assert report["rospy"].startswith("/usr/lib/python3/dist-packages/"), "Debian's, after PYTHONPATH"
 
 
 @pytest.mark.emulated
-def test_static_transforms_are_there_again_after_the_sensors_were_killed(up: EmulatedTestbed) -> None:
+def test_static_transforms_return_after_the_sensors_were_killed(up: EmulatedTestbed) -> None:
     up.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
-    assert listened(up)["reached"]
+    assert tf_report(up)["reached"]
     up.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
     wait_until(lambda: "/tf_static" in in_ros(up, "rostopic", "list"), Deadline.after(LONG_S))
-    assert listened(up)["reached"]
+    assert tf_report(up)["reached"]
 
 
 @pytest.mark.emulated
-def test_python_finds_what_runs_fieldkit_before_debian_s_packages(up: EmulatedTestbed) -> None:
-    """Both must be found: middlewares of the Python that runs fieldkit, and rospy."""
+def test_packages_of_fieldkit_s_python_precede_debian_s(up: EmulatedTestbed) -> None:
+    """Both must be importable: middlewares of the Python that runs fieldkit, and rospy."""
     origin = "import numpy, rospy, sys; print(sys.executable); print(numpy.__file__)"
     executable, numpy = in_ros(up, "python3", "-c", origin).splitlines()
     assert not numpy.startswith("/usr/lib/python3/dist-packages/")
@@ -91,7 +91,7 @@ print(json.dumps(rospy.wait_for_message("/scan", LaserScan, 60).ranges))
 
 
 @pytest.mark.emulated
-def test_the_laser_sees_the_wall_that_the_sender_stands_behind(up: EmulatedTestbed) -> None:
+def test_the_laser_detects_the_wall_next_to_the_sender(up: EmulatedTestbed) -> None:
     """In the lawn at (3, 18) facing west, the wall's near face 0.9 m behind it, from 4 m south to 4 m north."""
     up.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("5m")))
     ranges_m = json.loads(in_ros(up, "python3", "-c", ONE_SCAN))
@@ -99,7 +99,7 @@ def test_the_laser_sees_the_wall_that_the_sender_stands_behind(up: EmulatedTestb
     for beam, range_m in enumerate(ranges_m):
         off_rad = math.radians(beam - 180)
         true_m = 0.9 / math.cos(off_rad) if math.cos(off_rad) > 0 else math.inf
-        if abs(true_m - LASER_RANGE_M[1]) > 6 * LASER_NOISE_M:  # noise decides there
+        if abs(true_m - LASER_RANGE_M[1]) > 6 * LASER_NOISE_M:  # noise decides at this distance
             expected_m = true_m if true_m < LASER_RANGE_M[1] else math.inf
             assert range_m == pytest.approx(expected_m, abs=6 * LASER_NOISE_M), beam
     up.place(PLACED)
@@ -113,25 +113,26 @@ def test_bagpy_reads_a_recording_as_rosbags_does(up: EmulatedTestbed, tmp_path: 
     bag = tmp_path / "clients.bag"
     up.shells[Role.SENDER].fetch(("cat", "clients.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 22)
     with Reader(bag) as reader:
-        types = {one.topic: one.msgtype.replace("/msg/", "/") for one in reader.connections}
-        counts = {one.topic: one.msgcount for one in reader.connections}
-        connections = [one for one in reader.connections if one.topic == "/odom"]
+        types = {connection.topic: connection.msgtype.replace("/msg/", "/") for connection in reader.connections}
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        connections = [connection for connection in reader.connections if connection.topic == "/odom"]
         store = shipped().ros1
         odom: list[Any] = [
-            store.deserialize_ros1(data, one.msgtype) for one, _, data in reader.messages(connections=connections)
+            store.deserialize_ros1(data, connection.msgtype)
+            for connection, _, data in reader.messages(connections=connections)
         ]
     assert set(counts) == set(topics)
     assert counts["/tf_static"] == 1
 
     command = (sys.executable, str(BAGPY_CLIENT), str(bag), "/odom")
     environment = os.environ | {"PYTHONPATH": str(BAGPY)}
-    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    read = json.loads(done.stdout.splitlines()[-1])
+    result = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    read = json.loads(result.stdout.splitlines()[-1])
     assert read["topics"] == {topic: [types[topic], counts[topic]] for topic in topics}
     rows = [dict(zip(read["columns"], row, strict=True)) for row in read["rows"]]
-    assert [int(row["header.stamp.nsecs"]) for row in rows] == [one.header.stamp.nanosec for one in odom]
-    for row, one in zip(rows, odom, strict=True):
+    assert [int(row["header.stamp.nsecs"]) for row in rows] == [message.header.stamp.nanosec for message in odom]
+    for row, message in zip(rows, odom, strict=True):
         assert (row["header.frame_id"], row["child_frame_id"]) == ("odom", "base_footprint")
-        assert float(row["pose.pose.orientation.w"]) == one.pose.pose.orientation.w
-        assert float(row["twist.twist.angular.z"]) == one.twist.twist.angular.z
+        assert float(row["pose.pose.orientation.w"]) == message.pose.pose.orientation.w
+        assert float(row["twist.twist.angular.z"]) == message.twist.twist.angular.z

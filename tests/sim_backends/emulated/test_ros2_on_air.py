@@ -1,4 +1,4 @@
-"""Emulated robots with ROS 2: what a real ROS 2, and other nodes of DDS and Zenoh, hear of them over the medium."""
+"""Emulated robots with ROS 2, received over the medium by a real ROS 2 and by other nodes of DDS and Zenoh."""
 
 import json
 import math
@@ -39,7 +39,7 @@ from tests.helpers.paths import ROOT
 ROS2: Final = ROOT / ".ros2" / "bin" / "python"
 LISTENER: Final = ROOT / "tests" / "sim_backends" / "emulated" / "ros2_listener.py"
 WIRE_END: Final = ROOT / "tests" / "ros" / "wire_end.py"
-HEARD: Final = {
+RECEIVED: Final = {
     "/scan": "sensor_msgs/msg/LaserScan",
     "/odom": "nav_msgs/msg/Odometry",
     "/imu": "sensor_msgs/msg/Imu",
@@ -53,18 +53,18 @@ ROUTER: Final = "{discovery: router, router: duckiedrone-1}"
 NODES: Final = {Role.SENDER: "sensors_turtlebot_1", Role.RECEIVER: "sensors_turtlebot_2"}
 
 
-def speaking(rmw: str, distribution: str = "jazzy", **environment: str) -> RobotProfile:
+def profile_with(rmw: str, distribution: str = "jazzy", **environment: str) -> RobotProfile:
     profile = load_profile("turtlebot3_burger")
     command = ros_of(profile).variants["ros2"].model_copy(update={"distribution": distribution, "rmw": rmw})
-    told = {"variant": "ros2", "variants": {"ros2": command}, "environment": environment}
-    return profile.model_copy(update={"ros": ros_of(profile).model_copy(update=told)})
+    ros = {"variant": "ros2", "variants": {"ros2": command}, "environment": environment}
+    return profile.model_copy(update={"ros": ros_of(profile).model_copy(update=ros)})
 
 
 def cast(**rmws: str) -> Cast:
-    """Return the paper's robots, of which some speak ROS 2, by their role."""
+    """Return the paper's robots by their role; those with an RMW use ROS 2."""
     master = EmulatedBackend(None, None).cast(Topology.MASTER)
     return {
-        role: robot.model_copy(update={"profile": speaking(rmws[role])}) if role in rmws else robot
+        role: robot.model_copy(update={"profile": profile_with(rmws[role])}) if role in rmws else robot
         for role, robot in master.items()
     }
 
@@ -88,30 +88,32 @@ def multicast() -> Iterator[EmulatedTestbed]:
 
 
 def inside(up: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
-    """Return a command in the network of the drone, which has no ROS 2 of its own."""
+    """Return a command in the network namespace of the drone, which has no ROS 2."""
     return ("timeout", "-k", "10", str(LONG_S), "nsenter", "-t", str(up.robots[Role.RELAY].pid), "-n", *argv)
 
 
 @contextmanager
 def listening(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Iterator[Iterator[Any]]:
-    """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone hears."""
-    told = {"address": up.robots[Role.RELAY].spec.ip, "node": "ears", **network}
+    """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone receives."""
+    network_settings = {"address": up.robots[Role.RELAY].spec.ip, "node": "ears", **network}
     quality = offered_qos.LATCHED if topic == "/tf_static" else PROFILES["sensor_data"]
-    described = topics.describe(shipped(), topic, kind, quality, domain=0, node="ears")
-    command = (sys.executable, str(WIRE_END), "hear", over, json.dumps(told), json.dumps(described))
-    with subprocess.Popen(inside(up, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ears:
-        assert ears.stdout is not None
+    description = topics.describe(shipped(), topic, kind, quality, domain=0, node="ears")
+    command = (sys.executable, str(WIRE_END), "hear", over, json.dumps(network_settings), json.dumps(description))
+    with subprocess.Popen(inside(up, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
         try:
-            yield (shipped().ros2.deserialize_cdr(bytes.fromhex(line), described["type"]) for line in ears.stdout)
+            yield (
+                shipped().ros2.deserialize_cdr(bytes.fromhex(line), description["type"]) for line in process.stdout
+            )
         finally:
-            ears.terminate()
-            ears.communicate()
+            process.terminate()
+            process.communicate()
 
 
-def hears(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
+def receive(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
     """Return the first message of `listening`."""
-    with listening(up, over, topic, kind, **network) as heard:
-        return next(heard)
+    with listening(up, over, topic, kind, **network) as messages:
+        return next(messages)
 
 
 def stamp_s(message: Any) -> float:  # noqa: ANN401 (of rosbags)
@@ -119,75 +121,80 @@ def stamp_s(message: Any) -> float:  # noqa: ANN401 (of rosbags)
 
 
 @pytest.fixture(scope="module")
-def told(multicast: EmulatedTestbed, tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
-    """What a node of a real ROS 2 on the drone says of the sender."""
+def report(multicast: EmulatedTestbed, tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
+    """Return the report of a node of a real ROS 2 on the drone about the sender."""
     home = tmp_path_factory.mktemp("ros")
-    words = (str(COUNT), *(f"{topic}={kind}" for topic, kind in HEARD.items()))
+    words = (str(COUNT), *(f"{topic}={kind}" for topic, kind in RECEIVED.items()))
     command = inside(multicast, "env", f"ROS_HOME={home}", str(ROS2), str(LISTENER), *words)
-    done = subprocess.run(command, capture_output=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found: Mapping[str, Any] = json.loads(done.stdout)
-    return found
+    result = subprocess.run(command, capture_output=True, check=False)
+    assert result.returncode == 0, result.stderr
+    report: Mapping[str, Any] = json.loads(result.stdout)
+    return report
 
 
 @pytest.mark.emulated
-def test_a_real_ros_2_lists_the_topics_with_their_types_and_hashes(told: Mapping[str, Any]) -> None:
-    wanted = {**HEARD, "/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage"}
-    assert {topic: told["types"].get(topic) for topic in wanted} == {topic: [kind] for topic, kind in wanted.items()}
-    assert told["latched"] == ["TRANSIENT_LOCAL"]
-    assert told["hashes"] == {topic: [shipped().get(kind).rihs01] for topic, kind in wanted.items()}
+def test_a_real_ros_2_lists_the_topics_with_their_types_and_hashes(report: Mapping[str, Any]) -> None:
+    expected = {**RECEIVED, "/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage"}
+    assert {topic: report["types"].get(topic) for topic in expected} == {
+        topic: [kind] for topic, kind in expected.items()
+    }
+    assert report["latched"] == ["TRANSIENT_LOCAL"]
+    assert report["hashes"] == {topic: [shipped().get(kind).rihs01] for topic, kind in expected.items()}
 
 
 @pytest.mark.emulated
-def test_a_real_ros_2_lists_the_node_and_what_is_its_own(told: Mapping[str, Any]) -> None:
-    assert NODES[Role.SENDER] in told["nodes"]
-    topics_of_node = {topic for topic, _ in told["of_node"][NODES[Role.SENDER]]}
-    assert topics_of_node == {*HEARD, "/tf", "/tf_static", "/rosout"}
+def test_a_real_ros_2_lists_the_node_and_its_topics(report: Mapping[str, Any]) -> None:
+    assert NODES[Role.SENDER] in report["nodes"]
+    topics_of_node = {topic for topic, _ in report["of_node"][NODES[Role.SENDER]]}
+    assert topics_of_node == {*RECEIVED, "/tf", "/tf_static", "/rosout"}
 
 
 @pytest.mark.emulated
-def test_a_real_ros_2_reads_the_node_s_log(told: Mapping[str, Any]) -> None:
+def test_a_real_ros_2_reads_the_node_s_log(report: Mapping[str, Any]) -> None:
     of_robot = NODES[Role.SENDER]
-    lines = [line for line in told["logged"] if line["name"] == of_robot]
-    assert {f"{topic} has a subscriber" for topic in HEARD} <= {line["msg"] for line in lines}
+    lines = [line for line in report["logged"] if line["name"] == of_robot]
+    assert {f"{topic} has a subscriber" for topic in RECEIVED} <= {line["msg"] for line in lines}
     assert {line["level"] for line in lines} == {20}, "rcl_interfaces/msg/Log.INFO"
     assert all(0 <= time.time() - line["stamp"]["sec"] < LONG_S for line in lines)
-    # Of the robot, and of the listener, which is rclpy's own.
-    assert told["rosout"] == [["TRANSIENT_LOCAL", 10_000_000_000]] * 2
+    # One publisher is the robot's, one is that of the listener (rclpy).
+    assert report["rosout"] == [["TRANSIENT_LOCAL", 10_000_000_000]] * 2
 
 
 @pytest.mark.emulated
-def test_the_page_names_all_that_the_node_lacks(told: Mapping[str, Any]) -> None:
-    """Of what the node of rclpy that listens has by itself; a name of its own begins with that of the node."""
+def test_the_documentation_lists_all_that_the_node_lacks(report: Mapping[str, Any]) -> None:
+    """Compared with the services and topics of a node of rclpy, whose names start with that of the node."""
     of_robot = NODES[Role.SENDER]
-    services_of_rclpy = {service.rpartition("/")[2] for service in told["services_of_node"]["listener"]}
+    services_of_rclpy = {service.rpartition("/")[2] for service in report["services_of_node"]["listener"]}
     assert {"list_parameters", "get_type_description"} <= services_of_rclpy
-    assert told["services_of_node"][of_robot] == []
-    topics_of_robot = {topic for topic, _ in told["of_node"][of_robot]}
-    lacking = services_of_rclpy | (set(told["own_topics"]) - topics_of_robot - {"/cmd_vel"})
+    assert report["services_of_node"][of_robot] == []
+    topics_of_robot = {topic for topic, _ in report["of_node"][of_robot]}
+    missing = services_of_rclpy | (set(report["own_topics"]) - topics_of_robot - {"/cmd_vel"})
     page = (ROOT / "docs" / "add-a-robot.md").read_text(encoding="utf-8")
     section = page.partition("### What its node lacks")[2].partition("\n## ")[0]
-    assert [name for name in sorted(lacking) if f"`{name}`" not in section] == []
+    assert [name for name in sorted(missing) if f"`{name}`" not in section] == []
     assert "`/rosout`" in section
 
 
 @pytest.mark.emulated
-def test_a_real_ros_2_hears_right_values_across_the_medium(
-    multicast: EmulatedTestbed, told: Mapping[str, Any]
+def test_a_real_ros_2_receives_the_right_values_over_the_medium(
+    multicast: EmulatedTestbed, report: Mapping[str, Any]
 ) -> None:
-    heard = told["heard"]
-    for topic in HEARD:
-        stamps_s = [one["header"]["stamp"]["sec"] + one["header"]["stamp"]["nanosec"] / 1e9 for one in heard[topic]]
+    received = report["heard"]
+    for topic in RECEIVED:
+        stamps_s = [
+            message["header"]["stamp"]["sec"] + message["header"]["stamp"]["nanosec"] / 1e9
+            for message in received[topic]
+        ]
         assert len(stamps_s) == COUNT
         assert all(0 <= time.time() - stamp_s < LONG_S for stamp_s in stamps_s), topic
-    scan = heard["/scan"][0]
+    scan = received["/scan"][0]
     assert scan["header"]["frame_id"] == "base_scan"
     assert scan["ranges"] == [math.inf] * 360, "the lawn has nothing within 3.5 m of the line"
-    odom = heard["/odom"][0]
+    odom = received["/odom"][0]
     assert (odom["header"]["frame_id"], odom["child_frame_id"]) == ("odom", "base_footprint")
     assert odom["pose"]["covariance"][:: 6 + 1] == list(ODOMETRY_VARIANCES)
-    assert heard["/imu"][0]["linear_acceleration"]["z"] == pytest.approx(GRAVITY_M_S2, abs=0.2)
-    battery = heard["/battery_state"][0]
+    assert received["/imu"][0]["linear_acceleration"]["z"] == pytest.approx(GRAVITY_M_S2, abs=0.2)
+    battery = received["/battery_state"][0]
     assert battery["percentage"] == pytest.approx(0.8)
     assert math.isnan(battery["current"])
     # A scan is 2.9 kB, in two fragments.
@@ -196,54 +203,58 @@ def test_a_real_ros_2_hears_right_values_across_the_medium(
 
 @pytest.mark.emulated
 def test_a_real_ros_2_drives_the_robot_by_its_velocity_topic(
-    multicast: EmulatedTestbed, told: Mapping[str, Any]
+    multicast: EmulatedTestbed, report: Mapping[str, Any]
 ) -> None:
-    """In odometry, and in the world, as the medium is told."""
-    assert told["types"]["/cmd_vel"] == ["geometry_msgs/msg/Twist"]
-    assert told["driven_m"] >= DRIVEN_M
-    places_m = [one.position_m for one in multicast.oracle.track(0) if one.role is Role.SENDER and one.position_m]
+    """In odometry, and in the world according to the medium."""
+    assert report["types"]["/cmd_vel"] == ["geometry_msgs/msg/Twist"]
+    assert report["driven_m"] >= DRIVEN_M
+    places_m = [
+        whereabouts.position_m
+        for whereabouts in multicast.oracle.track(0)
+        if whereabouts.role is Role.SENDER and whereabouts.position_m
+    ]
     assert max(math.dist(places_m[0], place_m) for place_m in places_m) >= DRIVEN_M / 2
 
 
 @pytest.mark.emulated
-def test_odometry_heard_by_another_robot_adds_up_to_the_way_through_the_world(multicast: EmulatedTestbed) -> None:
+def test_odometry_received_by_another_robot_integrates_to_the_path(multicast: EmulatedTestbed) -> None:
     move = Move(Role.SENDER, (Leg(away_m=1.0), Leg(left_m=0.5)), speed_m_s=0.5)
-    multicast.place(PLACED)  # it may have driven off by itself
-    with listening(multicast, "dds", "/odom", "nav_msgs/Odometry") as heard:
-        first = next(heard)
-        begin, begun_ns = first.pose.pose.position, time.time_ns()
+    multicast.place(PLACED)  # an earlier test may have driven it
+    with listening(multicast, "dds", "/odom", "nav_msgs/Odometry") as messages:
+        first = next(messages)
+        start, start_ns = first.pose.pose.position, time.time_ns()
         with multicast.moving(move):
-            told = [first, *takewhile(lambda one: one.pose.pose.position.y < begin.y + 0.499, heard)]
-            whereabouts = [one for one in multicast.oracle.track(begun_ns) if one.role is Role.SENDER]
+            samples = [first, *takewhile(lambda message: message.pose.pose.position.y < start.y + 0.499, messages)]
+            whereabouts = [position for position in multicast.oracle.track(start_ns) if position.role is Role.SENDER]
     x_m = y_m = 0.0
-    for before, after in pairwise(told):
+    for before, after in pairwise(samples):
         facing_rad = 2 * math.atan2(before.pose.pose.orientation.z, before.pose.pose.orientation.w)
-        gone_m = before.twist.twist.linear.x * (stamp_s(after) - stamp_s(before))
-        x_m, y_m = x_m + gone_m * math.cos(facing_rad), y_m + gone_m * math.sin(facing_rad)
-    end = told[-1].pose.pose.position
-    assert (x_m, y_m) == pytest.approx((end.x - begin.x, end.y - begin.y), abs=0.1)
+        step_m = before.twist.twist.linear.x * (stamp_s(after) - stamp_s(before))
+        x_m, y_m = x_m + step_m * math.cos(facing_rad), y_m + step_m * math.sin(facing_rad)
+    end = samples[-1].pose.pose.position
+    assert (x_m, y_m) == pytest.approx((end.x - start.x, end.y - start.y), abs=0.1)
     assert (x_m, y_m) == pytest.approx((1.0, 0.5), abs=0.1)
-    begin_m, end_m = (whereabouts[number].position_m for number in (0, -1))
-    assert begin_m is not None
+    start_m, end_m = (whereabouts[number].position_m for number in (0, -1))
+    assert start_m is not None
     assert end_m is not None
-    # The medium is told every 0.1 m.
-    assert math.dist(begin_m[:2], end_m[:2]) == pytest.approx(math.hypot(x_m, y_m), abs=0.2)
+    # The medium is updated every 0.1 m.
+    assert math.dist(start_m[:2], end_m[:2]) == pytest.approx(math.hypot(x_m, y_m), abs=0.2)
 
 
 @pytest.mark.emulated
-def test_sensors_that_were_killed_are_heard_again(multicast: EmulatedTestbed) -> None:
-    with listening(multicast, "dds", "/battery_state", "sensor_msgs/BatteryState") as heard:
-        last = next(heard)
+def test_topics_return_after_the_sensors_were_killed(multicast: EmulatedTestbed) -> None:
+    with listening(multicast, "dds", "/battery_state", "sensor_msgs/BatteryState") as messages:
+        last = next(messages)
         multicast.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
-        began_s = time.time()
-        assert any(stamp_s(one) > began_s for one in heard), f"none after {last}"
-    # The relay itself goes on: it has left a topic whose publisher was gone.
-    assert hears(multicast, "dds", "/odom", "nav_msgs/Odometry").child_frame_id == "base_footprint"
+        killed_s = time.time()
+        assert any(stamp_s(message) > killed_s for message in messages), f"none after {last}"
+    # The relay continues: it has unsubscribed from the topic whose publisher exited.
+    assert receive(multicast, "dds", "/odom", "nav_msgs/Odometry").child_frame_id == "base_footprint"
 
 
 @pytest.mark.emulated
 def test_zenoh_scouts_across_the_medium(multicast: EmulatedTestbed) -> None:
-    message = hears(multicast, "zenoh", "/tf", "tf2_msgs/TFMessage")
+    message = receive(multicast, "zenoh", "/tf", "tf2_msgs/TFMessage")
     (transform,) = message.transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("odom", "base_footprint")
 
@@ -253,63 +264,67 @@ def test_unicast_peers_need_no_multicast() -> None:
     with lab(cast(sender="cyclonedds", receiver="zenoh"), "{discovery: peers}") as up:
         for role, over in ((Role.SENDER, "dds"), (Role.RECEIVER, "zenoh")):
             peers = (up.robots[role].spec.ip,)
-            odom = hears(up, over, "/odom", "nav_msgs/Odometry", discovery="peers", peers=peers)
+            odom = receive(up, over, "/odom", "nav_msgs/Odometry", discovery="peers", peers=peers)
             assert odom.child_frame_id == "base_footprint"
 
 
 @pytest.mark.emulated
-def test_a_router_on_the_relay_brings_zenoh_together() -> None:
+def test_zenoh_works_with_a_router_on_the_relay() -> None:
     with lab(cast(sender="zenoh"), ROUTER) as up:
         relay = up.robots[Role.RELAY].spec.ip
-        scan = hears(up, "zenoh", "/scan", "sensor_msgs/LaserScan", discovery="router", server=relay)
+        scan = receive(up, "zenoh", "/scan", "sensor_msgs/LaserScan", discovery="router", server=relay)
         assert np.isinf(scan.ranges).all()
         assert len(scan.ranges) == 360
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_whoever_comes_finds_the_way_from_every_sensor_to_the_world(multicast: EmulatedTestbed, over: str) -> None:
-    """What tf2 looks up: from the frame of a message, up to where the robot was switched on."""
-    lies_in = {
-        one.child_frame_id: one.header.frame_id
+def test_a_late_subscriber_gets_the_transforms_from_every_sensor_to_the_world(
+    multicast: EmulatedTestbed, over: str
+) -> None:
+    """The look-up of tf2: from the frame of a message up to the frame in which the robot was switched on."""
+    parent_of = {
+        transform.child_frame_id: transform.header.frame_id
         for topic in ("/tf_static", "/tf")
-        for one in hears(multicast, over, topic, "tf2_msgs/TFMessage").transforms
+        for transform in receive(multicast, over, topic, "tf2_msgs/TFMessage").transforms
     }
     for topic in ros_of(load_profile("turtlebot3_burger")).topics:
         frame = topic.frame
-        while frame in lies_in:
-            frame = lies_in[frame]
+        while frame in parent_of:
+            frame = parent_of[frame]
         assert frame in {"odom", ""}, topic.name
 
 
 def specs(robots: Cast, ros2: str, ros: str = "auto") -> Mapping[Role, Any]:
-    made = partial(robot_spec, robots, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
-    return {role: made(role, options=options(ros2, ros)) for role in robots}
+    make_spec = partial(robot_spec, robots, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
+    return {role: make_spec(role, options=options(ros2, ros)) for role in robots}
 
 
-def test_each_robot_is_told_how_it_takes_part() -> None:
-    found = specs(cast(sender="cyclonedds", receiver="zenoh"), "{discovery: peers}")
-    assert found[Role.SENDER].ros2.peers == ("10.42.0.2", "10.42.0.3")
-    assert (found[Role.SENDER].ros2.over, found[Role.RECEIVER].ros2.over) == ("dds", "zenoh")
-    assert found[Role.RELAY].ros2 is None
-    found = specs(cast(sender="zenoh"), ROUTER)
-    assert (found[Role.SENDER].ros2.router, found[Role.SENDER].ros2.peers) == ("10.42.0.3", ())
-    assert [role for role in found if found[role].routes_zenoh] == [Role.RELAY]
-    assert "zenoh_router" in [one.name for one in services.services(found[Role.RELAY])]
+def test_specifications_have_the_ros2_settings() -> None:
+    specs_by_role = specs(cast(sender="cyclonedds", receiver="zenoh"), "{discovery: peers}")
+    assert specs_by_role[Role.SENDER].ros2.peers == ("10.42.0.2", "10.42.0.3")
+    assert (specs_by_role[Role.SENDER].ros2.over, specs_by_role[Role.RECEIVER].ros2.over) == ("dds", "zenoh")
+    assert specs_by_role[Role.RELAY].ros2 is None
+    specs_by_role = specs(cast(sender="zenoh"), ROUTER)
+    assert (specs_by_role[Role.SENDER].ros2.router, specs_by_role[Role.SENDER].ros2.peers) == ("10.42.0.3", ())
+    assert [role for role in specs_by_role if specs_by_role[role].routes_zenoh] == [Role.RELAY]
+    assert "zenoh_router" in [service.name for service in services.services(specs_by_role[Role.RELAY])]
 
 
 def test_the_built_in_ros_stays_off_the_air() -> None:
     assert specs(cast(sender="cyclonedds"), "{}", ros="builtin")[Role.SENDER].ros2 is None
 
 
-def test_a_router_that_takes_no_part_is_refused() -> None:
-    robots = {role: one for role, one in cast(sender="zenoh").items() if role is not Role.RELAY}
-    with pytest.raises(ConfigurationError, match="has the router run on duckiedrone-1, which does not take part"):
+def test_a_router_outside_the_cast_is_rejected() -> None:
+    robots = {role: robot for role, robot in cast(sender="zenoh").items() if role is not Role.RELAY}
+    with pytest.raises(
+        ConfigurationError, match=r"emulated\.ros2\.router is duckiedrone-1, which does not take part"
+    ):
         specs(robots, ROUTER)
 
 
 @pytest.mark.parametrize(
-    ("ros2", "said"),
+    ("ros2", "message"),
     [
         ("{discovery: router}", "go together"),
         ("{router: duckiedrone-1}", "go together"),
@@ -317,26 +332,26 @@ def test_a_router_that_takes_no_part_is_refused() -> None:
         ("{discovery: magic}", "emulated.ros2.discovery"),
     ],
 )
-def test_wrong_options_are_told(ros2: str, said: str) -> None:
+def test_wrong_options_are_reported(ros2: str, message: str) -> None:
     text = f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros2: {ros2}}}\n"
     document = schema.parse(text, source="fieldkit.yaml")
-    with pytest.raises(ConfigurationError, match=said):
+    with pytest.raises(ConfigurationError, match=message):
         EmulatedBackend(schema.validate(document, Site), document)
 
 
 @pytest.mark.parametrize(
-    ("ros2", "profile", "said"),
+    ("ros2", "profile", "message"),
     [
-        (ROUTER, speaking("cyclonedds"), "speaks over DDS, which has none"),
-        ("{}", speaking("zenoh", ROS_DOMAIN_ID="150"), "the ports of ROS_DOMAIN_ID 150 of the profile"),
+        (ROUTER, profile_with("cyclonedds"), "uses DDS, which has no router"),
+        ("{}", profile_with("zenoh", ROS_DOMAIN_ID="150"), "the ports of ROS_DOMAIN_ID 150 of the profile"),
     ],
 )
-def test_what_a_profile_cannot_have_is_told(
-    ros2: str, profile: RobotProfile, said: str, monkeypatch: pytest.MonkeyPatch
+def test_unsupported_profiles_are_reported(
+    ros2: str, profile: RobotProfile, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros2: {ros2}}}\n"
     document = schema.parse(text, source="fieldkit.yaml")
     backend = EmulatedBackend(schema.validate(document, Site), document)
     monkeypatch.setattr("fieldkit.backends.registry.load_profile", lambda _: profile)
-    with pytest.raises(ConfigurationError, match=said):
+    with pytest.raises(ConfigurationError, match=message):
         backend.cast(Topology.MASTER)

@@ -1,4 +1,4 @@
-"""Setup files of a real robot, wherever they lie: an emulated one has them there, and its machine has not."""
+"""Setup files at the paths of a real robot: the emulated robot has them there, although the host does not."""
 
 import shlex
 import subprocess
@@ -35,7 +35,7 @@ LONG_S = 60.0
 
 
 def cast_with(*setup: str) -> Cast:
-    """The paper's sender alone, with other setup files."""
+    """Return the paper's sender alone, with other setup files."""
     robot = EmulatedBackend(None, None).cast(Topology.MASTERLESS)[Role.SENDER]
     ros = ros_of(robot.profile)
     command = ros.command.model_copy(update={"setup": setup})
@@ -50,33 +50,33 @@ def shell() -> Iterator[Shell]:
         yield up.shells[Role.SENDER]
 
 
-def said(shell: Shell, *argv: str) -> str:
+def output_of(shell: Shell, *argv: str) -> str:
     return shell.run(argv, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("path", SETUP)
 def test_a_setup_file_can_be_sourced_where_the_profile_says(path: str, shell: Shell) -> None:
-    assert not Path(path).exists(), "this machine's own would prove nothing"
-    printed = said(shell, *with_environment(["sh", "-c", 'echo "$ROS_DISTRO"; command -v rosbag'], setup=[path]))
+    assert not Path(path).exists(), "the host must not have this file"
+    printed = output_of(shell, *with_environment(["sh", "-c", 'echo "$ROS_DISTRO"; command -v rosbag'], setup=[path]))
     assert printed.split("\n") == ["noetic", f"{Path(path).parent}/bin/rosbag", ""]
 
 
 @pytest.mark.emulated
-def test_the_rest_is_as_on_any_robot(shell: Shell, untouched: Untouched) -> None:
-    assert said(shell, "hostname") == "turtlebot-1\n"
-    assert said(shell, "getent", "hosts", "turtlebot-1").split() == ["10.42.0.1", "turtlebot-1"]
+def test_the_rest_of_the_file_system_is_as_usual(shell: Shell, untouched: Untouched) -> None:
+    assert output_of(shell, "hostname") == "turtlebot-1\n"
+    assert output_of(shell, "getent", "hosts", "turtlebot-1").split() == ["10.42.0.1", "turtlebot-1"]
     for folder in ("/", "/etc", "/usr/share", "/etc/clearpath"):
-        done = shell.run(("touch", f"{folder}/mine"), deadline=Deadline.after(LONG_S), check=False)
-        assert b"Read-only file system" in done.stderr, folder
-    assert said(shell, "ls", "/etc/ssh") == "".join(f"{one}\n" for one in sorted_as_ls(Path("/etc/ssh")))
-    assert said(shell, "readlink", "/bin") == f"{Path('/bin').readlink()}\n"
-    mounts = said(shell, "cat", "/proc/self/mountinfo").splitlines()
-    assert sum(line.split()[4] == "/" for line in mounts) == 1, "the old root is gone"
+        result = shell.run(("touch", f"{folder}/mine"), deadline=Deadline.after(LONG_S), check=False)
+        assert b"Read-only file system" in result.stderr, folder
+    assert output_of(shell, "ls", "/etc/ssh") == "".join(f"{name}\n" for name in sorted_as_ls(Path("/etc/ssh")))
+    assert output_of(shell, "readlink", "/bin") == f"{Path('/bin').readlink()}\n"
+    mounts = output_of(shell, "cat", "/proc/self/mountinfo").splitlines()
+    assert sum(line.split()[4] == "/" for line in mounts) == 1, "the old root is unmounted"
     untouched()
 
 
-# /etc has mounts of others in it there.
+# There /etc contains other mounts.
 AS_A_USER = f"""
 mkdir robots
 echo 'emulated: {{ros: builtin}}' | cat {shlex.quote(str(DEFAULT_SITE))} - > fieldkit.yaml
@@ -89,13 +89,13 @@ sed 's#setup: .*noetic.*#setup: [/code/ws/setup.bash, /etc/clearpath/setup.bash]
 
 
 @pytest.mark.emulated
-def test_a_robot_of_an_ordinary_user_has_them_too() -> None:
+def test_setup_files_work_for_an_ordinary_user_too() -> None:
     words = ("sh", "-e", "-c", AS_A_USER, "sh", sys.executable, "-m", "fieldkit")
     environment = ordinary_user.environment()
-    done = subprocess.run(
+    result = subprocess.run(
         ordinary_user.command(*words), cwd="/", env=environment, capture_output=True, text=True, check=False
     )
-    assert "found noetic" in done.stdout, done.stdout + done.stderr
+    assert "found noetic" in result.stdout, result.stdout + result.stderr
 
 
 def sorted_as_ls(folder: Path) -> list[str]:
@@ -103,7 +103,7 @@ def sorted_as_ls(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("path", ["setup.bash", "~/ws/setup.bash", "/opt/../etc/x", "/opt/ros/", "$HOME/setup.bash"])
-def test_what_is_no_whole_path_is_refused_as_no_shell_would_complete_it(path: str) -> None:
+def test_paths_that_are_not_absolute_are_rejected(path: str) -> None:
     text = f'{{distribution: noetic, setup: ["{path}"], record: ["{{topics}}"], ends: itself, writes: x.bag}}'
     with pytest.raises(ConfigurationError, match="no whole path of a file"):
         schema.validate(schema.parse(text, source="x"), RecordCommand)

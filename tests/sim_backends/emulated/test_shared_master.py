@@ -1,4 +1,4 @@
-"""Robots with one ROS master on the relay: a real roscore, and what ROS says between robots crosses the medium."""
+"""Robots with one ROS master on the relay: a real roscore, and ROS traffic between robots crosses the medium."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -49,86 +49,90 @@ def up() -> Iterator[EmulatedTestbed]:
         yield robots
 
 
-def soon(condition: Callable[[], bool]) -> None:
+def wait(condition: Callable[[], bool]) -> None:
     wait_until(condition, Deadline.after(LONG_S))
 
 
-def said(shell: Shell, *argv: str) -> str:
+def output_of(shell: Shell, *argv: str) -> str:
     return shell.run(argv, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
 def in_ros(up: EmulatedTestbed, role: Role, *argv: str) -> str:
-    return said(up.shells[role], *with_environment(argv, setup=up.robots[role].spec.setup))
+    return output_of(up.shells[role], *with_environment(argv, setup=up.robots[role].spec.setup))
 
 
 def names(shell: Shell) -> set[str]:
-    return set(said(shell, "sh", "-c", "cat /proc/[0-9]*/comm 2>/dev/null || true").split())  # some end meanwhile
+    return set(
+        output_of(shell, "sh", "-c", "cat /proc/[0-9]*/comm 2>/dev/null || true").split()
+    )  # some exit meanwhile
 
 
-def asked(shell: Shell, need: Need) -> Said:
-    done = shell.run(need.argv, deadline=Deadline.after(LONG_S), check=False)
-    return Said((done.stdout + done.stderr).decode().strip(), done.exit_code)
+def answer_to(shell: Shell, need: Need) -> Said:
+    result = shell.run(need.argv, deadline=Deadline.after(LONG_S), check=False)
+    return Said((result.stdout + result.stderr).decode().strip(), result.exit_code)
 
 
 @pytest.mark.emulated
 def test_the_relay_runs_roscore_and_the_others_no_master(up: EmulatedTestbed) -> None:
     masters = {"roscore", "rosmaster", "rosout"}
-    soon(lambda: masters <= names(up.shells[Role.RELAY]))
+    wait(lambda: masters <= names(up.shells[Role.RELAY]))
     for role in (Role.SENDER, Role.RECEIVER):
         assert not masters & names(up.shells[role])
 
 
 @pytest.mark.emulated
-def test_every_robot_sees_the_topics_of_all_each_by_one_publisher(up: EmulatedTestbed) -> None:
+def test_every_robot_lists_all_topics_with_one_publisher_each(up: EmulatedTestbed) -> None:
     for role in up.shells:
         topics = set(in_ros(up, role, "rostopic", "list").split())
         assert topics >= {"/scan", "/odom", "/imu", "/battery_state", "/pidrone/imu", "/rosout"}
     info = in_ros(up, Role.RECEIVER, "rostopic", "info", "/scan")
     publishers = info.partition("Publishers:")[2].partition("Subscribers:")[0].split()
     assert publishers[:2] == ["*", "/sensors_turtlebot_1"], "the other TurtleBot's laser has the same name"
-    assert len([one for one in publishers if one == "*"]) == 1
+    assert len([publisher for publisher in publishers if publisher == "*"]) == 1
     assert "(http://10.42.0.1:" in info
 
 
 @pytest.mark.emulated
-def test_what_another_robot_hears_crosses_the_medium(up: EmulatedTestbed, tmp_path: Path) -> None:
+def test_subscriptions_to_another_robot_cross_the_medium(up: EmulatedTestbed, tmp_path: Path) -> None:
     receiver = up.shells[Role.RECEIVER]
     before = up.medium.stats().ports["turtlebot-1"].read
     in_ros(up, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
     bag = tmp_path / "heard.bag"
     receiver.fetch(("cat", "heard.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 20)
     with Reader(bag) as reader:
-        heard = reader.message_count
-        assert {getattr(one.ext, "callerid", None) for one in reader.connections} == {"/sensors_turtlebot_1"}
-    assert heard >= 5
+        count = reader.message_count
+        assert {getattr(connection.ext, "callerid", None) for connection in reader.connections} == {
+            "/sensors_turtlebot_1"
+        }
+    assert count >= 5
     # 2.9 kB in segments of 1,448 bytes.
-    assert up.medium.stats().ports["turtlebot-1"].read - before >= 3 * heard
+    assert up.medium.stats().ports["turtlebot-1"].read - before >= 3 * count
 
 
 @pytest.mark.emulated
-def test_preflight_s_question_is_answered_by_a_master_and_by_nobody_else(up: EmulatedTestbed) -> None:
+def test_the_preflight_probe_detects_a_master_and_its_absence(up: EmulatedTestbed) -> None:
     cast = backend().cast(Topology.MASTER)
     scene = Scene(Protocol.TCP, cast, "f")
     (need,) = ros_master.needs(scene, Role.SENDER, explains="rosbag")
-    answer = asked(up.shells[Role.SENDER], need)
+    answer = answer_to(up.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RELAY], answer)[0] is Verdict.OK, answer
     wrong = {role: robot.model_copy(update={"ros_master": "10.42.0.2"}) for role, robot in cast.items()}
     (need,) = ros_master.needs(Scene(Protocol.TCP, wrong, "f"), Role.SENDER, explains="rosbag")
-    answer = asked(up.shells[Role.SENDER], need)
+    answer = answer_to(up.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RECEIVER], answer)[0] is Verdict.FAIL
     assert "Connection refused" in answer.text
 
 
 @pytest.mark.emulated
-def test_a_master_that_is_killed_comes_back_and_knows_nobody_until_they_register(up: EmulatedTestbed) -> None:
+def test_a_restarted_master_has_no_topics_until_nodes_register(up: EmulatedTestbed) -> None:
     relay, sender = up.shells[Role.RELAY], up.shells[Role.SENDER]
-    soon(lambda: "rosmaster" in names(relay))
+    wait(lambda: "rosmaster" in names(relay))
     up.inject(Fault(FaultKind.KILL, Role.RELAY, process="rosmaster"))
-    soon(lambda: "/scan" not in topics_of(sender))
-    soon(lambda: {"rosmaster", "rosout"} <= names(relay))
+    wait(lambda: "/scan" not in topics_of(sender))
+    wait(lambda: {"rosmaster", "rosout"} <= names(relay))
     assert "/scan" not in topics_of(sender)
     up.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
-    soon(lambda: "/scan" in topics_of(sender))
+    wait(lambda: "/scan" in topics_of(sender))
 
 
 def topics_of(shell: Shell) -> list[str]:
@@ -136,18 +140,24 @@ def topics_of(shell: Shell) -> list[str]:
     return shell.run(argv, deadline=Deadline.after(LONG_S), check=False).stdout.decode().split()
 
 
-def test_a_robot_alone_has_its_own_master_as_before() -> None:
+def test_a_robot_alone_has_its_own_master() -> None:
     cast = backend().cast(Topology.MASTERLESS)
     keys = KeyPair.make(), KeyPair.make()
     spec = robot_spec(cast, Role.SENDER, ros=RosChoice.DEBIAN, login=keys[0], host_key=keys[1])
     assert spec.runs_master
     assert not spec.shares_master
     assert spec.ros1_environment == {"ROS_MASTER_URI": "http://127.0.0.1:11311", "ROS_IP": "127.0.0.1"}
-    assert [one.name for one in services.services(spec)] == ["sshd", "sensors", "base", "rosmaster", "ros_relay"]
+    assert [service.name for service in services.services(spec)] == [
+        "sshd",
+        "sensors",
+        "base",
+        "rosmaster",
+        "ros_relay",
+    ]
     assert spec.registered == ("/scan", "/odom", "/tf", "/imu", "/battery_state")
 
 
-def test_the_first_of_equal_robots_publishes_and_who_runs_the_master_runs_roscore() -> None:
+def test_the_first_of_equal_robots_publishes_and_the_relay_runs_roscore() -> None:
     cast = backend().cast(Topology.MASTER)
     keys = KeyPair.make(), KeyPair.make()
     specs = {role: robot_spec(cast, role, ros=RosChoice.DEBIAN, login=keys[0], host_key=keys[1]) for role in cast}
@@ -164,8 +174,8 @@ def test_the_first_of_equal_robots_publishes_and_who_runs_the_master_runs_roscor
     }
 
 
-def test_the_built_in_ros_has_no_master_to_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigurationError, match="with Debian's ROS alone") as caught:
+def test_the_built_in_ros_has_no_shared_master(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigurationError, match="which for emulated robots needs Debian's ROS") as caught:
         requirements.check_shared_master(RosChoice.BUILTIN)
     assert "python3-rosmaster" in caught.value.remedy
     requirements.check_shared_master(RosChoice.DEBIAN)

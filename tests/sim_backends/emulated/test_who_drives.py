@@ -1,4 +1,4 @@
-"""Which emulated robots drive by their topic where a step moves them; the lab moves the others."""
+"""Which emulated robots are driven by their topic when a step moves them; the lab moves the others."""
 
 from pathlib import Path
 
@@ -59,20 +59,20 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ((ZENOH, ZENOH | OWN_TOPICS), "auto\n  ros2: {discovery: router, router: drone}", set()),
     ],
 )
-def test_who_drives_is_obeyed_by_nobody_else(
+def test_robots_are_driven_by_topic_only_if_no_other_robot_subscribes_to_it(
     folder: Path, profiles: tuple[dict[str, str], dict[str, str]], ros: str, drives: set[str]
 ) -> None:
     assert driving(folder, profiles, SITE.replace("ROS", ros)) == drives
 
 
 @pytest.mark.parametrize(("two", "drives"), [({}, set()), (OWN_TOPICS, {"one", "two"})])
-def test_on_a_shared_master_topics_have_to_be_ones_own(folder: Path, two: dict[str, str], drives: set[str]) -> None:
+def test_on_a_shared_master_topics_must_differ(folder: Path, two: dict[str, str], drives: set[str]) -> None:
     text = SITE.replace("ROS", "debian") + "ros_master: relay\n"
     assert driving(folder, ({}, two), text) == drives
 
 
 def driving(folder: Path, profiles: tuple[dict[str, str], dict[str, str]], site: str) -> set[str]:
-    """Return the names of the robots of a site file that drive by themselves."""
+    """Return the names of the robots of a site file that are driven by their topic."""
     for name, changes in zip(("one", "two"), profiles, strict=True):
         write_profile(folder / "robots", name, changes)
     (folder / "fieldkit.yaml").write_text(site, encoding="utf-8")

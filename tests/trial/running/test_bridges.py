@@ -199,7 +199,7 @@ def test_an_emulated_lab_without_debian_s_ros_refuses_it(monkeypatch: pytest.Mon
     backend = EmulatedBackend(schema.validate(document, Site), document)
     monkeypatch.setattr("sim_backends.emulated.requirements.check", lambda _: None)
     with (
-        pytest.raises(ConfigurationError, match="asks for a bridge, which needs Debian's ROS"),
+        pytest.raises(ConfigurationError, match="has a bridge, which needs Debian's ROS"),
         backend.open(cast(), seed=1, sink=lambda _: None, operator=NOBODY),
     ):
         raise AssertionError("it is open")

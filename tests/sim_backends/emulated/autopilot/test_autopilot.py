@@ -1,4 +1,4 @@
-"""The autopilot as a ground station sees it: answers, refusals, flights, and bytes that are no MAVLink."""
+"""The autopilot from the view of a ground station: answers, refusals, flights, and bytes that are not MAVLink."""
 
 import math
 import random
@@ -26,7 +26,7 @@ RELATIVE = d.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 def gcs() -> GroundStation:
     station = GroundStation()
     station.wait(2)
-    station.ask(10, d.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
+    station.request_rate(10, d.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
     return station
 
 
@@ -37,7 +37,7 @@ def take_off(gcs: GroundStation, height_m: float = 3.0) -> None:
 
 
 def remarks(gcs: GroundStation) -> list[str]:
-    return [one.text for one in gcs.heard if one.get_type() == "STATUSTEXT"]
+    return [message.text for message in gcs.received if message.get_type() == "STATUSTEXT"]
 
 
 def item(number: int, east_m: float, north_m: float, up_m: float, command: int = d.MAV_CMD_NAV_WAYPOINT) -> Message:
@@ -46,63 +46,65 @@ def item(number: int, east_m: float, north_m: float, up_m: float, command: int =
 
 
 def upload(gcs: GroundStation, items: list[Message]) -> int:
-    """Upload items, saying again what has no answer; return the result."""
+    """Upload items, repeating messages without an answer; return the result."""
     pending = d.MAVLink_mission_count_message(SYSTEM, 1, len(items))
     for _ in range(200):
-        for answer in gcs.say(pending) + gcs.wait(0.3):
+        for answer in gcs.send_message(pending) + gcs.wait(0.3):
             if answer.get_type() == "MISSION_ACK":
                 return int(answer.type)
             if answer.get_type() == "MISSION_REQUEST_INT":
                 pending = items[answer.seq]
-    raise AssertionError("no end")
+    raise AssertionError("the upload did not end")
 
 
 class TestTelemetry:
-    def test_comes_at_its_rates(self, gcs: GroundStation) -> None:
-        heard = Counter(one.get_type() for one in gcs.wait(20))
-        assert heard["HEARTBEAT"] == heard["SYS_STATUS"] == heard["EXTENDED_SYS_STATE"] == 20
-        assert abs(heard["LOCAL_POSITION_NED"] - 200) <= 1, "as asked"
-        assert abs(heard["ATTITUDE"] - 300) <= 1
-        assert heard["GLOBAL_POSITION_INT"] == 100
-        assert heard["HOME_POSITION"] == heard["BATTERY_STATUS"] == 10
-        assert not {"HIGHRES_IMU", "ODOMETRY", "ATTITUDE_QUATERNION"} & heard.keys()
+    def test_messages_have_their_rates(self, gcs: GroundStation) -> None:
+        counts = Counter(message.get_type() for message in gcs.wait(20))
+        assert counts["HEARTBEAT"] == counts["SYS_STATUS"] == counts["EXTENDED_SYS_STATE"] == 20
+        assert abs(counts["LOCAL_POSITION_NED"] - 200) <= 1, "as requested"
+        assert abs(counts["ATTITUDE"] - 300) <= 1
+        assert counts["GLOBAL_POSITION_INT"] == 100
+        assert counts["HOME_POSITION"] == counts["BATTERY_STATUS"] == 10
+        assert not {"HIGHRES_IMU", "ODOMETRY", "ATTITUDE_QUATERNION"} & counts.keys()
 
-    def test_is_numbered_without_a_gap(self, gcs: GroundStation) -> None:
-        numbers = [one.get_seq() for one in gcs.wait(10)]
+    def test_sequence_numbers_have_no_gaps(self, gcs: GroundStation) -> None:
+        numbers = [message.get_seq() for message in gcs.wait(10)]
         assert all((after - before) % 256 == 1 for before, after in pairwise(numbers))
 
-    def test_an_interval_holds_until_it_is_as_usual_again(self, gcs: GroundStation) -> None:
+    def test_an_interval_stays_until_the_default_is_requested(self, gcs: GroundStation) -> None:
         for interval_us, expected in ((100_000, 100), (-1, 0), (0, 10)):
             assert gcs.command(d.MAV_CMD_SET_MESSAGE_INTERVAL, d.MAVLINK_MSG_ID_SYS_STATUS, interval_us) == OK
-            heard = Counter(one.get_type() for one in gcs.wait(10))
-            assert abs(heard["SYS_STATUS"] - expected) <= 1
+            counts = Counter(message.get_type() for message in gcs.wait(10))
+            assert abs(counts["SYS_STATUS"] - expected) <= 1
         assert gcs.command(d.MAV_CMD_SET_MESSAGE_INTERVAL, 12_345, 1e6) == d.MAV_RESULT_FAILED
 
-    def test_a_data_stream_is_not_known_to_it(self, gcs: GroundStation) -> None:
-        gcs.say(d.MAVLink_request_data_stream_message(SYSTEM, 1, d.MAV_DATA_STREAM_POSITION, 2, 1))
-        assert abs(Counter(one.get_type() for one in gcs.wait(10))["LOCAL_POSITION_NED"] - 100) <= 1
+    def test_data_stream_requests_are_ignored(self, gcs: GroundStation) -> None:
+        gcs.send_message(d.MAVLink_request_data_stream_message(SYSTEM, 1, d.MAV_DATA_STREAM_POSITION, 2, 1))
+        assert abs(Counter(message.get_type() for message in gcs.wait(10))["LOCAL_POSITION_NED"] - 100) <= 1
 
-    def test_it_says_what_it_is_when_asked(self, gcs: GroundStation) -> None:
+    def test_it_sends_its_version_on_request(self, gcs: GroundStation) -> None:
         assert gcs.command(d.MAV_CMD_REQUEST_MESSAGE, d.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == OK
         assert gcs.last("AUTOPILOT_VERSION").capabilities & d.MAV_PROTOCOL_CAPABILITY_MISSION_INT
         assert gcs.command(d.MAV_CMD_REQUEST_MESSAGE, math.nan) == d.MAV_RESULT_DENIED
         assert gcs.command(d.MAV_CMD_DO_PARACHUTE) == d.MAV_RESULT_UNSUPPORTED
 
-    def test_who_says_nothing_hears_nothing_more(self, gcs: GroundStation) -> None:
+    def test_silent_clients_receive_nothing_more(self, gcs: GroundStation) -> None:
         later_ns = gcs.now_ns + 16_000_000_000
         assert not list(gcs.autopilot.advance(later_ns))
         assert gcs.autopilot.next_ns() is None
 
-    def test_places_agree_with_each_other(self, gcs: GroundStation) -> None:
+    def test_positions_agree_with_each_other(self, gcs: GroundStation) -> None:
         take_off(gcs)
-        place, home, local = (gcs.last(one) for one in ("GLOBAL_POSITION_INT", "HOME_POSITION", "LOCAL_POSITION_NED"))
+        place, home, local = (
+            gcs.last(kind) for kind in ("GLOBAL_POSITION_INT", "HOME_POSITION", "LOCAL_POSITION_NED")
+        )
         assert (place.lat, place.lon) == (home.latitude, home.longitude) == degrees_e7(*HOME_M[:2])
         assert place.alt - home.altitude == pytest.approx(place.relative_alt, abs=1)
         assert -local.z * 1e3 == pytest.approx(place.relative_alt, abs=50)
 
 
 class TestFlight:
-    def test_up_and_down(self, gcs: GroundStation) -> None:
+    def test_take_off_and_land(self, gcs: GroundStation) -> None:
         take_off(gcs)
         assert gcs.last("LOCAL_POSITION_NED").z == pytest.approx(-3.0, abs=0.1)
         assert gcs.last("EXTENDED_SYS_STATE").landed_state == d.MAV_LANDED_STATE_IN_AIR
@@ -112,7 +114,7 @@ class TestFlight:
         assert gcs.last("EXTENDED_SYS_STATE").landed_state == d.MAV_LANDED_STATE_ON_GROUND
         assert not gcs.last("HEARTBEAT").base_mode & d.MAV_MODE_FLAG_SAFETY_ARMED
 
-    def test_what_it_refuses(self, gcs: GroundStation) -> None:
+    def test_refused_commands(self, gcs: GroundStation) -> None:
         assert gcs.command(d.MAV_CMD_NAV_TAKEOFF) == NOT_NOW
         assert gcs.command(d.MAV_CMD_NAV_LAND) == NOT_NOW
         assert gcs.command(d.MAV_CMD_MISSION_START) == NOT_NOW
@@ -127,30 +129,30 @@ class TestFlight:
         assert "Takeoff denied: not armed" in remarks(gcs)
         assert "Disarming denied: not landed" in remarks(gcs)
 
-    def test_a_takeoff_whose_answer_was_lost_can_be_asked_again(self, gcs: GroundStation) -> None:
+    def test_a_takeoff_can_be_repeated_after_a_lost_answer(self, gcs: GroundStation) -> None:
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
         for _ in range(3):
             assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 3) == OK
             gcs.wait(0.5)
 
-    def test_forced_in_the_air_it_falls(self, gcs: GroundStation) -> None:
+    def test_a_forced_disarm_in_the_air_makes_it_fall(self, gcs: GroundStation) -> None:
         take_off(gcs)
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196) == OK
         gcs.wait(1)
         assert gcs.last("LOCAL_POSITION_NED").z == 0
 
-    def test_armed_and_left_alone_it_disarms(self, gcs: GroundStation) -> None:
+    def test_it_disarms_if_it_does_not_take_off(self, gcs: GroundStation) -> None:
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
         gcs.wait(9)
         assert gcs.autopilot.vehicle.armed
         gcs.wait(2)
         assert not gcs.autopilot.vehicle.armed
 
-    def test_set_points_lead_it_as_long_as_they_come(self, gcs: GroundStation) -> None:
+    def test_it_follows_set_points_until_they_stop(self, gcs: GroundStation) -> None:
         take_off(gcs)
         only_velocity = 0b111111000111
         for number in range(30):
-            gcs.say(
+            gcs.send_message(
                 d.MAVLink_set_position_target_local_ned_message(
                     0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, only_velocity, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0
                 )
@@ -164,11 +166,11 @@ class TestFlight:
         assert gcs.last("HEARTBEAT").custom_mode == 4 << 16 | 3 << 24
         assert (d.MAV_SEVERITY_CRITICAL, "Failsafe activated") in gcs.texts()
 
-    def test_no_set_point_takes_it_over_the_fence(self, gcs: GroundStation) -> None:
+    def test_set_points_do_not_lead_over_the_fence(self, gcs: GroundStation) -> None:
         take_off(gcs)
-        gcs.say(d.MAVLink_param_set_message(SYSTEM, 1, b"GF_MAX_HOR_DIST", 10.0, d.MAV_PARAM_TYPE_REAL32))
+        gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, b"GF_MAX_HOR_DIST", 10.0, d.MAV_PARAM_TYPE_REAL32))
         for number in range(100):
-            gcs.say(
+            gcs.send_message(
                 d.MAVLink_set_position_target_local_ned_message(
                     0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, 0b111111000111, 0, 0, 0, 3.0, 3.0, 0, 0, 0, 0, 0, 0
                 )
@@ -180,25 +182,25 @@ class TestFlight:
         here = gcs.last("LOCAL_POSITION_NED")
         assert 9.0 < math.hypot(here.x, here.y) <= 10.1
 
-    def test_home_again(self, gcs: GroundStation) -> None:
+    def test_return_to_launch(self, gcs: GroundStation) -> None:
         take_off(gcs)
         x, y = degrees_e7(HOME_M[0] + 8, HOME_M[1])
-        gcs.say(
+        gcs.send_message(
             d.MAVLink_command_int_message(SYSTEM, 1, RELATIVE, d.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, 0, x, y, 4)
         )
         gcs.wait(10)
         assert gcs.last("LOCAL_POSITION_NED").y == pytest.approx(8.0, abs=0.1)
         assert gcs.command(d.MAV_CMD_NAV_RETURN_TO_LAUNCH) == OK
-        heights = [-one.z for one in gcs.wait(40) if one.get_type() == "LOCAL_POSITION_NED"]
+        heights = [-message.z for message in gcs.wait(40) if message.get_type() == "LOCAL_POSITION_NED"]
         assert max(heights) == pytest.approx(10.0, abs=0.2), "RTL_RETURN_ALT"
         assert not gcs.autopilot.vehicle.armed
         assert math.hypot(*gcs.autopilot.vehicle.body.position_m[:2]) < 0.6
 
 
 class TestLimits:
-    """Whatever it is told, it stays within what its profile allows, but for half a metre while it stops.
+    """Any commands keep it within the limits of its profile, except for half a metre while it brakes.
 
-    And it may be faster by a twentieth for a moment, since its attitude lags behind what it is told.
+    Its speed may exceed the limit by a twentieth for a short time, since its attitude lags behind the commands.
     """
 
     BEYOND_M, FASTER = 0.5, 1.05
@@ -217,25 +219,25 @@ class TestLimits:
             (False, (0, -6, -14), (-10, -2, 33)),
         ]
     )  # brakes twice at the fence
-    def test_no_order_takes_it_beyond(
+    def test_commands_do_not_exceed_the_limits(
         self, orders: list[tuple[bool, tuple[float, float, float], tuple[float, float, float]]]
     ) -> None:
         gcs = GroundStation(limits=self.LIMITS)
         gcs.wait(1)
-        for name, much in ((b"GF_MAX_HOR_DIST", 99.0), (b"GF_MAX_VER_DIST", 99.0), (b"MPC_XY_VEL_MAX", 9.0)):
-            gcs.say(d.MAVLink_param_set_message(SYSTEM, 1, name, much, d.MAV_PARAM_TYPE_REAL32))
+        for name, value in ((b"GF_MAX_HOR_DIST", 99.0), (b"GF_MAX_VER_DIST", 99.0), (b"MPC_XY_VEL_MAX", 9.0)):
+            gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, name, value, d.MAV_PARAM_TYPE_REAL32))
         take_off(gcs)
         for by_velocity, velocity, place in orders:
             east_m, north_m, up_m = place
             x, y = degrees_e7(HOME_M[0] + east_m, HOME_M[1] + north_m)
-            gcs.say(
+            gcs.send_message(
                 d.MAVLink_command_int_message(
                     SYSTEM, 1, RELATIVE, d.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, 0, x, y, up_m
                 )
             )
             mask = 0b111111000111 if by_velocity else 0b110111111000
             for number in range(40):
-                gcs.say(
+                gcs.send_message(
                     d.MAVLink_set_position_target_local_ned_message(
                         0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, mask, *place, *velocity, 0, 0, 0, 0, 0
                     )
@@ -248,7 +250,7 @@ class TestLimits:
                 assert -0.01 <= body.position_m[2] <= self.LIMITS.height_m + self.BEYOND_M
                 assert math.hypot(*body.velocity_m_s[:2]) <= self.LIMITS.speed_m_s * self.FASTER
 
-    def test_a_take_off_and_a_mission_beyond_are_refused(self) -> None:
+    def test_a_take_off_and_a_mission_outside_the_limits_are_refused(self) -> None:
         gcs = GroundStation(limits=self.LIMITS)
         gcs.wait(1)
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
@@ -258,55 +260,60 @@ class TestLimits:
 
 
 class TestParameters:
-    def test_all_of_them(self, gcs: GroundStation) -> None:
-        answers = gcs.say(d.MAVLink_param_request_list_message(SYSTEM, 1))
-        assert [one.param_index for one in answers] == list(range(answers[0].param_count))
-        assert {one.param_id: one.param_value for one in answers}["MPC_XY_VEL_MAX"] == 3.0
+    def test_the_list_is_complete(self, gcs: GroundStation) -> None:
+        answers = gcs.send_message(d.MAVLink_param_request_list_message(SYSTEM, 1))
+        assert [answer.param_index for answer in answers] == list(range(answers[0].param_count))
+        assert {answer.param_id: answer.param_value for answer in answers}["MPC_XY_VEL_MAX"] == 3.0
 
-    def test_no_more_than_it_may_be(self, gcs: GroundStation) -> None:
-        for wanted, stands in ((2.0, 2.0), (30.0, 2.0), (math.nan, 2.0)):
-            (now,) = gcs.say(
-                d.MAVLink_param_set_message(SYSTEM, 1, b"MPC_XY_VEL_MAX", wanted, d.MAV_PARAM_TYPE_REAL32)
+    def test_values_outside_the_range_are_rejected(self, gcs: GroundStation) -> None:
+        for requested, expected in ((2.0, 2.0), (30.0, 2.0), (math.nan, 2.0)):
+            (now,) = gcs.send_message(
+                d.MAVLink_param_set_message(SYSTEM, 1, b"MPC_XY_VEL_MAX", requested, d.MAV_PARAM_TYPE_REAL32)
             )
-            assert now.param_value == stands
-        assert not gcs.say(d.MAVLink_param_request_read_message(SYSTEM, 1, b"NO_SUCH", -1))
+            assert now.param_value == expected
+        assert not gcs.send_message(d.MAVLink_param_request_read_message(SYSTEM, 1, b"NO_SUCH", -1))
 
 
 class TestMission:
     PLACES = ((4.0, 0.0, 3.0), (4.0, 4.0, 4.0), (0.0, 4.0, 3.0))
 
     @pytest.mark.parametrize("loss", [0.0, 0.05, 0.3])
-    def test_is_flown_whatever_is_lost(self, loss: float) -> None:
+    def test_a_mission_is_flown_despite_loss(self, loss: float) -> None:
         dice = random.Random(7)
-        gcs = GroundStation(lost=lambda: dice.random() < loss)
+        gcs = GroundStation(is_lost=lambda: dice.random() < loss)
         items = [item(number, *place) for number, place in enumerate(self.PLACES)]
         items.append(item(len(items), 0, 0, 0, d.MAV_CMD_NAV_RETURN_TO_LAUNCH))
         assert upload(gcs, items) == d.MAV_MISSION_ACCEPTED
-        assert [one.command for one in gcs.autopilot.vehicle.mission.items] == [one.command for one in items]
+        assert [entry.command for entry in gcs.autopilot.vehicle.mission.items] == [entry.command for entry in items]
         gcs.autopilot.vehicle.arm()
         for _ in range(30):
-            gcs.say(d.MAVLink_command_long_message(SYSTEM, 1, d.MAV_CMD_MISSION_START, 0, *(0,) * 7))
+            gcs.send_message(d.MAVLink_command_long_message(SYSTEM, 1, d.MAV_CMD_MISSION_START, 0, *(0,) * 7))
         nearest = dict.fromkeys(self.PLACES, math.inf)
         for _ in range(600):
             gcs.wait(0.1)
             here = gcs.autopilot.vehicle.body.position_m
-            nearest = {place: min(far, math.dist(place, here)) for place, far in nearest.items()}
+            nearest = {place: min(distance_m, math.dist(place, here)) for place, distance_m in nearest.items()}
         assert max(nearest.values()) < 0.5
         assert not gcs.autopilot.vehicle.armed
         if not loss:
-            told = [one.seq for one in gcs.heard if one.get_type() == "MISSION_ITEM_REACHED"]
-            assert list(dict.fromkeys(told)) == [0, 1, 2, 3]
-            assert told.count(3) == 1 + REPEATS, "for whoever did not hear it"
+            reached = [message.seq for message in gcs.received if message.get_type() == "MISSION_ITEM_REACHED"]
+            assert list(dict.fromkeys(reached)) == [0, 1, 2, 3]
+            assert reached.count(3) == 1 + REPEATS, "repeated in case of loss"
 
-    def test_comes_back_as_it_went(self, gcs: GroundStation) -> None:
+    def test_a_mission_can_be_downloaded(self, gcs: GroundStation) -> None:
         items = [item(number, *place) for number, place in enumerate(self.PLACES)]
         assert upload(gcs, items) == d.MAV_MISSION_ACCEPTED
-        (count,) = gcs.say(d.MAVLink_mission_request_list_message(SYSTEM, 1))
+        (count,) = gcs.send_message(d.MAVLink_mission_request_list_message(SYSTEM, 1))
         assert count.count == len(items)
         for sent in items:
-            (back,) = gcs.say(d.MAVLink_mission_request_int_message(SYSTEM, 1, sent.seq))
-            assert (back.x, back.y, back.z, back.command) == (sent.x, sent.y, sent.z, sent.command)
-        (ack,) = gcs.say(d.MAVLink_mission_request_int_message(SYSTEM, 1, 3))
+            (downloaded,) = gcs.send_message(d.MAVLink_mission_request_int_message(SYSTEM, 1, sent.seq))
+            assert (downloaded.x, downloaded.y, downloaded.z, downloaded.command) == (
+                sent.x,
+                sent.y,
+                sent.z,
+                sent.command,
+            )
+        (ack,) = gcs.send_message(d.MAVLink_mission_request_int_message(SYSTEM, 1, 3))
         assert ack.type == d.MAV_MISSION_INVALID_SEQUENCE
 
     @pytest.mark.parametrize(
@@ -318,21 +325,21 @@ class TestMission:
             (item(0, 0.0, 0.0, 3.0, d.MAV_CMD_DO_PARACHUTE), d.MAV_MISSION_UNSUPPORTED),
         ],
     )
-    def test_that_it_cannot_fly_is_refused(self, gcs: GroundStation, wrong: Message, result: int) -> None:
+    def test_unsupported_items_are_refused(self, gcs: GroundStation, wrong: Message, result: int) -> None:
         assert upload(gcs, [wrong]) == result
         assert not gcs.autopilot.vehicle.mission.items
 
-    def test_an_upload_that_nobody_goes_on_with_is_given_up(self, gcs: GroundStation) -> None:
-        gcs.say(d.MAVLink_mission_count_message(SYSTEM, 1, 3))
-        heard = Counter(one.get_type() for one in gcs.wait(10))
-        assert heard["MISSION_REQUEST_INT"] == 19
+    def test_an_abandoned_upload_is_cancelled(self, gcs: GroundStation) -> None:
+        gcs.send_message(d.MAVLink_mission_count_message(SYSTEM, 1, 3))
+        counts = Counter(message.get_type() for message in gcs.wait(10))
+        assert counts["MISSION_REQUEST_INT"] == 19
         assert gcs.last("MISSION_ACK").type == d.MAV_MISSION_OPERATION_CANCELLED
 
 
 def frames() -> list[bytes]:
-    """One frame of every message of the dialect, with zeros in it, and some that ask for much."""
+    """Return one frame of every message of the dialect, with zeros, and some with extreme requests."""
     link = d.MAVLink(None, srcSystem=255, srcComponent=190)
-    asks = [
+    requests = [
         d.MAVLink_mission_count_message(SYSTEM, 1, 65_535),
         d.MAVLink_mission_count_message(SYSTEM, 1, 2),
         item(0, 1.0, 1.0, 2.0),
@@ -343,9 +350,12 @@ def frames() -> list[bytes]:
             for command in (16, 20, 21, 22, 176, 178, 192, 224, 300, 400, 510, 511, 512, 520)
             for value in (0.0, 1.0, -1.0, 1e30, math.nan, math.inf, 0.5)
         ),
-        *(d.MAVLink_command_int_message(SYSTEM, 1, f, 192, 0, 0, *(0,) * 4, 1, 1, math.nan) for f in (0, 6, 99)),
+        *(
+            d.MAVLink_command_int_message(SYSTEM, 1, frame, 192, 0, 0, *(0,) * 4, 1, 1, math.nan)
+            for frame in (0, 6, 99)
+        ),
     ]
-    return [one.pack(link) for one in asks]
+    return [request.pack(link) for request in requests]
 
 
 FRAMES = frames()
@@ -360,8 +370,8 @@ mutated = st.builds(changed, st.sampled_from(FRAMES), st.integers(0, 279), st.in
 cut = st.builds(lambda frame, end: frame[: end % len(frame)], st.sampled_from(FRAMES), st.integers(0, 279))
 
 
-def signed_again(frame: bytes) -> bytes:
-    """Return a frame with a checksum that is right for what is in it: so that it is read as what it says."""
+def with_valid_checksum(frame: bytes) -> bytes:
+    """Return a frame with a valid checksum for its content, so that it is not discarded."""
     kind = int.from_bytes(frame[7:10], "little")
     if frame[0] != 0xFD or len(frame) < 12 or kind not in d.mavlink_map:
         return frame
@@ -371,30 +381,30 @@ def signed_again(frame: bytes) -> bytes:
     return frame[:-2] + checksum.to_bytes(2, "little")
 
 
-hostile = st.one_of(st.binary(max_size=300), mutated, cut, mutated.map(signed_again), st.sampled_from(FRAMES))
+hostile = st.one_of(st.binary(max_size=300), mutated, cut, mutated.map(with_valid_checksum), st.sampled_from(FRAMES))
 
 
 class TestHostile:
     @settings(deadline=None)
     @given(st.lists(hostile, min_size=1, max_size=12))
-    def test_no_bytes_end_it(self, datagrams: list[bytes]) -> None:
+    def test_any_bytes_are_survived(self, datagrams: list[bytes]) -> None:
         gcs = GroundStation()
         for datagram in datagrams:
             gcs.send(datagram)
             gcs.wait(0.1)
-        assert Counter(one.get_type() for one in gcs.wait(3))["HEARTBEAT"] >= 2
+        assert Counter(message.get_type() for message in gcs.wait(3))["HEARTBEAT"] >= 2
 
-    def test_a_frame_that_was_cut_does_not_spoil_the_next(self, gcs: GroundStation) -> None:
+    def test_a_truncated_frame_does_not_affect_the_next(self, gcs: GroundStation) -> None:
         gcs.send(FRAMES[3][:-4])
         assert gcs.send(FRAMES[3])
 
     @pytest.mark.parametrize(("system", "component"), [(SYSTEM + 1, 1), (SYSTEM, 100)])
-    def test_what_is_for_others_is_left_to_them(self, gcs: GroundStation, system: int, component: int) -> None:
+    def test_messages_to_other_systems_are_ignored(self, gcs: GroundStation, system: int, component: int) -> None:
         message = d.MAVLink_command_long_message(system, component, d.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, *(0,) * 6)
-        assert gcs.say(message) == []
+        assert gcs.send_message(message) == []
         assert not gcs.autopilot.vehicle.armed
 
-    def test_one_client_too_many_is_not_served(self, gcs: GroundStation) -> None:
+    def test_clients_beyond_the_maximum_are_not_served(self, gcs: GroundStation) -> None:
         for port in range(2, 40):
             list(gcs.autopilot.receive(FRAMES[3], ("other", port), gcs.now_ns))
         assert not list(gcs.autopilot.receive(FRAMES[3], ("late", 1), gcs.now_ns))

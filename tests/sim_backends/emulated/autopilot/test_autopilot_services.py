@@ -1,4 +1,4 @@
-"""Services that ground stations use: parameters, missions, ping, logs, files, and messages on request."""
+"""Services for ground stations: parameters, missions, ping, logs, files, and messages on request."""
 
 import struct
 from typing import Any
@@ -28,16 +28,16 @@ def station(firmware: Firmware) -> GroundStation:
 @FIRMWARES
 def test_ping_logs_and_files_have_an_answer(firmware: Firmware) -> None:
     gcs = station(firmware)
-    (ping,) = gcs.say(d.MAVLink_ping_message(123_456, 7, 0, 0))
+    (ping,) = gcs.send_message(d.MAVLink_ping_message(123_456, 7, 0, 0))
     assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (123_456, 7, 255, 190)
-    assert gcs.say(d.MAVLink_ping_message(1, 1, SYSTEM, 1)) == [], "an answer has no answer"
-    (log,) = gcs.say(d.MAVLink_log_request_list_message(SYSTEM, 1, 0, 0xFFFF))
+    assert gcs.send_message(d.MAVLink_ping_message(1, 1, SYSTEM, 1)) == [], "an answer has no answer"
+    (log,) = gcs.send_message(d.MAVLink_log_request_list_message(SYSTEM, 1, 0, 0xFFFF))
     assert log.num_logs == 0
     for opcode, expected, error in ((4, 129, 10), (3, 129, 6), (77, 129, 7), (2, 128, None)):
         request = struct.pack("<HBBBBBxI", 65_535, 3, opcode, 0, 0, 0, 0).ljust(251, b"\0")
-        (answer,) = gcs.say(d.MAVLink_file_transfer_protocol_message(0, SYSTEM, 1, list(request)))
-        number, session, result, size, asked, _, _ = struct.unpack_from("<HBBBBBxI", bytes(answer.payload))
-        assert (number, session, result, asked) == (0, 3, expected, opcode)
+        (answer,) = gcs.send_message(d.MAVLink_file_transfer_protocol_message(0, SYSTEM, 1, list(request)))
+        number, session, result, size, requested_opcode, _, _ = struct.unpack_from("<HBBBBBxI", bytes(answer.payload))
+        assert (number, session, result, requested_opcode) == (0, 3, expected, opcode)
         assert list(answer.payload[12 : 12 + size]) == ([] if error is None else [error])
 
 
@@ -77,10 +77,10 @@ def test_messages_that_pymavlink_lacks_have_the_right_checksums() -> None:
 
 
 class Raw(GroundStation):
-    """A ground station that sees the ids of messages that pymavlink's dialect does not have."""
+    """A ground station that reads the ids of messages missing in pymavlink's dialect."""
 
     def answers(self, kind: int, param2: float = 0) -> tuple[int, list[int]]:
-        """Return the result of MAV_CMD_REQUEST_MESSAGE, and the ids of what else came."""
+        """Return the result of MAV_CMD_REQUEST_MESSAGE, and the ids of the other messages received."""
         command = d.MAVLink_command_long_message(
             SYSTEM, 1, d.MAV_CMD_REQUEST_MESSAGE, 0, kind, param2, 0, 0, 0, 0, 0
         ).pack(self._link)
@@ -122,14 +122,18 @@ def test_each_mode_is_listed(firmware: Firmware) -> None:
 
 def test_attitude_and_acceleration_agree_in_flight() -> None:
     gcs = station(PX4)
-    gcs.ask(10, d.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, d.MAVLINK_MSG_ID_HIGHRES_IMU, d.MAVLINK_MSG_ID_ODOMETRY)
-    gcs.ask(10, d.MAVLINK_MSG_ID_LOCAL_POSITION_NED, d.MAVLINK_MSG_ID_ATTITUDE)
+    gcs.request_rate(
+        10, d.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, d.MAVLINK_MSG_ID_HIGHRES_IMU, d.MAVLINK_MSG_ID_ODOMETRY
+    )
+    gcs.request_rate(10, d.MAVLINK_MSG_ID_LOCAL_POSITION_NED, d.MAVLINK_MSG_ID_ATTITUDE)
     gcs.autopilot.vehicle.arm()
     gcs.autopilot.vehicle.take_off(3.0)
     gcs.wait(10)
     x, y = degrees_e7(HOME_M[0] + 20, HOME_M[1])
     frame = d.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
-    gcs.say(d.MAVLink_command_int_message(SYSTEM, 1, frame, d.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, 0, x, y, 3))
+    gcs.send_message(
+        d.MAVLink_command_int_message(SYSTEM, 1, frame, d.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, 0, x, y, 3)
+    )
     gcs.wait(4)
     gcs.now_ns -= gcs.now_ns % 100_000_000
     gcs.wait(0.2)
@@ -141,12 +145,12 @@ def test_attitude_and_acceleration_agree_in_flight() -> None:
     odometry, local = gcs.last("ODOMETRY"), gcs.last("LOCAL_POSITION_NED")
     body_speed = (odometry.vx**2 + odometry.vy**2 + odometry.vz**2) ** 0.5
     assert body_speed == pytest.approx((local.vx**2 + local.vy**2 + local.vz**2) ** 0.5, abs=0.2)
-    assert local.vy > 1.0, "it flies east"
+    assert local.vy > 1.0, "it is flying east"
     assert odometry.vx == pytest.approx(body_speed, abs=0.2), "with its nose ahead"
 
 
 def pitch_of(quaternion: Any) -> float:  # noqa: ANN401 (of pymavlink)
-    """Return the pitch of a quaternion by pymavlink's own library."""
+    """Return the pitch of a quaternion, computed by pymavlink's library."""
     turned = Quaternion([quaternion.q1, quaternion.q2, quaternion.q3, quaternion.q4])
     return float(turned.euler[1])
 
@@ -154,27 +158,29 @@ def pitch_of(quaternion: Any) -> float:  # noqa: ANN401 (of pymavlink)
 class TestParameters:
     def test_px4_integers_are_bytewise(self) -> None:
         gcs = station(PX4)
-        values = {one.param_id: one for one in gcs.say(d.MAVLink_param_request_list_message(SYSTEM, 1))}
+        values = {
+            value.param_id: value for value in gcs.send_message(d.MAVLink_param_request_list_message(SYSTEM, 1))
+        }
         autostart = values["SYS_AUTOSTART"]
         assert autostart.param_type == d.MAV_PARAM_TYPE_INT32
         assert struct.unpack("<i", struct.pack("<f", autostart.param_value)) == (10_040,)
         gcs.set("COM_DL_LOSS_T", 30)
-        gcs.say(d.MAVLink_param_set_message(SYSTEM, 1, b"COM_DL_LOSS_T", 20.0, d.MAV_PARAM_TYPE_REAL32))
+        gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, b"COM_DL_LOSS_T", 20.0, d.MAV_PARAM_TYPE_REAL32))
         gcs.wait(0.1)
         assert (d.MAV_SEVERITY_INFO, "[pm] param types mismatch param: COM_DL_LOSS_T") in gcs.texts()
 
     def test_arducopter_integers_are_cast(self) -> None:
         gcs = station(ARDUCOPTER)
-        (value,) = gcs.say(d.MAVLink_param_request_read_message(SYSTEM, 1, b"SYSID_MYGCS", -1))
+        (value,) = gcs.send_message(d.MAVLink_param_request_read_message(SYSTEM, 1, b"SYSID_MYGCS", -1))
         assert (value.param_value, value.param_type) == (255.0, d.MAV_PARAM_TYPE_INT32)
-        gcs.say(d.MAVLink_param_set_message(SYSTEM, 1, b"SYSID_MYGCS", 245.0, d.MAV_PARAM_TYPE_REAL32))
-        (value,) = gcs.say(d.MAVLink_param_request_read_message(SYSTEM, 1, b"SYSID_MYGCS", -1))
+        gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, b"SYSID_MYGCS", 245.0, d.MAV_PARAM_TYPE_REAL32))
+        (value,) = gcs.send_message(d.MAVLink_param_request_read_message(SYSTEM, 1, b"SYSID_MYGCS", -1))
         assert value.param_value == 245.0
 
     @pytest.mark.parametrize(("firmware", "texts"), [(PX4, ["[pm] unknown param: NO_SUCH"]), (ARDUCOPTER, [])])
     def test_an_unknown_name(self, firmware: Firmware, texts: list[str]) -> None:
         gcs = station(firmware)
-        assert not gcs.say(d.MAVLink_param_set_message(SYSTEM, 1, b"NO_SUCH", 1.0, d.MAV_PARAM_TYPE_REAL32))
+        assert not gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, b"NO_SUCH", 1.0, d.MAV_PARAM_TYPE_REAL32))
         gcs.wait(0.1)
         assert [text for _, text in gcs.texts()] == texts
 
@@ -184,7 +190,7 @@ def test_a_refused_mission_is_refused_again_when_the_answer_was_lost() -> None:
     x, y = degrees_e7(HOME_M[0] + 500, HOME_M[1])
     frame, waypoint = d.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, d.MAV_CMD_NAV_WAYPOINT
     item = d.MAVLink_mission_item_int_message(SYSTEM, 1, 0, frame, waypoint, 0, 1, 0, 0, 0, 0, x, y, 3.0)
-    gcs.say(d.MAVLink_mission_count_message(SYSTEM, 1, 1))
+    gcs.send_message(d.MAVLink_mission_count_message(SYSTEM, 1, 1))
     for _ in range(3):
-        (ack,) = gcs.say(item)
+        (ack,) = gcs.send_message(item)
         assert ack.type == d.MAV_MISSION_DENIED

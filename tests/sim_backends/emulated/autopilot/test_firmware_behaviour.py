@@ -38,7 +38,7 @@ class Station(GroundStation):
     def mode(self) -> str:
         return str(mavutil.mode_mapping_acm[self.last("HEARTBEAT").custom_mode])
 
-    def change(self, name: str) -> int:
+    def change_mode(self, name: str) -> int:
         return self.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, COPTER_MODES[name])
 
     def arm(self) -> int:
@@ -47,22 +47,22 @@ class Station(GroundStation):
     def take_off(self, height_m: float) -> int:
         return self.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height_m)
 
-    def alone(self, seconds: float) -> None:
-        """Let time pass without heartbeats."""
+    def wait_silently(self, seconds: float) -> None:
+        """Advance the time without heartbeats."""
         for _ in range(round(seconds * 10)):
             self.now_ns += 100_000_000
-            self._hear(frame for _, frame in self.autopilot.advance(self.now_ns))
+            self._receive(frame for _, frame in self.autopilot.advance(self.now_ns))
 
-    def beats(self, system: int, seconds: int) -> None:
-        """Let time pass while only a station of this system id sends heartbeats."""
+    def wait_with_heartbeats(self, system: int, seconds: int) -> None:
+        """Advance the time while only a station of this system id sends heartbeats."""
         link = d.MAVLink(None, srcSystem=system, srcComponent=190)
         for _ in range(seconds):
             beat = d.MAVLink_heartbeat_message(d.MAV_TYPE_GCS, 8, 0, 0, 4, 3).pack(link)
             list(self.autopilot.receive(beat, ("gcs", 1), self.now_ns))
-            self.alone(1)
+            self.wait_silently(1)
 
-    def reaches(self, condition: str, limit_s: float) -> Iterator[None]:
-        """Yield every tenth of a second of virtual time, at most for `limit_s`."""
+    def poll(self, condition: str, limit_s: float) -> Iterator[None]:
+        """Yield every 0.1 s of virtual time; fail after `limit_s`."""
         for _ in range(round(limit_s * 10)):
             self.wait(0.1)
             yield
@@ -71,10 +71,10 @@ class Station(GroundStation):
     def fly(self, height_m: float = 3.0) -> None:
         """Take off in the guided mode of ArduCopter, or by PX4's TAKEOFF."""
         if self.autopilot.vehicle.firmware.is_ardupilot:
-            assert self.change("GUIDED") == OK
+            assert self.change_mode("GUIDED") == OK
         assert self.arm() == OK
         assert self.take_off(height_m) == OK
-        for _ in self.reaches("up", 30):
+        for _ in self.poll("up", 30):
             if self.autopilot.vehicle.body.position_m[2] > 0.95 * height_m:
                 return
 
@@ -93,11 +93,11 @@ def px4() -> Station:
     return station
 
 
-def test_arducopter_sends_nothing_else_unasked(copter: Station) -> None:
-    heard = Counter(one.get_type() for one in copter.wait(60))
-    assert heard.keys() == {"HEARTBEAT", "TIMESYNC"}
-    assert heard["HEARTBEAT"] == 60
-    assert heard["TIMESYNC"] == 6
+def test_arducopter_sends_only_heartbeat_and_timesync_unasked(copter: Station) -> None:
+    counts = Counter(message.get_type() for message in copter.wait(60))
+    assert counts.keys() == {"HEARTBEAT", "TIMESYNC"}
+    assert counts["HEARTBEAT"] == 60
+    assert counts["TIMESYNC"] == 6
 
 
 @pytest.mark.parametrize("by", ["parameter", "request"])
@@ -105,50 +105,59 @@ def test_stream_rates_of_arducopter_are_parameters(copter: Station, by: str) -> 
     if by == "parameter":
         copter.set("SR0_POSITION", 4)
     else:
-        copter.say(d.MAVLink_request_data_stream_message(SYSTEM, 1, d.MAV_DATA_STREAM_POSITION, 4, 1))
-        assert copter.say(d.MAVLink_param_request_read_message(SYSTEM, 1, b"SR0_POSITION", -1))[0].param_value == 4
-    heard = Counter(one.get_type() for one in copter.wait(10))
-    assert abs(heard["LOCAL_POSITION_NED"] - 40) <= 1
-    copter.ask(10, LOCAL)
-    assert abs(Counter(one.get_type() for one in copter.wait(10))["LOCAL_POSITION_NED"] - 100) <= 1
+        copter.send_message(d.MAVLink_request_data_stream_message(SYSTEM, 1, d.MAV_DATA_STREAM_POSITION, 4, 1))
+        assert (
+            copter.send_message(d.MAVLink_param_request_read_message(SYSTEM, 1, b"SR0_POSITION", -1))[0].param_value
+            == 4
+        )
+    counts = Counter(message.get_type() for message in copter.wait(10))
+    assert abs(counts["LOCAL_POSITION_NED"] - 40) <= 1
+    copter.request_rate(10, LOCAL)
+    assert abs(Counter(message.get_type() for message in copter.wait(10))["LOCAL_POSITION_NED"] - 100) <= 1
     assert copter.command(d.MAV_CMD_SET_MESSAGE_INTERVAL, LOCAL, 0) == OK
-    assert abs(Counter(one.get_type() for one in copter.wait(10))["LOCAL_POSITION_NED"] - 40) <= 1, "the default"
+    assert abs(Counter(message.get_type() for message in copter.wait(10))["LOCAL_POSITION_NED"] - 40) <= 1, (
+        "the default"
+    )
 
 
 def other_frames(autopilot: Autopilot, now_ns: int, system: int, message: object) -> dict[int, Counter[str]]:
-    """Let another client send a message; return what each port number received as the answer."""
+    """Send a message from another client; return the message types that each client port received as answers."""
     link = d.MAVLink(None, srcSystem=system, srcComponent=190)
     readers = {port: d.MAVLink(None) for port in (1, 2)}
-    heard: dict[int, Counter[str]] = {1: Counter(), 2: Counter()}
+    counts: dict[int, Counter[str]] = {1: Counter(), 2: Counter()}
     for (_, port), frame in autopilot.receive(message.pack(link), ("gcs", 2), now_ns):  # type: ignore[attr-defined]
-        heard[port].update(one.get_type() for one in readers[port].parse_buffer(frame))
-    return heard
+        counts[port].update(answer.get_type() for answer in readers[port].parse_buffer(frame))
+    return counts
 
 
-def test_rates_belong_to_the_port_and_acknowledgements_to_the_asker(copter: Station) -> None:
-    copter.ask(10, LOCAL)
+def test_rates_belong_to_the_port_and_acknowledgements_to_the_sender(copter: Station) -> None:
+    copter.request_rate(10, LOCAL)
     stop = d.MAVLink_command_long_message(SYSTEM, 1, d.MAV_CMD_SET_MESSAGE_INTERVAL, 0, LOCAL, -1, 0, 0, 0, 0, 0)
-    heard = other_frames(copter.autopilot, copter.now_ns, 245, stop)
-    assert heard == {1: Counter(), 2: Counter(COMMAND_ACK=1)}
-    assert "LOCAL_POSITION_NED" not in {one.get_type() for one in copter.wait(5)}, "the other client stopped it"
+    counts = other_frames(copter.autopilot, copter.now_ns, 245, stop)
+    assert counts == {1: Counter(), 2: Counter(COMMAND_ACK=1)}
+    assert "LOCAL_POSITION_NED" not in {message.get_type() for message in copter.wait(5)}, (
+        "the other client stopped it"
+    )
     read = d.MAVLink_param_request_read_message(SYSTEM, 1, b"RTL_ALT", -1)
-    heard = other_frames(copter.autopilot, copter.now_ns, 245, read)
-    assert heard == {1: Counter(PARAM_VALUE=1), 2: Counter(PARAM_VALUE=1)}, "without a target it is for all"
+    counts = other_frames(copter.autopilot, copter.now_ns, 245, read)
+    assert counts == {1: Counter(PARAM_VALUE=1), 2: Counter(PARAM_VALUE=1)}, (
+        "a message without a target goes to all clients"
+    )
 
 
 def test_arducopter_has_a_position_once_its_estimate_has_an_origin() -> None:
     copter = Station(ARDUCOPTER, boot_s=10)
-    copter.ask(5, LOCAL, EKF, d.MAVLINK_MSG_ID_GPS_RAW_INT)
+    copter.request_rate(5, LOCAL, EKF, d.MAVLINK_MSG_ID_GPS_RAW_INT)
     early = copter.wait(9)
     assert copter.arm() == FAILED
     late = copter.wait(5)
-    assert {one.flags for one in early if one.get_type() == "EKF_STATUS_REPORT"} == {0xA7}
+    assert {message.flags for message in early if message.get_type() == "EKF_STATUS_REPORT"} == {0xA7}
     assert copter.last("EKF_STATUS_REPORT").flags == 831
-    assert "LOCAL_POSITION_NED" not in {one.get_type() for one in early}
+    assert "LOCAL_POSITION_NED" not in {message.get_type() for message in early}
     assert copter.last("LOCAL_POSITION_NED").z == 0
-    assert next(one.fix_type for one in early if one.get_type() == "GPS_RAW_INT") == d.GPS_FIX_TYPE_NO_FIX
+    assert next(message.fix_type for message in early if message.get_type() == "GPS_RAW_INT") == d.GPS_FIX_TYPE_NO_FIX
     assert copter.last("GPS_RAW_INT").fix_type == d.GPS_FIX_TYPE_RTK_FIXED == 6
-    texts = [one.text for one in early + late if one.get_type() == "STATUSTEXT"]
+    texts = [message.text for message in early + late if message.get_type() == "STATUSTEXT"]
     assert texts == [
         "PreArm: Need Position Estimate",
         "Arm: Need Position Estimate",
@@ -162,20 +171,20 @@ def test_arducopter_has_a_position_once_its_estimate_has_an_origin() -> None:
     assert copter.command(d.MAV_CMD_SET_MESSAGE_INTERVAL, d.MAVLINK_MSG_ID_RADIO_STATUS, 1e5) == DENIED
 
 
-def test_px4_is_not_armed_before_its_estimate_holds() -> None:
+def test_px4_is_not_armed_before_its_estimate_is_good() -> None:
     px4 = Station(PX4, boot_s=10)
     px4.wait(5)
     assert px4.arm() == d.MAV_RESULT_TEMPORARILY_REJECTED
     px4.wait(6)
     assert (CRITICAL, "Preflight Fail: ekf2 missing data") in px4.texts()
-    flags = [one.flags for one in px4.heard if one.get_type() == "ESTIMATOR_STATUS"]
+    flags = [message.flags for message in px4.received if message.get_type() == "ESTIMATOR_STATUS"]
     assert flags[0] & d.ESTIMATOR_CONST_POS_MODE
     assert flags[-1] == 831
     assert px4.arm() == OK
 
 
 def test_spool_up_landing_and_the_mode_afterwards(copter: Station) -> None:
-    assert copter.change("GUIDED") == OK
+    assert copter.change_mode("GUIDED") == OK
     assert copter.arm() == OK
     assert copter.take_off(3.0) == OK
     copter.wait(2.8)
@@ -186,17 +195,17 @@ def test_spool_up_landing_and_the_mode_afterwards(copter: Station) -> None:
     assert copter.last("HEARTBEAT").system_status == d.MAV_STATE_ACTIVE
     assert copter.take_off(3.0) == FAILED
     copter.wait(10)
-    assert copter.change("LAND") == OK
-    began_ns = copter.now_ns
-    for _ in copter.reaches("landed", 12):
+    assert copter.change_mode("LAND") == OK
+    start_ns = copter.now_ns
+    for _ in copter.poll("landed", 12):
         if copter.autopilot.vehicle.body.on_ground:
             break
-    down_s = (copter.now_ns - began_ns) / 1e9
-    for _ in copter.reaches("disarmed", 5):
+    down_s = (copter.now_ns - start_ns) / 1e9
+    for _ in copter.poll("disarmed", 5):
         if not copter.autopilot.vehicle.armed:
             break
     assert down_s == pytest.approx(6.4, abs=0.6), "as real ArduCopter from 3 m"
-    assert (copter.now_ns - began_ns) / 1e9 - down_s == pytest.approx(2.1, abs=0.2)
+    assert (copter.now_ns - start_ns) / 1e9 - down_s == pytest.approx(2.1, abs=0.2)
     copter.wait(1)
     assert copter.mode == "LAND"
     assert copter.arm() == FAILED
@@ -205,13 +214,13 @@ def test_spool_up_landing_and_the_mode_afterwards(copter: Station) -> None:
     assert (INFO, "Arming motors") in copter.texts()
 
 
-def test_an_unknown_mode_and_those_of_pilots(copter: Station) -> None:
+def test_an_unknown_mode_and_pilot_modes(copter: Station) -> None:
     assert copter.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 99) == FAILED
     copter.wait(0.1)
     assert copter.texts() == [(WARNING, "No such mode 99")]
     copter.fly()
     for name in ("ALT_HOLD", "STABILIZE", "POSHOLD", "BRAKE", "LOITER"):
-        assert copter.change(name) == OK
+        assert copter.change_mode(name) == OK
         copter.wait(4)
         assert copter.mode == name
         assert copter.autopilot.vehicle.body.position_m[2] == pytest.approx(3.0, abs=0.3)
@@ -232,38 +241,38 @@ def local_set_point(north: float, east: float, yaw_rad: float | None = None) -> 
 
 
 @pytest.mark.parametrize(("yaw_rad", "behavior", "heading_deg"), [(None, 2, 90), (None, 0, 0), (-1.0, 2, -57.3)])
-def test_arducopter_turns_along_the_way_unless_told(
+def test_arducopter_turns_along_its_path_unless_a_heading_is_set(
     copter: Station, yaw_rad: float | None, behavior: int, heading_deg: float
 ) -> None:
     copter.set("WP_YAW_BEHAVIOR", behavior)
     copter.fly()
-    copter.say(local_set_point(0.0, 30.0, yaw_rad))  # east
+    copter.send_message(local_set_point(0.0, 30.0, yaw_rad))  # east
     copter.wait(6)
     yaw_deg = math.degrees(math.remainder(math.pi / 2 - copter.autopilot.vehicle.body.yaw_rad, math.tau))
     assert yaw_deg == pytest.approx(heading_deg, abs=5)
 
 
-def test_where_it_landed_it_stays_and_home_follows_its_arming(copter: Station) -> None:
-    copter.ask(5, LOCAL, d.MAVLINK_MSG_ID_HOME_POSITION)
+def test_home_is_where_it_was_armed_last(copter: Station) -> None:
+    copter.request_rate(5, LOCAL, d.MAVLINK_MSG_ID_HOME_POSITION)
     copter.fly()
-    copter.say(local_set_point(4.0, 3.0))
+    copter.send_message(local_set_point(4.0, 3.0))
     copter.wait(10)
-    assert copter.change("LAND") == OK
+    assert copter.change_mode("LAND") == OK
     copter.wait(12)
-    assert copter.change("GUIDED") == OK
+    assert copter.change_mode("GUIDED") == OK
     assert copter.arm() == OK
     copter.wait(1)
     home, here = copter.last("HOME_POSITION"), copter.last("LOCAL_POSITION_NED")
     assert (home.x, home.y) == pytest.approx((here.x, here.y), abs=0.01)
     assert (here.x, here.y) == pytest.approx((4.0, 3.0), abs=0.3)
-    # Carried back by a person, it keeps the origin of its frame.
+    # If a person carries it back, the origin of its frame stays.
     copter.autopilot.vehicle.place((HOME_M[0], HOME_M[1] + 1.0, 0.0), 0.0, copter.now_ns)
     copter.wait(1)
     here = copter.last("LOCAL_POSITION_NED")
     assert (here.x, here.y) == pytest.approx((1.0, 0.0), abs=0.01)
 
 
-def test_a_battery_failsafe_lands_it_and_lasts_until_a_reboot(copter: Station) -> None:
+def test_a_battery_failsafe_lands_the_drone_and_lasts_until_a_reboot(copter: Station) -> None:
     for name, value in (("BATT_LOW_VOLT", 11.0), ("BATT_FS_LOW_ACT", 1), ("BATT_LOW_TIMER", 5)):
         copter.set(name, value)
     copter.fly()
@@ -278,30 +287,30 @@ def test_a_battery_failsafe_lands_it_and_lasts_until_a_reboot(copter: Station) -
     assert texts[1] == "Battery Failsafe"
     copter.wait(15)
     copter.set("SIM_BATT_VOLTAGE", 12.6)
-    assert copter.change("GUIDED") == OK
+    assert copter.change_mode("GUIDED") == OK
     assert copter.arm() == FAILED
     copter.wait(0.1)
     assert (CRITICAL, "Arm: Battery failsafe") in copter.texts()
     assert copter.command(d.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == OK
     copter.wait(2)
     assert copter.mode == "STABILIZE"
-    assert copter.change("GUIDED") == OK
+    assert copter.change_mode("GUIDED") == OK
     assert copter.arm() == OK
 
 
-def test_a_ground_station_failsafe_lands_it_until_it_is_heard_again(copter: Station) -> None:
+def test_a_ground_station_failsafe_lasts_until_heartbeats_return(copter: Station) -> None:
     copter.set("FS_GCS_ENABLE", 5)
     copter.fly()
-    copter.beats(254, 4)
+    copter.wait_with_heartbeats(254, 4)
     assert copter.mode == "GUIDED"
-    copter.beats(254, 2)
+    copter.wait_with_heartbeats(254, 2)
     assert copter.mode == "LAND", "system 254 is not its ground station"
     assert (WARNING, "GCS Failsafe") in copter.texts()
-    copter.beats(254, 15)
+    copter.wait_with_heartbeats(254, 15)
     assert copter.last("HEARTBEAT").system_status == d.MAV_STATE_CRITICAL
-    assert copter.change("GUIDED") == OK
+    assert copter.change_mode("GUIDED") == OK
     assert copter.arm() == FAILED
-    copter.beats(255, 2)
+    copter.wait_with_heartbeats(255, 2)
     assert (WARNING, "GCS Failsafe Cleared") in copter.texts()
     assert copter.arm() == OK
 
@@ -313,16 +322,16 @@ def px4_mode(px4: Station) -> int:
 def test_px4_holds_then_returns_without_its_ground_station(px4: Station) -> None:
     px4.set("NAV_DLL_ACT", 2)
     px4.fly()
-    px4.alone(11)
-    assert px4_mode(px4) == 4 << 16 | 3 << 24, "it holds"
+    px4.wait_silently(11)
+    assert px4_mode(px4) == 4 << 16 | 3 << 24, "the mode is Hold"
     assert px4.last("HEARTBEAT").system_status == d.MAV_STATE_CRITICAL
-    px4.alone(6)  # a silent client receives nothing after 15 s
+    px4.wait_silently(6)  # a silent client receives nothing after 15 s
     assert px4.autopilot.vehicle.mode in RETURNING
     assert (CRITICAL, "Failsafe activated: entering Hold for 5 seconds") in px4.texts()
 
 
 @pytest.mark.parametrize(("action", "lands"), [(0, False), (2, True)])
-def test_px4_lands_with_a_low_battery_if_its_parameter_says_so(px4: Station, action: int, *, lands: bool) -> None:
+def test_px4_lands_with_a_low_battery_as_its_parameter_requires(px4: Station, action: int, *, lands: bool) -> None:
     px4.set("COM_LOW_BAT_ACT", action)
     px4.set("SIM_BAT_MIN_PCT", 6.0)
     px4.fly()
@@ -334,10 +343,10 @@ def test_px4_lands_with_a_low_battery_if_its_parameter_says_so(px4: Station, act
 
 
 @pytest.mark.parametrize(("action", "sub"), [(0, 3), (3, 5), (4, 6)])
-def test_px4_without_set_points_does_what_its_parameter_says(px4: Station, action: int, sub: int) -> None:
+def test_px4_without_set_points_acts_as_its_parameter_requires(px4: Station, action: int, sub: int) -> None:
     px4.set("COM_OBL_RC_ACT", action)
     px4.fly()
-    px4.say(local_set_point(0.0, 0.0))
+    px4.send_message(local_set_point(0.0, 0.0))
     assert px4.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 6, 0) == OK
     px4.wait(0.5)
     assert px4_mode(px4) == 6 << 16
@@ -346,10 +355,10 @@ def test_px4_without_set_points_does_what_its_parameter_says(px4: Station, actio
 
 
 @pytest.mark.parametrize("action", [3, 4])
-def test_px4_that_loses_its_set_points_on_the_ground_still_answers(px4: Station, action: int) -> None:
+def test_px4_still_answers_after_losing_set_points_on_the_ground(px4: Station, action: int) -> None:
     """Neither Return nor Land is accepted on the ground."""
     px4.set("COM_OBL_RC_ACT", action)
-    px4.say(local_set_point(0.0, 0.0))
+    px4.send_message(local_set_point(0.0, 0.0))
     assert px4.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 6, 0) == OK
     assert px4.arm() == OK
     px4.wait(2)
@@ -358,16 +367,16 @@ def test_px4_that_loses_its_set_points_on_the_ground_still_answers(px4: Station,
     assert px4.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 0) == OK
 
 
-def test_px4_whose_mission_returns_on_the_ground_still_answers(px4: Station) -> None:
+def test_px4_still_answers_after_a_mission_that_returns_on_the_ground(px4: Station) -> None:
     px4.autopilot.vehicle.load((Item(6, d.MAV_CMD_NAV_RETURN_TO_LAUNCH, (0.0, 0.0, 0.0, 0.0), 0, 0, 0.0),))
     assert px4.arm() == OK
     assert px4.command(d.MAV_CMD_MISSION_START) == OK
     px4.wait(2)
-    assert px4_mode(px4) == 4 << 16 | 3 << 24, "it holds after its mission"
+    assert px4_mode(px4) == 4 << 16 | 3 << 24, "the mode after a mission is Hold"
     assert px4.autopilot.vehicle.body.on_ground
 
 
-def test_the_system_id_is_a_parameter_that_holds_after_a_reboot(copter: Station) -> None:
+def test_the_system_id_parameter_takes_effect_after_a_reboot(copter: Station) -> None:
     copter.set("SYSID_THISMAV", 9)
     copter.wait(1)
     assert copter.last("HEARTBEAT").get_srcSystem() == SYSTEM

@@ -1,4 +1,4 @@
-"""The drone's body, against closed forms, its own limits, and what stands in its world."""
+"""The airframe of the drone, compared with closed forms and its limits, among the obstacles of its world."""
 
 import math
 from collections.abc import Sequence
@@ -18,44 +18,44 @@ from sim_backends.world.world import World
 
 STEP_S = STEP_NS / 1e9
 FLOOR = Ground(None, None).around
-UNHURRIED = 1e-2
-"""What a speed may be above its limit for a moment: attitude follows late."""
+OVERSHOOT = 1e-2
+"""Fraction by which a speed may exceed its limit for a short time, because the attitude lags."""
 
 coordinates = st.floats(-80, 80)
 points = st.tuples(coordinates, coordinates, st.floats(-9, 40))
-wishes = st.tuples(coordinates, coordinates, coordinates)
+velocities = st.tuples(coordinates, coordinates, coordinates)
 quadrotors = st.sampled_from([DUCKIEDRONE, IRIS])
 
 
-def flying(can: QuadrotorLimits = DUCKIEDRONE, heading_rad: float = 0.0) -> Airframe:
+def flying(limits: QuadrotorLimits = DUCKIEDRONE, heading_rad: float = 0.0) -> Airframe:
     """Return a drone that hovers 10 m above the ground, where its home is."""
-    body = Airframe(can, (3.0, 4.0, 10.0), heading_rad, FLOOR, 0)
+    body = Airframe(limits, (3.0, 4.0, 10.0), heading_rad, FLOOR, 0)
     body.driven = True
-    body.step((0.0, 0.0, 0.0), can)
+    body.step((0.0, 0.0, 0.0), limits)
     return body
 
 
 @settings(max_examples=12)
-@given(quadrotors, st.lists(st.tuples(wishes, st.integers(1, 100)), min_size=1, max_size=4))
-def test_no_wish_takes_it_beyond_its_limits(can: QuadrotorLimits, led: list[tuple[Vector, int]]) -> None:
-    body = flying(can)
-    for wish, steps in led:
+@given(quadrotors, st.lists(st.tuples(velocities, st.integers(1, 100)), min_size=1, max_size=4))
+def test_commands_do_not_exceed_the_limits(limits: QuadrotorLimits, commands: list[tuple[Vector, int]]) -> None:
+    body = flying(limits)
+    for velocity_m_s, steps in commands:
         for _ in range(steps):
-            body.step(wish, can)
+            body.step(velocity_m_s, limits)
             east, north, up = body.velocity_m_s
-            assert math.hypot(east, north) <= can.speed_m_s * (1 + UNHURRIED)
-            assert -can.climb_m_s[0] * (1 + UNHURRIED) <= up <= can.climb_m_s[1] * (1 + UNHURRIED)
+            assert math.hypot(east, north) <= limits.speed_m_s * (1 + OVERSHOOT)
+            assert -limits.climb_m_s[0] * (1 + OVERSHOOT) <= up <= limits.climb_m_s[1] * (1 + OVERSHOOT)
             assert body.place_m[2] >= 0
-            assert max(map(abs, body.tilt_rad)) <= can.tilt_rad + 1e-9
+            assert max(map(abs, body.tilt_rad)) <= limits.tilt_rad + 1e-9
 
 
 @settings(max_examples=12)
 @given(quadrotors, points)
-def test_it_comes_to_a_point_and_hardly_beyond(can: QuadrotorLimits, goal: Vector) -> None:
-    body = flying(can)
+def test_it_reaches_a_point_with_little_overshoot(limits: QuadrotorLimits, goal: Vector) -> None:
+    body = flying(limits)
     direct_m = math.hypot(*goal[:2])
     for _ in range(30_000):
-        body.step(velocity_to(goal, body, can), can)
+        body.step(velocity_to(goal, body, limits), limits)
         if direct_m > 1:
             along_m = (body.position_m[0] * goal[0] + body.position_m[1] * goal[1]) / direct_m
             assert along_m < direct_m + 0.1 * min(direct_m, 10.0)
@@ -65,35 +65,35 @@ def test_it_comes_to_a_point_and_hardly_beyond(can: QuadrotorLimits, goal: Vecto
 
 
 @settings(max_examples=12)
-@given(quadrotors, wishes)
-def test_where_it_can_stop_is_where_it_stops(can: QuadrotorLimits, wish: Vector) -> None:
-    body = flying(can)
+@given(quadrotors, velocities)
+def test_it_stops_where_predicted(limits: QuadrotorLimits, velocity_m_s: Vector) -> None:
+    body = flying(limits)
     for _ in range(500):
-        body.step((wish[0], wish[1], 0.0), can)
-    promised_m = stop_m(body, can)
+        body.step((velocity_m_s[0], velocity_m_s[1], 0.0), limits)
+    predicted_m = stop_m(body, limits)
     while math.hypot(*body.velocity_m_s) > 1e-3:
-        body.step((0.0, 0.0, 0.0), can)
-    out_m, promised_out_m = math.hypot(*body.position_m[:2]), math.hypot(*promised_m[:2])
-    assert out_m <= promised_out_m + 0.1
+        body.step((0.0, 0.0, 0.0), limits)
+    out_m, predicted_out_m = math.hypot(*body.position_m[:2]), math.hypot(*predicted_m[:2])
+    assert out_m <= predicted_out_m + 0.1
 
 
-def test_without_motors_it_falls_as_drag_lets_it_and_lies_still() -> None:
+def test_without_motors_it_falls_with_drag_and_comes_to_rest() -> None:
     """Linear drag alone, from rest: v(t) = g m / c (1 - exp(-c t / m))."""
-    can = replace(DUCKIEDRONE, drag_n_s2_m2=0.0)
-    body = flying(can)
+    limits = replace(DUCKIEDRONE, drag_n_s2_m2=0.0)
+    body = flying(limits)
     body.driven = False
     fallen = []
     while not body.on_ground:
-        body.step((0.0, 0.0, 5.0), can)
+        body.step((0.0, 0.0, 5.0), limits)
         fallen.append(body.velocity_m_s[2])
-    tau_s = can.mass_kg / can.drag_n_s_m
+    tau_s = limits.mass_kg / limits.drag_n_s_m
     assert fallen[99] == pytest.approx(-GRAVITY_M_S2 * tau_s * (1 - math.exp(-100 * STEP_S / tau_s)), rel=0.01)
     assert body.velocity_m_s == (0.0, 0.0, 0.0)
     assert body.tilt_rad == (0.0, 0.0)
     assert body.place_m[2] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_it_leans_into_its_acceleration() -> None:
+def test_it_tilts_towards_its_acceleration() -> None:
     """Speeding up eastwards with the nose north is a roll to the right; ahead, the nose goes down."""
     body = flying(heading_rad=math.pi / 2)
     for _ in range(20):

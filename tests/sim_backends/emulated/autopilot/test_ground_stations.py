@@ -1,4 +1,4 @@
-"""MAVSDK and MAVProxy, which know nothing of us, fly the emulated drone from another robot, across the medium."""
+"""MAVSDK and MAVProxy, independent programs, fly the emulated drone from another robot over the medium."""
 
 import json
 import math
@@ -22,7 +22,7 @@ from tests.helpers.paths import ROOT
 pytestmark = pytest.mark.emulated
 
 LOSS = "0.05"
-"""Each way."""
+"""Loss in each direction."""
 
 
 @pytest.fixture
@@ -38,26 +38,27 @@ def up() -> Iterator[EmulatedTestbed]:
         yield robots
 
 
-def flown(up: EmulatedTestbed, program: str) -> dict[str, Any]:
-    """Let a program on the sender's robot fly the drone; return what it saw."""
+def fly(up: EmulatedTestbed, program: str) -> dict[str, Any]:
+    """Let a program on the sender's robot fly the drone; return its report."""
     drone = up.robots[Role.RELAY].spec
     carried = up.medium.stats().ports[drone.name].read
     words = (sys.executable, "-m", f"tests.helpers.{program}", drone.ip, str(drone.mavlink_port), LOSS)
     argv = ("env", f"PYTHONPATH={ROOT}", *words)
-    done = up.shells[Role.SENDER].run(argv, deadline=Deadline.after(240))
+    result = up.shells[Role.SENDER].run(argv, deadline=Deadline.after(240))
     assert up.medium.stats().ports[drone.name].read - carried > 100
     log = up.shells[Role.RELAY].run(("cat", "/run/robot/autopilot.log"), deadline=Deadline.after(10))
     assert log.stdout == b""
-    seen: dict[str, Any] = json.loads(done.stdout.decode().splitlines()[-1])
+    seen: dict[str, Any] = json.loads(result.stdout.decode().splitlines()[-1])
     assert max(seen["nearest_m"]) < 0.5
     return seen
 
 
 def test_mavsdk_flies_a_mission_of_three_points_where_every_twentieth_datagram_is_lost(up: EmulatedTestbed) -> None:
-    seen = flown(up, "mavsdk_flight")
+    seen = fly(up, "mavsdk_flight")
     assert seen["items"] == 3
     assert 90 <= seen["battery"] < 100.1
-    # The lab saw the same flight, to the ground below its last corner.
+    # The lab recorded the same flight, down to the ground below its last corner.
+
     flown_m = [one.position_m for one in up.oracle.track(0) if one.role is Role.RELAY and one.position_m]
     (east_m, north_m, up_m), last_m = flown_m[0], flown_m[-1]
     assert max(one[2] for one in flown_m) - up_m == pytest.approx(1.0, abs=0.2)
@@ -66,7 +67,7 @@ def test_mavsdk_flies_a_mission_of_three_points_where_every_twentieth_datagram_i
 
 
 def test_mavproxy_flies_a_mission_where_every_twentieth_datagram_is_lost(up: EmulatedTestbed) -> None:
-    seen = flown(up, "mavproxy_flight")
+    seen = fly(up, "mavproxy_flight")
     assert seen["height_m"] < 0.2
     for words in ("Loaded 4 waypoints in ", "COMPONENT_ARM_DISARM: ACCEPTED", "DISARMED"):
         assert words in seen["said"]

@@ -1,4 +1,4 @@
-"""The autopilot's process among datagrams that are no MAVLink, that were changed, and that no ground station says."""
+"""The autopilot's process and datagrams that are not MAVLink, that were altered, or that have arbitrary values."""
 
 import random
 import re
@@ -31,8 +31,8 @@ serve(drone, motion=folder / "motion", steered=folder / "steered", ready=folder 
 """
 
 
-def of_any_values(dice: random.Random) -> bytes:
-    """Return a whole frame of any message of the dialect, whose fields have any values; most are for the drone."""
+def frame_with_any_values(dice: random.Random) -> bytes:
+    """Return a valid frame of any message with arbitrary field values; most are addressed to the drone."""
     kind = dice.choice(list(d.mavlink_map.values()))
     link = d.MAVLink(None, srcSystem=dice.randrange(1, 256), srcComponent=190)
     size = struct.calcsize(kind.unpacker.format)
@@ -46,7 +46,7 @@ def of_any_values(dice: random.Random) -> bytes:
     return packed
 
 
-def a_free_port() -> int:
+def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind(("", 0))
         port: int = endpoint.getsockname()[1]
@@ -54,7 +54,7 @@ def a_free_port() -> int:
 
 
 def heartbeat(port: int) -> d.MAVLink_message:
-    """Return what the drone answers to a new client, within a minute."""
+    """Return the heartbeat that the drone sends to a new client, within a minute."""
     sender, end_s = Sender(255, 190), time.monotonic() + 60
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         while time.monotonic() < end_s:
@@ -66,11 +66,11 @@ def heartbeat(port: int) -> d.MAVLink_message:
     raise AssertionError("no heartbeat")
 
 
-def test_whatever_datagrams_come_it_goes_on_and_says_nothing_of_them(tmp_path: Path) -> None:
-    dice, port, sender = random.Random(11), a_free_port(), Sender(255, 190)
+def test_the_process_survives_any_datagrams_without_output(tmp_path: Path) -> None:
+    dice, port, sender = random.Random(11), free_port(), Sender(255, 190)
     seeds = [
-        sender.frame(one)
-        for one in (
+        sender.frame(message)
+        for message in (
             d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3),
             d.MAVLink_command_long_message(SYSTEM, 1, d.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, 0, 0, 0, 0, 0, 0),
             d.MAVLink_param_set_message(SYSTEM, 1, b"GF_MAX_HOR_DIST", 10.0, d.MAV_PARAM_TYPE_REAL32),
@@ -83,7 +83,9 @@ def test_whatever_datagrams_come_it_goes_on_and_says_nothing_of_them(tmp_path: P
             before = heartbeat(port)
             clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
             for number in range(DATAGRAMS):
-                hostile = mutated(dice.choice(seeds), seeds, dice)[:60_000] if number % 3 else of_any_values(dice)
+                hostile = (
+                    mutated(dice.choice(seeds), seeds, dice)[:60_000] if number % 3 else frame_with_any_values(dice)
+                )
                 clients[number % 4].sendto(hostile, ("127.0.0.1", port))
             for client in clients:
                 client.close()

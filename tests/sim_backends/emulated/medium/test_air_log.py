@@ -1,4 +1,4 @@
-"""What goes over the air as a capture and a table: fieldkit's reader and scapy say the same of it."""
+"""Radio transmissions as a capture and a table: fieldkit's reader and scapy agree about them."""
 
 import csv
 import os
@@ -37,7 +37,7 @@ def attempt(number: int, payload: bytes = b"\x45" + bytes(99)) -> TransmissionAt
     return TransmissionAttempt(1000, 51_000, "a", "b", G_MODES[0], len(payload) + 36, number, ("b",), payload)
 
 
-def test_the_files_end_together_at_their_limit(tmp_path: Path) -> None:
+def test_both_files_stop_at_their_limit(tmp_path: Path) -> None:
     paths = [tmp_path / air_log.PCAP, tmp_path / air_log.CSV]
     log = AirLog([os.open(path, os.O_WRONLY | os.O_CREAT) for path in paths], ("a", "b"), limit_bytes=10_000)
     for _ in range(100):
@@ -81,27 +81,29 @@ def test_each_hop_of_a_ping_is_in_both_files(
     assert spaces["a"].run("ping", "-c", "1", ADDRESSES["b"]).returncode == 0
     medium.record(None)
     spaces["a"].run("ping", "-c", "1", ADDRESSES["b"])
-    whole = table(tmp_path)
-    lines = [line for line in whole if line["size_bytes"] == str(84 + 36)]
+    all_lines = table(tmp_path)
+    lines = [line for line in all_lines if line["size_bytes"] == str(84 + 36)]
     hops = [("a", "r"), ("r", "b"), ("b", "r"), ("r", "a")]
     assert [(line["transmitter"], line["receiver"]) for line in lines] == hops
     assert [line["received"] for line in lines] == [receiver for _, receiver in hops]
     frames = [frame for frame in rdpcap(str(tmp_path / air_log.PCAP)) if ICMP in frame]
-    assert [(frame.addr2, frame.addr1) for frame in frames] == [(MAC[one], MAC[other]) for one, other in hops]
+    assert [(frame.addr2, frame.addr1) for frame in frames] == [
+        (MAC[sender], MAC[receiver]) for sender, receiver in hops
+    ]
     assert [frame[ICMP].type for frame in frames] == [8, 8, 0, 0]
     acks = [frame for frame in rdpcap(str(tmp_path / air_log.PCAP)) if (frame.type, frame.subtype) == (1, 13)]
-    assert {(frame.addr1, len(frame)) for frame in acks} >= {(MAC[one], 10) for one, _ in hops}
-    assert len(acks) == sum(line["attempt"] == "0" for line in whole)
+    assert {(frame.addr1, len(frame)) for frame in acks} >= {(MAC[sender], 10) for sender, _ in hops}
+    assert len(acks) == sum(line["attempt"] == "0" for line in all_lines)
     read = pcap.read(tmp_path / air_log.PCAP)
     assert read.damage is None
     assert read.frames == len(table(tmp_path))
-    starts_ns = [int(line["start_ns"]) for line in whole if line["attempt"] != "0"]
+    starts_ns = [int(line["start_ns"]) for line in all_lines if line["attempt"] != "0"]
     assert read.packets.time_ns.tolist() == starts_ns
     assert all(int(line["end_ns"]) > int(line["start_ns"]) for line in lines)
 
 
 @pytest.mark.emulated
-def test_a_site_file_that_asks_for_it_finds_it_in_the_evidence(tmp_path: Path) -> None:
+def test_a_site_file_with_record_air_adds_the_files_to_the_evidence(tmp_path: Path) -> None:
     lab = make_lab(tmp_path / "air", "{fading: false}\n  record_air: true")
     run = fieldkit(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
     assert run.code == 0, run.err

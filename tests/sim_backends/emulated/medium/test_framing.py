@@ -1,4 +1,4 @@
-"""To whom packets and frames go: scapy makes them."""
+"""Receivers of packets and frames; scapy builds the packets."""
 
 import socket
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from scapy.layers.l2 import ARP, Ether
 
 from fieldkit.config.profiles import Radio
 from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.medium.framing import ETHERNET, NOBODY, mac_of
+from sim_backends.emulated.medium.framing import ETHERNET, NO_ROBOT, mac_of
 from sim_backends.emulated.medium.framing import IP as BARE
 from sim_backends.radio.options import RadioOptions
 
@@ -26,7 +26,7 @@ RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivit
 
 
 def test_a_mac_address_is_of_one_station_and_locally_administered() -> None:
-    assert {name: mac_of(one.ip).hex(":") for name, one in ADDRESSES.items()} == MACS
+    assert {name: mac_of(interface.ip).hex(":") for name, interface in ADDRESSES.items()} == MACS
 
 
 @pytest.mark.parametrize(
@@ -36,15 +36,15 @@ def test_a_mac_address_is_of_one_station_and_locally_administered() -> None:
         ("10.42.0.255", None),
         ("255.255.255.255", None),
         ("239.1.2.3", None),
-        ("10.42.0.9", NOBODY),
-        ("192.168.0.1", NOBODY),
+        ("10.42.0.9", NO_ROBOT),
+        ("192.168.0.1", NO_ROBOT),
     ],
 )
-def test_a_bare_packet_goes_where_its_address_says(to: str, expected: str | None) -> None:
+def test_a_bare_packet_goes_to_its_destination_address(to: str, expected: str | None) -> None:
     packet = bytes(IP(src="10.42.0.1", dst=to) / UDP())
     assert BARE.carries(packet)
     assert BARE.destination(packet, BARE.routes(OWN, OTHERS)) == expected
-    assert BARE.destination(packet, BARE.routes(OWN, {})) == NOBODY
+    assert BARE.destination(packet, BARE.routes(OWN, {})) == NO_ROBOT
     assert not BARE.carries(bytes(IPv6()))
 
 
@@ -55,15 +55,15 @@ def test_a_bare_packet_goes_where_its_address_says(to: str, expected: str | None
         ("ff:ff:ff:ff:ff:ff", None),
         ("01:00:5e:01:02:03", None),
         ("33:33:00:01:00:06", None),
-        ("02:00:0a:2a:00:09", NOBODY),
+        ("02:00:0a:2a:00:09", NO_ROBOT),
     ],
 )
-def test_a_frame_goes_to_the_next_hop_whatever_is_in_it(to: str, expected: str | None) -> None:
+def test_a_frame_goes_to_the_next_hop_with_any_payload(to: str, expected: str | None) -> None:
     for inner in (IP(dst="10.42.0.3"), IPv6(dst="ff02::1:6"), ARP()):
         frame = bytes(Ether(dst=to, src=MACS["a"]) / inner)
         assert ETHERNET.carries(frame)
         assert ETHERNET.destination(frame, ETHERNET.routes(OWN, OTHERS)) == expected
-        assert ETHERNET.destination(frame, ETHERNET.routes(OWN, {})) == NOBODY
+        assert ETHERNET.destination(frame, ETHERNET.routes(OWN, {})) == NO_ROBOT
 
 
 def test_the_packet_in_a_frame_is_found_by_its_type() -> None:
@@ -76,36 +76,36 @@ def test_the_packet_in_a_frame_is_found_by_its_type() -> None:
 
 
 @given(st.binary(min_size=1, max_size=40), st.ip_addresses(v=4))
-def test_no_bytes_are_too_strange(frame: bytes, address: IPv4Address) -> None:
+def test_any_bytes_are_handled(frame: bytes, address: IPv4Address) -> None:
     routes = ETHERNET.routes(OWN, {"x": IPv4Interface(address)})
     assert not ETHERNET.carries(frame) or len(frame) >= 14
-    assert ETHERNET.destination(frame, routes) in {None, NOBODY, "x"}
+    assert ETHERNET.destination(frame, routes) in {None, NO_ROBOT, "x"}
 
 
 @pytest.fixture
 def air() -> Iterator[tuple[MediumClient, dict[str, socket.socket]]]:
-    """A medium of frames between a, b and c 60 m apart, of which a and c do not hear each other."""
+    """A medium of frames between a, b and c 60 m apart, of which a and c are out of range."""
     with ExitStack() as stack:
         medium = stack.enter_context(MediumClient(RadioOptions(fading=False), seed=1, framing=ETHERNET))
         ends: dict[str, socket.socket] = {}
         for name, address in ADDRESSES.items():
-            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            ends[name] = stack.enter_context(ours)
-            ours.settimeout(30)
-            with theirs:
-                medium.attach(name, str(address), RADIO, theirs.fileno())
+            robot_end, medium_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            ends[name] = stack.enter_context(robot_end)
+            robot_end.settimeout(30)
+            with medium_end:
+                medium.attach(name, str(address), RADIO, medium_end.fileno())
         medium.place({name: (60.0 * number, 0.0, 0.2) for number, name in enumerate(ADDRESSES)})
         yield medium, ends
 
 
-def test_a_broadcast_reaches_all_who_hear_it_and_nobody_else(
+def test_a_broadcast_reaches_only_robots_in_range(
     air: tuple[MediumClient, dict[str, socket.socket]],
 ) -> None:
     medium, ends = air
     everyone = bytes(Ether(dst="ff:ff:ff:ff:ff:ff", src=MACS["b"]) / IP(dst="255.255.255.255") / UDP())
     ends["b"].send(everyone)
     assert [ends[name].recv(2000) for name in ("a", "c")] == [everyone, everyone]
-    # Who is not in range hears nothing of it: what a receives next is what b sends it after that.
+    # Robot a is out of range: it next receives what b sends after that.
     ends["c"].send(bytes(Ether(dst="33:33:00:01:00:06", src=MACS["c"]) / IPv6()))
     assert ends["b"].recv(2000)[:6] == bytes.fromhex("333300010006")
     onward = bytes(Ether(dst=MACS["a"], src=MACS["b"]) / IP(src="10.42.0.3", dst="10.42.0.1") / UDP())
@@ -116,7 +116,7 @@ def test_a_broadcast_reaches_all_who_hear_it_and_nobody_else(
     assert ("c", "a") not in links or not links["c", "a"].delivered
 
 
-def test_a_frame_to_who_is_out_of_range_is_lost_and_one_to_nobody_is_counted(
+def test_a_frame_out_of_range_is_lost_and_an_unknown_address_is_counted(
     air: tuple[MediumClient, dict[str, socket.socket]],
 ) -> None:
     medium, ends = air

@@ -1,4 +1,4 @@
-"""The medium between real namespaces, with real tools; and its end."""
+"""The medium between real namespaces, with real tools; and its shutdown."""
 
 import os
 import re
@@ -84,14 +84,14 @@ def ping(space: Namespace, address: str, *options: str, count: int = 20) -> list
     return [float(value) for value in re.findall(r"time=([\d.]+)", space.run(*argv, timeout_s=60).stdout)]
 
 
-def until(condition: Callable[[], bool], what: str) -> None:
+def until(condition: Callable[[], bool], condition_text: str) -> None:
     deadline = Deadline.after(LONG_S)
     while not condition():
-        assert not deadline.expired, f"not within {LONG_S:g} s: {what}"
+        assert not deadline.expired, f"not within {LONG_S:g} s: {condition_text}"
         time.sleep(0.01)
 
 
-def test_robots_ping_each_other_and_counters_say_so(bench: Bench) -> None:
+def test_robots_ping_each_other_and_counters_agree(bench: Bench) -> None:
     medium, spaces = bench(PLAIN)
     medium.place(PLACES)
     assert len(ping(spaces["a"], ADDRESSES["b"])) == 20
@@ -103,7 +103,7 @@ def test_robots_ping_each_other_and_counters_say_so(bench: Bench) -> None:
     assert len([*Path(f"/proc/{medium.pid}/task").iterdir()]) == 1, "numpy's OpenBLAS has no threads there"
 
 
-def test_delay_is_met_in_both_directions_and_twice_through_the_relay(bench: Bench) -> None:
+def test_delay_applies_in_both_directions_and_twice_through_the_relay(bench: Bench) -> None:
     medium, spaces = bench("{loss: 0%, delay: 20ms, rate: unlimited}")
     medium.place(PLACES)
     assert 40 <= min(ping(spaces["a"], ADDRESSES["b"])) < 80
@@ -113,7 +113,7 @@ def test_delay_is_met_in_both_directions_and_twice_through_the_relay(bench: Benc
     assert medium.stats().links["r", "b"].delivered == 20
 
 
-def test_links_are_sampled_as_long_as_somebody_asks_and_nothing_of_it_is_on_the_air(bench: Bench) -> None:
+def test_links_are_sampled_while_requested_without_traffic_on_the_air(bench: Bench) -> None:
     medium, spaces = bench("{fading: false}")
     medium.place(PLACES, relay="r")
     first = medium.links(go_on=True)
@@ -124,26 +124,29 @@ def test_links_are_sampled_as_long_as_somebody_asks_and_nothing_of_it_is_on_the_
     sent = {name: port.read - port.not_ipv4 for name, port in stats.ports.items()}
     assert sent == {"a": 80, "b": 80, "r": 0}, "a kernel looks for routers of IPv6 once"
     assert sum(link.sent for link in stats.links.values()) == 4 * 80, "two hops each way, and nothing else"
-    known = {name: samples[-1].stations for name, samples in last.items()}
-    assert [one.station for one in known["a"]] == ["r"], "a station knows its access point"
-    assert [(one.station, one.tx_packets, one.rx_packets) for one in known["r"]] == [("a", 80, 80), ("b", 80, 80)]
-    air_s = [one.busy_ns / 1e9 for one in (last["a"][-1],) if one.busy_ns is not None]
+    stations = {name: samples[-1].stations for name, samples in last.items()}
+    assert [station.station for station in stations["a"]] == ["r"], "a station lists its access point"
+    assert [(station.station, station.tx_packets, station.rx_packets) for station in stations["r"]] == [
+        ("a", 80, 80),
+        ("b", 80, 80),
+    ]
+    air_s = [sample.busy_ns / 1e9 for sample in (last["a"][-1],) if sample.busy_ns is not None]
     assert 0 < air_s[0] < 1
-    assert known["a"][0].signal_dbm == pytest.approx(known["r"][0].signal_dbm), "both send with the same power"
+    assert stations["a"][0].signal_dbm == pytest.approx(stations["r"][0].signal_dbm), "both send with the same power"
 
 
 def in_a_fade(options: RadioOptions) -> dict[str, Vector]:
-    """Return places of b and r some 78 m apart, where they hear each other on average and do not in a deep fade."""
+    """Return places of b and r some 78 m apart, in range on average and out of range in a deep fade."""
     channel = WorldChannel(1, {"b": antenna_of(RADIO), "r": antenna_of(RADIO)}, options)
     for centimetres in range(7700, 7900):
         places: dict[str, Vector] = {"b": (0.0, 0.0, 0.0), "r": (centimetres / 100, 0.0, 0.0)}
         channel.move(0, places)
         if channel.linked(0, 1) and channel.powers_mw(0, 0)[1] < channel.sensitivity_mw[1] / 2:
             return places
-    raise AssertionError("there is no fade")
+    raise AssertionError("no fade in this range")
 
 
-def test_who_moves_leaves_the_fade_that_it_would_stand_in(bench: Bench) -> None:
+def test_a_moving_robot_leaves_a_fade(bench: Bench) -> None:
     text = "{fading: true, k_db: -20, stir_m_s: 0}"
     medium, spaces = bench(text)
     places = in_a_fade(schema.validate(schema.parse(text, source="radio.yaml"), RadioOptions))
@@ -153,27 +156,29 @@ def test_who_moves_leaves_the_fade_that_it_would_stand_in(bench: Bench) -> None:
     assert ping(spaces["b"], ADDRESSES["r"])
 
 
-def test_the_parts_of_the_delay_are_told_end_to_end(bench: Bench) -> None:
+def test_the_parts_of_the_delay_are_end_to_end(bench: Bench) -> None:
     medium, spaces = bench("{loss: 0%, delay: 20ms, rate: 8Mbit/s}")
     for hops, relay in ((1, None), (2, "r")):
         medium.place(PLACES, relay=relay)
         before = medium.stats().delays.get(("a", "b"), NO_PACKETS)
-        rtt_ms = ping(spaces["a"], ADDRESSES["b"], "-s", "972", "-i", "0.1")  # so that none queues
+        rtt_ms = ping(spaces["a"], ADDRESSES["b"], "-s", "972", "-i", "0.1")  # so that no packet queues
         after = medium.stats().delays["a", "b"]
-        told = DelayParts(**{name: value - getattr(before, name) for name, value in vars(after).items()})
-        assert (told.packets, told.queuing_ns) == (20, 0)
-        assert told.propagation_ns == hops * 20 * 20_000_000
-        assert told.transmission_ns == hops * 20 * 1_000_000, "1,000 bytes at 8 Mbit/s"
-        assert 0 < told.processing_ns < sum(rtt_ms) * 1e6, "of the round trips, which have another way back"
+        delta = DelayParts(**{name: value - getattr(before, name) for name, value in vars(after).items()})
+        assert (delta.packets, delta.queuing_ns) == (20, 0)
+        assert delta.propagation_ns == hops * 20 * 20_000_000
+        assert delta.transmission_ns == hops * 20 * 1_000_000, "1,000 bytes at 8 Mbit/s"
+        assert 0 < delta.processing_ns < sum(rtt_ms) * 1e6, (
+            "compared with round trips, which include the reverse path"
+        )
     assert medium.stats().delays.keys() == {("a", "b"), ("b", "a")}
     spaces["b"].ip("link", "set", "wlan0", "down")
     before = medium.stats().delays["a", "b"]
     assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
-    assert medium.stats().delays["a", "b"] == before, "what the robot did not take was not delivered"
+    assert medium.stats().delays["a", "b"] == before, "packets refused by the robot were not delivered"
 
 
-def test_flows_of_one_pair_are_told_apart_in_fragments_and_while_they_cross(bench: Bench) -> None:
-    """Of known truth: 8 Mbit/s, 20 ms; 2 datagrams of 6 fragments each, and 3 small ones, beside a ping."""
+def test_flows_of_one_pair_are_distinguished_in_fragments_and_mixed(bench: Bench) -> None:
+    """Known truth: 8 Mbit/s, 20 ms; 2 datagrams of 6 fragments each, and 3 small ones, beside a ping."""
     medium, spaces = bench("{loss: 0%, delay: 20ms, rate: 8Mbit/s}")
     medium.place(PLACES)
     flows = {port: ("a", "b", socket.IPPROTO_UDP, port) for port in (1234, 1235)}
@@ -210,13 +215,13 @@ def test_loss_has_the_set_value(bench: Bench) -> None:
     assert interval.low <= 0.1 <= interval.high
 
 
-def test_what_the_medium_was_late_by_is_told(bench: Bench) -> None:
+def test_lateness_of_the_medium_is_reported(bench: Bench) -> None:
     medium, spaces = bench("{loss: 0%, delay: 1500ms, rate: unlimited}")
     medium.place(PLACES)
     pinging = spaces["a"].start("ping", "-n", "-c", "1", ADDRESSES["b"])
     until(lambda: medium.stats().links["a", "b"].sent == 1, "the request is on the air")
     os.kill(medium.pid, signal.SIGSTOP)
-    assert ping(spaces["b"], ADDRESSES["a"], "-W", "2", count=1) == [], "the medium stands still"
+    assert ping(spaces["b"], ADDRESSES["a"], "-W", "2", count=1) == [], "the medium is stopped"
     os.kill(medium.pid, signal.SIGCONT)
     pinging.communicate(timeout=LONG_S)
     late = medium.stats().late
@@ -241,21 +246,21 @@ def test_walking_out_of_range_ends_the_link_and_coming_back_restores_it(bench: B
     assert len(ping(spaces["a"], ADDRESSES["b"], count=3)) == 3
 
 
-def test_what_waited_until_the_medium_read_it_was_late(bench: Bench) -> None:
+def test_packets_that_waited_to_be_read_count_as_late(bench: Bench) -> None:
     medium, spaces = bench(PLAIN)
     medium.place(PLACES)
     assert len(ping(spaces["a"], ADDRESSES["b"])) == 20
     os.kill(medium.pid, signal.SIGSTOP)
-    until(lambda: ") T " in Path(f"/proc/{medium.pid}/stat").read_text(), "the medium stands still")
+    until(lambda: ") T " in Path(f"/proc/{medium.pid}/stat").read_text(), "the medium is stopped")
     spaces["a"].run(sys.executable, "-c", SPEAK, ADDRESSES["b"], "200").check_returncode()
     time.sleep(0.5)
     os.kill(medium.pid, signal.SIGCONT)
-    until(lambda: medium.stats().ports["b"].written >= 220, "all datagrams are handed over")
+    until(lambda: medium.stats().ports["b"].written >= 220, "all datagrams are delivered")
     stats = medium.stats()
-    # To within the time between two beats, 10 ms; most of the 200 are not read at once.
+    # With an error of one poll timeout, 10 ms; most of the 200 are not read immediately.
     assert sum(count for late_ns, count in stats.late.items() if late_ns >= 0.49e9) >= 200
     assert stats.delays["a", "b"].processing_ns >= 200 * 0.49e9
-    assert sum(stats.late.values()) == sum(one.packets for one in stats.delays.values())
+    assert sum(stats.late.values()) == sum(parts.packets for parts in stats.delays.values())
 
 
 @pytest.mark.parametrize("address", ["239.1.1.1", "10.9.0.255", "255.255.255.255"])
@@ -277,7 +282,7 @@ def test_multicast_and_broadcast_reach_everyone(bench: Bench, address: str, rela
     }
 
 
-def test_what_has_no_way_is_counted_and_not_carried(bench: Bench) -> None:
+def test_unroutable_packets_are_counted_and_not_carried(bench: Bench) -> None:
     medium, spaces = bench(PLAIN)
     assert ping(spaces["a"], ADDRESSES["b"], count=2) == []
     assert medium.stats().ports["a"].unroutable == 2
@@ -299,17 +304,17 @@ def test_the_medium_outlives_a_robot(bench: Bench) -> None:
     assert medium.stats().ports["a"].unroutable == 2
 
 
-def test_a_socket_of_packets_is_a_transport_too_and_its_end_is_the_end_of_that_robot() -> None:
+def test_a_packet_socket_is_a_transport_too_and_may_close() -> None:
     packet = bytes((0x45, 0, 0, 20, *(0,) * 8, 10, 9, 0, 1, 10, 9, 0, 2))
     with ExitStack() as stack:
         options = schema.validate(schema.parse(PLAIN, source="radio.yaml"), RadioOptions)
         medium = stack.enter_context(MediumClient(options, seed=1))
         robots = {}
         for name in ("a", "b"):
-            theirs, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            robots[name] = stack.enter_context(ours)
-            with theirs:
-                medium.attach(name, f"{ADDRESSES[name]}/24", RADIO, theirs.fileno())
+            medium_end, robot_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            robots[name] = stack.enter_context(robot_end)
+            with medium_end:
+                medium.attach(name, f"{ADDRESSES[name]}/24", RADIO, medium_end.fileno())
         medium.place({name: PLACES[name] for name in robots})
         robots["b"].settimeout(LONG_S)
         robots["a"].send(packet)
@@ -319,14 +324,14 @@ def test_a_socket_of_packets_is_a_transport_too_and_its_end_is_the_end_of_that_r
         wait_until(lambda: medium.stats().ports["a"].read == 2, Deadline.after(LONG_S))
 
 
-def test_the_medium_carries_on_between_the_others(bench: Bench) -> None:
+def test_the_medium_continues_between_the_other_robots(bench: Bench) -> None:
     medium, spaces = bench(PLAIN)
     medium.place(PLACES)
     spaces["r"].ip("link", "delete", "wlan0")
     assert len(ping(spaces["a"], ADDRESSES["b"], count=5)) == 5
 
 
-def test_requests_that_make_no_sense_are_refused(bench: Bench) -> None:
+def test_invalid_requests_are_rejected(bench: Bench) -> None:
     medium, spaces = bench(PLAIN)
     fd = spaces["a"].tun("wlan1", "10.9.1.1/24")
     with pytest.raises(RobotError, match="attached already"):
@@ -350,7 +355,7 @@ def test_close_ends_the_medium_and_may_be_repeated() -> None:
     assert not alive(medium.pid)
 
 
-def test_a_dead_medium_is_an_error_with_its_last_words() -> None:
+def test_a_killed_medium_raises_an_error() -> None:
     with MediumClient(RadioOptions(), seed=1) as medium:
         medium.stats()
         os.kill(medium.pid, signal.SIGKILL)
@@ -381,13 +386,13 @@ def test_killing_the_owner_ends_the_medium() -> None:
     until(lambda: not alive(pid), "the medium ends")
 
 
-def test_the_end_of_the_control_socket_alone_ends_the_medium() -> None:
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        argv = [sys.executable, "-m", "sim_backends.emulated.medium.process", str(theirs.fileno()), "1", "ip"]
-        process = subprocess.Popen(argv, pass_fds=[theirs.fileno()], cwd=ROOT)
-        theirs.close()
-        ours.close()
+def test_closing_the_control_socket_ends_the_medium() -> None:
+    robot_end, medium_end = socket.socketpair()
+    with robot_end, medium_end:
+        argv = [sys.executable, "-m", "sim_backends.emulated.medium.process", str(medium_end.fileno()), "1", "ip"]
+        process = subprocess.Popen(argv, pass_fds=[medium_end.fileno()], cwd=ROOT)
+        medium_end.close()
+        robot_end.close()
         assert process.wait(LONG_S) == 0
 
 
@@ -401,8 +406,8 @@ except FieldkitError as error:
 """
 
 
-def test_a_tun_that_cannot_be_made_says_why() -> None:
-    with pytest.raises(ConfigurationError, match="no name for an interface"):
+def test_an_error_of_the_tun_device_has_its_reason() -> None:
+    with pytest.raises(ConfigurationError, match="is not a valid interface name"):
         open_tun("a-name-that-is-too-long")
     with Namespace() as space:
         first = space.tun("wlan0", "10.9.0.1/24")

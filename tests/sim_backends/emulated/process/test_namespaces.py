@@ -1,4 +1,4 @@
-"""What lets an ordinary user make namespaces, as files say it."""
+"""Checks whether an ordinary user can create namespaces, from files."""
 
 from pathlib import Path
 
@@ -15,13 +15,13 @@ OWNERS = st.from_regex(r"[a-z0-9_][a-z0-9_-]{0,30}", fullmatch=True)
 
 @given(st.lists(st.builds(IdRange, OWNERS, NUMBERS, NUMBERS)))
 def test_id_ranges_read_back(ranges: list[IdRange]) -> None:
-    text = "".join(f"{one.owner}:{one.first}:{one.count}\n" for one in ranges)
+    text = "".join(f"{ids.owner}:{ids.first}:{ids.count}\n" for ids in ranges)
     assert namespaces.id_ranges(text) == ranges
     assert namespaces.id_ranges(text.rstrip("\n")) == ranges
 
 
 @pytest.mark.parametrize("line", ["", "#", "ann", "ann:1", "ann:1:", ":1:2", "ann:-1:2", "ann:1:2:3", "ann:x:2"])
-def test_a_line_that_is_no_range_gives_nobody_anything(line: str) -> None:
+def test_malformed_lines_are_ignored(line: str) -> None:
     assert namespaces.id_ranges(f"{line}\nbob:5:6\n{line}") == [IdRange("bob", 5, 6)]
 
 
@@ -33,12 +33,12 @@ def test_a_line_that_is_no_range_gives_nobody_anything(line: str) -> None:
         ("user.max_user_namespaces", "0", "10000"),
     ],
 )
-def test_a_setting_that_forbids_is_named_with_its_remedy(
+def test_a_forbidding_setting_is_reported_with_its_remedy(
     name: str, forbids: str, allows: str, tmp_path: Path
 ) -> None:
     path = tmp_path / name.replace(".", "/")
     path.parent.mkdir()
     path.write_text(f"{allows}\n", encoding="ascii")
-    assert namespaces.forbidding(tmp_path) == {}
+    assert namespaces.forbidding_settings(tmp_path) == {}
     path.write_text(f"{forbids}\n", encoding="ascii")
-    assert namespaces.forbidding(tmp_path) == {f"{name} = {forbids}": f"sudo sysctl {name}={allows}"}
+    assert namespaces.forbidding_settings(tmp_path) == {f"{name} = {forbids}": f"sudo sysctl {name}={allows}"}

@@ -1,4 +1,4 @@
-"""The base of an emulated robot: within limits, its odometry the integral of its speed; without words it stands."""
+"""The base controller: limits, odometry as the integral of the speed, and the stop without velocities."""
 
 import math
 
@@ -14,20 +14,20 @@ from sim_backends.emulated.ros.own_motion import OwnMotion
 S = 10**9
 BASE = Base("/cmd_vel", 0.5, 1.0, 2.0)
 ANY = st.floats(allow_nan=True, allow_infinity=True)
-PUT = OwnMotion(x_m=1.0, y_m=2.0, yaw_rad=0.5, place_m=(30.0, 40.0, 0.2), heading_rad=-1.0)
+START = OwnMotion(x_m=1.0, y_m=2.0, yaw_rad=0.5, place_m=(30.0, 40.0, 0.2), heading_rad=-1.0)
 
 
 @given(st.lists(st.tuples(st.integers(0, S), st.one_of(st.floats(-2, 2), ANY), st.one_of(st.floats(-9, 9), ANY))))
-def test_whatever_it_is_told_it_stays_within_limits_and_its_wheels_count_it(
-    told: list[tuple[int, float, float]],
+def test_any_velocities_stay_within_limits_and_odometry_follows(
+    commands: list[tuple[int, float, float]],
 ) -> None:
     controller, now_ns = BaseController(BASE, 0), 0
-    controller.put(PUT)
-    x_m, y_m, yaw_rad = PUT.x_m, PUT.y_m, PUT.yaw_rad
-    for later_ns, ahead_m_s, turn_rad_s in told:
+    controller.reset(START)
+    x_m, y_m, yaw_rad = START.x_m, START.y_m, START.yaw_rad
+    for later_ns, ahead_m_s, turn_rad_s in commands:
         now_ns += later_ns
         controller.advance(now_ns)
-        controller.hear(now_ns, ahead_m_s, turn_rad_s)
+        controller.set_velocity(now_ns, ahead_m_s, turn_rad_s)
         for _ in range(20):
             before, (x0, y0, yaw0) = controller.pose, controller.wheels
             now_ns += STEP_NS
@@ -38,47 +38,47 @@ def test_whatever_it_is_told_it_stays_within_limits_and_its_wheels_count_it(
             assert abs(after.speed_m_s - before.speed_m_s) <= BASE.acceleration_m_s2 * 2 * STEP_NS / S + 1e-9
             ahead = math.hypot(x_m - x0, y_m - y0)
             assert ahead == pytest.approx(math.dist(after.place_m, before.place_m), abs=1e-9)
-            # Ahead of its wheels is ahead of it in the world.
+            # Odometry and world show the same change of heading.
             assert yaw_rad - yaw0 == pytest.approx(after.heading_rad - before.heading_rad, abs=1e-9)
-    assert yaw_rad - PUT.yaw_rad == pytest.approx(controller.pose.heading_rad - PUT.heading_rad, abs=1e-6)
+    assert yaw_rad - START.yaw_rad == pytest.approx(controller.pose.heading_rad - START.heading_rad, abs=1e-6)
 
 
-def test_it_drives_while_it_is_told_and_stands_where_it_was_when_words_end() -> None:
+def test_it_drives_while_velocities_arrive_and_then_stops() -> None:
     controller = BaseController(BASE, 0)
-    controller.put(PUT)
-    assert controller.stands
+    controller.reset(START)
+    assert controller.is_idle
     for now_ns in range(10 * S, 12 * S, S // 10):
-        controller.hear(now_ns, 0.4, 0.0)
+        controller.set_velocity(now_ns, 0.4, 0.0)
         controller.advance(now_ns)
     assert controller.pose.speed_m_s == pytest.approx(0.4)
     last_ns = 12 * S - S // 10
     controller.advance(last_ns + TIMEOUT_NS)
-    assert controller.pose.speed_m_s == pytest.approx(0.4), "patience"
+    assert controller.pose.speed_m_s == pytest.approx(0.4), "before the timeout"
     controller.advance(last_ns + TIMEOUT_NS + S // 2)
-    assert controller.stands
-    stood = controller.pose.place_m
+    assert controller.is_idle
+    stopped_m = controller.pose.place_m
     controller.advance(100 * S)
-    assert controller.pose.place_m == stood
-    # It takes as long to stop as to come up to its speed.
+    assert controller.pose.place_m == stopped_m
+    # Deceleration takes as long as acceleration.
     far_m = 0.4 * (1.9 + TIMEOUT_NS / S)
-    assert math.dist(stood, PUT.place_m) == pytest.approx(far_m, abs=0.02)
-    along = math.atan2(stood[1] - PUT.place_m[1], stood[0] - PUT.place_m[0])
-    assert along == pytest.approx(PUT.heading_rad)
+    assert math.dist(stopped_m, START.place_m) == pytest.approx(far_m, abs=0.02)
+    along = math.atan2(stopped_m[1] - START.place_m[1], stopped_m[0] - START.place_m[0])
+    assert along == pytest.approx(START.heading_rad)
     x_m, y_m, _ = controller.wheels
-    assert math.atan2(y_m - PUT.y_m, x_m - PUT.x_m) == pytest.approx(PUT.yaw_rad)
+    assert math.atan2(y_m - START.y_m, x_m - START.x_m) == pytest.approx(START.yaw_rad)
 
 
-def test_who_is_carried_off_stands_there() -> None:
+def test_a_reset_robot_is_at_rest_at_the_new_place() -> None:
     controller = BaseController(BASE, 0)
-    controller.hear(0, 0.5, 0.0)
+    controller.set_velocity(0, 0.5, 0.0)
     controller.advance(S // 2)
-    assert not controller.stands
-    controller.put(PUT)
-    assert controller.stands
-    assert (controller.pose.place_m, controller.wheels) == (PUT.place_m, (PUT.x_m, PUT.y_m, PUT.yaw_rad))
+    assert not controller.is_idle
+    controller.reset(START)
+    assert controller.is_idle
+    assert (controller.pose.place_m, controller.wheels) == (START.place_m, (START.x_m, START.y_m, START.yaw_rad))
 
 
-def test_velocities_cross_as_they_are_and_others_are_not_heard() -> None:
+def test_velocities_are_packed_exactly_and_other_datagrams_are_ignored() -> None:
     assert twists.unpack(twists.pack(0.25, 1.0, 2.0, 3.0, 4.0, -0.5)) == (0.25, -0.5)
     assert twists.unpack(b"") is None
     assert twists.unpack(bytes(twists.BYTES + 1)) is None

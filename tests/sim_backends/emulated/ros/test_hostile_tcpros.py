@@ -1,4 +1,4 @@
-"""Recorders among publishers, and a publisher among subscribers, who speak anything but TCPROS: nobody ends."""
+"""Recorders with publishers, and a publisher with subscribers, that violate TCPROS: all of them keep running."""
 
 import fcntl
 import random
@@ -26,9 +26,9 @@ from sim_backends.emulated.ros.sensors import Publication
 from tests.fuzz.mutate import mutated
 
 GOOD: Final = "/good"
-GARBLED: Final = 80
-"""Topics whose publishers mean harm, and subscribers who do."""
-ENOUGH: Final = 20
+HOSTILE: Final = 80
+"""Number of topics with hostile publishers, and number of hostile subscribers."""
+COUNT: Final = 20
 
 _PATCHED: Final = "import sys; from sim_backends.emulated.ros import tcpros; tcpros.FOLDER = sys.argv.pop(1); "
 RECORDERS: Final = {
@@ -40,8 +40,8 @@ BAGS: Final = {"ros1": "bag.bag", "ros2": "bag"}
 SENSOR: Final = Sensor("/imu", "sensor_msgs/Imu", rate_hz=5.0, frame="imu", points=None)
 
 
-def said(topic: str, count: int) -> bytes:
-    """What a publisher of numbers says: its header, then messages."""
+def stream_of(topic: str, count: int) -> bytes:
+    """Return the stream of a publisher of numbers: its header, then messages."""
     header = {
         "callerid": "/test",
         "latching": "0",
@@ -55,19 +55,19 @@ def said(topic: str, count: int) -> bytes:
 
 
 class Publishers:
-    """Say to whoever hears a topic what belongs to it.
+    """Publishers that send fixed bytes to every subscriber of a topic.
 
     Args:
-        folder: Of their sockets.
-        what: By topic.
+        folder: Folder of their sockets.
+        what: Bytes by topic.
     """
 
-    def __init__(self, folder: Path, what: dict[str, bytes]) -> None:
-        self._what = what
-        self._over = threading.Event()
-        self._unread = set(what)
+    def __init__(self, folder: Path, content: dict[str, bytes]) -> None:
+        self._content = content
+        self._stopped = threading.Event()
+        self._unread = set(content)
         self._servers = []
-        for topic in what:
+        for topic in content:
             server = socket.socket(socket.AF_UNIX)
             server.bind(str(folder / topic.strip("/")))
             server.listen()
@@ -79,7 +79,7 @@ class Publishers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._over.set()
+        self._stopped.set()
         for server, thread in self._servers:
             with socket.socket(socket.AF_UNIX) as last, suppress(OSError):
                 last.connect(server.getsockname())
@@ -87,40 +87,40 @@ class Publishers:
             server.close()
 
     def wait(self) -> None:
-        """Wait until somebody has read, or refused to read, what each says."""
+        """Wait until some subscriber has read, or refused to read, the bytes of each topic."""
         end_s = time.monotonic() + 60
         while self._unread:
             assert time.monotonic() < end_s, self._unread
-            self._over.wait(0.02)
+            self._stopped.wait(0.02)
 
     def _serve(self, server: socket.socket, topic: str) -> None:
-        while not self._over.is_set():
+        while not self._stopped.is_set():
             stream, _ = server.accept()
             with stream, suppress(OSError):
-                stream.sendall(self._what[topic])
-                while not self._over.is_set() and any(fcntl.ioctl(stream, termios.TIOCOUTQ, bytes(4))):
-                    self._over.wait(0.01)
+                stream.sendall(self._content[topic])
+                while not self._stopped.is_set() and any(fcntl.ioctl(stream, termios.TIOCOUTQ, bytes(4))):
+                    self._stopped.wait(0.01)
                 self._unread.discard(topic)
                 if topic == GOOD:
-                    self._over.wait()
+                    self._stopped.wait()
             self._unread.discard(topic)
 
 
 @pytest.mark.parametrize("ros", ["ros1", "ros2"])
-def test_a_recorder_goes_on_whatever_publishers_say(ros: str, tmp_path: Path) -> None:
-    dice, seeds = random.Random(7), [said(GOOD, 3), said("/other", 3), b"\xff" * 40]
-    topics = {f"/bad{number}": mutated(dice.choice(seeds), seeds, dice)[:100_000] for number in range(GARBLED)}
-    # Damaged in their messages, or in their headers, alone.
-    topics |= {f"/torn{number}": said(f"/torn{number}", 2) + dice.randbytes(40) for number in range(10)}
+def test_a_recorder_survives_hostile_publishers(ros: str, tmp_path: Path) -> None:
+    dice, seeds = random.Random(7), [stream_of(GOOD, 3), stream_of("/other", 3), b"\xff" * 40]
+    topics = {f"/bad{number}": mutated(dice.choice(seeds), seeds, dice)[:100_000] for number in range(HOSTILE)}
+    # Damaged only in the messages, or only in the headers.
+    topics |= {f"/torn{number}": stream_of(f"/torn{number}", 2) + dice.randbytes(40) for number in range(10)}
     topics |= {
-        f"/odd{number}": said(f"/odd{number}", 2).replace(b"std_msgs/Float64", kind.ljust(16, b"x"))
+        f"/odd{number}": stream_of(f"/odd{number}", 2).replace(b"std_msgs/Float64", kind.ljust(16, b"x"))
         for number, kind in enumerate(
             (b"std_msgs/Nothing", b"\xc3\x28/x", b"", b"sensor_msgs/Imu/", b"std_msgs/String_")
         )
     }
     folder = tmp_path / "ros"
     folder.mkdir()
-    with Publishers(folder, topics | {GOOD: said(GOOD, ENOUGH)}) as publishers:
+    with Publishers(folder, topics | {GOOD: stream_of(GOOD, COUNT)}) as publishers:
         argv = (sys.executable, "-c", RECORDERS[ros], str(folder), *ARGV[ros])
         with subprocess.Popen(argv, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as recorder:
             publishers.wait()
@@ -129,33 +129,35 @@ def test_a_recorder_goes_on_whatever_publishers_say(ros: str, tmp_path: Path) ->
             _, errors = recorder.communicate(timeout=60)
     assert b"Traceback" not in errors
     with AnyReader([tmp_path / BAGS[ros]]) as reader:
-        good = [one for one in reader.connections if one.topic == GOOD]
-        found: list[Any] = [reader.deserialize(data, one.msgtype) for one, _, data in reader.messages(good)]
-    heard = [one.data for one in found]
-    assert heard == list(range(ENOUGH))
+        good = [connection for connection in reader.connections if connection.topic == GOOD]
+        messages: list[Any] = [
+            reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages(good)
+        ]
+    numbers = [message.data for message in messages]
+    assert numbers == list(range(COUNT))
 
 
-def test_a_publisher_goes_on_whatever_subscribers_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_publisher_survives_hostile_subscribers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcpros, "FOLDER", str(tmp_path))
     dice, request = random.Random(3), tcpros.request("/test", SENSOR.topic)
     selector = selectors.DefaultSelector()
     odometer = Odometer(tmp_path / "motion", 0)
     publication = Publication(SENSOR, definition(SENSOR.type), 0.0, odometer, selector)
     streams = []
-    for number in range(GARBLED + 1):
+    for number in range(HOSTILE + 1):
         stream = socket.socket(socket.AF_UNIX)
         stream.connect(str(tcpros.socket_path(SENSOR.topic)))
         stream.setblocking(False)
         with suppress(BlockingIOError):
-            stream.send(request if number == GARBLED else mutated(request, [request], dice)[:50_000])
+            stream.send(request if number == HOSTILE else mutated(request, [request], dice)[:50_000])
         if number % 3 == 1:
             stream.close()
         streams.append(stream)
-    for _ in range(2 * GARBLED):
+    for _ in range(2 * HOSTILE):
         for key, events in selector.select(0):
             key.data(events)
         publication.publish()
     header = tcpros.PacketSplitter()
-    header.feed(streams[GARBLED].recv(1 << 16))
+    header.feed(streams[HOSTILE].recv(1 << 16))
     first, *_ = header
     assert tcpros.unpack_header(first)["topic"] == SENSOR.topic

@@ -1,4 +1,4 @@
-"""Other robots in a laser's beams: their places as the lab wrote them, and the range to an upright cylinder."""
+"""Other robots in the beams of a laser: their positions in shared memory, and the range to an upright cylinder."""
 
 import math
 import os
@@ -36,12 +36,12 @@ def writer() -> Iterator[PlacesWriter]:
 
 
 def expected(places_m: dict[str, Vector]) -> list[LaserTarget]:
-    known = [places_m[name] for name in NAMES if name in places_m]
-    return [LaserTarget(((east, north),), 0.1, up - 0.2, up + 0.3) for east, north, up in known]
+    positions = [places_m[name] for name in NAMES if name in places_m]
+    return [LaserTarget(((east, north),), 0.1, up - 0.2, up + 0.3) for east, north, up in positions]
 
 
 @given(st.lists(PLACES, max_size=4))
-def test_a_reader_finds_the_places_that_were_written_last(written: list[dict[str, Vector]]) -> None:
+def test_a_reader_gets_the_places_written_last(written: list[dict[str, Vector]]) -> None:
     with closing(PlacesWriter(NAMES)) as writer:
         reader = Neighbourhood(writer.fd, len(NAMES))
         assert reader.targets(BODIES) == []
@@ -52,14 +52,14 @@ def test_a_reader_finds_the_places_that_were_written_last(written: list[dict[str
         assert late.targets(BODIES) == (expected(written[-1]) if written else [])
 
 
-def test_a_slot_that_is_half_written_leaves_the_places_before_it(writer: PlacesWriter) -> None:
+def test_a_partly_written_slot_is_ignored(writer: PlacesWriter) -> None:
     first: dict[str, Vector] = {"other": (1.0, 2.0, 3.0)}
     writer.write(first)
     before = os.pread(writer.fd, 1 << 10, 0)
     writer.write({"other": (4.0, 5.0, 6.0)})
     after = os.pread(writer.fd, 1 << 10, 0)
     changed = [at for at in range(len(before)) if before[at] != after[at]]
-    for end in changed[1:]:  # all but the first of the bytes that differ may be missing
+    for end in changed[1:]:  # all bytes that differ except the first may be missing
         os.pwrite(writer.fd, after[:end] + before[end:], 0)
         assert Neighbourhood(writer.fd, len(NAMES)).targets(BODIES) == expected(first)
 
@@ -69,7 +69,7 @@ def test_memory_for_fewer_robots_is_refused(writer: PlacesWriter) -> None:
         Neighbourhood(writer.fd, 200)
 
 
-def test_the_range_to_a_robot_ahead_is_its_distance_less_its_radius_and_follows_it(writer: PlacesWriter) -> None:
+def test_the_range_to_a_robot_is_its_distance_less_its_radius(writer: PlacesWriter) -> None:
     neighbourhood = Neighbourhood(writer.fd, len(NAMES))
     bodies = [neighbour(1, load_profile("turtlebot3_burger"))]
     scanner = Sensor("/scan", LASER_SCAN, 5.0, "base_scan", 360)
@@ -99,7 +99,7 @@ def test_the_range_to_a_robot_ahead_is_its_distance_less_its_radius_and_follows_
     ("profile", "radius_m", "above_m"),
     [("turtlebot3_burger", 0.113, 0.0), ("husky", 0.6, 0.19), ("duckiedrone", 0.2, 0.0), ("iris", 0.384, 0.0)],
 )
-def test_a_body_reaches_from_the_ground_to_its_antenna_or_higher(
+def test_a_body_extends_from_the_ground_to_its_antenna_or_higher(
     profile: str, radius_m: float, above_m: float
 ) -> None:
     body = neighbour(3, load_profile(profile))

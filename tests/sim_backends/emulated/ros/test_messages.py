@@ -1,4 +1,4 @@
-"""What the sensors of every shipped robot say, rule by rule: of REP 103, 105, 117 and 145, and of sensor_msgs."""
+"""Messages of the sensors of every shipped robot, checked against REP 103, 105, 117 and 145, and sensor_msgs."""
 
 import math
 from collections.abc import Iterator
@@ -38,24 +38,26 @@ STORE: Final = shipped().ros1
 
 @cache
 def of_profile(name: str) -> dict[str, Sensor]:
-    """Return what a shipped robot publishes by its topic."""
+    """Return the sensors of a shipped robot by their topics."""
     return {topic.name: _sensor(topic) for topic in ros_of(load_profile(name)).topics}
 
 
 def sensors(kind: str = "") -> list[Sensor]:
-    """Return what all shipped robots publish, or that of a type."""
-    found = [one for name in PROFILES for one in of_profile(name).values()]
-    assert found
-    return [one for one in found if kind in (one.type, "")]
+    """Return the sensors of all shipped robots, or those of one type."""
+    result = [sensor for name in PROFILES for sensor in of_profile(name).values()]
+    assert result
+    return [sensor for sensor in result if kind in (sensor.type, "")]
 
 
-def said(one: Sensor, now: OwnMotion = AT_REST, *, source: Source | None = None, number: int = 1) -> Any:  # noqa: ANN401 (of rosbags)
-    data = (source or Source(one)).message(number, number * S, now)
-    return STORE.deserialize_ros1(data, one.type.replace("/", "/msg/"))
+def publish(sensor: Sensor, now: OwnMotion = AT_REST, *, source: Source | None = None, number: int = 1) -> Any:  # noqa: ANN401 (of rosbags)
+    data = (source or Source(sensor)).message(number, number * S, now)
+    return STORE.deserialize_ros1(data, sensor.type.replace("/", "/msg/"))
 
 
 def headers(message: Any) -> list[Any]:  # noqa: ANN401 (as above)
-    return [one.header for one in message.transforms] if hasattr(message, "transforms") else [message.header]
+    return (
+        [transform.header for transform in message.transforms] if hasattr(message, "transforms") else [message.header]
+    )
 
 
 def quaternions(message: Any) -> Iterator[tuple[float, ...]]:  # noqa: ANN401 (as above)
@@ -65,8 +67,8 @@ def quaternions(message: Any) -> Iterator[tuple[float, ...]]:  # noqa: ANN401 (a
         if "Quaternion" in type(value).__name__:
             yield (value.x, value.y, value.z, value.w)
         elif isinstance(value, list):
-            for one in value:
-                yield from quaternions(one)
+            for item in value:
+                yield from quaternions(item)
         else:
             yield from quaternions(value)
 
@@ -76,39 +78,39 @@ def yaw_rad(quaternion: Any) -> float:  # noqa: ANN401 (as above)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_all_that_robots_measure_has_a_generator(profile: str) -> None:
-    assert {one.type for one in ros_of(load_profile(profile)).topics} <= GENERATORS.keys()
+def test_every_topic_of_a_shipped_robot_has_a_generator(profile: str) -> None:
+    assert {topic.type for topic in ros_of(load_profile(profile)).topics} <= GENERATORS.keys()
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_every_place_has_a_frame_that_tf2_takes(profile: str) -> None:
+def test_every_message_has_a_frame_that_tf2_accepts(profile: str) -> None:
     for topic in ros_of(load_profile(profile)).topics:
-        for header in headers(said(_sensor(topic))):
+        for header in headers(publish(_sensor(topic))):
             assert header.frame_id == topic.frame
-            assert not header.frame_id.startswith("/"), "tf2 refuses those"
-            # A battery is nowhere.
+            assert not header.frame_id.startswith("/"), "tf2 rejects these"
+            # Only a battery has no frame.
             assert header.frame_id or topic.type == "sensor_msgs/BatteryState"
 
 
-def test_stamps_are_those_of_the_clock() -> None:
-    for one in sensors():
-        source = Source(one)
+def test_stamps_are_those_passed_in() -> None:
+    for sensor in sensors():
+        source = Source(sensor)
         for number in (1, 2):
-            (header,) = headers(said(one, source=source, number=number))
+            (header,) = headers(publish(sensor, source=source, number=number))
             assert (header.stamp.sec, header.stamp.nanosec, header.seq) == (number, 0, number)
 
 
 @given(MOTIONS)
 def test_quaternions_are_of_length_1(now: OwnMotion) -> None:
-    for one in sensors():
-        for found in quaternions(said(one, now)):
-            assert math.hypot(*found) == pytest.approx(1.0)
+    for sensor in sensors():
+        for quaternion in quaternions(publish(sensor, now)):
+            assert math.hypot(*quaternion) == pytest.approx(1.0)
 
 
-def test_covariances_are_symmetric_and_of_no_negative_variance() -> None:
+def test_covariances_are_symmetric_and_positive_definite() -> None:
     checked = 0
-    for one in sensors():
-        message = said(one)
+    for sensor in sensors():
+        message = publish(sensor)
         holders = [message, *(getattr(message, name, None) for name in ("pose", "twist"))]
         for holder in holders:
             for name in getattr(holder, "__dataclass_fields__", {}):
@@ -116,7 +118,7 @@ def test_covariances_are_symmetric_and_of_no_negative_variance() -> None:
                     size = math.isqrt(len(getattr(holder, name)))
                     matrix = getattr(holder, name).reshape(size, size)
                     assert (matrix == matrix.T).all()
-                    assert (np.diag(matrix) > 0).all(), "0 is unknown, -1 there is none: these robots measure"
+                    assert (np.diag(matrix) > 0).all(), "0 would mean unknown, -1 not measured"
                     assert (np.linalg.eigvalsh(matrix) > 0).all()
                     checked += 1
     assert checked >= 10
@@ -124,13 +126,16 @@ def test_covariances_are_symmetric_and_of_no_negative_variance() -> None:
 
 @given(MOTIONS)
 def test_a_transform_is_the_pose_of_its_robot_s_odometry(now: OwnMotion) -> None:
-    """REP 105: odom is the parent, and the robot's base the child; both say the same."""
+    """REP 105: odom is the parent, and the robot's base the child; both have the same pose."""
     for name in PROFILES:
-        own = {one.type: one for one in of_profile(name).values()}
-        if "nav_msgs/Odometry" not in own:
-            assert "tf2_msgs/TFMessage" not in own
+        by_type = {sensor.type: sensor for sensor in of_profile(name).values()}
+        if "nav_msgs/Odometry" not in by_type:
+            assert "tf2_msgs/TFMessage" not in by_type
             continue
-        odom, (transform,) = (said(own["nav_msgs/Odometry"], now), said(own["tf2_msgs/TFMessage"], now).transforms)
+        odom, (transform,) = (
+            publish(by_type["nav_msgs/Odometry"], now),
+            publish(by_type["tf2_msgs/TFMessage"], now).transforms,
+        )
         assert odom.header.frame_id == transform.header.frame_id == "odom"
         assert odom.child_frame_id == transform.child_frame_id
         assert odom.child_frame_id in {"base_link", "base_footprint"}
@@ -142,60 +147,60 @@ def test_a_transform_is_the_pose_of_its_robot_s_odometry(now: OwnMotion) -> None
         assert twist.angular.z == pytest.approx(now.turn_rad_s, abs=0.01)
 
 
-@pytest.mark.parametrize("one", sensors("sensor_msgs/LaserScan"), ids=lambda one: str(one.points))
-def test_a_scan_s_angles_and_times_fit_its_number_of_beams(one: Sensor) -> None:
-    scan = said(one)
+@pytest.mark.parametrize("sensor", sensors("sensor_msgs/LaserScan"), ids=lambda sensor: str(sensor.points))
+def test_a_scan_s_angles_and_times_fit_its_number_of_beams(sensor: Sensor) -> None:
+    scan = publish(sensor)
     count = len(scan.ranges)
-    assert count == len(scan.intensities) == one.points
+    assert count == len(scan.intensities) == sensor.points
     assert scan.angle_max - scan.angle_min == pytest.approx((count - 1) * scan.angle_increment, rel=1e-5)
     assert count * scan.angle_increment == pytest.approx(2 * math.pi, rel=1e-5)
     assert (scan.scan_time, count * scan.time_increment) == pytest.approx(
-        (1 / one.rate_hz, 1 / one.rate_hz), rel=1e-5
+        (1 / sensor.rate_hz, 1 / sensor.rate_hz), rel=1e-5
     )
 
 
 @given(MOTIONS)
 def test_ranges_are_within_the_sensor_s_reach_or_infinite(now: OwnMotion) -> None:
     """REP 117: minus infinity for too near, infinity for too far."""
-    for one in sensors("sensor_msgs/LaserScan"):
-        scan = said(one, now)
-        told = scan.ranges[np.isfinite(scan.ranges)]
-        assert ((told >= scan.range_min) & (told <= scan.range_max)).all()
+    for sensor in sensors("sensor_msgs/LaserScan"):
+        scan = publish(sensor, now)
+        samples = scan.ranges[np.isfinite(scan.ranges)]
+        assert ((samples >= scan.range_min) & (samples <= scan.range_max)).all()
         assert not np.isnan(scan.ranges).any()
-    for one in sensors("sensor_msgs/Range"):
-        down = said(one, now)
+    for sensor in sensors("sensor_msgs/Range"):
+        down = publish(sensor, now)
         assert math.isinf(down.range) or down.min_range <= down.range <= down.max_range
         assert 0 < down.field_of_view < math.pi
 
 
-def test_walls_come_nearer_and_turn_as_the_robot_drives_and_turns() -> None:
-    """By its place in the world, wherever its odometry began to count."""
-    (one, *_) = sensors("sensor_msgs/LaserScan")
+def test_ranges_to_walls_follow_position_and_heading() -> None:
+    """By its position in the world, wherever its odometry started."""
+    (sensor, *_) = sensors("sensor_msgs/LaserScan")
     room = LaserTarget(((8.0, 4.0), (12.0, 4.0), (12.0, 7.0), (8.0, 7.0)), 0.0, 0.0, 2.0)
-    source = Source(one, [room])
-    ahead, left = 0, (one.points or 0) // 4
-    driven = said(one, OwnMotion(x_m=70.0, yaw_rad=1.0, place_m=(10.5, 5.5, 0.2)), source=source)
-    assert driven.ranges[ahead] == pytest.approx(1.5, abs=0.1)
-    assert driven.ranges[left] == pytest.approx(1.5, abs=0.1)
-    assert driven.ranges[2 * left] == pytest.approx(2.5, abs=0.1)
-    turned = said(one, OwnMotion(place_m=(10.5, 5.0, 0.2), heading_rad=math.pi / 2), source=source)
-    assert turned.ranges[ahead] == pytest.approx(2.0, abs=0.1)
-    assert turned.ranges[left] == pytest.approx(2.5, abs=0.1)
-    assert (driven.intensities > 0).all()
+    source = Source(sensor, [room])
+    ahead, left = 0, (sensor.points or 0) // 4
+    after_drive = publish(sensor, OwnMotion(x_m=70.0, yaw_rad=1.0, place_m=(10.5, 5.5, 0.2)), source=source)
+    assert after_drive.ranges[ahead] == pytest.approx(1.5, abs=0.1)
+    assert after_drive.ranges[left] == pytest.approx(1.5, abs=0.1)
+    assert after_drive.ranges[2 * left] == pytest.approx(2.5, abs=0.1)
+    after_turn = publish(sensor, OwnMotion(place_m=(10.5, 5.0, 0.2), heading_rad=math.pi / 2), source=source)
+    assert after_turn.ranges[ahead] == pytest.approx(2.0, abs=0.1)
+    assert after_turn.ranges[left] == pytest.approx(2.5, abs=0.1)
+    assert (after_drive.intensities > 0).all()
 
 
-def test_no_echo_is_infinitely_far_and_of_no_intensity_in_as_many_bytes() -> None:
-    (one, *_) = sensors("sensor_msgs/LaserScan")
+def test_a_beam_without_echo_has_infinite_range_and_no_intensity() -> None:
+    (sensor, *_) = sensors("sensor_msgs/LaserScan")
     room = LaserTarget(((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)), 0.0, 0.0, 2.0)
-    assert len(Source(one).message(1, 2)) == len(Source(one, [room]).message(1, 2))
-    scan = said(one)
+    assert len(Source(sensor).message(1, 2)) == len(Source(sensor, [room]).message(1, 2))
+    scan = publish(sensor)
     assert np.isposinf(scan.ranges).all()
     assert not scan.intensities.any()
 
 
-def test_batteries_are_shares_volts_and_ampere_hours_or_not_a_number() -> None:
-    for one in sensors("sensor_msgs/BatteryState"):
-        battery = said(one)
+def test_battery_values_are_plausible_or_nan() -> None:
+    for sensor in sensors("sensor_msgs/BatteryState"):
+        battery = publish(sensor)
         assert 0 <= battery.percentage <= 1
         assert 3 < battery.voltage < 60
         assert battery.present
@@ -207,69 +212,74 @@ def test_batteries_are_shares_volts_and_ampere_hours_or_not_a_number() -> None:
 
 
 @given(ANGLES)
-def test_an_imu_that_stands_feels_gravity_alone_and_faces_from_east_to_north(heading_rad: float) -> None:
-    """REP 145: what is up is positive, and acceleration has gravity in it."""
-    for one in sensors("sensor_msgs/Imu"):
-        imu = said(one, OwnMotion(heading_rad=heading_rad))
-        felt = imu.linear_acceleration
-        assert (felt.x, felt.y, felt.z) == pytest.approx((0, 0, GRAVITY_M_S2), abs=0.2)
+def test_an_imu_at_rest_measures_only_gravity(heading_rad: float) -> None:
+    """REP 145: up is positive, and acceleration includes gravity."""
+    for sensor in sensors("sensor_msgs/Imu"):
+        imu = publish(sensor, OwnMotion(heading_rad=heading_rad))
+        acceleration = imu.linear_acceleration
+        assert (acceleration.x, acceleration.y, acceleration.z) == pytest.approx((0, 0, GRAVITY_M_S2), abs=0.2)
         assert math.remainder(yaw_rad(imu.orientation) - heading_rad, 2 * math.pi) == pytest.approx(0, abs=1e-6)
 
 
-def test_a_gyroscope_s_turning_adds_up_to_the_heading() -> None:
-    (one, *_) = sensors("sensor_msgs/Imu")
-    source, rate_rad_s, count = Source(one), 0.5, round(2 * one.rate_hz)
-    told = [
-        said(one, OwnMotion(heading_rad=rate_rad_s * number / one.rate_hz, turn_rad_s=rate_rad_s), source=source)
+def test_the_turn_rate_integrates_to_the_heading() -> None:
+    (sensor, *_) = sensors("sensor_msgs/Imu")
+    source, rate_rad_s, count = Source(sensor), 0.5, round(2 * sensor.rate_hz)
+    samples = [
+        publish(
+            sensor, OwnMotion(heading_rad=rate_rad_s * number / sensor.rate_hz, turn_rad_s=rate_rad_s), source=source
+        )
         for number in range(count + 1)
     ]
-    turned_rad = sum(imu.angular_velocity.z for imu in told[:-1]) / one.rate_hz
-    assert yaw_rad(told[-1].orientation) - yaw_rad(told[0].orientation) == pytest.approx(turned_rad, abs=0.01)
+    turned_rad = sum(imu.angular_velocity.z for imu in samples[:-1]) / sensor.rate_hz
+    assert yaw_rad(samples[-1].orientation) - yaw_rad(samples[0].orientation) == pytest.approx(turned_rad, abs=0.01)
 
 
 @given(MOTIONS)
-def test_heights_are_of_the_robot(now: OwnMotion) -> None:
-    for one in sensors("sensor_msgs/NavSatFix"):
-        assert said(one, now).altitude == pytest.approx(now.place_m[2], abs=5)
-    for one in sensors("geometry_msgs/PoseStamped"):
-        pose = said(one, now).pose
+def test_heights_are_those_of_the_robot(now: OwnMotion) -> None:
+    for sensor in sensors("sensor_msgs/NavSatFix"):
+        assert publish(sensor, now).altitude == pytest.approx(now.place_m[2], abs=5)
+    for sensor in sensors("geometry_msgs/PoseStamped"):
+        pose = publish(sensor, now).pose
         assert (pose.position.x, pose.position.y, pose.position.z) == now.place_m
         assert math.remainder(yaw_rad(pose.orientation) - now.heading_rad, 2 * math.pi) == pytest.approx(0, abs=1e-6)
-    for one in sensors("sensor_msgs/Range"):
-        down_m = said(one, now).range
+    for sensor in sensors("sensor_msgs/Range"):
+        down_m = publish(sensor, now).range
         assert down_m == pytest.approx(max(0.1, now.place_m[2]), abs=0.1) or (now.place_m[2] > 3.8 and down_m > 3.8)
-    pressure = said(Sensor("/p", "sensor_msgs/FluidPressure", 1.0, "base_link", None), now)
+    pressure = publish(Sensor("/p", "sensor_msgs/FluidPressure", 1.0, "base_link", None), now)
     # 11.3 to 12.0 Pa less per metre below 600 m (ISO 2533).
     fallen_pa = 101_325 - pressure.fluid_pressure
     assert 11.3 * now.place_m[2] - 20 < fallen_pa < 12.02 * now.place_m[2] + 20
 
 
 @given(ANGLES)
-def test_the_magnetic_field_points_north_whatever_the_robot_faces(heading_rad: float) -> None:
-    one = Sensor("/mag", "sensor_msgs/MagneticField", 1.0, "imu_link", None)
-    field = said(one, OwnMotion(heading_rad=heading_rad)).magnetic_field
+def test_the_magnetic_field_points_north_for_any_heading(heading_rad: float) -> None:
+    sensor = Sensor("/mag", "sensor_msgs/MagneticField", 1.0, "imu_link", None)
+    field = publish(sensor, OwnMotion(heading_rad=heading_rad)).magnetic_field
     towards_rad = math.atan2(field.y, field.x) + heading_rad
     assert math.remainder(towards_rad - math.pi / 2, 2 * math.pi) == pytest.approx(0, abs=0.05)
 
 
-@pytest.mark.parametrize("one", sensors("nav_msgs/Odometry"), ids=lambda one: one.topic)
-def test_odometry_s_speeds_add_up_to_its_pose_and_to_the_way_through_the_world(one: Sensor, tmp_path: Path) -> None:
+@pytest.mark.parametrize("sensor", sensors("nav_msgs/Odometry"), ids=lambda sensor: sensor.topic)
+def test_the_speed_of_odometry_integrates_to_its_pose_and_to_the_path(sensor: Sensor, tmp_path: Path) -> None:
     placement = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("10m"))
     world, move = load_world("lawn"), Move(Role.SENDER, (Leg(away_m=2.0), Leg(left_m=1.0), Leg(away_m=1.0)), 0.5)
-    own_motion.say(tmp_path / "motion", places.own_way(placement, move, world, 0))
-    odometer, source = Odometer(tmp_path / "motion", 0), Source(one)
-    period_s, long_s = 1 / one.rate_hz, 8.0
-    told = [said(one, odometer.at(round(n * period_s * S)), source=source) for n in range(round(10 * one.rate_hz))]
+    own_motion.append_path(tmp_path / "motion", places.assigned_path(placement, move, world, 0))
+    odometer, source = Odometer(tmp_path / "motion", 0), Source(sensor)
+    period_s, long_s = 1 / sensor.rate_hz, 8.0
+    samples = [
+        publish(sensor, odometer.at(round(n * period_s * S)), source=source)
+        for n in range(round(10 * sensor.rate_hz))
+    ]
     x_m = y_m = 0.0
-    for before, after in pairwise(told):
+    for before, after in pairwise(samples):
         towards_rad = yaw_rad(before.pose.pose.orientation)
         x_m += before.twist.twist.linear.x * math.cos(towards_rad) * period_s
         y_m += before.twist.twist.linear.x * math.sin(towards_rad) * period_s
-        # Off by less than what a leg's last period has too much of, for each leg.
+        # The error is less than what the last period of each leg adds too much.
         assert (after.pose.pose.position.x, after.pose.pose.position.y) == pytest.approx(
             (x_m, y_m), abs=3 * 0.5 * period_s
         )
     motion = places.motion(CAST, placement, move, world)
-    begin, end = (motion.at(round(t_s * S))[CAST[Role.SENDER].name].position_m for t_s in (0.0, long_s + 1))
-    assert math.hypot(x_m, y_m) == pytest.approx(math.dist(begin[:2], end[:2]), abs=3 * 0.5 * period_s)
-    assert (told[-1].pose.pose.position.x, told[-1].pose.pose.position.y) == pytest.approx((3.0, 1.0))
+    start, end = (motion.at(round(t_s * S))[CAST[Role.SENDER].name].position_m for t_s in (0.0, long_s + 1))
+    assert math.hypot(x_m, y_m) == pytest.approx(math.dist(start[:2], end[:2]), abs=3 * 0.5 * period_s)
+    assert (samples[-1].pose.pose.position.x, samples[-1].pose.pose.position.y) == pytest.approx((3.0, 1.0))

@@ -1,4 +1,4 @@
-"""What robots know of their own motion: odometry that is the integral of its own speed, and places of the world."""
+"""Motion of a robot for its sensors: odometry is the integral of its speed, and positions are those of the world."""
 
 import math
 from itertools import pairwise
@@ -15,7 +15,7 @@ from fieldkit.core.units import parse_distance
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.messages import FIX_NOISE_M, Sensor, Source
-from sim_backends.emulated.ros.own_motion import AT_REST, Odometer, OwnMotion, OwnWay
+from sim_backends.emulated.ros.own_motion import AT_REST, AssignedPath, Odometer, OwnMotion
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
 
@@ -27,16 +27,16 @@ POINTS = st.lists(st.tuples(METRES, METRES, st.just(UP_M)), min_size=1, max_size
 ANGLES = st.floats(-math.pi, math.pi)
 
 
-def ways(folder: Path, *told: OwnWay) -> Path:
+def write_paths(folder: Path, *assigned_paths: AssignedPath) -> Path:
     path = folder / "motion"
     path.unlink(missing_ok=True)
-    for way in told:
-        own_motion.say(path, way)
+    for assigned in assigned_paths:
+        own_motion.append_path(path, assigned)
     return path
 
 
-def test_it_counts_ahead_turns_to_the_left_and_stands(tmp_path: Path) -> None:
-    odometer = Odometer(ways(tmp_path, OwnWay(10 * S, CORNER, 2.0, 0.0)), 0)
+def test_odometry_along_a_path_with_a_left_turn(tmp_path: Path) -> None:
+    odometer = Odometer(write_paths(tmp_path, AssignedPath(10 * S, CORNER, 2.0, 0.0)), 0)
     assert odometer.at(10 * S) == OwnMotion(speed_m_s=2.0, place_m=CORNER[0])
     assert odometer.at(11 * S) == OwnMotion(2.0, 0.0, 0.0, 2.0, (5.0, 6.0, UP_M))
     half = odometer.at(round(12.5 * S))
@@ -47,21 +47,21 @@ def test_it_counts_ahead_turns_to_the_left_and_stands(tmp_path: Path) -> None:
     assert end.place_m == CORNER[-1]
 
 
-def test_who_is_carried_back_turns_no_wheel(tmp_path: Path) -> None:
-    path = ways(tmp_path, OwnWay(0, CORNER, 2.0, 0.0))
+def test_a_robot_that_is_put_back_keeps_its_odometry(tmp_path: Path) -> None:
+    path = write_paths(tmp_path, AssignedPath(0, CORNER, 2.0, 0.0))
     odometer = Odometer(path, 0)
     odometer.at(2 * S)
-    own_motion.say(path, OwnWay(4 * S, CORNER[:1], 2.0, 0.0))
+    own_motion.append_path(path, AssignedPath(4 * S, CORNER[:1], 2.0, 0.0))
     back = odometer.at(5 * S)
     assert (back.x_m, back.y_m) == pytest.approx((4.0, 2.0))
     assert back.place_m == CORNER[0]
-    own_motion.say(path, OwnWay(6 * S, CORNER, 2.0, 0.0))
+    own_motion.append_path(path, AssignedPath(6 * S, CORNER, 2.0, 0.0))
     again = odometer.at(7 * S)
-    # It faces as it did at first, which its wheels have not seen: ahead is to the left of where they began.
+    # It faces as at first again, which its odometry has not recorded: ahead is to the left of the start.
     assert (again.x_m, again.y_m, again.yaw_rad) == pytest.approx((4.0, 4.0, math.pi / 2))
 
 
-def test_nobody_said_anything_or_half_a_line(tmp_path: Path) -> None:
+def test_a_missing_file_or_an_incomplete_line_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "motion"
     odometer = Odometer(path, 0)
     assert odometer.at(S) == AT_REST
@@ -72,60 +72,60 @@ def test_nobody_said_anything_or_half_a_line(tmp_path: Path) -> None:
 
 
 @given(POINTS, ANGLES, st.floats(0.1, 3), st.integers(0, 100 * S))
-def test_switched_on_anywhere_it_counts_from_there(
+def test_odometry_starts_at_zero_when_it_is_created(
     tmp_path_factory: pytest.TempPathFactory,
     points_m: list[tuple[float, float, float]],
     facing_rad: float,
     speed_m_s: float,
     on_ns: int,
 ) -> None:
-    path = ways(tmp_path_factory.getbasetemp(), OwnWay(0, points_m, speed_m_s, facing_rad))
-    found = Odometer(path, on_ns).at(on_ns)
-    assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((0, 0, 0), abs=1e-6)
+    path = write_paths(tmp_path_factory.getbasetemp(), AssignedPath(0, points_m, speed_m_s, facing_rad))
+    motion = Odometer(path, on_ns).at(on_ns)
+    assert (motion.x_m, motion.y_m, motion.yaw_rad) == pytest.approx((0, 0, 0), abs=1e-6)
 
 
 @given(POINTS, ANGLES, st.floats(0.1, 3))
-def test_its_place_is_the_integral_of_its_speed_and_as_far_as_the_world_has_it(
+def test_odometry_is_the_integral_of_the_speed(
     tmp_path_factory: pytest.TempPathFactory,
     points_m: list[tuple[float, float, float]],
     facing_rad: float,
     speed_m_s: float,
 ) -> None:
-    path = ways(tmp_path_factory.getbasetemp(), OwnWay(0, points_m, speed_m_s, facing_rad))
+    path = write_paths(tmp_path_factory.getbasetemp(), AssignedPath(0, points_m, speed_m_s, facing_rad))
     odometer = Odometer(path, 0)
     long_s = sum(math.dist(*pair) for pair in pairwise(points_m)) / speed_m_s
     steps = 400
-    told = [odometer.at(round((n + 0.5) * long_s * S / steps)) for n in range(steps)]
-    x_m = sum(one.speed_m_s * math.cos(one.yaw_rad) for one in told) * long_s / steps
-    y_m = sum(one.speed_m_s * math.sin(one.yaw_rad) for one in told) * long_s / steps
+    samples = [odometer.at(round((n + 0.5) * long_s * S / steps)) for n in range(steps)]
+    x_m = sum(sample.speed_m_s * math.cos(sample.yaw_rad) for sample in samples) * long_s / steps
+    y_m = sum(sample.speed_m_s * math.sin(sample.yaw_rad) for sample in samples) * long_s / steps
     end = odometer.at(round(long_s * S) + S)
     off_m = 2 * len(points_m) * speed_m_s * long_s / steps + 1e-6
     assert (end.x_m, end.y_m) == pytest.approx((x_m, y_m), abs=off_m)
-    begin = points_m[0]
-    assert math.hypot(end.x_m, end.y_m) == pytest.approx(math.dist(begin[:2], points_m[-1][:2]), abs=1e-6)
+    start = points_m[0]
+    assert math.hypot(end.x_m, end.y_m) == pytest.approx(math.dist(start[:2], points_m[-1][:2]), abs=1e-6)
 
 
 @pytest.mark.parametrize("role", [Role.SENDER, Role.RECEIVER])
-def test_away_is_ahead_and_left_is_left(tmp_path: Path, role: Role) -> None:
+def test_away_is_ahead_and_left_is_to_the_left(tmp_path: Path, role: Role) -> None:
     placement = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("10m"))
     world, move = load_world("lawn"), Move(role, (Leg(away_m=2.0), Leg(left_m=1.0)), 1.0)
-    odometer = Odometer(ways(tmp_path, places.own_way(placement, move, world, 0)), 0)
+    odometer = Odometer(write_paths(tmp_path, places.assigned_path(placement, move, world, 0)), 0)
     end = odometer.at(4 * S)
     assert (end.x_m, end.y_m) == pytest.approx((2.0, 1.0))
     motion = places.motion(CAST, placement, move, world)
     assert end.place_m == pytest.approx(motion.at(4 * S)[CAST[role].name].position_m)
 
 
-def test_messages_say_it_in_ros_s_frames_and_units() -> None:
+def test_messages_use_ros_s_frames_and_units() -> None:
     store, now = (
         get_typestore(Stores.ROS1_NOETIC),
         OwnMotion(4.0, 2.0, math.pi / 2, 1.5, (300.0, 400.0, UP_M), math.pi / 2),
     )
-    found: dict[str, Any] = {}
+    messages: dict[str, Any] = {}
     for kind in ("nav_msgs/Odometry", "sensor_msgs/Imu", "sensor_msgs/NavSatFix"):
-        made = Source(Sensor("/x", kind, 10.0, "frame", None)).message(1, 2 * S, now)
-        found[kind.partition("/")[2]] = store.deserialize_ros1(made, kind.replace("/", "/msg/"))
-    odom, imu, fix = (found[kind] for kind in ("Odometry", "Imu", "NavSatFix"))
+        data = Source(Sensor("/x", kind, 10.0, "frame", None)).message(1, 2 * S, now)
+        messages[kind.partition("/")[2]] = store.deserialize_ros1(data, kind.replace("/", "/msg/"))
+    odom, imu, fix = (messages[kind] for kind in ("Odometry", "Imu", "NavSatFix"))
     half = math.sqrt(0.5)
     assert (odom.pose.pose.position.x, odom.pose.pose.position.y) == (4.0, 2.0)
     assert (odom.child_frame_id, odom.twist.twist.linear.x) == ("base_link", 1.5)
@@ -137,11 +137,11 @@ def test_messages_say_it_in_ros_s_frames_and_units() -> None:
     assert fix.altitude == pytest.approx(UP_M, abs=5 * up_m)
 
 
-def test_noise_of_fixes_is_what_their_covariance_says() -> None:
+def test_noise_of_fixes_agrees_with_their_covariance() -> None:
     source, store = (
         Source(Sensor("/fix", "sensor_msgs/NavSatFix", 10.0, "gps", None)),
         get_typestore(Stores.ROS1_NOETIC),
     )
     fixes: list[Any] = [store.deserialize_ros1(source.message(n, n), "sensor_msgs/msg/NavSatFix") for n in range(500)]
-    east_m = [one.longitude * 111_319.49 for one in fixes]
-    assert math.sqrt(sum(one**2 for one in east_m) / 500) == pytest.approx(FIX_NOISE_M[0], rel=0.15)
+    east_m = [fix.longitude * 111_319.49 for fix in fixes]
+    assert math.sqrt(sum(error_m**2 for error_m in east_m) / 500) == pytest.approx(FIX_NOISE_M[0], rel=0.15)

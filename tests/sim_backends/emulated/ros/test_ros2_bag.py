@@ -1,4 +1,4 @@
-"""The robot's `ros2 bag record` writes real ROS 2 bags and behaves as its users know it."""
+"""The robot's `ros2 bag record` writes real ROS 2 bags and behaves like the original."""
 
 import io
 import sqlite3
@@ -34,7 +34,7 @@ from tests.helpers.casts import ros_of
 Robots = dict[str, Shell]
 """Robots by the ROS distribution that they run."""
 
-# Runs a recorder in a new folder on the robot until it says a text, signals its group, and packs what it left.
+# Runs a recorder in a new folder on the robot until it prints a text, signals its group, and packs its files.
 DRIVER: Final = r"""
 import json, os, pathlib, signal, subprocess, sys, tarfile, tempfile, time
 
@@ -58,11 +58,11 @@ with tarfile.open(fileobj=sys.stdout.buffer, mode="w|") as tar:
 
 
 @dataclass(frozen=True)
-class Left:
-    """How a recorder ended, and what it said."""
+class Recording:
+    """Exit code and output of a recorder."""
 
     code: int
-    said: str
+    output: str
 
 
 def ros2_profile(distribution: str) -> RobotProfile:
@@ -83,7 +83,7 @@ def robots() -> Iterator[Robots]:
     cast = {
         role: master[role].model_copy(update={"profile": ros2_profile(name)}) for role, name in distributions.items()
     }
-    # Debian's ROS is for robots with ROS 1; these get the built-in all the same.
+    # Debian's ROS is for robots with ROS 1; these get the built-in recorder anyway.
     with testbed.bring_up(
         cast, options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1
     ) as up:
@@ -99,20 +99,20 @@ def record(
     signal: int = 2,
     until: str,
     for_s: float = 1.0,
-) -> Left:
+) -> Recording:
     driver = (sys.executable, "-c", DRIVER, str(signal), until, str(for_s), "ros2", "bag", "record", *argv)
     command = with_environment(driver, setup=ros_of(ros2_profile(distribution)).command.setup)
     packed = robots[distribution].run(command, deadline=Deadline.after(180)).stdout
     with tarfile.open(fileobj=io.BytesIO(packed)) as tar:
         tar.extractall(into, filter="data")
-    return Left(int((into / "code").read_text()), (into / "err").read_text())
+    return Recording(int((into / "code").read_text()), (into / "err").read_text())
 
 
 def scans(bag: Path, store: Stores) -> list[Any]:
     types = get_typestore(store)
     with Reader(bag) as reader:
-        assert {one.msgtype for one in reader.connections} == {"sensor_msgs/msg/LaserScan"}
-        return [types.deserialize_cdr(data, one.msgtype) for one, _, data in reader.messages()]
+        assert {connection.msgtype for connection in reader.connections} == {"sensor_msgs/msg/LaserScan"}
+        return [types.deserialize_cdr(data, connection.msgtype) for connection, _, data in reader.messages()]
 
 
 @pytest.mark.emulated
@@ -125,15 +125,15 @@ def scans(bag: Path, store: Stores) -> list[Any]:
         ("jazzy", ["-s", "sqlite3"], "scan_0.db3"),
     ],
 )
-def test_a_recording_is_a_whole_ros2_bag(
+def test_a_recording_is_a_complete_ros2_bag(
     robots: Robots, tmp_path: Path, distribution: str, options: list[str], file: str
 ) -> None:
     until = "All requested topics are subscribed"
-    left = record(robots, distribution, tmp_path, ["-o", "scan", *options, "/scan"], until=until, for_s=3.0)
-    assert "Subscribed to topic '/scan'" in left.said
+    recording = record(robots, distribution, tmp_path, ["-o", "scan", *options, "/scan"], until=until, for_s=3.0)
+    assert "Subscribed to topic '/scan'" in recording.output
     assert {path.name for path in (tmp_path / "scan").iterdir()} == {"metadata.yaml", file}
     messages = scans(tmp_path / "scan", Stores[f"ROS2_{distribution.upper()}"])
-    assert len(messages) >= 2, "three seconds of a 5 Hz laser"
+    assert len(messages) >= 2, "in three seconds of a 5 Hz laser"
     assert {len(scan.ranges) for scan in messages} == {360}
     assert {scan.header.frame_id for scan in messages} == {"base_scan"}
     stamps_s = [scan.header.stamp.sec + scan.header.stamp.nanosec / 1e9 for scan in messages]
@@ -144,15 +144,17 @@ def test_a_recording_is_a_whole_ros2_bag(
     assert information["message_count"] == len(messages)
     (topic,) = information["topics_with_message_count"]
     offered = topic["topic_metadata"]["offered_qos_profiles"]
-    # As a text with rmw's numbers until Iron, as names from Jazzy on (rosbag2_storage/yaml.hpp).
+    # A text with rmw's numbers until Iron, names since Jazzy (rosbag2_storage/yaml.hpp).
     if distribution == "jazzy":
         assert information["version"] == 9
-        assert [(one["reliability"], one["durability"]) for one in offered] == [("best_effort", "volatile")]
+        assert [(profile["reliability"], profile["durability"]) for profile in offered] == [
+            ("best_effort", "volatile")
+        ]
     else:
         assert information["version"] == 8
-        (one,) = parse(offered, source="offered_qos_profiles").data
-        assert (one["reliability"], one["durability"], one["history"], one["depth"]) == (2, 2, 3, 0)
-        assert one["deadline"] == {"sec": 9223372036, "nsec": 854775807}
+        (profile,) = parse(offered, source="offered_qos_profiles").data
+        assert (profile["reliability"], profile["durability"], profile["history"], profile["depth"]) == (2, 2, 3, 0)
+        assert profile["deadline"] == {"sec": 9223372036, "nsec": 854775807}
     content = (tmp_path / "scan" / file).read_bytes()
     if file.endswith(".mcap"):
         assert content.startswith(b"\x89MCAP0\r\n")
@@ -173,10 +175,10 @@ def test_the_exit_code_is_that_of_the_distribution(
     robots: Robots, tmp_path: Path, distribution: str, signal: int, code: int
 ) -> None:
     argv = ["-o", "x", "/none"]
-    left = record(robots, distribution, tmp_path, argv, signal=signal, until="Listening", for_s=0.0)
-    assert left.code == code, left.said
+    recording = record(robots, distribution, tmp_path, argv, signal=signal, until="Listening", for_s=0.0)
+    assert recording.code == code, recording.output
     with Reader(tmp_path / "x") as reader:
-        assert reader.message_count == 0, "nobody publishes it"
+        assert reader.message_count == 0, "it has no publisher"
 
 
 def offered_by(connection: Connection) -> tuple[QosReliability, QosDurability]:
@@ -188,14 +190,14 @@ def offered_by(connection: Connection) -> tuple[QosReliability, QosDurability]:
 @pytest.mark.emulated
 @pytest.mark.parametrize("words", [["-a"], ["--topics", "/scan", "odom", "tf", "imu", "battery_state"]])
 def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Path, words: list[str]) -> None:
-    left = record(robots, "jazzy", tmp_path, ["-o", "all", *words], until="Listening for topics", for_s=5.0)
-    assert left.code == 0, left.said
+    recording = record(robots, "jazzy", tmp_path, ["-o", "all", *words], until="Listening for topics", for_s=5.0)
+    assert recording.code == 0, recording.output
     with Reader(tmp_path / "all") as reader:
-        counts = {one.topic: one.msgcount for one in reader.connections}
-        offered = {one.topic: offered_by(one) for one in reader.connections}
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        offered = {connection.topic: offered_by(connection) for connection in reader.connections}
     rates_hz = {topic.name: topic.rate for topic in ros_of(ros2_profile("jazzy")).topics}
     if "-a" in words:
-        rates_hz["/tf_static"] = 1  # in all: it is latched
+        rates_hz["/tf_static"] = 1  # one message in total, because it is latched
         assert counts["/tf_static"] == 1
         assert offered["/tf_static"] == (QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL)
     assert counts.keys() == rates_hz.keys()
@@ -206,7 +208,7 @@ def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Pa
 
 @pytest.mark.emulated
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "output"),
     [
         (["-o", ".", "/scan"], 1, "Output folder '.' already exists."),
         (["-o", "scan"], 1, "topics or --all"),
@@ -214,12 +216,12 @@ def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Pa
         (["--duration=15", "-o", "scan", "/scan"], 2, "unrecognized arguments: --duration=15"),
     ],
 )
-def test_a_wrong_command_line_is_refused(
-    robots: Robots, tmp_path: Path, words: list[str], code: int, said: str
+def test_a_wrong_command_line_is_rejected(
+    robots: Robots, tmp_path: Path, words: list[str], code: int, output: str
 ) -> None:
-    left = record(robots, "foxy", tmp_path, words, until="Listening")
-    assert left.code == code
-    assert said in left.said
+    recording = record(robots, "foxy", tmp_path, words, until="Listening")
+    assert recording.code == code
+    assert output in recording.output
     assert not (tmp_path / "scan").exists()
 
 
@@ -227,10 +229,10 @@ def test_a_wrong_command_line_is_refused(
 @pytest.mark.parametrize(
     ("distribution", "recorder"), [("foxy", Recorder.SQLITE3), ("humble", Recorder.SQLITE3), ("jazzy", Recorder.MCAP)]
 )
-def test_preflight_tells_what_it_writes(robots: Robots, distribution: str, recorder: Recorder) -> None:
+def test_the_probe_detects_the_format_of_the_recorder(robots: Robots, distribution: str, recorder: Recorder) -> None:
     profile = ros2_profile(distribution)
-    said = robots[distribution].run(tools.probe(profile, {Tool.RECORDER}), deadline=Deadline.after(180)).stdout
-    assert tools.parse(said, profile).recorder is recorder
+    output = robots[distribution].run(tools.probe(profile, {Tool.RECORDER}), deadline=Deadline.after(180)).stdout
+    assert tools.parse(output, profile).recorder is recorder
 
 
 def test_debian_s_ros_is_not_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,7 +242,7 @@ def test_debian_s_ros_is_not_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
         document = parse(f"{text}\nemulated: {{ros: {choice}}}\n", source="fieldkit.yaml")
         backend = EmulatedBackend(validate(document, Site), document)
         if choice == "debian":
-            with pytest.raises(ConfigurationError, match="asks for Debian's ROS, which is ROS 1"):
+            with pytest.raises(ConfigurationError, match="requests Debian's ROS, which is ROS 1"):
                 backend.cast(Topology.MASTER)
         else:
             assert backend.cast(Topology.MASTER)

@@ -1,7 +1,7 @@
-"""The robot's `rosbag` does what ROS's own does: outputs, exit codes, files, signals.
+"""The robot's `rosbag` behaves like ROS's own: outputs, exit codes, files, signals.
 
-`tests/data/rosbag/1.15.15/outputs.json` holds what ROS's own said and did, verbatim. Run this file as a program to
-observe it again: `python -m tests.sim_backends.test_rosbag_behaviour`.
+`tests/data/rosbag/1.15.15/outputs.json` has the output and behaviour of ROS's own, verbatim. Run this file as a
+program to record them again: `python -m tests.sim_backends.emulated.ros.test_rosbag_behaviour`.
 """
 
 import json
@@ -27,8 +27,8 @@ from tests.helpers.paths import DATA
 RECORDED: Final = DATA / "rosbag" / "1.15.15"
 SETUP: Final = "/opt/ros/noetic/setup.bash"
 
-# One case: command line after `rosbag`, files that exist before, the signal and who gets it once the bag is open.
-# What is sent to `wrapper` reaches the process that was started, to `group` its whole process group.
+# One case: command line after `rosbag`, files that exist before, the signal and its receiver after the bag is open:
+# `wrapper` is the process that was started, `group` its process group.
 CASES: Final[dict[str, dict[str, Any]]] = {
     "duration": {"argv": ["record", "--duration=1.5", "-O", "scan", "/scan"]},
     "bag_suffix": {"argv": ["record", "--duration=1", "-O", "scan.bag", "/scan"]},
@@ -60,8 +60,8 @@ CASES: Final[dict[str, dict[str, Any]]] = {
     },
 }
 
-# Runs one case on the robot. A recorder that outlives its wrapper is given some seconds to end; what it leaves is
-# listed then, and it is killed.
+# Runs one case on the robot. A recorder that outlives its wrapper gets some seconds to exit; then its files are
+# listed, and it is killed.
 DRIVER: Final = r"""
 import json, os, pathlib, signal, subprocess, sys, tempfile, time
 
@@ -117,14 +117,14 @@ def observe(shell: Shell, case: dict[str, Any], *, patience_s: float) -> Result:
 
 
 def comparable(result: Result) -> Result:
-    """Take out what changes from run to run: stamps and dates."""
+    """Replace what changes from run to run: time stamps and dates."""
     text = json.dumps(result)
     text = re.sub(r"\[\d{10}\.\d{9}\]", "[STAMP]", text)
     same: Result = json.loads(re.sub(r"\d{4}(-\d\d){5}", "DATE", text))
     return same
 
 
-def turtlebot(stack: ExitStack, ros: RosChoice) -> Shell:
+def start_turtlebot(stack: ExitStack, ros: RosChoice) -> Shell:
     cast = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
     alone = {Role.SENDER: cast[Role.SENDER]}
     up = stack.enter_context(
@@ -136,7 +136,7 @@ def turtlebot(stack: ExitStack, ros: RosChoice) -> Shell:
 @pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])
 def shell(request: pytest.FixtureRequest) -> Iterator[Shell]:
     with ExitStack() as stack:
-        yield turtlebot(stack, request.param)
+        yield start_turtlebot(stack, request.param)
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def observed() -> dict[str, Result]:
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("name", CASES)
-def test_rosbag_does_what_ros_s_own_does(name: str, shell: Shell, observed: dict[str, Result]) -> None:
+def test_rosbag_behaves_like_ros_s_own(name: str, shell: Shell, observed: dict[str, Result]) -> None:
     patience_s = 1.0 if observed[name]["recorder_lives_on"] else 60.0
     assert comparable(observe(shell, CASES[name], patience_s=patience_s)) == comparable(observed[name])
 
@@ -169,16 +169,18 @@ def test_every_option_is_one_of_the_original(capsys: pytest.CaptureFixture[str])
     with pytest.raises(SystemExit) as stopped:
         rosbag.record(["--help"])
     assert stopped.value.code == 0
-    ours = capsys.readouterr().out
-    theirs = (RECORDED / "record-help.txt").read_text(encoding="utf-8")
-    assert ours.splitlines()[:5] == theirs.splitlines()[:5]
-    assert set(re.findall(r"-[a-zA-Z]\b|--[a-z0-9-]+", ours)) <= set(re.findall(r"-[a-zA-Z]\b|--[a-z0-9-]+", theirs))
+    builtin = capsys.readouterr().out
+    original = (RECORDED / "record-help.txt").read_text(encoding="utf-8")
+    assert builtin.splitlines()[:5] == original.splitlines()[:5]
+    assert set(re.findall(r"-[a-zA-Z]\b|--[a-z0-9-]+", builtin)) <= set(
+        re.findall(r"-[a-zA-Z]\b|--[a-z0-9-]+", original)
+    )
 
 
 def main() -> None:
-    """Observe ROS's own rosbag again."""
+    """Record the behaviour of ROS's own rosbag again."""
     with ExitStack() as stack:
-        shell = turtlebot(stack, RosChoice.DEBIAN)
+        shell = start_turtlebot(stack, RosChoice.DEBIAN)
         outputs = {name: observe(shell, case, patience_s=5.0) for name, case in CASES.items()}
     (RECORDED / "outputs.json").write_text(json.dumps(outputs, indent=1) + "\n", encoding="utf-8")
 

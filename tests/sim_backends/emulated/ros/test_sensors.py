@@ -1,4 +1,4 @@
-"""Sensors publish what is due to whoever hears, wait for nobody, and take no memory for what they do not need."""
+"""Sensors publish what is due to their subscribers, never wait for one of them, and load no unneeded modules."""
 
 import json
 import math
@@ -23,7 +23,7 @@ HEADER: Final = tcpros.pack(b"the header")
 REQUEST: Final = tcpros.request("/test", "/imu")
 IMU: Final = Sensor("/imu", "sensor_msgs/Imu", rate_hz=5.0, frame="imu", points=None)
 
-# Forks with a descriptor of its own open, as a robot's first process does; the fork says what it is, and fails.
+# Forks with an open descriptor, as a robot's init process does; the fork prints its state, and fails.
 FORKED: Final = """
 import json, os, signal, sys
 from pathlib import Path
@@ -54,21 +54,21 @@ class Peer:
 
     def __init__(self) -> None:
         self.selector = selectors.DefaultSelector()
-        self.stream, theirs = socket.socketpair()
-        self.subscriber = Subscriber(theirs, HEADER, self.selector)
+        self.stream, peer_socket = socket.socketpair()
+        self.subscriber = Subscriber(peer_socket, HEADER, self.selector)
 
-    def served(self) -> None:
-        """Let the subscriber do all that it can do at once."""
+    def serve_all(self) -> None:
+        """Serve the subscriber until it would block."""
         while not self.subscriber.gone and (ready := self.selector.select(0)):
             for key, events in ready:
                 key.data(events)
 
-    def said(self) -> list[bytes]:
-        """Return all that it has sent, as packets."""
+    def output(self) -> list[bytes]:
+        """Return all packets that it has sent."""
         packets = tcpros.PacketSplitter()
         self.stream.setblocking(False)
         while True:
-            self.served()
+            self.serve_all()
             try:
                 data = self.stream.recv(1 << 16)
             except BlockingIOError:
@@ -76,72 +76,70 @@ class Peer:
             if not data:
                 break
             packets.feed(data)
-        found = list(packets)
+        result = list(packets)
         assert packets.pending == 0
-        return found
+        return result
 
 
 @pytest.fixture
 def peer() -> Iterator[Peer]:
-    made = Peer()
-    yield made
-    made.stream.close()
-    if not made.subscriber.gone:
-        made.served()
+    peer = Peer()
+    yield peer
+    peer.stream.close()
+    if not peer.subscriber.gone:
+        peer.serve_all()
 
 
-def test_a_subscriber_is_answered_once_its_request_is_whole(peer: Peer) -> None:
+def test_a_subscriber_is_answered_once_its_request_is_complete(peer: Peer) -> None:
     for byte in REQUEST[:-1]:
         peer.stream.send(bytes([byte]))
-        peer.served()
-    assert not peer.subscriber.hears
+        peer.serve_all()
+    assert not peer.subscriber.is_subscribed
     peer.stream.send(REQUEST[-1:])
-    peer.served()
-    assert peer.subscriber.hears
+    peer.serve_all()
+    assert peer.subscriber.is_subscribed
     peer.stream.send(b"what it says now means nothing")
-    peer.served()
-    assert peer.said() == [b"the header"]
+    peer.serve_all()
+    assert peer.output() == [b"the header"]
 
 
-@pytest.mark.parametrize("said", [b"\xff\xff\xff\xff", tcpros.pack(tcpros.pack(b"no field")), tcpros.pack(b"x")])
-def test_one_that_speaks_another_protocol_has_left(peer: Peer, said: bytes) -> None:
-    peer.stream.send(said)
-    peer.served()
+@pytest.mark.parametrize("data", [b"\xff\xff\xff\xff", tcpros.pack(tcpros.pack(b"no field")), tcpros.pack(b"x")])
+def test_a_subscriber_with_another_protocol_is_disconnected(peer: Peer, data: bytes) -> None:
+    peer.stream.send(data)
+    peer.serve_all()
     assert peer.subscriber.gone
     assert peer.stream.recv(1) == b""
 
 
-def test_one_that_hangs_up_has_left_and_is_sent_nothing(peer: Peer) -> None:
+def test_a_closed_subscriber_is_removed_and_gets_nothing(peer: Peer) -> None:
     peer.stream.send(REQUEST)
-    peer.served()
+    peer.serve_all()
     peer.stream.close()
-    peer.served()
+    peer.serve_all()
     assert peer.subscriber.gone
     peer.subscriber.send(HEADER)
 
 
-def test_one_that_breaks_off_is_noticed_while_it_is_sent_to(peer: Peer) -> None:
+def test_a_closed_subscriber_is_detected_while_sending(peer: Peer) -> None:
     peer.stream.close()
     peer.subscriber.send(HEADER)
     assert peer.subscriber.gone
 
 
-def test_a_slow_subscriber_loses_whole_messages_and_keeps_nobody_waiting(
-    peer: Peer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_subscriber_loses_whole_messages_without_blocking(peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sensors, "QUEUE_BYTES", 1 << 16)
     sent = [bytes([number]) * 50_000 for number in range(100)]
     for message in sent:
         peer.subscriber.send(tcpros.pack(message))
-    heard = peer.said()
-    assert 2 <= len(heard) < len(sent)
-    assert heard == sent[: len(heard)]
+    received = peer.output()
+    assert 2 <= len(received) < len(sent)
+    assert received == sent[: len(received)]
     peer.subscriber.send(tcpros.pack(b"again"))
-    assert peer.said() == [b"again"]
+    assert peer.output() == [b"again"]
 
 
 class Topic:
-    """A topic on a clock that stands."""
+    """A topic with a clock that is set by the test."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
         self.now_s = 1000.0
@@ -156,7 +154,7 @@ class Topic:
         )
 
     def subscriber(self) -> socket.socket:
-        """Return the stream of one who has asked for the topic."""
+        """Return the stream of a subscriber that has requested the topic."""
         stream = socket.socket(socket.AF_UNIX)
         stream.connect(str(tcpros.socket_path(IMU.topic)))
         stream.sendall(REQUEST)
@@ -164,18 +162,19 @@ class Topic:
         return stream
 
     def serve(self) -> None:
-        """Do all that can be done at once."""
+        """Serve all sockets until they would block."""
         while ready := self.selector.select(0):
             for key, events in ready:
                 key.data(events)
 
 
-def heard(stream: socket.socket) -> list[Any]:
-    """Return the connection header, if it is new, and the numbers of the messages that came."""
+def received(stream: socket.socket) -> list[Any]:
+    """Return the connection header, if it is new, and the numbers of the messages received."""
     packets = tcpros.PacketSplitter()
     packets.feed(stream.recv(1 << 20, socket.MSG_DONTWAIT))
     return [
-        tcpros.unpack_header(one) if b"callerid=" in one else int.from_bytes(one[:4], "little") for one in packets
+        tcpros.unpack_header(packet) if b"callerid=" in packet else int.from_bytes(packet[:4], "little")
+        for packet in packets
     ]
 
 
@@ -189,58 +188,58 @@ def test_messages_are_numbered_and_due_by_the_clock_also_after_a_pause(
     assert topic.publication.publish() == pytest.approx(0.09)
     topic.now_s = 1000.41
     assert topic.publication.publish() == pytest.approx(0.19)
-    header, *numbers = heard(first)
+    header, *numbers = received(first)
     assert header["topic"] == "/imu"
     assert header["md5sum"] == definition(IMU.type).md5
     assert header["message_definition"] == definition(IMU.type).text
     assert numbers == [2]
-    topic.now_s = 1000.85  # it was kept from running: what is overdue comes at once, in turn
+    topic.now_s = 1000.85  # the process was delayed: overdue messages are sent immediately, in order
     topic.publication.publish()
     assert topic.publication.publish() == pytest.approx(0.15)
-    assert heard(first) == [3, 4]
+    assert received(first) == [3, 4]
     first.close()
     topic.serve()
     assert topic.publication.publish() == math.inf
-    topic.now_s = 4600.05  # nobody heard what was due meanwhile
+    topic.now_s = 4600.05  # messages without subscribers are skipped
     second = topic.subscriber()
     assert topic.publication.publish() == pytest.approx(0.15)
     topic.now_s = 4600.21
     topic.publication.publish()
-    assert heard(second)[1:] == [18001]
+    assert received(second)[1:] == [18001]
     second.close()
 
 
-def test_a_socket_that_killed_sensors_left_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_socket_left_by_a_killed_process_is_replaced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     Topic(monkeypatch, tmp_path)
     topic = Topic(monkeypatch, tmp_path)
     stream = topic.subscriber()
-    assert len(heard(stream)) == 1
+    assert len(received(stream)) == 1
     stream.close()
 
 
 def test_equal_noise_whatever_the_process() -> None:
-    """A robot's sensors start anew after a reboot, and Python's own hashes differ from process to process."""
-    told = (
+    """A robot's sensors restart after a reboot, and Python's hashes differ from process to process."""
+    program = (
         "from sim_backends.emulated.ros import messages; "
         f"print(messages.Source(messages.{IMU!r}).message(1, 2).hex())"
     )
-    done = subprocess.run((sys.executable, "-c", told), capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == messages.Source(IMU).message(1, 2).hex()
+    result = subprocess.run((sys.executable, "-c", program), capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == messages.Source(IMU).message(1, 2).hex()
 
 
 def test_a_fork_has_its_own_name_session_log_and_descriptors(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    done = subprocess.run((sys.executable, "-c", FORKED, str(log)), capture_output=True, text=True, check=True)
-    assert done.stdout == "1\n"
-    said, *trace = log.read_text(encoding="utf-8").splitlines()
-    assert json.loads(said) == {"name": "worker", "session": True, "open": [0, 1, 2], "wakes": -1, "children": True}
+    result = subprocess.run((sys.executable, "-c", FORKED, str(log)), capture_output=True, text=True, check=True)
+    assert result.stdout == "1\n"
+    output, *trace = log.read_text(encoding="utf-8").splitlines()
+    assert json.loads(output) == {"name": "worker", "session": True, "open": [0, 1, 2], "wakes": -1, "children": True}
     assert trace[-1] == "RuntimeError: no more"
 
 
-def test_what_runs_in_a_robot_imports_the_standard_library_alone() -> None:
-    """numpy and rosbags, which the lab has, would take each robot 20 MB and most of its start."""
+def test_robot_processes_import_only_the_standard_library() -> None:
+    """numpy and rosbags, which the lab has, would cost each robot 20 MB and most of its startup time."""
     imported = "import sim_backends.emulated.robot.init"
-    told = f"import sys; before = set(sys.modules); {imported}; print(*set(sys.modules) - before)"
-    done = subprocess.run((sys.executable, "-c", told), capture_output=True, text=True, check=True)
-    foreign = {name.split(".")[0] for name in done.stdout.split()} - sys.stdlib_module_names
+    program = f"import sys; before = set(sys.modules); {imported}; print(*set(sys.modules) - before)"
+    result = subprocess.run((sys.executable, "-c", program), capture_output=True, text=True, check=True)
+    foreign = {name.split(".")[0] for name in result.stdout.split()} - sys.stdlib_module_names
     assert foreign == {"fieldkit", "sim_backends"}

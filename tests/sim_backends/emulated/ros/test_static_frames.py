@@ -1,4 +1,4 @@
-"""`/tf_static` of an emulated robot: every frame is joined to the one that moves, and the bytes are ROS 1's."""
+"""`/tf_static` of an emulated robot: every frame is linked to the moving frame, in ROS 1 serialization."""
 
 from typing import Any
 
@@ -17,19 +17,19 @@ def links_of(profile: str) -> tuple[static_frames.Link, ...]:
 
 
 @pytest.mark.parametrize("profile", locations.names("robots"))
-def test_every_frame_of_a_shipped_robot_has_one_way_to_the_world(profile: str) -> None:
-    joined = links_of(profile)
-    lies_in = {child: parent for parent, child in joined}
-    assert len(lies_in) == len(joined), "tf2 takes one parent"
+def test_every_frame_of_a_shipped_robot_has_one_path_to_the_world(profile: str) -> None:
+    links = links_of(profile)
+    parent_of = {child: parent for parent, child in links}
+    assert len(parent_of) == len(links), "tf2 accepts one parent"
     topics = ros_of(load_profile(profile)).topics
-    moves = {topic.child_frame for topic in topics if topic.child_frame} or {static_frames.BASE}
-    worlds = {topic.frame for topic in topics if topic.child_frame} | {"", "map"}
+    moving_frames = {topic.child_frame for topic in topics if topic.child_frame} or {static_frames.BASE}
+    world_frames = {topic.frame for topic in topics if topic.child_frame} | {"", "map"}
     for topic in topics:
         frame = topic.frame
-        while frame in lies_in:
-            frame = lies_in[frame]
-        assert frame in moves | worlds, topic.name
-    assert not {child for _, child in joined} & (moves | worlds)
+        while frame in parent_of:
+            frame = parent_of[frame]
+        assert frame in moving_frames | world_frames, topic.name
+    assert not {child for _, child in links} & (moving_frames | world_frames)
 
 
 def test_a_turtlebots_frames_are_those_of_its_description() -> None:
@@ -40,11 +40,11 @@ def test_a_turtlebots_frames_are_those_of_its_description() -> None:
     )
 
 
-def test_the_message_is_read_as_ros_1_reads_it() -> None:
-    found = (("base_link", "a"), ("base_link", "b"))
-    read: Any = shipped().ros1.deserialize_ros1(static_frames.message(found, 3_000_000_004), "tf2_msgs/msg/TFMessage")
-    for (parent, child), one in zip(found, read.transforms, strict=True):
-        assert (one.header.frame_id, one.child_frame_id) == (parent, child)
-        assert (one.header.stamp.sec, one.header.stamp.nanosec) == (3, 4)
-        move, turn = one.transform.translation, one.transform.rotation
+def test_the_message_can_be_deserialized_by_ros_1() -> None:
+    links = (("base_link", "a"), ("base_link", "b"))
+    read: Any = shipped().ros1.deserialize_ros1(static_frames.message(links, 3_000_000_004), "tf2_msgs/msg/TFMessage")
+    for (parent, child), transform in zip(links, read.transforms, strict=True):
+        assert (transform.header.frame_id, transform.child_frame_id) == (parent, child)
+        assert (transform.header.stamp.sec, transform.header.stamp.nanosec) == (3, 4)
+        move, turn = transform.transform.translation, transform.transform.rotation
         assert (move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w) == (0, 0, 0, 0, 0, 0, 1)

@@ -1,4 +1,4 @@
-"""What a robot says of its own motion: read whole or not at all, reckoned on, and over when it is carried off."""
+"""Records of a robot's motion: read completely or not at all, extrapolated, and void after the robot was moved."""
 
 import math
 import os
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.helm import Helm
-from sim_backends.emulated.ros.own_motion import Odometer, OwnWay
+from sim_backends.emulated.ros.own_motion import AssignedPath, Odometer
 from sim_backends.emulated.ros.steered import SILENT_NS, Steered, SteeredRecord
 
 S = 10**9
@@ -35,23 +35,25 @@ def fresh(folder: Path) -> Path:
 
 
 @given(st.lists(MOTIONS, max_size=5))
-def test_readers_find_what_was_said_last(folder: Path, said: list[Steered]) -> None:
+def test_readers_get_the_last_motion(folder: Path, motions: list[Steered]) -> None:
     path = fresh(folder)
     writer, reader = SteeredRecord.open(path), SteeredRecord.open(path)
     assert reader.read() is None
-    for one in said:
-        writer.write(one)
-        assert reader.read() == one
+    for motion in motions:
+        writer.write(motion)
+        assert reader.read() == motion
     late = SteeredRecord.open(path)
-    assert late.read() == (said[-1] if said else None)
-    late.write(Steered(1, 2, (3.0, 4.0, 5.0)))  # one that was killed has a successor
+    assert late.read() == (motions[-1] if motions else None)
+    late.write(Steered(1, 2, (3.0, 4.0, 5.0)))  # a new process continues after a killed one
     assert reader.read() == Steered(1, 2, (3.0, 4.0, 5.0))
     for record in (writer, reader, late):
         record.close()
 
 
 @given(MOTIONS, MOTIONS, st.data())
-def test_half_a_record_is_the_one_before(folder: Path, first: Steered, second: Steered, data: st.DataObject) -> None:
+def test_a_partly_written_record_is_ignored(
+    folder: Path, first: Steered, second: Steered, data: st.DataObject
+) -> None:
     path = fresh(folder)
     writer = SteeredRecord.open(path)
     writer.write(first)
@@ -62,85 +64,89 @@ def test_half_a_record_is_the_one_before(folder: Path, first: Steered, second: S
     cut = data.draw(st.integers(0, len(written) - 1))
     path.write_bytes(written[:cut] + bytes(len(written) - cut) + before[len(written) :])
     reader = SteeredRecord.open(path)
-    whole = not any(written[cut:])  # what is missing is zeros anyway
-    assert reader.read() == (second if whole else first)
+    is_complete = not any(written[cut:])  # the missing bytes are zeros
+    assert reader.read() == (second if is_complete else first)
     path.write_bytes(b"")
-    assert reader.read() == reader._last, "a file that lost its end is no end of it"
+    assert reader.read() == reader._last, "a truncated file keeps the last motion"
     writer.close()
     reader.close()
 
 
 @given(MOTIONS, st.integers(0, 2 * SILENT_NS))
-def test_it_is_reckoned_on_as_long_as_it_is_not_silent(one: Steered, late_ns: int) -> None:
-    now = one.at(one.time_ns + late_ns)
+def test_motion_is_extrapolated_until_the_timeout(motion: Steered, late_ns: int) -> None:
+    now = motion.at(motion.time_ns + late_ns)
     for_s = min(late_ns, SILENT_NS) / 1e9
     assert now.place_m == pytest.approx(
-        [p + v * for_s for p, v in zip(one.place_m, one.velocity_m_s, strict=True)], abs=1e-6
+        [p + v * for_s for p, v in zip(motion.place_m, motion.velocity_m_s, strict=True)], abs=1e-6
     )
-    assert now.heading_rad == pytest.approx(one.heading_rad + one.turn_rad_s * for_s)
-    assert now.moves == (one.moves and late_ns < SILENT_NS)
-    assert one.at(one.time_ns - late_ns).place_m == one.place_m, "never back"
+    assert now.heading_rad == pytest.approx(motion.heading_rad + motion.turn_rad_s * for_s)
+    assert now.moves == (motion.moves and late_ns < SILENT_NS)
+    assert motion.at(motion.time_ns - late_ns).place_m == motion.place_m, "never extrapolated into the past"
     x, y, _ = now.wheels
-    assert math.hypot(x - one.wheels[0], y - one.wheels[1]) == pytest.approx(abs(one.speed_m_s) * for_s, abs=1e-6)
+    assert math.hypot(x - motion.wheels[0], y - motion.wheels[1]) == pytest.approx(
+        abs(motion.speed_m_s) * for_s, abs=1e-6
+    )
 
 
-def test_the_helm_knows_where_it_was_put_and_sensors_follow_it(tmp_path: Path) -> None:
-    ways, record = tmp_path / "motion", tmp_path / "steered"
-    own_motion.say(ways, OwnWay(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
-    helm, odometer = Helm(ways, record, 6 * S), Odometer(ways, 6 * S, record)
-    put = helm.put(6 * S)
-    assert put is not None
-    assert (put.place_m, put.heading_rad, put.x_m) == ((3.0, 6.0, 0.2), math.pi / 2, 0.0)
-    assert helm.put(7 * S) is None
-    helm.say(7 * S, (3.0, 7.0, 0.2), (0.0, 0.5, 0.0), heading_rad=math.pi / 2, turn_rad_s=0.1, wheels=(1.0, 0.0, 0.0))
+def test_the_helm_gets_its_place_and_sensors_follow_it(tmp_path: Path) -> None:
+    paths, record = tmp_path / "motion", tmp_path / "steered"
+    own_motion.append_path(paths, AssignedPath(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    helm, odometer = Helm(paths, record, 6 * S), Odometer(paths, 6 * S, record)
+    placement = helm.poll_placement(6 * S)
+    assert placement is not None
+    assert (placement.place_m, placement.heading_rad, placement.x_m) == ((3.0, 6.0, 0.2), math.pi / 2, 0.0)
+    assert helm.poll_placement(7 * S) is None
+    helm.write(
+        7 * S, (3.0, 7.0, 0.2), (0.0, 0.5, 0.0), heading_rad=math.pi / 2, turn_rad_s=0.1, wheels=(1.0, 0.0, 0.0)
+    )
     now = odometer.at(7 * S + S // 10)
     assert now.place_m == pytest.approx((3.0, 7.05, 0.2))
     assert (now.x_m, now.speed_m_s, now.turn_rad_s) == pytest.approx((1.05, 0.5, 0.1))
-    own_motion.say(ways, OwnWay(8 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    own_motion.append_path(paths, AssignedPath(8 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
     back = odometer.at(9 * S)
     assert back.place_m == (3.0, 6.0, 0.2)
-    assert back.x_m > 1.0, "who is carried turns no wheel"
-    helm.say(9 * S, (3.0, 9.0, 0.2), wheels=(1.25, 0.0, 0.05))
-    assert odometer.at(9 * S).place_m == (3.0, 6.0, 0.2), "it was carried off since"
-    again = helm.put(9 * S)
+    assert back.x_m > 1.0, "odometry continues"
+    helm.write(9 * S, (3.0, 9.0, 0.2), wheels=(1.25, 0.0, 0.05))
+    assert odometer.at(9 * S).place_m == (3.0, 6.0, 0.2), "the lab has moved it since"
+    again = helm.poll_placement(9 * S)
     assert again is not None
     assert again.place_m == back.place_m
     assert again.x_m == pytest.approx(back.x_m, abs=0.01)
 
 
-def test_a_helm_that_was_killed_goes_on_where_it_was(tmp_path: Path) -> None:
-    ways, record = tmp_path / "motion", tmp_path / "steered"
-    own_motion.say(ways, OwnWay(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
-    helm = Helm(ways, record, 2 * S)
-    helm.put(2 * S)
-    helm.say(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), wheels=(4.0, 0.0, 0.0))
+def test_a_restarted_helm_continues_where_it_was(tmp_path: Path) -> None:
+    paths, record = tmp_path / "motion", tmp_path / "steered"
+    own_motion.append_path(paths, AssignedPath(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
+    helm = Helm(paths, record, 2 * S)
+    helm.poll_placement(2 * S)
+    helm.write(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), wheels=(4.0, 0.0, 0.0))
     late_ns = 60 * S
-    found = Helm(ways, record, late_ns).put(late_ns)
-    assert found is not None
-    assert found.place_m == pytest.approx((4.0 + SILENT_NS / 1e9, 0.0, 0.2))
-    assert found.speed_m_s == 0.0
+    motion = Helm(paths, record, late_ns).poll_placement(late_ns)
+    assert motion is not None
+    assert motion.place_m == pytest.approx((4.0 + SILENT_NS / 1e9, 0.0, 0.2))
+    assert motion.speed_m_s == 0.0
 
 
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-2, 2)), min_size=2, max_size=20))
-def test_wheels_reckoned_by_sensors_are_those_of_the_helm(folder: Path, driven: list[tuple[float, float]]) -> None:
-    """A robot that says its motion twenty times a second: between, readers are off by far less than a centimetre."""
+def test_extrapolated_odometry_agrees_with_the_helm(folder: Path, driven: list[tuple[float, float]]) -> None:
+    """With a record twenty times a second, the error of readers is far less than a centimetre."""
     path, step_s = fresh(folder), 0.05
     record, pose = SteeredRecord.open(path), (0.0, 0.0, 0.0)
-    said = []
+    motions = []
     for number, (speed, turn) in enumerate(driven):
         x, y, yaw = pose
         velocity = (speed * math.cos(yaw), speed * math.sin(yaw), 0.0)
-        said.append(Steered(round(number * step_s * S), 0, (x, y, 0.0), velocity, yaw, turn, pose))
+        motions.append(Steered(round(number * step_s * S), 0, (x, y, 0.0), velocity, yaw, turn, pose))
         pose = x + speed * step_s * math.cos(yaw), y + speed * step_s * math.sin(yaw), yaw + turn * step_s
-    for one, after in pairwise(said):
-        record.write(one)
+    for motion, after in pairwise(motions):
+        record.write(motion)
         read = record.read()
         assert read is not None
         assert read.at(after.time_ns).wheels == pytest.approx(after.wheels, abs=1e-9)
     record.close()
 
 
-def test_a_record_of_nobody_is_none(tmp_path: Path) -> None:
+def test_a_file_without_a_valid_record_is_none(tmp_path: Path) -> None:
     path = tmp_path / "record"
     path.write_bytes(struct.pack("<Q", 7) + os.urandom(300))
     assert SteeredRecord.open(path).read() is None

@@ -1,4 +1,4 @@
-"""Messages of any type by its definition: rosbags reads each field back, and sizes are those that were asked for."""
+"""Messages of any type from its definition: rosbags reads each field back, and sizes are as requested."""
 
 import struct
 from typing import Any
@@ -37,95 +37,95 @@ def topic(text: str) -> PublishedTopic:
     return schema.validate(schema.parse(f"{{name: /x, rate: 10Hz, frame: lens, {text}}}", source="x"), PublishedTopic)
 
 
-def message(one: PublishedTopic) -> Any:  # noqa: ANN401 (rosbags makes its classes as it goes)
+def read_message(topic: PublishedTopic) -> Any:  # noqa: ANN401 (rosbags makes its classes as it goes)
     store = get_typestore(Stores.ROS1_NOETIC)
-    kind = one.type.replace("/", "/msg/")
-    if one.definition:
-        store.register(get_types_from_msg(one.definition, kind))
-    data = messages.Source(_sensor(one)).message(7, 1_500_000_000_123_456_789)
-    found = store.deserialize_ros1(data, kind)
-    assert bytes(store.serialize_ros1(found, kind)) == data, "to the last byte"
-    return found
+    kind = topic.type.replace("/", "/msg/")
+    if topic.definition:
+        store.register(get_types_from_msg(topic.definition, kind))
+    data = messages.Source(_sensor(topic)).message(7, 1_500_000_000_123_456_789)
+    message = store.deserialize_ros1(data, kind)
+    assert bytes(store.serialize_ros1(message, kind)) == data, "to the last byte"
+    return message
 
 
 def custom(definition: str, more: str) -> PublishedTopic:
     return topic(f"type: my_msgs/Scan, {more}").model_copy(update={"definition": definition})
 
 
-def test_an_image_has_the_size_in_pixels_that_it_says() -> None:
-    found = message(topic("type: sensor_msgs/Image, width: 640, height: 480"))
-    assert (found.width, found.height, found.step, found.encoding) == (640, 480, 1920, "rgb8")
-    assert len(found.data) == 640 * 480 * 3
-    assert (found.header.seq, found.header.stamp.nanosec, found.header.frame_id) == (7, 123_456_789, "lens")
-    assert len(np.unique(found.data)) > 200, "nothing that compresses well"
+def test_an_image_has_the_size_in_its_fields() -> None:
+    message = read_message(topic("type: sensor_msgs/Image, width: 640, height: 480"))
+    assert (message.width, message.height, message.step, message.encoding) == (640, 480, 1920, "rgb8")
+    assert len(message.data) == 640 * 480 * 3
+    assert (message.header.seq, message.header.stamp.nanosec, message.header.frame_id) == (7, 123_456_789, "lens")
+    assert len(np.unique(message.data)) > 200, "incompressible"
 
 
-def test_a_compressed_image_has_the_bytes_that_were_asked_for() -> None:
-    found = message(topic("type: sensor_msgs/CompressedImage, size: 1MB"))
-    assert (found.format, len(found.data)) == ("jpeg", 1_000_000)
+def test_a_compressed_image_has_the_requested_size() -> None:
+    message = read_message(topic("type: sensor_msgs/CompressedImage, size: 1MB"))
+    assert (message.format, len(message.data)) == ("jpeg", 1_000_000)
 
 
 def test_a_point_cloud_holds_finite_points_of_four_floats() -> None:
-    one = topic("type: sensor_msgs/PointCloud2, points: 1000")
-    found = message(one)
-    assert [(field.name, field.offset, field.datatype, field.count) for field in found.fields] == [
+    cloud = topic("type: sensor_msgs/PointCloud2, points: 1000")
+    message = read_message(cloud)
+    assert [(field.name, field.offset, field.datatype, field.count) for field in message.fields] == [
         ("x", 0, 7, 1),
         ("y", 4, 7, 1),
         ("z", 8, 7, 1),
         ("intensity", 12, 7, 1),
     ]
-    assert (found.width, found.height, found.point_step, found.row_step) == (1000, 1, 16, 16_000)
-    points = found.data.view(np.float32)
+    assert (message.width, message.height, message.point_step, message.row_step) == (1000, 1, 16, 16_000)
+    points = message.data.view(np.float32)
     assert len(points) == 4000
     assert np.isfinite(points).all()
     assert abs(float(points.std()) - 1) < 0.1
-    source = messages.Source(_sensor(one))
+    source = messages.Source(_sensor(cloud))
     assert source.message(1, 0)[20:] != source.message(2, 0)[20:]
 
 
-def test_a_type_of_the_lab_s_own_is_filled_by_its_definition() -> None:
-    found = message(custom(LIDAR, "size: 3kB"))
-    assert len(found.packets) == 0
-    assert len(found.first.data) == 3000, "the first list of numbers, wherever it stands"
-    assert (len(found.ranges), len(found.rest), found.names) == (0, 0, ["", ""])
-    assert (found.pose.orientation.w, found.pose.orientation.x) == (1.0, 0.0)
-    assert not found.bias.any()
+def test_a_custom_type_is_filled_by_its_definition() -> None:
+    message = read_message(custom(LIDAR, "size: 3kB"))
+    assert len(message.packets) == 0
+    assert len(message.first.data) == 3000, "the first list of numbers, wherever it is"
+    assert (len(message.ranges), len(message.rest), message.names) == (0, 0, ["", ""])
+    assert (message.pose.orientation.w, message.pose.orientation.x) == (1.0, 0.0)
+    assert not message.bias.any()
 
 
 def test_a_type_without_a_header_begins_with_its_fields() -> None:
-    found = message(custom(PLAIN, "size: 400B"))
-    assert (found.number, len(found.samples)) == (0, 100)
-    assert np.isfinite(found.samples).all()
+    message = read_message(custom(PLAIN, "size: 400B"))
+    assert (message.number, len(message.samples)) == (0, 100)
+    assert np.isfinite(message.samples).all()
 
 
-def test_a_type_that_ros_has_needs_neither_definition_nor_size() -> None:
-    found = message(topic("type: nav_msgs/Path"))
-    assert len(found.poses) == 0
-    assert found.header.frame_id == "lens"
+def test_a_ros_type_needs_neither_definition_nor_size() -> None:
+    message = read_message(topic("type: nav_msgs/Path"))
+    assert len(message.poses) == 0
+    assert message.header.frame_id == "lens"
 
 
-def test_the_sum_of_a_definition_is_that_of_ros() -> None:
+def test_the_md5_sum_of_a_definition_is_that_of_ros() -> None:
     assert definition("sensor_msgs/Image").md5 == "060021388200f6f0f447d0fcd9c64743"
     assert definition("my_msgs/Two", "std_msgs/Header header\nfloat64 x\n").text.startswith("std_msgs/Header header")
 
 
 @pytest.mark.parametrize(
-    ("one", "said"),
+    ("published", "error_text"),
     [
         (topic("type: my_msgs/Scan"), "cannot publish my_msgs/Scan"),
         (custom("other_msgs/Thing thing\n", ""), "cannot publish my_msgs/Scan"),
         (custom("float32 3x = [\n", ""), "definition of my_msgs/Scan cannot be read"),
-        (topic("type: std_msgs/String, size: 10B"), "no list of numbers that could have 10 bytes"),
-        (custom(PLAIN, "size: 401B"), "no list of numbers that could have 401 bytes"),
+        (topic("type: std_msgs/String, size: 10B"), "no list of numbers whose size can be 10 bytes"),
+        (custom(PLAIN, "size: 401B"), "no list of numbers whose size can be 401 bytes"),
     ],
 )
-def test_what_cannot_be_made_is_refused_with_a_remedy(one: PublishedTopic, said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said) as caught:
-        templates.template_of(one)
+def test_unsupported_types_are_rejected_with_a_remedy(published: PublishedTopic, error_text: str) -> None:
+    with pytest.raises(ConfigurationError, match=error_text) as caught:
+        templates.template_of(published)
     assert caught.value.remedy
 
 
-def test_a_template_survives_the_way_to_its_robot() -> None:
-    made = templates.template_of(topic("type: sensor_msgs/CompressedImage, size: 5B"))
-    assert bytes.fromhex(made.head) == struct.pack("<I", 4) + b"jpeg" + struct.pack("<I", 5)
-    assert (made.tail, made.size_bytes, made.stamped, made.floats) == ("", 5, True, False)
+def test_a_template_has_serialized_head_and_tail() -> None:
+    template = templates.template_of(topic("type: sensor_msgs/CompressedImage, size: 5B"))
+    assert bytes.fromhex(template.head) == struct.pack("<I", 4) + b"jpeg" + struct.pack("<I", 5)
+    assert (template.tail, template.size_bytes, template.stamped, template.floats) == ("", 5, True, False)
