@@ -333,8 +333,8 @@ def test_an_interval_that_leaves_the_axis_ends_in_an_arrow_and_a_repeat_beyond_i
 
 def test_a_lost_last_ping_stands_behind_the_last_reply() -> None:
     seq, at_s = np.array([1.0, 2.0, 4.0]), np.array([10.0, 10.5, 11.5])
-    assert timeline.left_at(np.array([0, 3, 5, 7]), seq, at_s) == pytest.approx([9.5, 11.0, 12.0, 13.0])
-    assert timeline.left_at(np.array([2]), seq[:1], at_s[:1]) == pytest.approx([11.0])
+    assert timeline.estimate_send_times(np.array([0, 3, 5, 7]), seq, at_s) == pytest.approx([9.5, 11.0, 12.0, 13.0])
+    assert timeline.estimate_send_times(np.array([2]), seq[:1], at_s[:1]) == pytest.approx([11.0])
 
 
 @pytest.mark.parametrize("procedures", ["los nlos", "nlos", "driveaway los nlos", "abroad los selfheal", "driveaway"])
