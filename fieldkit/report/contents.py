@@ -306,7 +306,7 @@ def _missing_reasons(table: CellTable, evidence: Evidence) -> dict[tuple[int, st
 def _tables_of_protocol(
     title: str, cells: Sequence[Cell], differing: Collection[str], evidence: Evidence, ranking: Ranking
 ) -> Iterator[CellTable]:
-    """Yield the tables of one protocol: expected and lab-declared quantities, built-in ones, those of steps, words."""
+    """Yield the tables of one protocol: expected and lab-declared quantities, built-in ones, steps, words."""
     lines = [(wording.place(cell, differing=differing), cell) for cell in cells]
     words = worded(cells)
     first = ranking.first(measured_in(cells))

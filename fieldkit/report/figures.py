@@ -104,7 +104,7 @@ def save(charts: Iterable[Chart], folder: Path) -> Iterator[Path]:
 
 
 def overview(lab: Overview, form: Format) -> bytes:
-    """Return a plan view of a lab: obstacles, robots, and links coloured by SNR; links without reception are dotted."""
+    """Return a plan view of a lab: obstacles, robots, and links coloured by SNR (dotted: no reception)."""
     with _settings(8.0):
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _BOTH_COLUMNS_INCHES * 0.75), layout="constrained")
         axes = figure.add_subplot()

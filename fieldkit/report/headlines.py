@@ -131,7 +131,7 @@ class _HeadlineWriter:
         return Headline("Repeats", ends)
 
     def quantity(self, subject: str, same: Sequence[Quantity], cells: Sequence[Cell]) -> Iterator[Headline]:
-        """Yield the headline of one quantity, or of the same quantity of several steps; one per payload size of pings."""
+        """Yield the headline of a quantity, or of the same one of several steps; one per payload size of pings."""
         if len(same) > 1 or plain_name(same[0].name) != "rtt_median_s":
             sizes = {size: None for quantity in same for size in self._sizes(quantity, cells)}
             yield self._headline(", ".join((subject, *sizes)), same, cells)

@@ -13,10 +13,7 @@ def value(result: Estimate) -> str:
 
 
 def interval(result: Estimate) -> str:
-    """Return the interval of an estimate, and the number of repeats if not all have a value:
-
-    `[1.10, 6.70] (7 of 10)`.
-    """
+    """Return the interval of an estimate, and the count of its repeats if not all: `[1.10, 6.70] (7 of 10)`."""
     part = incomplete(result)
     return unbroken(" ".join(filter(None, (interval_of(_scale(result), result), f"({part})" if part else ""))))
 
