@@ -53,8 +53,8 @@ HEIGHT_M: Final = 1.0
 Control = Literal["newreno", "cubic-rfc9438"]
 CONTROLS: Final[dict[Control, str]] = {"newreno": "TcpLinuxReno", "cubic-rfc9438": "TcpCubic"}
 """Congestion controls of `Control`, and their names in ns-3."""
-Peer = Literal["802.11g", "802.11a", "mended", "ours"]
-PEERS: Final[tuple[Peer, ...]] = ("802.11g", "802.11a", "mended", "ours")
+Peer = Literal["802.11g", "802.11a", "corrected", "ours"]
+PEERS: Final[tuple[Peer, ...]] = ("802.11g", "802.11a", "corrected", "ours")
 """Three variants of ns-3, and the co-simulation."""
 DISTANCES_M: Final = {
     ("g54", False): (10, 44, 46, 47, 48),
@@ -172,7 +172,7 @@ class Ns3Link:
         # 802.11a has the modes, slots and times of 802.11g, but no signal extension and no modes of 802.11b.
         standard = "ErpOfdm" if peer == "802.11g" else "Ofdm"
         chosen = {"mode": f"{standard}Rate{cell.mode[1:] if cell.mode else 6}Mbps", "adapt": int(cell.mode is None)}
-        self._control = "Counting{}" if peer == "mended" else "ns3::{}"
+        self._control = "Counting{}" if peer == "corrected" else "ns3::{}"
         loss = loss_db(cell.distance_m, wall=cell.wall)
         self._run = partial(ns3, loss=loss, queue=QUEUE_PACKETS, RngRun=run, **chosen)
 
@@ -309,7 +309,7 @@ def draw(path: Path, results: Sequence[Row], windows: dict[Control, tuple[Trace,
         left.plot(at_m, means[:, -2], color=f"C{number}", label=label)
         left.plot(at_m, means[:, -1], "o", color=f"C{number}", markerfacecolor="none")
     left.set(xlabel="distance (m)", ylabel="goodput of NewReno (Mbit/s)", ylim=(-1, 38))
-    left.legend(title="ns-3, mended: lines; ours: marks", fontsize="small", ncols=2, loc="upper right")
+    left.legend(title="ns-3, corrected: lines; ours: marks", fontsize="small", ncols=2, loc="upper right")
     for axes, (control, (theirs, ours)) in zip(others, windows.items(), strict=True):
         for trace, colour, label in ((theirs, "0.6", "ns-3"), (ours, "C0", "ours")):
             # One value per 20 ms is enough for the figure.

@@ -256,7 +256,7 @@ def tables(findings: MiddlewareFindings, conditions: str) -> Iterator[str]:
     yield ""
     fragmented = [cell for cell in pairs if cell.expected_loss is not None and cell.size_bytes >= 10_000]
     yield from _table(fragmented, "distance_m", lambda metres: f"{metres:g} m", _with_expected)
-    for metres in sorted({one.distance_m for one in findings.cells if one.robots > 2}):
+    for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
         yield ""
         yield f"Robots that publish to one at {metres:g} m, all streams together; delay of the first:"
         yield ""

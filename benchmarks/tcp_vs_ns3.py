@@ -68,9 +68,12 @@ CHANCES: Final = {
 The losses of data are like those at 20 m behind the wall of `cosim_vs_ns3`, and at 47 m in sight.
 """
 
-PEERS: Final = {"ns-3": "ns3::{}", "mended": "Counting{}", "no clamp": "Counting{}"}
-"""Class names of congestion controls in ns-3, in the corrected variant, and in the variant without the clamp of CUBIC: after
-a timeout the window grows by a segment per 255 acknowledged ones, the largest possible setting, in place of 20."""
+PEERS: Final = {"ns-3": "ns3::{}", "corrected": "Counting{}", "no clamp": "Counting{}"}
+"""Class names of congestion controls in ns-3, in the corrected variant, and in the variant without the clamp of CUBIC.
+
+With the clamp the window grows by at least a segment per 20 acknowledged ones after a timeout. Without it this is a
+segment per 255, the largest value that can be set.
+"""
 
 
 def by_chance(seed: int, data: float, acks: float) -> Losses:
@@ -168,7 +171,7 @@ def first_difference_ns(first: Run, second: Run) -> int | None:
 
 
 def paired_ratio(ours_mbit_s: np.ndarray, peers_mbit_s: np.ndarray) -> tuple[float, float]:
-    """Return the ratio of means of runs with the same losses, each of shape (runs,), and half of its 95 % interval."""
+    """Return the ratio of means of runs with equal losses, each of shape (runs,), and half of its 95 % interval."""
     ratio = float(ours_mbit_s.mean() / peers_mbit_s.mean())
     error = float(
         (ours_mbit_s - ratio * peers_mbit_s).std(ddof=1) / peers_mbit_s.mean() / math.sqrt(len(ours_mbit_s))

@@ -60,13 +60,13 @@ done
 
 
 def measure(shell: Sequence[str], text: str, words: Sequence[str], seconds: float) -> tuple[float, int]:
-    """Run a script in a folder like an attempt's; return processor time in ms per second, and the number of samples."""
+    """Run a script in a folder like an attempt's; return processor time in ms per second, and the sample count."""
     with tempfile.TemporaryDirectory() as folder:
         jobs = Path(folder, ".jobs", "link")
         jobs.mkdir(parents=True)
         os.mkfifo(jobs / "end")
         Path(folder, ".began").write_text("- benchmark\n", encoding="ascii")
-        script, output = Path(folder, "script.sh"), Path(folder, "told")
+        script, output = Path(folder, "script.sh"), Path(folder, "output")
         script.write_text(text, encoding="utf-8")
         path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
         environment = os.environ | {"STATION": _STATION, "PATH": path}

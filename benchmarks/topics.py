@@ -1,4 +1,4 @@
-"""Delay that the step `topics` adds to a message: `python -m benchmarks.topics [--json] [--rounds N]`; needs rosmaster.
+"""Delay that the step `topics` adds to messages: `python -m benchmarks.topics [--json] [--rounds N]`, with rosmaster.
 
 The agent that the step starts on robots (`agent publish`, `agent subscribe`) is compared with plain pairs of
 CycloneDDS, Zenoh and rospy on loopback, one middleware after the other. Each round restarts all programs, because
@@ -192,9 +192,7 @@ def main() -> int:
     if options.json:
         print(json.dumps(results))
         return 0
-    print(
-        f"{'over':6}{'pair':10}{'delay, ms':>26}{'relative to plain':>24}{'relative to attached':>24}{'messages/s':>26}"
-    )
+    print(f"{'over':6}{'pair':10}{'delay, ms':>26}{'by plain':>24}{'by attached':>24}{'messages/s':>26}")
     for over, plain in PLAIN.items():
         rows = [row for row in results if row["over"] == over]
         for pair in (*plain, "agent"):

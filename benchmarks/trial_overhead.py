@@ -1,4 +1,4 @@
-"""Overhead of fieldkit per repeat, compared with a bash script: `python -m benchmarks.trial_overhead [--json]`, as root.
+"""Overhead of fieldkit per repeat, compared with a script: `python -m benchmarks.trial_overhead [--json]`, as root.
 
 Both run the same steps on the same emulated robots, in alternating repeats: create a folder and log the host's state
 on both robots, record, capture at both ends, send the bag, drain, ping, log the state again, fetch all files and

@@ -88,7 +88,7 @@ def _output(*argv: str) -> str:
 
 @contextmanager
 def running(lab: Path) -> Iterator[Sequence[int]]:
-    """Start the machine, and stop it afterwards; yield the robots' SSH ports on this machine, in the order of `ROBOTS`."""
+    """Start the machine, and stop it afterwards; yield the robots' SSH ports here, in the order of `ROBOTS`."""
     ports = _free_ports(len(ROBOTS))
     argv = ["qemu-system-x86_64", *_accelerators(), "-cpu", "max", "-smp", "2", "-m", "3G"]
     argv += ["-kernel", "vmlinuz", "-initrd", "root.cpio", "-append", "console=ttyS0 rdinit=/init quiet"]

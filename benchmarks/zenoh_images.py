@@ -37,8 +37,8 @@ SAMPLES: Final = 16
 PUBLISHER: Final = ("rover-1", "10.42.0.1")
 SUBSCRIBER: Final = ("base", "10.42.0.5")
 WAITS: Final = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"
-"""Microseconds for which a publisher with DROP waits for space in its queue, for a fragmented sample; 50,000 by default
-(Zenoh 1.9, DEFAULT_CONFIG.json5)."""
+"""Microseconds for which a publisher with DROP waits for space in its queue, for a fragmented sample; 50,000 by
+default (Zenoh 1.9, DEFAULT_CONFIG.json5)."""
 LONG_WAIT_US: Final = 500_000
 _PORT: Final = 7447
 _DOMAIN: Final = 42
