@@ -69,7 +69,7 @@ The losses of data are like those at 20 m behind the wall of `cosim_vs_ns3`, and
 """
 
 PEERS: Final = {"ns-3": "ns3::{}", "corrected": "Counting{}", "no clamp": "Counting{}"}
-"""Class names of congestion controls in ns-3, in the corrected variant, and in the variant without the clamp of CUBIC.
+"""Class names of congestion controls in ns-3, in the corrected variant, and in that without the clamp of CUBIC.
 
 With the clamp the window grows by at least a segment per 20 acknowledged ones after a timeout. Without it this is a
 segment per 255, the largest value that can be set.
