@@ -46,7 +46,7 @@ def explain(problems: Sequence[Any], document: Document) -> ConfigurationError:
     remedy = f"add {missing}: to it" if missing else "correct this line"
     # A value with several valid forms has one problem per form at the same location.
     others = len({(document.known(_location(problem)), _missing_key(problem)) for problem in problems}) - 1
-    more = f" ({others} more errors after this one)" if others else ""
+    more = f" ({others} more after this one)" if others else ""
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",
         where=document.where(location),

@@ -111,7 +111,7 @@ def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: 
     assert main(["bag", "info", str(bag)]) == 0
     assert "/t1" in capsys.readouterr().out
     assert main(["bag", "check", str(bag)]) == 0
-    assert capsys.readouterr().out == f"{bag}: whole, 31 messages\n"
+    assert capsys.readouterr().out == f"{bag}: intact, 31 messages\n"
 
 
 @pytest.mark.parametrize("form", BagFormat)

@@ -112,7 +112,7 @@ def test_everything_else_is_a_difference(tmp_path: Path, item: Item, before: Fil
 def test_what_fails_with_the_base_proves_nothing(tmp_path: Path) -> None:
     failed: Files = {"exit_code": "3\n", "stderr": "error: no namespaces"}
     (found,) = compared(tmp_path, Item(Class.TRIALS), failed, failed).real
-    assert found.startswith("proves nothing: exit code 3")
+    assert found.startswith("no proof: exit code 3")
 
 
 def test_emulated_trials_may_differ_in_numbers_but_not_in_fields_files_and_columns(tmp_path: Path) -> None:

@@ -70,7 +70,7 @@ def test_a_label_passes_and_a_number_does_not(clone: Path) -> None:
 def test_an_unknown_commit_is_a_wrong_command_line(clone: Path) -> None:
     done = prove(clone, "no-such-commit")
     assert (done.returncode, done.stdout) == (2, "")
-    assert "resolves 'no-such-commit' to no commit" in done.stderr
+    assert "cannot resolve 'no-such-commit' to a commit" in done.stderr
 
 
 def test_every_kind_of_step_is_in_a_dry_run() -> None:

@@ -55,7 +55,7 @@ def test_a_wrong_word_is_exit_2_with_a_remedy(words: str, said: str, capsys: pyt
     assert "Traceback" not in shown.err
 
 
-@pytest.mark.parametrize(("content", "said"), [(None, "No such file"), (b"float64 \xff", "it is no UTF-8")])
+@pytest.mark.parametrize(("content", "said"), [(None, "No such file"), (b"float64 \xff", "it is not UTF-8")])
 def test_a_definition_that_cannot_be_read_is_exit_2(
     lab: Path, content: bytes | None, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -98,7 +98,7 @@ def test_an_output_that_is_full_says_what_to_do() -> None:
         run = subprocess.run(
             (sys.executable, "-m", "fieldkit", "columns"), stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
-    said = "remedy: free some space, then type it again; what had ended is saved"
+    said = "remedy: free some space, then run the command again; finished repeats are saved"
     assert (run.returncode, run.stderr) == (2, f"error: its output: No space left on device\n  {said}\n")
 
 
@@ -126,7 +126,7 @@ def test_a_topology_without_roles_names_the_line_of_the_roles(
 
 
 def test_asking_without_a_terminal_says_what_to_add() -> None:
-    with pytest.raises(ConfigurationError, match="somebody must put a and b 5m apart") as caught:
+    with pytest.raises(ConfigurationError, match="a person must put a and b 5m apart") as caught:
         Terminal(lambda event: None).ask("put a and b 5m apart")
     assert "--yes" in caught.value.remedy
 

@@ -102,13 +102,13 @@ def test_every_way_in_which_something_is_shown_completes_it(capsys: pytest.Captu
     shown = capsys.readouterr()
     assert shown.err.endswith("remedy: fieldkit abort --site x.yaml\n")
     assert "end it: fieldkit abort --site x.yaml\n" in shown.out
-    assert "to go on: fieldkit resume --site x.yaml 'my trials/a'\n" in shown.out
+    assert "to continue: fieldkit resume --site x.yaml 'my trials/a'\n" in shown.out
     assert json.loads(shown.out.splitlines()[-1])["remedy"] == "wait, or end it: fieldkit abort --site x.yaml"
 
 
 def test_without_options_a_hint_is_as_it_was_worded() -> None:
     ((text, _),) = words_of(TrialStopped("trials/a", 1, 2))
-    assert hints.completed(text).endswith("to go on: fieldkit resume trials/a")
+    assert hints.completed(text).endswith("to continue: fieldkit resume trials/a")
 
 
 @pytest.mark.parametrize(("words", "begin"), [([], "usage: fieldkit [-h]"), (["lab"], "usage: fieldkit lab [-h]")])

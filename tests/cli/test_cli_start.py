@@ -140,12 +140,20 @@ def test_every_command_has_a_module_of_its_name_with_a_function_that_runs_it() -
 @pytest.mark.parametrize(
     ("words", "said", "remedy"),
     [
-        ("--toplogy", "fieldkit does not take '--toplogy'", "did you mean 'fieldkit check --topology'?"),
-        ("--versoin", "fieldkit does not take '--versoin'", "did you mean '--version'?"),
-        ("trial los 30ft --toplogy master", "fieldkit trial does not take '--toplogy'", "did you mean '--topology'?"),
+        ("--toplogy", "fieldkit has no option or argument '--toplogy'", "did you mean 'fieldkit check --topology'?"),
+        ("--versoin", "fieldkit has no option or argument '--versoin'", "did you mean '--version'?"),
+        (
+            "trial los 30ft --toplogy master",
+            "fieldkit trial has no option or argument '--toplogy'",
+            "did you mean '--topology'?",
+        ),
         ("trial los 30ft --topology mastr", "--topology cannot be 'mastr'", "did you mean 'master'?"),
-        ("aggregate x --zzz=1", "fieldkit aggregate does not take '--zzz=1'", "fieldkit aggregate --help"),
-        ("rebuild x y", "fieldkit rebuild does not take 'y'", "fieldkit rebuild --help"),
+        (
+            "aggregate x --zzz=1",
+            "fieldkit aggregate has no option or argument '--zzz=1'",
+            "fieldkit aggregate --help",
+        ),
+        ("rebuild x y", "fieldkit rebuild has no option or argument 'y'", "fieldkit rebuild --help"),
         ("lab mvoe", "COMMAND cannot be 'mvoe'", "did you mean 'move'?"),
         ("lab move a --by -5m", "--by takes EAST NORTH [UP], not '-5m'", "fieldkit lab move ROBOT --to 20m 10m"),
     ],

@@ -115,7 +115,7 @@ def test_a_terminal_that_closes_is_an_error() -> None:
     with asked() as (person, process):
         person.wait_for("\n> ")
         person.type("\x04")
-        person.wait_for("the terminal was closed at a question")
+        person.wait_for("the terminal was closed during a question")
         assert process.wait(WITHIN_S) == 1
 
 
@@ -125,9 +125,9 @@ def test_an_abort_that_is_refused_ends_nothing(tmp_path: Path) -> None:
     site = f"backend: field\nrobots:\n  a: {robot}\nroles: {{}}\n"
     (tmp_path / SITE_FILE).write_text(site, encoding="utf-8")
     with asked("-m", "fieldkit", "abort", lab=tmp_path) as (person, process):
-        person.wait_for("end every job of fieldkit on a? yes or no", "\n> ")
+        person.wait_for("terminate every job of fieldkit on a? yes or no", "\n> ")
         person.type("no\n")
-        person.wait_for("nothing was ended")
+        person.wait_for("nothing was terminated")
         assert process.wait(WITHIN_S) == 1
 
 

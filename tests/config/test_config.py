@@ -54,7 +54,7 @@ def test_every_shipped_procedure_loads(name: str) -> None:
         ("points: 360", "points: many", "valid integer"),
         ("points: 360", "points: 0", "greater than 0"),
         ("{duration_s}", "{duraton_s}", "unknown placeholder"),
-        ("  variant: ros1", "  variant: ros3", "'ros3' is none of these: ros1, ros2"),
+        ("  variant: ros1", "  variant: ros3", "'ros3' is not one of: ros1, ros2"),
         ("kind: ugv", "kind: ugv\nkind: uav", "duplicate key 'kind'"),
         ("kind: ugv", "kind: *ugv", "aliases"),
         ("kind: ugv", "kind: [ugv", "not valid YAML"),
@@ -160,9 +160,13 @@ def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
     ("old", "new", "said"),
     [
         ("receiver: b", "receiver: c", "names 'c'; the robots are: a, b"),
-        ("receiver: b", "receiver: a", "one robot plays two roles"),
+        ("receiver: b", "receiver: a", "one robot has two roles"),
         ("receiver: b", "reciever: b", "roles.masterless.reciever: did you mean 'receiver'?"),
-        ("  a: {profile", "  A b: {profile", "'A b' cannot be a key here: 'A b' is not a name: small letters"),
+        (
+            "  a: {profile",
+            "  A b: {profile",
+            "'A b' cannot be a key here: 'A b' is not a name of at most 31 lower-case letters",
+        ),
         ("{profile: turtlebot3_burger}", "{profile: turtlebot3_burger, hots: x}", "did you mean 'host'?"),
     ],
 )

@@ -90,19 +90,19 @@ def test_a_file_without_loops_stays_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "what", "line", "remedy"),
     [
-        ('"p{bytes}"', '"p{size}"', "there is no variable size; here are: bytes", 4, "write {{size}} for"),
-        ('"p{bytes}"', '"p{byte}"', "there is no variable byte; did you mean 'bytes'?", 4, "or name a variable"),
-        ('"{bytes}"}', "{bytes}}", "without quotes YAML takes {bytes} for a map", 4, 'put it in quotes: "{bytes}"'),
-        ("[502, 1400, 8192]", "502", "the values of bytes are no list", 2, "bytes: [1, 2]"),
-        ("[502, 1400, 8192]", "[]", "the values of bytes are no list", 2, "bytes: [1, 2]"),
-        ("[502, 1400, 8192]", "[[502]]", "a value of bytes is no text or number", 2, "bytes: [1, 2]"),
-        ("{bytes: [502, 1400, 8192]}", "[502]", "each: of for: names no variable", 2, "each: {bytes: [502, 1400]}"),
-        ("{bytes: [", "{Bytes: [", "'Bytes' cannot be a variable", 2, "small letters"),
+        ('"p{bytes}"', '"p{size}"', "there is no variable size; the variables are: bytes", 4, "write {{size}} for"),
+        ('"p{bytes}"', '"p{byte}"', "there is no variable byte; did you mean 'bytes'?", 4, "or use a variable"),
+        ('"{bytes}"}', "{bytes}}", "without quotes YAML reads {bytes} as a map", 4, 'put it in quotes: "{bytes}"'),
+        ("[502, 1400, 8192]", "502", "the values of bytes are not a list", 2, "bytes: [1, 2]"),
+        ("[502, 1400, 8192]", "[]", "the values of bytes are not a list", 2, "bytes: [1, 2]"),
+        ("[502, 1400, 8192]", "[[502]]", "a value of bytes is not a text or a number", 2, "bytes: [1, 2]"),
+        ("{bytes: [502, 1400, 8192]}", "[502]", "each: of for: has no variable", 2, "each: {bytes: [502, 1400]}"),
+        ("{bytes: [", "{Bytes: [", "'Bytes' is not a valid variable", 2, "lower-case letters"),
         ("each:", "eech:", "unknown key eech in for:", 2, "for: {each:"),
         ("      each: {bytes: [502, 1400, 8192]}\n", "", "for: needs each: and during:", 1, "for: {each:"),
         ("      during:\n", "      during: 5\n      due:\n", "unknown key due in for:", 4, "for: {each:"),
-        ("  - for:", "  - fore:", "unknown key fore", 1, "mend this line"),
-        ("  - for:", "  - ping: {}\n    for:", "for: stands alone in its entry", 1, "- for:"),
+        ("  - for:", "  - fore:", "unknown key fore", 1, "correct this line"),
+        ("  - for:", "  - ping: {}\n    for:", "for: must be the only key of its entry", 1, "- for:"),
         ('name: "p{bytes}", ', "", "a ping comes twice; tell them apart by name:, inside for:", 4, ""),
         ('"p{bytes}"', "p", "a ping named p comes twice; give one another name, inside for:", 4, ""),
         ('"{bytes}"}', '"{bytes}", cuont: 3}', "unknown key cuont; did you mean 'count'?", 4, ""),
@@ -119,7 +119,7 @@ def test_what_is_wrong_names_its_line_and_a_remedy(old: str, new: str, what: str
 
 def test_a_variable_is_not_hidden_by_a_loop_inside() -> None:
     inner = SWEEP.replace("- ping", "- for: {each: {bytes: [1]}, during: [ping").replace('"}', '"}]}')
-    assert refused(inner)[:2] == ("bytes is a variable of a for: around this one", 4)
+    assert refused(inner)[:2] == ("bytes is a variable of an enclosing for:", 4)
 
 
 def test_steps_are_bounded() -> None:
@@ -127,7 +127,7 @@ def test_steps_are_bounded() -> None:
     twice = f"{{each: {{a: [{values}], b: [{values}]}}, during: [a: {{}}]}}"
     assert refused(f"  - for: {twice}")[:2] == ("for: has 1024 combinations, more than 1000", 1)
     nested = f"{{each: {{a: [{values}]}}, during: [for: {{each: {{b: [{values}]}}, during: [a: {{}}]}}]}}"
-    assert refused(f"  - for: {nested}")[:2] == ("there are more than 1000 steps, all for: written out", 1)
+    assert refused(f"  - for: {nested}")[:2] == ("there are more than 1000 steps after for: is expanded", 1)
 
 
 SCALARS = st.one_of(st.integers(-9, 9), st.booleans(), st.text("abc", min_size=1, max_size=3))

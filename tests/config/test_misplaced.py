@@ -64,15 +64,15 @@ def refused(text: str, model: type[schema.Strict]) -> ConfigurationError:
             "    profile: x",
             "    profile: x\n    patience: 3s",
             4,
-            "patience here; it is a key of the whole file: indent it as robots: is",
+            "patience here; it is a key of the whole file: indent it like robots:",
         ),
-        (Site, "    profile: x", "  profile: x", 2, "keys that belong to this line are indented more than it is"),
+        (Site, "    profile: x", "  profile: x", 2, "indent the keys that belong to this line more than this line"),
         (
             Procedure,
             "to: receiver",
             "to: receiver\n            attempts: 3",
             13,
-            "of the whole file: indent it as steps: is",
+            "of the whole file: indent it like steps:",
         ),
         (
             Procedure,

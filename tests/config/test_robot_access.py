@@ -35,9 +35,9 @@ def test_the_access_is_that_of_the_whole_site_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("entry", "what"),
     [
-        (f"{{host: h, user: u, port: 0, host_key: {KEY}}}", "port of bad must be a number of 1 to 65535"),
-        (f"{{host: h, user: u, port: '22', host_key: {KEY}}}", "port of bad must be a number of 1 to 65535"),
-        (f"{{host: h, user: u, port: true, host_key: {KEY}}}", "port of bad must be a number of 1 to 65535"),
+        (f"{{host: h, user: u, port: 0, host_key: {KEY}}}", "port of bad must be a number from 1 to 65535"),
+        (f"{{host: h, user: u, port: '22', host_key: {KEY}}}", "port of bad must be a number from 1 to 65535"),
+        (f"{{host: h, user: u, port: true, host_key: {KEY}}}", "port of bad must be a number from 1 to 65535"),
         (f"{{user: u, host_key: {KEY}}}", "host of bad must be a text"),
         (f"{{host: h, host_key: {KEY}}}", "user of bad must be a text"),
         ("{host: h, user: u}", "host_key of bad must be a text: fieldkit enroll bad"),

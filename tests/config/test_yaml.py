@@ -110,7 +110,7 @@ def test_a_byte_order_mark_and_windows_lines_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", ["/dev/zero", "/"])
 def test_what_never_ends_is_no_file(path: str) -> None:
-    with pytest.raises(ConfigurationError, match="this is no file"):
+    with pytest.raises(ConfigurationError, match="this is not a file"):
         schema.read(Path(path))
 
 
@@ -118,9 +118,9 @@ def test_what_never_ends_is_no_file(path: str) -> None:
     ("text", "where", "said"),
     [
         ("# lab\n\nbackend: field\n", "x:3", "required key 'robots' is missing"),
-        ("", "x:1", "keys with values are needed here, and nothing stands here"),
+        ("", "x:1", "keys with values are needed here, and there are none"),
         ("robots: {a: {profile: x, host: 10}}\nroles: {}", "x:1", "put it in quotes"),
-        ("robots: {a: {profile: x, port: 1_0}}\nroles: {}", "x:1", "in digits alone"),
+        ("robots: {a: {profile: x, port: 1_0}}\nroles: {}", "x:1", "in digits only"),
         ("robots: {a: {profile: x}}\nroles: {}\npatience: 0.2", "x:3", "write for example 0.2s or 0.2ms"),
         ("robots: {a: {profile: x}}\nroles: {}\npatience: [1]", "x:3", "a number with a unit is needed here"),
         (f"robots: {{a: {{profile: x}}}}\nroles: {{}}\npatience: {'9' * 15}s", "x:3", "too large"),

@@ -202,7 +202,7 @@ def test_the_page_warns_of_what_matters(tmp_path: Path) -> None:
     said = [(one.text, list(map(plain, one.reasons))) for one in summary.warnings(cells, found)]
     assert said[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
     assert said[1] == ("1 attempt failed.", ["no answer (1)"])
-    assert said[2] == ("Nothing valid in 1 condition.", ["UDP, 20ft"])
+    assert said[2] == ("No valid repeat in 1 condition.", ["UDP, 20ft"])
     assert said[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
     assert "2 repeats give 50 %" in plain(said[3][0])
     assert said[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])

@@ -78,7 +78,7 @@ def test_the_site_file_gives_a_master_where_somebody_plays_its_role() -> None:
 def test_a_master_that_nobody_plays_is_refused(role: str) -> None:
     text = SITE.replace("ros_master: relay", f"ros_master: {role}")
     with pytest.raises(
-        ConfigurationError, match="one of the roles that robots play: sender, receiver, relay"
+        ConfigurationError, match="one of the assigned roles: sender, receiver, relay"
     ) as caught:
         site(text)
     assert caught.value.where == "fieldkit.yaml:9"

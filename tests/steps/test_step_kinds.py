@@ -119,7 +119,7 @@ def test_a_kind_may_have_any_name(install: Install) -> None:
 
 def test_a_kind_that_is_not_installed_asks_for_its_package(install: Install) -> None:
     install()
-    with pytest.raises(ValidationError, match=r"unknown key zoom; .* comes with a package to be installed"):
+    with pytest.raises(ValidationError, match=r"unknown key zoom; .* need a package that is not installed"):
         TypeAdapter(tuple[StepEntry, ...]).validate_python([{"zoom": {}}])
 
 

@@ -110,7 +110,7 @@ def _check_bag(path: Path) -> int:
     if bag_contents.problems:
         _show_problems(path, bag_contents)
         return EvidenceError.exit_code
-    say(f"{path}: whole, {format_count(bag_contents.messages, 'message')}")
+    say(f"{path}: intact, {format_count(bag_contents.messages, 'message')}")
     return 0
 
 

@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace) -> int:
     for problem in problems:
         show_error(problem)
     say(
-        f"{format_count(len(problems), 'file')} differ from the manifest"
+        f"{format_count(len(problems), 'file')} different from the manifest"
         if problems
         else "every file matches the manifest"
     )

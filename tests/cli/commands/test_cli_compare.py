@@ -99,8 +99,8 @@ def test_runs_that_are_not_comparable_are_refused_unless_forced(
         "error: A and B are not comparable:\n"
         "  procedure_sha256: A has bbbb, B has ffff (los, master, 9.144 m, udp)\n"
         "  sent_bytes, median: A has 230,695 B, B has 293,797 B (los, master, 9.144 m, udp)\n"
-        "  remedy: run both alike (what a name means: fieldkit columns show NAME); "
-        "or, to compare them all the same, add --force\n"
+        "  remedy: run both under the same conditions (to look up a name: fieldkit columns show NAME); "
+        "or, to compare them anyway, add --force\n"
     )
     assert compare("field other --force") == 0
     shown = capsys.readouterr()
@@ -156,7 +156,7 @@ def test_more_than_two_runs_are_named_with_what_shows_them_side_by_side(
     (lab / "field again").symlink_to("field")
     assert main(["compare", "field", "sim", "field again"]) == 2
     said = capsys.readouterr().err
-    assert "two runs are compared, A and B, and 3 are named" in said
+    assert "compare takes two runs, A and B, and 3 are given" in said
     command = said.partition("side by side: fieldkit ")[2].strip()
     assert command == "aggregate field sim 'field again' --by trial,protocol"
     assert main(shlex.split(command)) == 0
@@ -192,11 +192,14 @@ def test_two_distances_compare_where_the_distance_is_all_that_differs(
     assert compare("field far --by protocol") == 0
     shown = capsys.readouterr()
     assert shown.err.startswith(
-        "note: A and B differ in this, which may be why figures differ: distance_m: A has 9.1"
+        "note: A and B differ in this, which may explain differences between their figures: distance_m: A has 9.1"
     )
     assert shown.out.startswith("udp: A 20 valid; B 20 valid\n")
     assert compare("field far --by protocol --format markdown") == 0
-    assert "- A and B differ in this, which may be why figures differ: distance" in capsys.readouterr().out
+    assert (
+        "- A and B differ in this, which may explain differences between their figures: distance"
+        in capsys.readouterr().out
+    )
 
 
 def test_distances_that_are_mixed_in_a_run_do_not_compare(
