@@ -80,7 +80,7 @@ def test_every_command_that_is_named_is_one_and_takes_its_options() -> None:
 def test_a_hint_carries_what_was_given(typed_before: str, hint: str, whole: str) -> None:
     top = parser()
     with hints.completing(top) as known:
-        known.take(top.parse_args((*typed_before.split(), *GIVEN)))
+        known.read(top.parse_args((*typed_before.split(), *GIVEN)))
         completed = hints.completed(hint)
     assert completed == whole.format(given=shlex.join(GIVEN))
     if completed.split()[0] == "fieldkit" and not any(mark in completed for mark in (" lists", ",", ";")):
@@ -92,7 +92,7 @@ def test_every_way_in_which_something_is_shown_completes_it(capsys: pytest.Captu
     finding = Finding("a", "lock", Verdict.FAIL, "held", "wait, or end it: fieldkit abort")
     top = parser()
     with hints.completing(top) as known:
-        known.take(top.parse_args(("check", "--site", "x.yaml")))
+        known.read(top.parse_args(("check", "--site", "x.yaml")))
         show_error("held\n  remedy: fieldkit abort")
         show_findings([finding])
         for as_json in (False, True):

@@ -31,7 +31,7 @@ BEGUN = (
 def line(width: int, *events: Event) -> str:
     progress = ProgressBar()
     for event in events:
-        progress.take(event)
+        progress.update(event)
     return "".join(text for text, _ in progress.words(width))
 
 
@@ -69,14 +69,14 @@ def test_before_a_repeat_ended_nothing_is_estimated() -> None:
 def test_nothing_is_drawn_over_a_question_nor_after_the_end() -> None:
     progress = ProgressBar()
     assert not progress.is_needed
-    progress.take(BEGUN[-1])
+    progress.update(BEGUN[-1])
     assert progress.is_needed
-    progress.take(Request("move a", may_skip=False))
-    progress.take(PhaseStarted("told by another thread"))
+    progress.update(Request("move a", may_skip=False))
+    progress.update(PhaseStarted("told by another thread"))
     assert not progress.is_needed
-    progress.take(Answered(skip=False, note=""))
+    progress.update(Answered(skip=False, note=""))
     assert progress.is_needed
-    progress.take(TrialEnded("trials/a", 1, 0, 0))
+    progress.update(TrialEnded("trials/a", 1, 0, 0))
     assert not progress.is_needed
 
 

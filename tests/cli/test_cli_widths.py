@@ -71,7 +71,7 @@ def test_a_repeat_in_which_nothing_arrived_is_red() -> None:
 def test_the_live_line_marks_what_it_cuts(trial: str, phase: str, width: int) -> None:
     progress = ProgressBar()
     for event in (CampaignTrial(trial, 1, 2), TrialStarted("a", 0, 40), PhaseStarted(phase, repeat="udp-07")):
-        progress.take(event)
+        progress.update(event)
     text = "".join(part for part, _ in progress.words(width))
     assert len(text) <= width
     assert f"udp-07 {phase}" in text or text.endswith("...") or "..." in text

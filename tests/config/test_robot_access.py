@@ -44,7 +44,7 @@ def test_the_access_is_that_of_the_whole_site_file(tmp_path: Path) -> None:
         (f"{{host: h, user: u, host_key: {KEY}, key: 3}}", "key of bad must be the path of a file"),
         (f"{{host: h, user: u, host_key: {KEY}, password: hunter2}}", "password of bad must be ask or keyring"),
         (f"{{host: h, user: u, host_key: {KEY}, password: [ask]}}", "password of bad must be ask or keyring"),
-        ("nothing", "is not a mapping"),
+        ("nothing", "this entry is not a mapping"),
     ],
 )
 def test_an_error_of_one_robot_keeps_no_other_from_being_reached(entry: str, what: str) -> None:

@@ -86,7 +86,7 @@ def test_what_cannot_be_edited_is_left_as_it_is(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigurationError, match="cannot be inserted") as caught:
         site_file.pin(path, "a", KEY)
-    assert caught.value.remedy == f"write host_key: {KEY}"
+    assert caught.value.remedy == f"add it in an editor: host_key: {KEY}"
     assert path.read_text(encoding="utf-8") == text
 
 

@@ -63,7 +63,7 @@ def test_a_scalar_is_what_yaml_1_2_says(written: str, meant: object) -> None:
         ("*b", "aliases"),
         ('"\\0"', "no file can hold"),
         ('"\\ud800"', "no file can hold"),
-        ('"\\U00110000"', "names no character"),
+        ('"\\U00110000"', "an escape or a directive is not valid"),
         ("\x00", "cannot hold the character 0x00"),
         ("\x7f", "cannot hold the character 0x7f"),
         ("[" * 60 + "]" * 60, "nested more than 50 deep"),

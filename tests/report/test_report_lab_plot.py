@@ -25,7 +25,7 @@ def test_names_at_the_edges_of_the_world_stay_in_it(
         drawn.append(figure)
         return b""
 
-    monkeypatch.setattr(figures, "_saved", kept)
+    monkeypatch.setattr(figures, "_to_bytes", kept)
     figures.overview(Overview("a world with a long name " * 4, area_m, [], robots, links), "png")
     axes = drawn[0].axes[0]
     world = axes.get_window_extent()

@@ -261,6 +261,6 @@ def test_what_no_repeat_has_is_left_out_and_the_counts_remain(
     assert "| 1 failed |" in said(capsys, failed, "--format", "markdown")
     assert json.loads(said(capsys, failed, "--format", "json"))["cells"][0]["n_failed"] == 1
     assert main(["aggregate", failed, "--format", "latex"]) == 4
-    assert "no valid repeat has rtt_median_s" in capsys.readouterr().err
+    assert "no valid repeat has a value of rtt_median_s" in capsys.readouterr().err
     assert main(["aggregate", failed, "--quantity", "jitter_s", "--format", "csv"]) == 0
     assert "note: no valid repeat has jitter_s" in capsys.readouterr().err

@@ -57,7 +57,7 @@ def test_a_key_is_shown_asked_for_and_pinned(
     line = f"    host_key: {key_of(server)}\n"
     assert lab.read_text(encoding="utf-8") == before.replace("roles:", f"{line}roles:")
     assert main(["enroll", "turtlebot-1"]) == 0
-    assert "pinned already" in capsys.readouterr().out
+    assert "already pinned" in capsys.readouterr().out
 
 
 def test_no_is_respected(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
