@@ -1,4 +1,4 @@
-"""A key that is known at another level is reported as a line that is indented wrongly, not as a typing error."""
+"""A key that is valid at another level is reported as an indentation error, not as a misspelling."""
 
 import copy
 import re
@@ -42,14 +42,14 @@ steps:
 """
 
 
-def refused(text: str, model: type[schema.Strict]) -> ConfigurationError:
+def error_of(text: str, model: type[schema.Strict]) -> ConfigurationError:
     with pytest.raises(ConfigurationError) as caught:
         schema.validate(schema.parse(text, source="f.yaml"), model)
     return caught.value
 
 
 @pytest.mark.parametrize(
-    ("model", "old", "new", "line", "said"),
+    ("model", "old", "new", "line", "message"),
     [
         (
             Site,
@@ -100,21 +100,21 @@ def refused(text: str, model: type[schema.Strict]) -> ConfigurationError:
         (Procedure, "command: a", "comand: a", 15, "did you mean 'command'"),
     ],
 )
-def test_the_message_says_where_the_line_belongs(
-    model: type[schema.Strict], old: str, new: str, line: int, said: str
+def test_message_gives_the_correct_indentation(
+    model: type[schema.Strict], old: str, new: str, line: int, message: str
 ) -> None:
     text = SITE if model is Site else STEPS
     assert text.count(old) == 1
-    error = refused(text.replace(old, new), model)
+    error = error_of(text.replace(old, new), model)
     assert error.where == f"f.yaml:{line}"
-    assert re.search(said, error.what), error.what
+    assert re.search(message, error.what), error.what
 
 
 PROFILES = sorted((ROOT / "robots").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
-def test_every_key_of_a_section_that_slips_out_of_it_is_sent_back(path: Path) -> None:
+def test_every_key_outside_its_section_is_reported_with_the_section(path: Path) -> None:
     whole = documents.read(path).data
     known = {field.alias or name for name, field in RobotProfile.model_fields.items()}
     moved = [
@@ -133,5 +133,5 @@ def test_every_key_of_a_section_that_slips_out_of_it_is_sent_back(path: Path) ->
         text = documents.to_text(dict([*items[:at], (key, slipped), *items[at:]]))
         assert (
             f"unknown key {key}; it is a key of {section}: indent it below {section}:"
-            in refused(text, RobotProfile).what
+            in error_of(text, RobotProfile).what
         )
