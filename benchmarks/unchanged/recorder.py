@@ -2,9 +2,9 @@
 
 Runs as a program in an environment in which Python imports that tree: `python -P recorder.py ITEMS RESULTS`, where
 ITEMS is a JSON file of a list of items (`items.Item` as dictionaries) and RESULTS a folder, which is made. With
-`--commands` it prints the commands that the tree has. It imports
-nothing but the standard library and the tree, by the names that users know: the module `fieldkit`, and `build` and
-`load_scenario` of `sim_backends.cosim`.
+`--commands` it prints the commands that the tree has. It imports only the standard library and the public names of
+the
+tree: the module `fieldkit`, and `build` and `load_scenario` of `sim_backends.cosim`.
 
 All commands run in this process, one after the other: importing the libraries takes longer than most commands.
 """

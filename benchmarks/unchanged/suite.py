@@ -49,7 +49,7 @@ class Unit:
 
 @dataclass
 class Changes:
-    """What differs between the tests of two commits, beyond names.
+    """Differences between the tests of two commits, except for names.
 
     Attributes:
         same: Tests that are the same.
@@ -103,10 +103,9 @@ def compare(before: Path, after: Path) -> Changes:
 
 
 def _match_by_shape(olds: Sequence[Unit], news: Sequence[Unit]) -> tuple[list[Unit], list[Unit], list[Unit]]:
-    """Return the old units that have a partner of the same shape, and the units of both that have none."""
-    # Units of the same name are matched first, so that a remaining copy is the removed one. A test is matched only
-    # with
-    # a test, because pytest does not run functions with other names.
+    """Return the old units that have a partner of the same shape, and the unmatched units of both."""
+    # Units of the same name are matched first, so that a remaining copy is the removed one. A test is matched
+    # only with a test, because pytest does not run functions with other names.
     partners: defaultdict[tuple[str, bool], list[Unit]] = defaultdict(list)
     for new in news:
         partners[new.shape, new.is_test].append(new)
