@@ -109,7 +109,7 @@ class Bench:
             raise CaseFailed(f"code {code}, {high_m:.1f} m high, {far_m:.1f} m far, {self._last_words()}")
         return f"{high_m:.1f} m high, {far_m:.1f} m far, landed"
 
-    def lapses(self) -> str:
+    def lease_expires(self) -> str:
         """Stop renewing the orders in the air; check that the drone lands."""
         with self._flight() as process:
             self._order("climb", lease_s=60.0)
@@ -121,7 +121,7 @@ class Bench:
             raise CaseFailed(f"code {code}, {self._last_words()}")
         return f"landed {time.monotonic() - began_s:.0f} s after the last order"
 
-    def called_off(self) -> str:
+    def terminated(self) -> str:
         """Terminate the program in the air by SIGTERM; check that the drone lands."""
         with self._flight() as process:
             self._order("climb")
@@ -221,8 +221,8 @@ def rows(connection: str) -> Iterator[Row]:
             "can be armed": bench.check,
             "telemetry is recorded": bench.record,
             "out and back": bench.out_and_back,
-            "orders lapse in the air": bench.lapses,
-            "program ended in the air": bench.called_off,
+            "orders lapse in the air": bench.lease_expires,
+            "program ended in the air": bench.terminated,
         }
         for name, case in cases.items():
             began_s = time.monotonic()

@@ -5,9 +5,8 @@ robots, the lateness of their packets in the medium, 64-byte UDP payloads at ful
 The other robots are silent and should not add cost; the processor time per frame is measured at 2,000 packets/s. Then
 all neighbours form pairs, in each of which one sends to the other: over fixed links at full rate, over Wi-Fi 2,000
 packets/s in all, about a third of the channel's capacity. These robots are bare namespaces. Then whole robots, with
-SSH server and
-sensors: start-up time, its processor time, and the memory per robot without shared pages (own) and with a
-proportional part of them (PSS).
+SSH server and sensors: start-up time, its processor time, and the memory per robot without shared pages (own) and
+with a proportional part of them (PSS).
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Whether two recorded outputs are the same, differ in words alone, or differ.
+"""Compare two recorded outputs: they are equal, differ only in words, or differ.
 
 What programs read (commands of dry runs, tables, exports, hashes, exit codes) must be equal byte by byte. What people
 read (help, messages, tables on a terminal, reports) may differ in words, which are listed as labels; numbers and
@@ -25,7 +25,7 @@ _VARYING: Final = (
     (re.compile(r"(job|agent|fieldkit)-[0-9a-f]{12}\b"), r"\1-HASH"),
 )
 _FIXED: Final = re.compile(r"--[a-z][a-z-]+|\d+(?:\.\d+)?")
-"""What may not change in a text for people: options and numbers."""
+"""The parts of a text for people that must not change: options and numbers."""
 
 _WORDS_IN_EVENTS: Final = frozenset(
     ("text", "how", "note", "detail", "remedy", "reason", "summary", "question", "why")
@@ -39,7 +39,7 @@ _SHOWN_LINES: Final = 12
 
 @dataclass
 class Differences:
-    """What differs between two outputs.
+    """Differences between two outputs.
 
     Attributes:
         labels: Pairs of words before and after, and how often.

@@ -88,8 +88,8 @@ class Parser(argparse.ArgumentParser):
         if self._commands is not None:
             self._require_command(words)
         if self.takes_lengths:
-            # argparse does not parse a word with a leading space as an option. Converters of lengths remove the
-            # space.
+            # argparse does not parse a word with a leading space as an option. Converters of lengths
+            # remove the space.
             words = [f" {word}" if _NEGATIVE.match(word) else word for word in words]
         arguments, unknown = super().parse_known_args(words, namespace)
         if unknown:

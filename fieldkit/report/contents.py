@@ -66,7 +66,7 @@ class CellTable:
         more: Quantities of collapsed columns.
         lines: Cells, each with its condition as far as it differs from the others.
         notes: Text below the name of a quantity.
-        words: Labels of columns of words, by name.
+        words: Labels of text columns, by name of the column.
         missing: Reason for a missing figure, by the number of the line and the name of the quantity.
     """
 

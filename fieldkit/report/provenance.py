@@ -20,7 +20,7 @@ class Provenance:
     Attributes:
         name: Its name.
         source: Its folder, or the table with its rows.
-        is_at_hand: True if its raw evidence is available.
+        has_evidence: True if its raw evidence is available.
         began: Start of its first attempt, as text.
         robots: Sender, receiver and relay.
         attempts: Numbers of attempts by status.
@@ -32,7 +32,7 @@ class Provenance:
 
     name: str
     source: Path
-    is_at_hand: bool
+    has_evidence: bool
     began: str
     robots: str
     attempts: str
@@ -63,7 +63,7 @@ def _trial(name: str, source: Path, rows: list[int], evidence: Evidence) -> Prov
     return Provenance(
         name=name,
         source=source,
-        is_at_hand=plan is not None,
+        has_evidence=plan is not None,
         began=summary.utc(float(np.nanmin(started))) if np.isfinite(started).any() else "",
         robots=f"{texts['sender'][first]} to {texts['receiver'][first]}" + (f" by {relay}" if relay else ""),
         attempts=ended(Counter(texts["status"][rows])),
