@@ -42,7 +42,7 @@ class Differences:
     """Differences between two outputs.
 
     Attributes:
-        labels: Pairs of words before and after, and how often.
+        labels: Pairs of words before and after, with their counts.
         real: Differences that are not labels, each with the lines that differ.
     """
 
