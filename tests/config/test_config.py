@@ -149,10 +149,10 @@ def test_bags_of_two_robots_need_different_names() -> None:
         schema.validate(schema.parse(one, source="los.yaml"), Procedure)
 
 
-def test_transfer_without_a_file_needs_a_recording_of_its_sender() -> None:
+def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
     document = schema.parse(PROCEDURE.replace("robot: sender", "robot: receiver", 1), source="los.yaml")
-    message = "the transfer from sender names no file, and no step before it records on sender"
-    with pytest.raises(ConfigurationError, match=message):
+    said = "the transfer from sender names no file, and no step before it records on sender"
+    with pytest.raises(ConfigurationError, match=said):
         schema.validate(document, Procedure)
 
 
@@ -162,11 +162,7 @@ def test_transfer_without_a_file_needs_a_recording_of_its_sender() -> None:
         ("receiver: b", "receiver: c", "names 'c'; the robots are: a, b"),
         ("receiver: b", "receiver: a", "one robot has two roles"),
         ("receiver: b", "reciever: b", "roles.masterless.reciever: did you mean 'receiver'?"),
-        (
-            "  a: {profile",
-            "  A b: {profile",
-            "'A b' cannot be a key here: 'A b' is not a name of",
-        ),
+        ("  a: {profile", "  A b: {profile", "'A b' cannot be a key here: 'A b' is not a name"),
         ("{profile: turtlebot3_burger}", "{profile: turtlebot3_burger, hots: x}", "did you mean 'host'?"),
     ],
 )
