@@ -1,4 +1,4 @@
-"""Build the documentation site into the wheel, as `fieldkit/data/docs/`, where `fieldkit docs` finds it."""
+"""Build the documentation site into the wheel, as `fieldkit/data/docs/`, which `fieldkit docs` opens."""
 
 import shutil
 import tempfile
@@ -9,7 +9,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class DocumentationHook(BuildHookInterface):
-    """Runs mkdocs, unless the package is installed in place: then `fieldkit docs` shows the pages of the checkout."""
+    """Runs mkdocs, except for an editable installation, for which `fieldkit docs` shows the pages of the checkout."""
 
     PLUGIN_NAME = "custom"
 
@@ -26,10 +26,10 @@ class DocumentationHook(BuildHookInterface):
         config.plugins.on_startup(command="build", dirty=False)
         build(config)
         for path in self._site.rglob("*.map"):
-            path.unlink()  # of scripts, for the theme's developers
+            path.unlink()  # source maps of scripts, needed only by developers of the theme
         build_data["force_include"][str(self._site)] = "fieldkit/data/docs"
 
-    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:  # noqa: ARG002 (hatch's)
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:  # noqa: ARG002 (set by hatch)
         """Remove the built site."""
         if self._site is not None:
             shutil.rmtree(self._site)

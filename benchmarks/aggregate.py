@@ -1,9 +1,9 @@
-"""From thousands of trial.csv to a table with intervals, beside pandas and scipy: `python -m benchmarks.aggregate`.
+"""Aggregate thousands of trial.csv into one table, compared with pandas: `python -m benchmarks.aggregate`.
 
-Tables of 40 repeats each, every column filled, drawn by a fixed seed, over 160 conditions. `fieldkit aggregate` is
-started as its users start it, once per number of tables in every round, so that one sees whether cost grows linearly.
-The peer reads the fewest tables in the same round: pandas puts them together and groups them, scipy makes a bootstrap
-interval per cell and quantity. Both find the same means and medians, or the benchmark stops.
+The tables have 40 repeats each and 160 conditions in all, with random values of a fixed seed in every column. Each
+round runs `fieldkit aggregate` as a user would, once per number of tables, to show whether the cost grows linearly.
+The peer reads the smallest number of tables in the same round: pandas concatenates and groups them, and scipy
+computes a bootstrap interval per cell and quantity. The benchmark stops if their means and medians differ.
 
 `--rows N` adds one table of N repeats: the CSV that `fieldkit export` makes of a whole campaign.
 """
@@ -42,9 +42,9 @@ class Run:
     """A finished process.
 
     Attributes:
-        wall_s: From its start to its end.
-        processor_s: What it took of the processor.
-        peak_mb: Its peak memory.
+        wall_s: Wall time in seconds.
+        processor_s: Processor time in seconds.
+        peak_mb: Peak memory in MB.
     """
 
     wall_s: float
@@ -85,8 +85,8 @@ def _lines(draw: np.random.Generator, number: int) -> Iterator[str]:
         fixed["status"] = "void" if shares[repeat][0] < 0.03 else "valid"
         fixed["started_utc_ns"] = str(START_NS + (number * REPEATS + repeat) * 10**10)
         for quantity, arrived in zip(_COUNTED, counts[repeat], strict=False):
-            own = zip(quantity.columns, (f"{1 - arrived / SENT:.9g}", str(arrived), str(SENT)), strict=True)
-            fixed |= dict(own)
+            counted = zip(quantity.columns, (f"{1 - arrived / SENT:.9g}", str(arrived), str(SENT)), strict=True)
+            fixed |= dict(counted)
         drawn = zip(columns, shares[repeat], counts[repeat], strict=True)
         yield ",".join(fixed.get(column.name) or _drawn(column, *two) for column, *two in drawn) + "\n"
 
@@ -100,7 +100,7 @@ def _drawn(column: Column, share: float, whole: int) -> str:
 
 
 def _condition(number: int) -> dict[str, str]:
-    """Return the cells of a trial that are not drawn."""
+    """Return the fixed columns of a trial."""
     metres, rest = 5 * (1 + number % 10), number // 10
     return {
         "schema_version": str(SCHEMA_VERSION),
@@ -119,18 +119,18 @@ def _condition(number: int) -> dict[str, str]:
 
 
 def run(argv: Sequence[str], out: Path) -> Run:
-    """Run a program to its end, its output into a file.
+    """Run a program to its end with its output in a file.
 
     Raises:
         RuntimeError: It failed.
     """
-    begun = time.perf_counter()
+    started = time.perf_counter()
     with out.open("wb") as file:
         pid = os.posix_spawn(argv[0], list(argv), os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, file.fileno(), 1)])
         _, status, usage = os.wait4(pid, 0)
     if status:
         raise RuntimeError(f"{' '.join(argv)}: exit code {os.waitstatus_to_exitcode(status)}")
-    return Run(time.perf_counter() - begun, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e3)
+    return Run(time.perf_counter() - started, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e3)
 
 
 def by_fieldkit(folder: Path, out: Path) -> Run:
@@ -149,48 +149,54 @@ def check(ours: Path, theirs: Path) -> None:
     Raises:
         RuntimeError: They differ.
     """
-    own: Figures = {
-        (tuple(map(str, cell["key"].values())), name): tuple(one[part] for part in ("n", "mean", "median", "p95"))
+    our_figures: Figures = {
+        (tuple(map(str, cell["key"].values())), name): tuple(
+            estimate[part] for part in ("n", "mean", "median", "p95")
+        )
         for cell in json.loads(ours.read_bytes())["cells"]
-        for name, one in cell["estimates"].items()
+        for name, estimate in cell["estimates"].items()
     }
-    other: Figures = {(tuple(key), name): tuple(rest[:4]) for key, name, *rest in json.loads(theirs.read_bytes())}
-    close = own.keys() == other.keys() and all(
-        math.isclose(one, two, rel_tol=1e-6) for key in own for one, two in zip(own[key], other[key], strict=True)
+    peer_figures: Figures = {
+        (tuple(key), name): tuple(rest[:4]) for key, name, *rest in json.loads(theirs.read_bytes())
+    }
+    close = our_figures.keys() == peer_figures.keys() and all(
+        math.isclose(our_value, peer_value, rel_tol=1e-6)
+        for key in our_figures
+        for our_value, peer_value in zip(our_figures[key], peer_figures[key], strict=True)
     )
     if not close:
-        raise RuntimeError("fieldkit and pandas found different figures")
+        raise RuntimeError("fieldkit and pandas computed different figures")
 
 
 def rounds(base: Path, counts: Sequence[int], number: int, rows: int) -> dict[str, list[Run]]:
-    """Return the runs of each round, by program and number of tables; `rows` as `--rows`."""
-    found: dict[str, list[Run]] = {}
+    """Return the runs of all rounds, by program and number of tables; `rows` as in `--rows`."""
+    runs: dict[str, list[Run]] = {}
     for _ in range(number):
         for count in counts:
-            done = by_fieldkit(base / str(count), base / f"{count}.json")
-            found.setdefault(f"fieldkit, {count:,} tables", []).append(done)
+            result = by_fieldkit(base / str(count), base / f"{count}.json")
+            runs.setdefault(f"fieldkit, {count:,} tables", []).append(result)
         fewest = min(counts)
-        done = by_pandas(base / str(fewest), base / "pandas.json")
-        found.setdefault(f"pandas and scipy, {fewest:,} tables", []).append(done)
+        result = by_pandas(base / str(fewest), base / "pandas.json")
+        runs.setdefault(f"pandas and scipy, {fewest:,} tables", []).append(result)
         check(base / f"{fewest}.json", base / "pandas.json")
         if rows:
-            done = by_fieldkit(base / TABLE, base / "table.json")
-            found.setdefault(f"fieldkit, one table of {rows:,} rows", []).append(done)
-    return found
+            result = by_fieldkit(base / TABLE, base / "table.json")
+            runs.setdefault(f"fieldkit, one table of {rows:,} rows", []).append(result)
+    return runs
 
 
-def show(found: Mapping[str, Sequence[Run]]) -> None:
+def show(runs_by_name: Mapping[str, Sequence[Run]]) -> None:
     """Print a table."""
     print("| | s, median (lowest to highest) | of the processor (s) | repeats/s | peak memory (MB) |")
     print("| --- | --- | --- | --- | --- |")
-    for name, runs in found.items():
-        walls = [one.wall_s for one in runs]
+    for name, runs in runs_by_name.items():
+        walls = [each_run.wall_s for each_run in runs]
         wall = statistics.median(walls)
         number, unit = name.split()[-2:]
         repeats = int(number.replace(",", "")) * (1 if unit == "rows" else REPEATS)
-        processor = statistics.median(one.processor_s for one in runs)
+        processor = statistics.median(each_run.processor_s for each_run in runs)
         spread = f"{wall:.2f} ({min(walls):.2f} to {max(walls):.2f})"
-        peak_mb = max(one.peak_mb for one in runs)
+        peak_mb = max(each_run.peak_mb for each_run in runs)
         print(f"| {name} | {spread} | {processor:.2f} | {repeats / wall:,.0f} | {peak_mb:.0f} |")
 
 
@@ -209,12 +215,16 @@ def main() -> None:
         if arguments.rows:
             write_table(Path(name) / TABLE, arguments.rows)
         load = os.getloadavg()[0]
-        found = rounds(Path(name), arguments.tables, arguments.rounds, arguments.rows)
+        runs_by_name = rounds(Path(name), arguments.tables, arguments.rounds, arguments.rows)
     if arguments.json:
-        print(json.dumps({"load": load, "runs": {name: [vars(one) for one in runs] for name, runs in found.items()}}))
+        print(
+            json.dumps(
+                {"load": load, "runs": {name: [vars(each) for each in runs] for name, runs in runs_by_name.items()}}
+            )
+        )
         return
     print(f"load average before: {load:.2f} on {os.cpu_count()} cores\n")
-    show(found)
+    show(runs_by_name)
 
 
 if __name__ == "__main__":

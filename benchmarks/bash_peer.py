@@ -1,4 +1,4 @@
-"""The bash script that fieldkit is measured against, at work on the same emulated robots."""
+"""Run the bash script with which fieldkit is compared, on the same emulated robots."""
 
 import os
 import signal
@@ -26,7 +26,7 @@ DONE: Final = "done"
 
 _DIES_WITH_US: Final = ("setpriv", "--pdeathsig", "KILL", "--")
 _CONNECT_S: Final = 10.0
-# ProxyCommand: without its master a client must not reach for this machine's own SSH server.
+# ProxyCommand: without its master connection a client must not connect to the SSH server of this machine.
 _SSH_CONFIG: Final = """\
 Host *
   HostName 127.0.0.1
@@ -43,7 +43,7 @@ Host *
 
 
 class BashPeer:
-    """The running script; `connected` gives the connections that it needs.
+    """The running script. `connected` makes the connections that it needs.
 
     Args:
         config: OpenSSH configuration with the hosts `sender` and `receiver`.
@@ -71,10 +71,10 @@ class BashPeer:
         self.close()
 
     def repeat(self, protocol: str, number: int, limit_s: float) -> Iterator[str]:
-        """Run a repeat; yield the name of each phase as it begins.
+        """Run a repeat; yield the name of each phase at its start.
 
         Raises:
-            RuntimeError: It failed or took longer than `limit_s`; the message has what it said.
+            RuntimeError: It failed or took longer than `limit_s`; the message contains its standard error.
         """
         deadline = Deadline.after(limit_s)
         self._orders.write(f"{protocol} {number}\n".encode())
@@ -83,11 +83,11 @@ class BashPeer:
             while (phase := self._lines.next(deadline)) != DONE:
                 yield phase
         except (EOFError, TimeoutError) as error:
-            said = os.pread(self._errors.fileno(), 1 << 12, 0).decode(errors="replace")
-            raise RuntimeError(f"{error}: {said}") from error
+            errors_text = os.pread(self._errors.fileno(), 1 << 12, 0).decode(errors="replace")
+            raise RuntimeError(f"{error}: {errors_text}") from error
 
     def close(self) -> None:
-        """End the script and the clients that it started."""
+        """Kill the script and its SSH clients."""
         os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         self._errors.close()
@@ -98,10 +98,10 @@ class BashPeer:
 
 @contextmanager
 def connected(testbed: EmulatedTestbed, roles: Sequence[Role], slow: SlowLinks | None) -> Iterator[Path]:
-    """Hold an OpenSSH connection to each robot, which its clients share; yield their configuration.
+    """Open an OpenSSH master connection to each robot, which clients share; yield their configuration.
 
-    The connection is opened inside the robot's network namespace: nothing but SSH stands between script and robot,
-    unless it goes over slow links.
+    The connection is opened inside of the robot's network namespace, so that there is only SSH between script and
+    robot, unless slow links are used.
     """
     login = KeyPair.make()
     with ExitStack() as stack:
@@ -124,10 +124,10 @@ def connected(testbed: EmulatedTestbed, roles: Sequence[Role], slow: SlowLinks |
 def _master(robot: EmulatedRobot, config: Path, role: Role, slow: SlowLinks | None) -> Iterator[None]:
     ssh = ("ssh", "-F", str(config), "-o", "ProxyCommand=none", "-M", "-N")
     if slow is None:
-        way: tuple[str, ...] = ("nsenter", f"--net=/proc/{robot.pid}/ns/net", "--", *ssh)
+        command_words: tuple[str, ...] = ("nsenter", f"--net=/proc/{robot.pid}/ns/net", "--", *ssh)
     else:
-        way = (*ssh, "-p", str(slow.port(partial(robot.stream_to, "127.0.0.1", SSH_PORT))))
-    argv = [*_DIES_WITH_US, *way, role]
+        command_words = (*ssh, "-p", str(slow.port(partial(robot.stream_to, "127.0.0.1", SSH_PORT))))
+    argv = [*_DIES_WITH_US, *command_words, role]
     process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, start_new_session=True)
     try:
         _wait_for_socket(config.parent / role, process)

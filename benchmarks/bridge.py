@@ -1,10 +1,10 @@
-"""What a bridge adds to a message: `python -m benchmarks.bridge [--json] [--rounds N]`, needs no root, but rosmaster.
+"""Delay that a bridge adds to a message: `python -m benchmarks.bridge [--json] [--rounds N]`; needs rosmaster.
 
-Publishers and subscribers are programs of their own on loopback. Plain pairs use each middleware's binding as its
-documentation does; `attached` is that with the attachment and the time stamp which samples of rmw_zenoh must have;
-`agent` are fieldkit's adapters of the same library; a way by `fieldkit bridge` begins or ends at a plain
-end of ROS 1, whose pair is its yardstick. All take turns in the same run: messages at a rate for their delay,
-then as many as go for one second. A message has the time at which it was made in front, by the machine's clock.
+Publishers and subscribers are separate programs on loopback. Plain pairs use the binding of each middleware as its
+documentation shows; `attached` adds the attachment and the time stamp that rmw_zenoh requires; `agent` uses
+fieldkit's adapters of the same library. A path over `fieldkit bridge` starts or ends at a plain end of ROS 1, and the
+plain pair of ROS 1 is its reference. All paths run in turn: first messages at a fixed rate to measure the delay, then
+as many messages as possible for one second. Each message starts with the time of its creation on the machine's clock.
 """
 
 import argparse
@@ -44,25 +44,25 @@ SETTLES_S: Final = 1.0
 _CDR: Final = bytes((0, 1, 0, 0)) + bytes(8) + SIZE.to_bytes(4, "little")
 
 Write = Callable[[bytes], Any]
-"""Sends; what it returns only keeps alive what it names."""
+"""Sends data. The returned objects must stay referenced."""
 Deliver = Callable[[bytes], None]
 
 
 @dataclass(frozen=True)
 class Way:
-    """A publisher, a subscriber, and what may be between.
+    """A path of messages: a publisher, a subscriber, and perhaps a bridge between them.
 
     Attributes:
-        name: As it is printed.
-        publisher: Kind of the one end.
-        subscriber: Kind of the other.
-        beside: The way that is its yardstick.
+        name: Its printed name.
+        publisher: Kind of the publisher.
+        subscriber: Kind of the subscriber.
+        reference: Name of the path with which it is compared.
     """
 
     name: str
     publisher: str
     subscriber: str
-    beside: str = ""
+    reference: str = ""
 
 
 WAYS: Final = (
@@ -80,7 +80,7 @@ WAYS: Final = (
 
 
 def dds_plain(name: str, deliver: Deliver | None) -> Write:
-    """Begin an end of a topic by CycloneDDS' binding, with a type of its own."""
+    """Start an end of a topic with the binding of CycloneDDS, with its own data type."""
     from cyclonedds.domain import Domain, DomainParticipant  # noqa: PLC0415
     from cyclonedds.idl import make_idl_struct, types  # noqa: PLC0415
     from cyclonedds.pub import DataWriter  # noqa: PLC0415
@@ -101,17 +101,17 @@ def dds_plain(name: str, deliver: Deliver | None) -> Write:
         return lambda data: (domain, writer.write(kind(data=data)))
     reader = DataReader(participant, topic, qos=qos)
 
-    def take() -> None:
+    def read() -> None:
         while True:
             for sample in reader.take_iter(timeout=duration(seconds=1)):
                 deliver(bytes(sample.data[: HEAD.size]))
 
-    threading.Thread(target=take, daemon=True).start()
+    threading.Thread(target=read, daemon=True).start()
     return lambda _: domain
 
 
 def zenoh_plain(name: str, deliver: Deliver | None, where: str, *, attached: bool) -> Write:
-    """Begin an end of a topic by Zenoh's binding, with the attachment and the time stamp of rmw_zenoh or not."""
+    """Start an end of a topic with the binding of Zenoh; `attached` adds attachment and time stamp of rmw_zenoh."""
     import zenoh  # noqa: PLC0415
 
     from fieldkit.agent.zenoh import ATTACHMENT, GID_BYTES  # noqa: PLC0415
@@ -136,8 +136,8 @@ def zenoh_plain(name: str, deliver: Deliver | None, where: str, *, attached: boo
 
 
 def ros1_plain(name: str, deliver: Deliver | None) -> Write:
-    """Begin an end of a topic by rospy."""
-    sys.path.append("/usr/lib/python3/dist-packages")  # Debian's
+    """Start an end of a topic with rospy."""
+    sys.path.append("/usr/lib/python3/dist-packages")  # of Debian
     import rospy  # noqa: PLC0415
     from std_msgs.msg import UInt8MultiArray  # noqa: PLC0415
 
@@ -157,10 +157,10 @@ def endpoint(where: str) -> tuple[str, str]:
     return f"{verb}/endpoints", json.dumps([f"tcp/{HOST}:{port}"])
 
 
-def agent(over: str, name: str, deliver: Deliver | None, where: str) -> Write:
-    """Begin an end of a topic by fieldkit's adapter."""
-    settings = dict([endpoint(where)]) if over == "zenoh" else {}
-    running = middleware.adapter(over)(
+def agent(middleware_name: str, name: str, deliver: Deliver | None, where: str) -> Write:
+    """Start an end of a topic with fieldkit's adapter."""
+    settings = dict([endpoint(where)]) if middleware_name == "zenoh" else {}
+    running = middleware.adapter(middleware_name)(
         Network(HOST, discovery="peers", peers=(HOST,), domain=DOMAIN, settings=settings)
     )
     topic = Topic.from_json(topics.describe(shipped(), name, TYPE, PROFILES["default"], domain=DOMAIN, node="end"))
@@ -171,77 +171,77 @@ def agent(over: str, name: str, deliver: Deliver | None, where: str) -> Write:
     return lambda _: running
 
 
-def end(kind: str, name: str, where: str, *, hears: bool) -> int:
-    """Be an end: a line `COUNT RATE` has it send, any line has it print what came."""
-    came: list[tuple[int, int]] = []
+def end(kind: str, name: str, where: str, *, is_subscriber: bool) -> int:
+    """Run an end: a line `SECONDS RATE` makes a publisher send, any line makes a subscriber print its messages."""
+    arrivals: list[tuple[int, int]] = []
 
     def deliver(data: bytes) -> None:
         at_ns = time.time_ns()
-        came.append((at_ns, at_ns - HEAD.unpack_from(data)[2]))
+        arrivals.append((at_ns, at_ns - HEAD.unpack_from(data)[2]))
 
-    over, how = kind.split()
-    told = deliver if hears else None
-    if how == "agent":
-        write = agent(over, name, told, where)
-    elif over == "zenoh":
-        write = zenoh_plain(name, told, where, attached=how == "attached")
+    middleware_name, binding = kind.split()
+    callback = deliver if is_subscriber else None
+    if binding == "agent":
+        write = agent(middleware_name, name, callback, where)
+    elif middleware_name == "zenoh":
+        write = zenoh_plain(name, callback, where, attached=binding == "attached")
     else:
-        write = {"dds": dds_plain, "ros1": ros1_plain}[over](name, told)
+        write = {"dds": dds_plain, "ros1": ros1_plain}[middleware_name](name, callback)
     print("up", flush=True)
     for line in sys.stdin:
-        if hears:
-            print(json.dumps(came), flush=True)
-            came.clear()
+        if is_subscriber:
+            print(json.dumps(arrivals), flush=True)
+            arrivals.clear()
         else:
             print(_send(write, *map(float, line.split())), flush=True)
-    os._exit(0)  # threads of the middleware may wait
+    os._exit(0)  # threads of the middleware may block a normal exit
 
 
 def _send(write: Write, lasts_s: float, rate_hz: float) -> int:
-    """Send for so long, at a rate or, where that is 0, one after the other; return how many."""
-    filling = random.Random(1).randbytes(SIZE - HEAD.size)
-    begun_s, number = time.monotonic(), 0
-    while (now_s := time.monotonic() - begun_s) < lasts_s:
+    """Send for `lasts_s`, at a rate or, if it is 0, as fast as possible; return the number of messages."""
+    padding = random.Random(1).randbytes(SIZE - HEAD.size)
+    started_s, number = time.monotonic(), 0
+    while (now_s := time.monotonic() - started_s) < lasts_s:
         if rate_hz and (early_s := number / rate_hz - now_s) > 0:
             time.sleep(early_s)
-        write(HEAD.pack(MAGIC, number, time.time_ns()) + filling)
+        write(HEAD.pack(MAGIC, number, time.time_ns()) + padding)
         number += 1
     return number
 
 
 class Running:
-    """A way whose ends are up."""
+    """A path whose ends are running."""
 
     def __init__(self, stack: ExitStack, way: Way, environment: dict[str, str]) -> None:
         self.way, port = way, free_port()
         name = "/" + way.name.replace(" ", "_")
         source, target = way.publisher.split()[0], way.subscriber.split()[0]
 
-        def begun(verb: str, place: str = "listen") -> "subprocess.Popen[str]":
+        def start(verb: str, mode: str = "listen") -> "subprocess.Popen[str]":
             kind = way.subscriber if verb == "hear" else way.publisher
-            return stack.enter_context(_program(("--end", kind, name, f"{place}:{port}", verb), environment))
+            return stack.enter_context(_program(("--end", kind, name, f"{mode}:{port}", verb), environment))
 
         if source == target:
-            self.hears, self.says = begun("hear"), begun("say", "connect")
+            self.subscriber, self.publisher = start("hear"), start("say", "connect")
             return
-        # First the end that is not of ROS 1: to that the bridge connects.
+        # The end that does not use ROS 1 starts first, because the bridge connects to it.
         verbs = ("hear", "say") if source == "ros1" else ("say", "hear")
-        over = target if source == "ros1" else source
-        to = ("--router", f"{HOST}:{port}") if over == "zenoh" else ("--peer", HOST)
+        other = target if source == "ros1" else source
+        to = ("--router", f"{HOST}:{port}") if other == "zenoh" else ("--peer", HOST)
         line = ("bridge", "--from", source, "--to", target, f"{name}:{TYPE}", "--domain", str(DOMAIN), *to)
-        ends = {verbs[0]: begun(verbs[0])}
+        ends = {verbs[0]: start(verbs[0])}
         stack.enter_context(_bridge((*line, "--node", f"bridge_{source}_{target}"), environment))
-        ends[verbs[1]] = begun(verbs[1])
-        self.hears, self.says = ends["hear"], ends["say"]
+        ends[verbs[1]] = start(verbs[1])
+        self.subscriber, self.publisher = ends["hear"], ends["say"]
 
     def run(self, lasts_s: float, rate_hz: float) -> tuple[int, list[tuple[int, int]]]:
-        """Send; return how many, and when each arrived and how late, in ns."""
-        sent = int(_ask(self.says, f"{lasts_s} {rate_hz}"))
+        """Send; return the number of messages, and the arrival time and delay of each received one in ns."""
+        sent = int(_query(self.publisher, f"{lasts_s} {rate_hz}"))
         time.sleep(SETTLES_S)
-        return sent, json.loads(_ask(self.hears, "report"))
+        return sent, json.loads(_query(self.subscriber, "report"))
 
 
-def _ask(process: "subprocess.Popen[str]", line: str) -> str:
+def _query(process: "subprocess.Popen[str]", line: str) -> str:
     assert process.stdin is not None
     assert process.stdout is not None
     process.stdin.write(f"{line}\n")
@@ -257,7 +257,7 @@ def _program(words: Sequence[str], environment: dict[str, str]) -> Iterator["sub
     with subprocess.Popen(argv, stdin=pipe, stdout=pipe, text=True, env=environment) as process:
         assert process.stdout is not None
         if process.stdout.readline() != "up\n":
-            raise RuntimeError(f"{words} does not start")
+            raise RuntimeError(f"{words} did not start")
         try:
             yield process
         finally:
@@ -270,8 +270,8 @@ def _bridge(words: Sequence[str], environment: dict[str, str]) -> Iterator[None]
     argv = (sys.executable, "-m", "fieldkit", *words)
     with subprocess.Popen(argv, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment) as process:
         assert process.stderr is not None
-        if not (said := process.stderr.readline()).startswith(b"note: the bridge is up"):
-            raise RuntimeError(f"{said!r}")
+        if not (first_line := process.stderr.readline()).startswith(b"note: the bridge is up"):
+            raise RuntimeError(f"{first_line!r}")
         try:
             yield
         finally:
@@ -280,15 +280,15 @@ def _bridge(words: Sequence[str], environment: dict[str, str]) -> Iterator[None]
 
 
 def free_port() -> int:
-    """Return a port of loopback that nobody had."""
-    with socket.socket() as one:
-        one.bind((HOST, 0))
-        return int(one.getsockname()[1])
+    """Return an unused port of loopback."""
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Run all ways in turn, round by round; return what each measured in each."""
-    found: list[dict[str, Any]] = []
+    """Run all paths in turn, round by round; return the measurements of each."""
+    measurements: list[dict[str, Any]] = []
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         port = free_port()
@@ -298,57 +298,57 @@ def measure(rounds: int) -> list[dict[str, Any]]:
             subprocess.Popen(("rosmaster", "--core", "-p", str(port)), stdout=log, stderr=log, env=environment)
         )
         stack.callback(master.terminate)
-        ways = [Running(stack, way, environment) for way in WAYS]
-        for one in ways:
-            one.run(SETTLES_S, RATE_HZ)  # until the ends know each other
+        paths = [Running(stack, way, environment) for way in WAYS]
+        for path in paths:
+            path.run(SETTLES_S, RATE_HZ)  # until the ends have discovered each other
         for number in range(rounds):
-            for one in ways if number % 2 else reversed(ways):
-                sent, came = one.run(COUNT / RATE_HZ, RATE_HZ)
-                burst, arrived = one.run(BURST_S, 0)
+            for path in paths if number % 2 else reversed(paths):
+                sent, received = path.run(COUNT / RATE_HZ, RATE_HZ)
+                burst, arrived = path.run(BURST_S, 0)
                 lasted_s = (arrived[-1][0] - arrived[0][0]) / 1e9
-                found.append(
+                measurements.append(
                     {
                         "round": number,
-                        "way": one.way.name,
+                        "way": path.way.name,
                         "sent": sent,
-                        "came": len(came),
-                        "delay_ms": median(delay_ns for _, delay_ns in came) / 1e6,
+                        "came": len(received),
+                        "delay_ms": median(delay_ns for _, delay_ns in received) / 1e6,
                         "burst_sent": burst,
                         "burst_came": len(arrived),
                         "per_s": (len(arrived) - 1) / lasted_s,
                     }
                 )
-    return found
+    return measurements
 
 
 def main() -> int:
-    """Print a line per way."""
+    """Print a line per path."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="single values")
-    parser.add_argument("--rounds", type=int, default=5, help="how often each way is measured")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON")
+    parser.add_argument("--rounds", type=int, default=5, help="measurements of each path")
     parser.add_argument("--end", nargs=4, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.end:
         kind, name, where, verb = options.end
-        return end(kind, name, where, hears=verb == "hear")
-    found = measure(options.rounds)
+        return end(kind, name, where, is_subscriber=verb == "hear")
+    measurements = measure(options.rounds)
     if options.json:
-        print(json.dumps(found))
+        print(json.dumps(measurements))
         return 0
-    print(f"{'way':22} {'delay, ms':>24} {'of it more than the yardstick':>32} {'messages/s':>26} {'of a burst':>10}")
-    yardsticks = {(one["way"], one["round"]): one["delay_ms"] for one in found}
+    print(f"{'path':22} {'delay, ms':>24} {'more than the reference':>32} {'messages/s':>26} {'of a burst':>10}")
+    references = {(row["way"], row["round"]): row["delay_ms"] for row in measurements}
     for way in WAYS:
-        rows = [one for one in found if one["way"] == way.name]
-        delays = [one["delay_ms"] for one in rows]
-        more = [one["delay_ms"] - yardsticks[way.beside, one["round"]] for one in rows] if way.beside else []
-        came = sum(one["burst_came"] for one in rows) / sum(one["burst_sent"] for one in rows)
-        rates = [one["per_s"] for one in rows]
-        print(f"{way.name:22} {spread(delays):>24} {spread(more):>32} {spread(rates):>26} {came:>10.0%}")
+        rows = [row for row in measurements if row["way"] == way.name]
+        delays = [row["delay_ms"] for row in rows]
+        more = [row["delay_ms"] - references[way.reference, row["round"]] for row in rows] if way.reference else []
+        received = sum(row["burst_came"] for row in rows) / sum(row["burst_sent"] for row in rows)
+        rates = [row["per_s"] for row in rows]
+        print(f"{way.name:22} {spread(delays):>24} {spread(more):>32} {spread(rates):>26} {received:>10.0%}")
     return 0
 
 
 def spread(values: Sequence[float]) -> str:
-    """Return the median and, behind it, the smallest and the largest."""
+    """Return the median, followed by the smallest and the largest value."""
     return f"{_figure(median(values))} ({_figure(min(values))} to {_figure(max(values))})" if values else ""
 
 

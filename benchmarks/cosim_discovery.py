@@ -1,8 +1,8 @@
-"""What it costs participants of topics to find each other: `python -m benchmarks.cosim_discovery`.
+"""Cost of the discovery of topic participants: `python -m benchmarks.cosim_discovery`.
 
-Twenty stand on a circle of 10 m radius, each publishing to the next, and start within some time. Told are, over some
-seeds, the IP packets that they send in the first second (mean), and when all writers and readers have found each
-other (median and range). Nothing depends on the machine or on how busy it is.
+Twenty participants are on a circle of 10 m radius, publish to the next one, and start within some time. The benchmark
+prints, over several seeds, the IP packets that they send in the first second (mean), and the time until all writers
+and readers have discovered each other (median and range). The results do not depend on the machine or its load.
 """
 
 import math
@@ -32,17 +32,17 @@ STANDARD: Final = "802.11n"
 SEEDS: Final = range(1, 7)
 
 ROWS: Final = ((0.0, None), (0.1, None), (5.0, None), (0.0, "g6"), (0.1, "g6"), (1.0, "g6"))
-"""Within how many seconds they start; the mode of every frame, None for rates as Linux chooses them."""
+"""Time in seconds within which they start, and the mode of every frame; None for rates chosen as in Linux."""
 
 
-def found(within_s: float, mode: str | None, seed: int) -> tuple[int, float]:
-    """Return the packets of the first second, and after how many seconds all had found each other, or infinity."""
+def discover(within_s: float, mode: str | None, seed: int) -> tuple[int, float]:
+    """Return the packets of the first second, and the time until discovery was complete, in s, or infinity."""
     names = [f"r{number}" for number in range(COUNT)]
     places_m = {name: _place_m(number) for number, name in enumerate(names)}
     starts_ns = {
         name: int(RandomStream(seed, name, "participant's start").draw(0) * within_s * SECOND_NS) for name in names
     }
-    flows = {f"{one} to {other}": TopicFlow(one, other) for one, other in pairwise([*names, names[0]])}
+    flows = {f"{source} to {target}": TopicFlow(source, target) for source, target in pairwise([*names, names[0]])}
     topics: list[Topics] = []
     sent_ns: list[int] = []
 
@@ -69,18 +69,19 @@ def found(within_s: float, mode: str | None, seed: int) -> tuple[int, float]:
 
 
 def _place_m(number: int) -> Vector:
-    turn = math.tau * number / COUNT
-    return RADIUS_M * math.cos(turn), RADIUS_M * math.sin(turn), 1.0
+    angle = math.tau * number / COUNT
+    return RADIUS_M * math.cos(angle), RADIUS_M * math.sin(angle), 1.0
 
 
 def main() -> None:
-    """Print a row per way to start."""
-    print(f"{COUNT} participants, {COUNT * (COUNT - 1)} talks")
+    """Print a row per start interval and mode."""
+    print(f"{COUNT} participants, {COUNT * (COUNT - 1)} pairs of participants")
     for within_s, mode in ROWS:
-        packets, after_s = zip(*(found(within_s, mode, seed) for seed in SEEDS), strict=True)
+        packets, after_s = zip(*(discover(within_s, mode, seed) for seed in SEEDS), strict=True)
         print(
             f"start within {within_s:g} s, {mode or STANDARD}: {statistics.mean(packets):,.0f} packets in the first "
-            f"second; all found after {statistics.median(after_s):.1f} s, {min(after_s):.1f} to {max(after_s):.1f}"
+            f"second; discovery complete after {statistics.median(after_s):.1f} s, {min(after_s):.1f} to "
+            f"{max(after_s):.1f}"
         )
 
 

@@ -1,14 +1,14 @@
-"""How fast the co-simulation is in one process: `python -m benchmarks.cosim_speed [--json]`.
+"""Speed of the co-simulation in one process: `python -m benchmarks.cosim_speed [--json]`.
 
-Robots that all drive, 5 m from each other, send 10 packets of 100 bytes per second each to the next by UDP over Wi-Fi
-that fades, under `sliding_window` with windows of 1.1 ms. Per number of robots, the medians of some rounds: the
-real-time factor; exchanges between physics and network per second; what an exchange costs beside what physics,
-programs and network take; and what the coordinator adds to a plain loop that steps the same programs, physics and
-network through the same windows, without policies, account or hash. If the two deliver different packets, or one at
-another time, there is an error. Then shipped scenarios, as they are.
+Driving robots, 5 m apart, send 10 packets of 100 bytes per second to the next robot by UDP over fading Wi-Fi, under
+`sliding_window` with windows of 1.1 ms. The figures per number of robots are medians of several rounds: the real-time
+factor; exchanges between physics and network per second; the cost of an exchange without the time of physics,
+programs and network; and the cost of the coordinator relative to a plain loop that steps the same programs, physics
+and network through the same windows, without policies, ledger or hash. If the two deliver different packets, or at
+different times, the benchmark raises an error. Shipped scenarios follow.
 
-It runs in one thread and waits for nothing, so all times are processor times: what it takes on a machine that does
-nothing else. A machine that does other things still slows it down, by what they leave of caches and clock.
+The benchmark runs in one thread without waiting, so all times are processor times. Other load still slows it down
+through shared caches and a lower clock.
 """
 
 import argparse
@@ -46,14 +46,14 @@ ANTENNA: Final = Antenna("802.11n", 15.0, -92.0)
 
 Figures = dict[str, float]
 Arrivals = list[tuple[str, int, int]]
-"""Flow, number and when, in ns."""
+"""Flow, packet number and arrival time in ns."""
 
 
 class Fleet:
-    """Robots in a square that all drive eastwards, each at a speed of its own, and send to the next.
+    """Robots in a square that drive eastwards at different speeds and send to the next robot.
 
     Args:
-        count: How many there are.
+        count: Number of robots.
     """
 
     def __init__(self, count: int) -> None:
@@ -62,7 +62,7 @@ class Fleet:
         self.first_ns = {name: number * PERIOD_NS // count for number, name in enumerate(self.names)}
 
     def physics(self) -> Paths:
-        """Return what moves them."""
+        """Return the physics of the robots."""
         side = round(len(self.names) ** 0.5)
         motions = []
         for number, name in enumerate(self.names):
@@ -72,27 +72,27 @@ class Fleet:
         return Paths(motions)
 
     def programs(self) -> dict[str, Periodic]:
-        """Return what runs on each."""
+        """Return the program of each robot."""
         return {
             name: Periodic(name, other, period_ns=PERIOD_NS, size_bytes=SIZE_BYTES, first_ns=self.first_ns[name])
             for name, other in self.next_of.items()
         }
 
     def network(self) -> RadioNetwork:
-        """Return what carries their packets."""
+        """Return the network between the robots."""
         return RadioNetwork(WifiInWorld(1, RadioOptions(), dict.fromkeys(self.names, ANTENNA), None), self.names)
 
 
 def coordinated(fleet: Fleet, seconds: float) -> tuple[Arrivals, Figures]:
-    """Return what arrived under the coordinator, and what it took."""
+    """Return the arrivals under the coordinator, and its figures."""
     agents = Agents(fleet.physics(), fleet.programs())
     pairs = list(fleet.next_of.items())
     coordinator = Coordinator(agents, fleet.network(), SlidingWindow(WINDOW_NS / 1e9), pairs)
     gc.collect()
-    begun_s = time.process_time()
+    started_s = time.process_time()
     run = coordinator.advance(round(seconds * 1e9))
-    spent_s = time.process_time() - begun_s
-    arrivals = [(*one, fate.arrived_ns) for one, fate in run.fates.items() if fate.arrived_ns is not None]
+    spent_s = time.process_time() - started_s
+    arrivals = [(*identity, fate.arrived_ns) for identity, fate in run.fates.items() if fate.arrived_ns is not None]
     return arrivals, figures(run, spent_s)
 
 
@@ -110,10 +110,10 @@ def figures(run: Run, spent_s: float) -> Figures:
 
 
 class PlainLoop:
-    """What whoever has programs, physics and network writes to let them go on together, and no more.
+    """A minimal loop that advances programs, physics and network together.
 
-    It asks programs when they wake, lets them have what arrived and send what they say, and keeps payload meanwhile.
-    What arrives changes nothing in when these programs wake, and the loop makes use of that.
+    It reads the wake times of the programs, passes them their packets, sends theirs, and stores payloads in transit.
+    In this benchmark arrivals do not change the wake times of programs, so the loop does not read them again.
 
     Args:
         fleet: The robots.
@@ -123,14 +123,14 @@ class PlainLoop:
         self.arrived: Arrivals = []
         self._physics, self._network, self._programs = fleet.physics(), fleet.network(), fleet.programs()
         self._wakes: list[tuple[int, str]] = []
-        self._under_way: dict[int, tuple[Packet, object]] = {}
+        self._in_transit: dict[int, tuple[Packet, object]] = {}
         self._packets = 0
         for name in self._programs:
             self._plan(name)
 
     def run(self, to_ns: int) -> None:
-        """Go on until `to_ns`, window by window."""
-        physics, network, wakes, under_way = self._physics, self._network, self._wakes, self._under_way
+        """Advance to `to_ns`, window by window."""
+        physics, network, wakes, in_transit = self._physics, self._network, self._wakes, self._in_transit
         mail: dict[str, list[Received]] = {}
         now_ns = 0
         while now_ns < to_ns:
@@ -147,12 +147,12 @@ class PlainLoop:
                 self._plan(name)
             arrivals, drops = network.advance(now_ns, packets, physics.advance(now_ns, {}))
             for arrival in arrivals:
-                packet, payload = under_way.pop(arrival.packet_id)
-                its = Received(packet.source, payload, packet.sent_ns, arrival.at_ns)
-                mail.setdefault(arrival.receiver, []).append(its)
+                packet, payload = in_transit.pop(arrival.packet_id)
+                received_packet = Received(packet.source, payload, packet.sent_ns, arrival.at_ns)
+                mail.setdefault(arrival.receiver, []).append(received_packet)
                 self.arrived.append((*packet.identity, arrival.at_ns))
             for drop in drops:
-                del under_way[drop.packet_id]
+                del in_transit[drop.packet_id]
 
     def _plan(self, name: str) -> None:
         wake_ns = self._programs[name].next_wake_ns()
@@ -160,55 +160,55 @@ class PlainLoop:
             heapq.heappush(self._wakes, (wake_ns, name))
 
     def _wake(self, name: str, at_ns: int, states: Mapping[str, State], received: Sequence[Received]) -> list[Packet]:
-        """Let a program act; return what it sends."""
+        """Wake a program; return the packets that it sends."""
         packets = []
-        for one in self._programs[name].wake(at_ns, states[name], received).datagrams:
+        for datagram in self._programs[name].wake(at_ns, states[name], received).datagrams:
             self._packets += 1
-            identity = one.flow, one.number
-            packet = Packet(self._packets, name, one.destination, one.size_bytes, identity, at_ns, at_ns)
-            self._under_way[self._packets] = packet, one.payload
+            identity = datagram.flow, datagram.number
+            packet = Packet(self._packets, name, datagram.destination, datagram.size_bytes, identity, at_ns, at_ns)
+            self._in_transit[self._packets] = packet, datagram.payload
             packets.append(packet)
         return packets
 
 
 def plain(fleet: Fleet, seconds: float) -> tuple[Arrivals, float]:
-    """Return what arrives in the plain loop, and the processor time that it takes."""
+    """Return the arrivals in the plain loop, and its processor time."""
     loop = PlainLoop(fleet)
     gc.collect()
-    begun_s = time.process_time()
+    started_s = time.process_time()
     loop.run(round(seconds * 1e9))
-    return loop.arrived, time.process_time() - begun_s
+    return loop.arrived, time.process_time() - started_s
 
 
 def one_fleet(count: int, seconds: float) -> Figures:
-    """Return the figures of one number of robots.
+    """Return the figures for a number of robots.
 
     Raises:
-        RuntimeError: Coordinator and plain loop do not deliver the same.
+        RuntimeError: Coordinator and plain loop deliver different packets.
     """
     fleet = Fleet(count)
-    # Before and after, so that a machine that becomes slower or quicker favours neither.
+    # The plain loop runs before and after, so that a drift of the machine's speed favours neither.
     expected, before_s = plain(fleet, seconds)
-    arrivals, found = coordinated(fleet, seconds)
+    arrivals, measured = coordinated(fleet, seconds)
     _, after_s = plain(fleet, seconds)
     if sorted(arrivals) != sorted(expected):
         raise RuntimeError(f"coordinator and plain loop deliver different packets among {count} robots")
-    adds = 2 * found["spent_s"] / (before_s + after_s) - 1
-    return found | {"coordinator_adds_percent": 100 * adds}
+    share_added = 2 * measured["spent_s"] / (before_s + after_s) - 1
+    return measured | {"coordinator_adds_percent": 100 * share_added}
 
 
 def one_scenario(name: str) -> Figures:
     """Return the figures of a shipped scenario."""
     simulation = build(load_scenario(name))
-    begun_s = time.process_time()
+    started_s = time.process_time()
     run = simulation.run()
-    return figures(run, time.process_time() - begun_s)
+    return figures(run, time.process_time() - started_s)
 
 
 def medians(rounds: int, measure: Callable[[], Figures]) -> Figures:
     """Return the median of each figure."""
-    found = [measure() for _ in range(rounds)]
-    return {name: statistics.median(one[name] for one in found) for name in found[0]}
+    results = [measure() for _ in range(rounds)]
+    return {name: statistics.median(result[name] for result in results) for name in results[0]}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -221,19 +221,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
     load_before = os.getloadavg()[0]
-    found = {
+    results = {
         f"{count} robots": medians(options.rounds, partial(one_fleet, count, options.seconds))
         for count in options.robots
     }
-    found |= {name: medians(options.rounds, partial(one_scenario, name)) for name in options.scenarios}
+    results |= {name: medians(options.rounds, partial(one_scenario, name)) for name in options.scenarios}
     if options.json:
-        print(json.dumps({"load_before": load_before, "figures": found}, indent=2))
+        print(json.dumps({"load_before": load_before, "figures": results}, indent=2))
         return
     print(f"{options.rounds} rounds, medians; load before: {load_before:.2f}, after: {os.getloadavg()[0]:.2f}")
-    columns = list(dict.fromkeys(column for one in found.values() for column in one))
+    columns = list(dict.fromkeys(column for row in results.values() for column in row))
     print(f"{'':12}" + "".join(f"{column:>26}" for column in columns))
-    for name, values in found.items():
-        print(f"{name:12}" + "".join(f"{values[one]:>26.4g}" if one in values else "" for one in columns))
+    for name, values in results.items():
+        print(f"{name:12}" + "".join(f"{values[column]:>26.4g}" if column in values else "" for column in columns))
 
 
 if __name__ == "__main__":

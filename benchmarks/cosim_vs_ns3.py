@@ -1,13 +1,13 @@
-"""Transports of the co-simulation beside ns-3: `python -m benchmarks.cosim_vs_ns3 [--figure FILE] [--json]`.
+"""Transports of the co-simulation compared with ns-3: `python -m benchmarks.cosim_vs_ns3 [--figure FILE] [--json]`.
 
 Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. One station sends to another, in sight or behind
-a wall, over 802.11g with the same power, noise, path loss, queue and slots in both. UDP sends 2 Mbit/s, and what is
-lost counts; TCP sends as fast as it may. What the wall takes is worked out here, and ns-3 is given the sum.
+a wall, over 802.11g with the same power, noise, path loss, queue and slots in both. UDP sends 2 Mbit/s, and its loss
+is measured; TCP sends as fast as it can. The loss of the wall is computed here, and ns-3 gets the total path loss.
 
-There are three ns-3: as it is, in 802.11g; as it is, in 802.11a, which has no signal extension for it to get wrong;
-and that with its TCP mended where `ns3_link.cc` says that it departs from the standards at a link's edge. Each link
-is run with so many seeds that the interval of the ratio is narrow enough to call a miss a miss. `--links g54` runs
-those that have this in their names.
+There are three variants of ns-3: unchanged in 802.11g; unchanged in 802.11a, which has no signal extension that ns-3
+models wrongly; and the latter with a corrected TCP, where ns-3 deviates from the standards at the edge of a link
+(`ns3_link.cc` lists the corrections). Each link is run with enough seeds for a narrow interval of the ratio. `--links
+g54` runs only the links with this text in their names.
 """
 
 import argparse
@@ -44,8 +44,7 @@ SECONDS: Final = 10.0
 TRACE_S: Final = 20.0
 QUEUE_PACKETS: Final = 100
 BATCH, MOST_RUNS, NARROW = 2, 48, 0.08
-"""Runs are made by so many, until the interval of a ratio of goodputs goes no further than this part of it each way,
-or so many were made."""
+"""Runs per batch, most runs, and the relative half-width of the interval of the ratio at which runs end."""
 RATE_MBIT_S: Final = 2.0
 PAYLOAD_BYTES: Final = 1000
 MESSAGE_BYTES: Final = 14480
@@ -54,9 +53,9 @@ HEIGHT_M: Final = 1.0
 Control = Literal["newreno", "cubic-rfc9438"]
 CONTROLS: Final[dict[Control, str]] = {"newreno": "TcpLinuxReno", "cubic-rfc9438": "TcpCubic"}
 """Congestion controls of `Control`, and their names in ns-3."""
-Peer = Literal["802.11g", "802.11a", "mended", "ours"]
-PEERS: Final[tuple[Peer, ...]] = ("802.11g", "802.11a", "mended", "ours")
-"""Three of ns-3, and ours."""
+Peer = Literal["802.11g", "802.11a", "corrected", "ours"]
+PEERS: Final[tuple[Peer, ...]] = ("802.11g", "802.11a", "corrected", "ours")
+"""Three variants of ns-3, and the co-simulation."""
 DISTANCES_M: Final = {
     ("g54", False): (10, 44, 46, 47, 48),
     ("g54", True): (15, 19, 20, 21),
@@ -82,7 +81,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Row:
-    """What was measured on one link, each of shape (runs, peers): goodputs in Mbit/s, and shares that were lost."""
+    """Results of one link, each of shape (runs, peers): goodputs in Mbit/s, and shares of lost datagrams."""
 
     cell: Cell
     newreno: np.ndarray
@@ -107,22 +106,22 @@ def world(*, wall: bool) -> World:
 
 
 def places_m(distance_m: float) -> dict[str, tuple[float, float, float]]:
-    """Return where the two stations are."""
+    """Return the positions of the two stations."""
     return {"a": (0.0, 0.0, HEIGHT_M), "b": (distance_m, 0.0, HEIGHT_M)}
 
 
 def loss_db(distance_m: float, *, wall: bool) -> float:
-    """Return the path loss that ns-3 is given."""
-    one, other = (np.array([place]) for place in places_m(distance_m).values())
-    return path_loss_db(distance_m) + float(world(wall=wall).penetration_loss_db(one, other, CHANNEL_6_HZ)[0])
+    """Return the path loss for ns-3, including the wall."""
+    near, far = (np.array([place]) for place in places_m(distance_m).values())
+    return path_loss_db(distance_m) + float(world(wall=wall).penetration_loss_db(near, far, CHANNEL_6_HZ)[0])
 
 
 class Link:
-    """A link of ours.
+    """A link of the co-simulation.
 
     Args:
-        cell: Where it is.
-        run: Which of several runs: the seed.
+        cell: Its place and mode.
+        run: Number of the run, used as the seed.
     """
 
     def __init__(self, cell: Cell, run: int) -> None:
@@ -141,13 +140,13 @@ class Link:
         return len(arrivals) * PAYLOAD_BYTES * 8 / SECONDS / 1e6, 1 - len(arrivals) / len(packets)
 
     def tcp(self, control: Control, seconds: float = SECONDS) -> tuple[float, Trace]:
-        """Return goodput in Mbit/s of a stream that never ends, and its congestion window."""
+        """Return the goodput in Mbit/s of an endless stream, and its congestion window over time."""
         trace: Trace = []
 
-        def note(sample: TcpSample) -> None:
+        def record(sample: TcpSample) -> None:
             trace.append((sample.at_ns / 1e9, sample.window_bytes / SEGMENT_BYTES))
 
-        make = partial(Tcp, options=TcpOptions(congestion=control), log=note)
+        make = partial(Tcp, options=TcpOptions(congestion=control), log=record)
         network = RadioNetwork(self._radio, "ab", transports={"tcp": make})
         count = round(seconds * 54e6 / 8 / MESSAGE_BYTES)
         packets = [self._packet(number, MESSAGE_BYTES, "tcp", 0) for number in range(count)]
@@ -160,23 +159,30 @@ class Link:
 
 
 class Ns3Link:
-    """A link of ns-3; as `Link`, after the call that runs ns-3, and with which of them it is."""
+    """A link of ns-3, with the interface of `Link`.
+
+    Args:
+        ns3: The ns-3 program.
+        cell: Its place and mode.
+        run: Number of the run, used as the seed.
+        peer: The variant of ns-3.
+    """
 
     def __init__(self, ns3: Ns3, cell: Cell, run: int, peer: Peer) -> None:
         # 802.11a has the modes, slots and times of 802.11g, but no signal extension and no modes of 802.11b.
         standard = "ErpOfdm" if peer == "802.11g" else "Ofdm"
         chosen = {"mode": f"{standard}Rate{cell.mode[1:] if cell.mode else 6}Mbps", "adapt": int(cell.mode is None)}
-        self._control = "Counting{}" if peer == "mended" else "ns3::{}"
+        self._control = "Counting{}" if peer == "corrected" else "ns3::{}"
         loss = loss_db(cell.distance_m, wall=cell.wall)
         self._run = partial(ns3, loss=loss, queue=QUEUE_PACKETS, RngRun=run, **chosen)
 
     def udp(self) -> tuple[float, float]:
-        """See `Link.udp`."""
+        """Return goodput in Mbit/s and loss, as `Link.udp`."""
         goodput, lost = self._run(what="udp", rate=RATE_MBIT_S, payload=PAYLOAD_BYTES, seconds=SECONDS).split()
         return float(goodput), float(lost)
 
     def tcp(self, control: Control, seconds: float = SECONDS) -> tuple[float, Trace]:
-        """See `Link.tcp`."""
+        """Return goodput and congestion window, as `Link.tcp`."""
         name = self._control.format(CONTROLS[control])
         lines = self._run(what="tcp", control=name, seconds=seconds).splitlines()
         trace = [(int(at) / 1e9, int(window) / SEGMENT_BYTES) for at, _, window in map(str.split, lines[:-1])]
@@ -184,7 +190,7 @@ class Ns3Link:
 
 
 def once(ns3: Ns3, cell: Cell, run: int) -> list[list[float]]:
-    """Return per peer goodput of NewReno and of CUBIC, and loss of UDP, each on a link that nobody used before."""
+    """Return per peer the goodputs of NewReno and CUBIC and the loss of UDP, each on a new link."""
 
     def link(peer: Peer) -> Link | Ns3Link:
         return Link(cell, run) if peer == "ours" else Ns3Link(ns3, cell, run, peer)
@@ -193,7 +199,7 @@ def once(ns3: Ns3, cell: Cell, run: int) -> list[list[float]]:
 
 
 def measured(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
-    """Return what a link carries, in as many runs as it takes."""
+    """Return the results of a link, from as many runs as needed."""
     runs: list[list[list[float]]] = []
     while True:
         runs += pool.map(partial(once, ns3, cell), range(len(runs) + 1, len(runs) + 1 + BATCH))
@@ -204,10 +210,10 @@ def measured(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
 
 
 def ratio_of(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float, float]:
-    """Return the ratio of two means and its 95 % interval, by the logarithm's variance; NaN where nothing arrives."""
+    """Return the ratio of two means and its 95 % interval, from the logarithm's variance; NaN without goodput."""
     if min(ours.mean(), theirs.mean()) < 0.01:
         return math.nan, math.nan, math.nan
-    spread = math.sqrt(sum(one.var(ddof=1) / len(one) / one.mean() ** 2 for one in (ours, theirs)))
+    spread = math.sqrt(sum(runs.var(ddof=1) / len(runs) / runs.mean() ** 2 for runs in (ours, theirs)))
     factor = math.exp(student.ppf(0.975, 2 * len(ours) - 2) * spread)
     ratio = float(ours.mean() / theirs.mean())
     return ratio, ratio / factor, ratio * factor
@@ -215,12 +221,12 @@ def ratio_of(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float, float]
 
 def points_of(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float]:
     """Return the difference of two mean shares in percent points, and half of its 95 % interval."""
-    spread = math.sqrt(sum(one.var(ddof=1) / len(one) for one in (ours, theirs)))
+    spread = math.sqrt(sum(runs.var(ddof=1) / len(runs) for runs in (ours, theirs)))
     return 100 * float(ours.mean() - theirs.mean()), 100 * float(student.ppf(0.975, 2 * len(ours) - 2)) * spread
 
 
 def rows(ns3: Ns3, wanted: Sequence[str]) -> Iterable[Row]:
-    """Yield goodput and loss over distance, of links whose name has one of these texts."""
+    """Yield the results of links whose name contains one of the given texts."""
     cells = [Cell(mode, wall, each_m) for (mode, wall), distances_m in DISTANCES_M.items() for each_m in distances_m]
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         for cell in cells:
@@ -229,41 +235,47 @@ def rows(ns3: Ns3, wanted: Sequence[str]) -> Iterable[Row]:
 
 
 def traces(ns3: Ns3) -> dict[Control, tuple[Trace, Trace]]:
-    """Return congestion windows over time by ns-3 and by us, on a good link."""
-    found: dict[Control, tuple[Trace, Trace]] = {}
+    """Return the congestion windows over time of ns-3 and of the co-simulation on a good link."""
+    result: dict[Control, tuple[Trace, Trace]] = {}
     cell = Cell("g54", wall=False, distance_m=20)
     for control in CONTROLS:
         links = Ns3Link(ns3, cell, 1, "802.11g"), Link(cell, 1)
         theirs, ours = (link.tcp(control, TRACE_S)[1] for link in links)
-        found[control] = theirs, ours
-    return found
+        result[control] = theirs, ours
+    return result
 
 
 def main() -> None:
-    """Run both, print the table, and draw the figure where asked for."""
+    """Run both, print the table, and draw the figure if `--figure` is given."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--links", nargs="*", default=[""], metavar="TEXT", help="only those named so, for example g54"
+        "--links",
+        nargs="*",
+        default=[""],
+        metavar="TEXT",
+        help="only links with this text in their names, for example g54",
     )
-    parser.add_argument("--json", action="store_true", help="single values")
+    parser.add_argument("--json", action="store_true", help="print single values")
     parser.add_argument("--figure", type=Path, help="write goodputs and windows of both to this SVG file")
     arguments = parser.parse_args()
-    found = []
+    measured_rows = []
     with tempfile.TemporaryDirectory() as folder:
         ns3 = build(Path(folder))
         for row in rows(ns3, arguments.links):
-            found.append(row)
+            measured_rows.append(row)
             print(line(row), file=sys.stderr if arguments.json else sys.stdout, flush=True)
         windows = traces(ns3) if arguments.figure else {}
     if arguments.figure:
-        draw(arguments.figure, found, windows)
+        draw(arguments.figure, measured_rows, windows)
     if arguments.json:
-        values = {str(row.cell): [row.newreno.tolist(), row.cubic.tolist(), row.udp_loss.tolist()] for row in found}
+        values = {
+            str(row.cell): [row.newreno.tolist(), row.cubic.tolist(), row.udp_loss.tolist()] for row in measured_rows
+        }
         json.dump(values, sys.stdout)
 
 
 def line(row: Row) -> str:
-    """Return what was measured on a link, as a line of a table: means of the `PEERS`, and ours by each other one."""
+    """Return the results of a link as a table row: means of the `PEERS`, and ratios of the co-simulation to each."""
     parts = [f"{row.cell!s:32}{len(row.newreno):3} runs"]
     for name, values in (("newreno", row.newreno), ("cubic", row.cubic)):
         means = " ".join(f"{mean:6.2f}" for mean in values.mean(axis=0))
@@ -273,34 +285,34 @@ def line(row: Row) -> str:
         )
         parts.append(f"{name} {means}  {intervals}")
     means = " ".join(f"{100 * mean:5.1f}" for mean in row.udp_loss.mean(axis=0))
-    # UDP has no congestion control that could be mended.
+    # The variant with the corrected TCP has the same UDP.
     differences = (points_of(row.udp_loss[:, -1], row.udp_loss[:, peer]) for peer in (0, 1))
-    parts.append(f"udp lost {means}  " + " ".join("{:+.1f} ({:.1f})".format(*one) for one in differences))
+    parts.append(f"udp lost {means}  " + " ".join("{:+.1f} ({:.1f})".format(*points) for points in differences))
     return " | ".join(parts)
 
 
-def draw(path: Path, found: Sequence[Row], windows: dict[Control, tuple[Trace, Trace]]) -> None:
-    """Draw goodputs over distance, and congestion windows over time, theirs as lines and ours as marks or dashes."""
-    import matplotlib as mpl  # noqa: PLC0415 (only who wants the figure needs it)
+def draw(path: Path, results: Sequence[Row], windows: dict[Control, tuple[Trace, Trace]]) -> None:
+    """Draw goodputs over distance, and windows over time: ns-3 as lines, the co-simulation as marks or dashes."""
+    import matplotlib as mpl  # noqa: PLC0415 (needed only for the figure)
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     mpl.rcParams["svg.hashsalt"] = "cosim_vs_ns3"
     figure = Figure(figsize=(11, 3.4), layout="constrained")
     left, *others = figure.subplots(1, 3)
     for number, (mode, wall) in enumerate(DISTANCES_M):
-        own = [row for row in found if (row.cell.mode, row.cell.wall) == (mode, wall)]
-        if not own:
+        link_rows = [row for row in results if (row.cell.mode, row.cell.wall) == (mode, wall)]
+        if not link_rows:
             continue
-        at_m = [row.cell.distance_m for row in own]
-        means = np.array([row.newreno.mean(axis=0) for row in own])
+        at_m = [row.cell.distance_m for row in link_rows]
+        means = np.array([row.newreno.mean(axis=0) for row in link_rows])
         label = f"{mode or 'minstrel'}, {'wall' if wall else 'in sight'}"
         left.plot(at_m, means[:, -2], color=f"C{number}", label=label)
         left.plot(at_m, means[:, -1], "o", color=f"C{number}", markerfacecolor="none")
     left.set(xlabel="distance (m)", ylabel="goodput of NewReno (Mbit/s)", ylim=(-1, 38))
-    left.legend(title="ns-3, mended: lines; ours: marks", fontsize="small", ncols=2, loc="upper right")
+    left.legend(title="ns-3, corrected: lines; ours: marks", fontsize="small", ncols=2, loc="upper right")
     for axes, (control, (theirs, ours)) in zip(others, windows.items(), strict=True):
         for trace, colour, label in ((theirs, "0.6", "ns-3"), (ours, "C0", "ours")):
-            # One value per 20 ms: a line of ten thousand points shows no more.
+            # One value per 20 ms is enough for the figure.
             kept = {round(at_s / 0.02): window for at_s, window in trace}
             axes.plot([0.02 * step for step in kept], list(kept.values()), color=colour, label=label, linewidth=1)
         axes.set(xlabel="time (s)", ylabel="congestion window (segments)", title=CONTROLS[control], ylim=(0, 210))

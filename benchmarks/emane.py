@@ -1,8 +1,8 @@
 """The paper's EMANE experiment in a lab: `python -m benchmarks.emane [--rounds 3] [--json]`, as root.
 
 Ten robots; 100 pings of 64 bytes from the first to the tenth, before and after the tenth moves by 100 m in each axis.
-Each radio and round has a new lab, started by the commands of docs/studies/emane.md. 64 bytes are what ping prints:
-56 of payload and 8 of ICMP header, 84 with the IP header. All times are round trips in ms; loss is in percent.
+Each radio and round has a new lab, started by the commands of docs/studies/emane.md. ping prints 64 bytes:
+56 of payload and 8 of ICMP header; with the IP header it is 84. All times are round trips in ms; loss is in percent.
 """
 
 import argparse
@@ -30,7 +30,7 @@ RADIOS: Final = {
     "Wi-Fi, exponent 2.5": "{exponent: 2.5, fading: false}",
     "Wi-Fi, exponent 3": "{fading: false}",
 }
-"""Radios by name, as `emulated.radio` has them, without fading; the first is what EMANE's RF Pipe has."""
+"""Radios by name, as values of `emulated.radio`, without fading. The first equals EMANE's RF Pipe."""
 
 SITE: Final = """\
 robots: {{}}
@@ -39,23 +39,23 @@ emulated: {{world: open, ros: builtin, radio: {radio}}}
 """
 ROBOTS: Final = 10
 PINGS: Final = 100
-WAYS: Final = ("before", "after")
-BESIDE: Final = {
+POSITIONS: Final = ("before", "after")
+REFERENCES: Final = {
     "paper": {"mean": (5.377, 54.309), "loss": (0.0, 0.0)},
     "EMANE 1.5.3, RF Pipe": {"mean": (2.26, 2.26), "median": (2.12, 2.12), "loss": (0.0, 0.0)},
 }
-"""The paper's figures, and EMANE's as measured on 2 quiet cores, which 100 m did not change."""
+"""The paper's figures, and EMANE's as measured on 2 quiet cores; a move by 100 m did not change them."""
 
 Figures = dict[str, float | None]
 
 
 def fieldkit(here: Path, *words: str) -> str:
-    """Return what a command of `fieldkit lab` printed; a ping without any reply ends with 1."""
+    """Return the output of a `fieldkit lab` command. A ping without any reply exits with 1."""
     done = subprocess.run(
         (sys.executable, "-m", "fieldkit", "lab", *words), cwd=here, stdout=subprocess.PIPE, text=True, check=False
     )
     if done.returncode not in ({0, 1} if "ping" in words else {0}):
-        raise SystemExit(f"fieldkit lab {' '.join(words)} ended with {done.returncode}")
+        raise SystemExit(f"fieldkit lab {' '.join(words)} exited with {done.returncode}")
     return done.stdout
 
 
@@ -73,10 +73,10 @@ def lab(radio: str) -> Iterator[Path]:
 
 
 def pinged(here: Path) -> Figures:
-    """Return what 100 pings found; None for times where nothing came back, and for the SNR of fixed links."""
+    """Return the results of 100 pings; None for times without a reply, and for the SNR of fixed links."""
     words = ("ping", "-c", str(PINGS), "-i", "0.1", "-W", "1", "-s", "56", f"robot-{ROBOTS}")
-    found = parse(fieldkit(here, "shell", "robot-1", *words))
-    rtt_ms = [1e3 * value for value in found.rtt_s]
+    ping_output = parse(fieldkit(here, "shell", "robot-1", *words))
+    rtt_ms = [1e3 * value for value in ping_output.rtt_s]
     times: Figures = dict.fromkeys(("min", "mean", "median", "p99"))
     if rtt_ms:
         times = {
@@ -91,44 +91,46 @@ def pinged(here: Path) -> Figures:
 
 
 def measured(radio: str) -> dict[str, Figures]:
-    """Return one round: both ways."""
+    """Return one round: the figures before and after the move."""
     with lab(radio) as here:
         before = pinged(here)
         fieldkit(here, "move", f"robot-{ROBOTS}", "--by", "100m", "100m", "100m")
-        return dict(zip(WAYS, (before, pinged(here)), strict=True))
+        return dict(zip(POSITIONS, (before, pinged(here)), strict=True))
 
 
 def spread(values: list[float | None]) -> str:
     """Return median (lowest to highest) of the rounds that have a value."""
-    known = [value for value in values if value is not None]
-    if not known:
+    present = [value for value in values if value is not None]
+    if not present:
         return "-"
-    middle, low, high = statistics.median(known), min(known), max(known)
-    return f"{middle:.2f}" if low == high else f"{middle:.2f} ({low:.2f} to {high:.2f})"
+    median_value, low, high = statistics.median(present), min(present), max(present)
+    return f"{median_value:.2f}" if low == high else f"{median_value:.2f} ({low:.2f} to {high:.2f})"
 
 
 def show(rounds: dict[str, list[dict[str, Figures]]]) -> None:
-    """Print the table, the paper's and EMANE's figures first."""
+    """Print the table, with the paper's and EMANE's figures first."""
     names = ("min", "mean", "median", "p99", "loss", "snr_db")
     print(f"{'ms, %, dB; median of rounds (range)':38}" + "".join(f"{name:>24}" for name in names))
-    for which, way in enumerate(WAYS):
-        for name, known in BESIDE.items():
-            cells = (f"{known[one][which]:g}" if one in known else "" for one in names)
-            print(f"{name + ', ' + way:38}" + "".join(f"{cell:>24}" for cell in cells))
+    for index, position in enumerate(POSITIONS):
+        for name, figures in REFERENCES.items():
+            cells = (f"{figures[column][index]:g}" if column in figures else "" for column in names)
+            print(f"{name + ', ' + position:38}" + "".join(f"{cell:>24}" for cell in cells))
         for name, each in rounds.items():
-            cells = (spread([one[way][column] for one in each]) for column in names)
-            print(f"{name + ', ' + way:38}" + "".join(f"{cell:>24}" for cell in cells))
+            cells = (spread([result[position][column] for result in each]) for column in names)
+            print(f"{name + ', ' + position:38}" + "".join(f"{cell:>24}" for cell in cells))
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", action="store_true", help="single values")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON")
     options = parser.parse_args()
     system = f"Python {platform.python_version()}, Linux {platform.release()}, {os.cpu_count()} cores"
-    said = subprocess.run(("ping", "-V"), stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()[0]
-    about = f"fieldkit {__version__}, {system}, {said}; load before: {os.getloadavg()[0]:.2f}"
+    ping_version = subprocess.run(("ping", "-V"), stdout=subprocess.PIPE, text=True, check=True).stdout.splitlines()[
+        0
+    ]
+    about = f"fieldkit {__version__}, {system}, {ping_version}; load before: {os.getloadavg()[0]:.2f}"
     rounds: dict[str, list[dict[str, Figures]]] = {name: [] for name in RADIOS}
     for _ in range(options.rounds):
         for name, radio in RADIOS.items():

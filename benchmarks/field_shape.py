@@ -1,8 +1,8 @@
 """The paper's field trial on emulated robots: `python -m benchmarks.field_shape [--figures FOLDER]`, as root.
 
-Four campaigns (benchmarks/lawn/: two topologies, with line of sight and behind the wall) run beside each other, for a
-repeat mostly waits; 640 repeats take 21 to 25 minutes. Stop it whenever you like: the same command goes on where it
-stopped. Then it prints the table of docs/studies/field-shape.md and draws its two figures.
+Four campaigns (benchmarks/lawn/: two topologies, with line of sight and behind the wall) run in parallel, because a
+repeat mostly waits; 640 repeats take 21 to 25 minutes. You can stop it at any time: the same command continues. At
+the end it prints the table of docs/studies/field-shape.md and draws its two figures.
 """
 
 import argparse
@@ -33,7 +33,7 @@ LAB: Final = Path(__file__).with_name("lawn")
 CAMPAIGNS: Final = ("master-los", "master-nlos", "masterless-los", "masterless-nlos")
 METRES_PER_FOOT: Final = 0.3048
 DODGE_FT: Final = 0.35
-"""Between series at one distance, so that no interval hides another."""
+"""Offset in feet between series at the same distance, so that intervals do not overlap."""
 
 PAPER_DELAY: Final = Quantity("paper_delay_s", "mean RTT", Kind.MEDIAN, "s")
 BY: Final = ("topology", "scenario", "protocol", "distance_m")
@@ -64,7 +64,7 @@ SHOWN: Final = (
 
 
 def lab(folder: Path, repeats_each: int | None) -> None:
-    """Put the lab's files into a folder; a campaign that was begun there keeps its own."""
+    """Copy the lab's files into a folder, unless it exists: a started campaign keeps its files."""
     if folder.exists():
         return
     shutil.copytree(LAB, folder)
@@ -76,10 +76,10 @@ def lab(folder: Path, repeats_each: int | None) -> None:
 
 
 def run(folder: Path) -> None:
-    """Run all campaigns, or go on with them, each with its log beside it.
+    """Run or continue all campaigns, each with a log file.
 
     Raises:
-        subprocess.CalledProcessError: One of them did not end well; its log says why.
+        subprocess.CalledProcessError: A campaign failed; its log contains the reason.
     """
     environment = os.environ | {"PYTHONPATH": str(LAB.parent.parent), "PYTHONUNBUFFERED": "1"}
     running = []
@@ -100,28 +100,30 @@ def read(folder: Path) -> Repeats:
 
 
 def chart(cells: Sequence[Cell], name: str, panels: Sequence[tuple[str, str, str]]) -> Chart:
-    """Return a chart of panels that are given as title, protocol and quantity."""
+    """Return a chart of panels, each given as title, protocol and quantity."""
     drawn = [_panel(cells, *panel) for panel in panels]
     return Chart(name=name, title=name, caption="", panels=drawn)
 
 
 def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> Panel:
-    own = [cell for cell in cells if cell.key["protocol"] == protocol]
-    largest = max(cell.estimates[quantity].value for cell in own)
-    written = scale(own[0].estimates[quantity].quantity, own)
-    factor, unit = written.factor, written.unit
+    protocol_cells = [cell for cell in cells if cell.key["protocol"] == protocol]
+    largest = max(cell.estimates[quantity].value for cell in protocol_cells)
+    axis_scale = scale(protocol_cells[0].estimates[quantity].quantity, protocol_cells)
+    factor, unit = axis_scale.factor, axis_scale.unit
     series = []
     for rank, ((topology, scenario), style) in enumerate(STYLES.items()):
-        mine = [cell for cell in own if (cell.key["topology"], cell.key["scenario"]) == (topology, scenario)]
-        found = [cell.estimates[quantity] for cell in mine]
+        series_cells = [
+            cell for cell in protocol_cells if (cell.key["topology"], cell.key["scenario"]) == (topology, scenario)
+        ]
+        estimates = [cell.estimates[quantity] for cell in series_cells]
         series.append(
             Series(
                 label=f"{topology}, {'in sight' if scenario == 'los' else 'behind the wall'}",
                 style=style,
-                x=[feet(cell) + (rank - 1.5) * DODGE_FT for cell in mine],
-                y=[factor * one.value for one in found],
-                low=[_end(one, one.low, factor) for one in found],
-                high=[_end(one, one.high, factor) for one in found],
+                x=[feet(cell) + (rank - 1.5) * DODGE_FT for cell in series_cells],
+                y=[factor * each.value for each in estimates],
+                low=[_end(each, each.low, factor) for each in estimates],
+                high=[_end(each, each.high, factor) for each in estimates],
             )
         )
     top = max(1.0 if unit == "%" else 0.0, 1.6 * factor * largest)
@@ -130,9 +132,9 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
     )
 
 
-def _end(one: Estimate, end: float | None, factor: float) -> float | None:
-    """Return an end of an interval to draw; where nothing was lost it tells of the number of repeats alone."""
-    return None if end is None or one.value == 0 else factor * end
+def _end(source: Estimate, end: float | None, factor: float) -> float | None:
+    """Return an end of an interval to draw, or None if nothing was lost: it then shows only the repeat count."""
+    return None if end is None or source.value == 0 else factor * end
 
 
 def feet(cell: Cell) -> float:
@@ -142,55 +144,61 @@ def feet(cell: Cell) -> float:
     return metres / METRES_PER_FOOT
 
 
-def table(cells: Sequence[Cell], found: Repeats) -> Iterator[str]:
-    """Yield a Markdown table, a line per condition, with how late the emulator was."""
+def table(cells: Sequence[Cell], attempts: Repeats) -> Iterator[str]:
+    """Yield a Markdown table with a line per condition and the lateness of the emulator."""
     yield "| " + " | ".join(["condition", *(title for title, _, _ in SHOWN), "late, p99 / max (ms)"]) + " |"
     yield "| " + " | ".join(["---"] * (len(SHOWN) + 2)) + " |"
     for topology, scenario, metres in sorted({_place(cell) for cell in cells}):
-        alike = {str(cell.key["protocol"]): cell for cell in cells if _place(cell) == (topology, scenario, metres)}
-        said = [
-            _said(alike[protocol].estimates[quantity]) if protocol in alike else "" for _, protocol, quantity in SHOWN
+        by_protocol = {
+            str(cell.key["protocol"]): cell for cell in cells if _place(cell) == (topology, scenario, metres)
+        }
+        values = [
+            _text(by_protocol[protocol].estimates[quantity]) if protocol in by_protocol else ""
+            for _, protocol, quantity in SHOWN
         ]
-        here = (found.texts["topology"] == topology) & (found.texts["scenario"] == scenario)
-        here &= found.numbers["distance_m"] == metres
-        late = [_milliseconds(found.numbers[f"emulator_late_{which}_s"][here], how) for which, how in LATE]
+        rows = (attempts.texts["topology"] == topology) & (attempts.texts["scenario"] == scenario)
+        rows &= attempts.numbers["distance_m"] == metres
+        late = [
+            _milliseconds(attempts.numbers[f"emulator_late_{statistic}_s"][rows], reduce)
+            for statistic, reduce in LATE
+        ]
         label = f"{topology}, {scenario.upper()}, {metres / METRES_PER_FOOT:.0f} ft"
-        yield "| " + " | ".join([label, *said, " / ".join(late)]) + " |"
+        yield "| " + " | ".join([label, *values, " / ".join(late)]) + " |"
 
 
 LATE: Final[tuple[tuple[str, Callable[..., float]], ...]] = (("p99", np.nanmedian), ("max", np.nanmax))
-"""The median repeat's, and the latest packet of all."""
+"""Statistics of the lateness: the p99 of the median repeat, and the maximum of all packets."""
 
 
 def _place(cell: Cell) -> tuple[str, str, float]:
     return str(cell.key["topology"]), str(cell.key["scenario"]), float(cell.key["distance_m"] or 0.0)
 
 
-def _said(one: Estimate) -> str:
-    return estimate(one) if one.value else "0"
+def _text(source: Estimate) -> str:
+    return estimate(source) if source.value else "0"
 
 
-def _milliseconds(values: np.ndarray[tuple[int], np.dtype[np.float64]], how: Callable[..., float]) -> str:
-    return f"{1e3 * float(how(values)):.2f}"
+def _milliseconds(values: np.ndarray[tuple[int], np.dtype[np.float64]], reduce: Callable[..., float]) -> str:
+    return f"{1e3 * float(reduce(values)):.2f}"
 
 
 def main() -> None:
-    """Run or go on, print the table, draw."""
+    """Run or continue the campaigns, print the table, draw the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("field-shape"), help="folder of the lab and its trials")
     parser.add_argument("--figures", type=Path, help="write field-shape-loss.svg and field-shape-delay.svg there")
-    parser.add_argument("--repeats", type=int, help="fewer, to try it")
-    parser.add_argument("--no-run", action="store_true", help="read what is there")
+    parser.add_argument("--repeats", type=int, help="fewer repeats, for a test")
+    parser.add_argument("--no-run", action="store_true", help="read the existing results")
     options = parser.parse_args()
     lab(options.out, options.repeats)
     if not options.no_run:
         run(options.out)
-    found = read(options.out)
-    cells = aggregate(found, BY, quantities=(*found.quantities, PAPER_DELAY))
-    statuses, counts = np.unique(found.texts["status"], return_counts=True)
-    ended = ", ".join(f"{count} {status}" for status, count in zip(statuses, counts, strict=True))
-    print(f"{ended}; load average {os.getloadavg()[1]:.1f} over the last 5 minutes")
-    print("\n".join(table(cells, found)))
+    attempts = read(options.out)
+    cells = aggregate(attempts, BY, quantities=(*attempts.quantities, PAPER_DELAY))
+    statuses, counts = np.unique(attempts.texts["status"], return_counts=True)
+    summary = ", ".join(f"{count} {status}" for status, count in zip(statuses, counts, strict=True))
+    print(f"{summary}; load average {os.getloadavg()[1]:.1f} over the last 5 minutes")
+    print("\n".join(table(cells, attempts)))
     if options.figures:
         for name, panels in (("field-shape-loss", LOSS), ("field-shape-delay", DELAY)):
             files.write(options.figures / f"{name}.svg", figures.paper(chart(cells, name, panels), "svg"))

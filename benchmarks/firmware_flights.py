@@ -1,4 +1,4 @@
-"""Fly and record a drone by fieldkit's programs for the drone's computer, and print a table with a row per case.
+"""Fly and record a drone with fieldkit's programs for the drone's computer, and print a table with a row per case.
 
     python -m benchmarks.firmware_flights --connection tcp:127.0.0.1:5760
 
@@ -27,7 +27,7 @@ HEIGHT_M: Final = 3.0
 AHEAD_M: Final = 6.0
 _RECORD_S: Final = 5.0
 _BOOT_S: Final = 90.0
-"""A real autopilot takes about 30 s until its position estimate is good."""
+"""A real autopilot needs about 30 s for a good position estimate."""
 _FLIGHT_S: Final = 240.0
 _RATES_US: Final = {"32": 100_000, "30": 100_000}
 """LOCAL_POSITION_NED and ATTITUDE at 10 Hz."""
@@ -35,7 +35,7 @@ _RATES_US: Final = {"32": 100_000, "30": 100_000}
 
 @dataclass(frozen=True)
 class Row:
-    """Result of a case: its name, whether it passed, what was measured, and how long it took."""
+    """Result of a case: its name, True if it passed, its measurements, and its duration."""
 
     case: str
     passed: bool
@@ -44,7 +44,7 @@ class Row:
 
 
 class CaseFailed(Exception):  # noqa: N818 (a result)
-    """A case failed; the text is what was seen."""
+    """A case failed; the text is the observation."""
 
 
 class Bench:
@@ -53,7 +53,7 @@ class Bench:
     Args:
         connection: As `mavlink.connection` of a profile.
         program: The agent.
-        folder: For orders and logs.
+        folder: Folder for orders and logs.
     """
 
     def __init__(self, connection: str, program: Path, folder: Path) -> None:
@@ -63,7 +63,7 @@ class Bench:
         self._orders = 0
 
     def check(self) -> str:
-        """Ask whether it can be armed, until it can."""
+        """Query the agent until the drone can be armed."""
         needs = {
             "highest_m": HEIGHT_M,
             "farthest_m": AHEAD_M,
@@ -71,9 +71,9 @@ class Bench:
             "least_charge": 0.2,
             "returns": False,
         }
-        asked, end_s = json.dumps({"connection": self._connection, "needs": needs}), time.monotonic() + _BOOT_S
+        request, end_s = json.dumps({"connection": self._connection, "needs": needs}), time.monotonic() + _BOOT_S
         while True:
-            done = self._run("arming", asked)
+            done = self._run("arming", request)
             lines = [json.loads(line) for line in done.stdout.splitlines()]
             faults = [line["what"] for line in lines if line.get("grave")]
             if done.returncode == 0 and lines and not faults:
@@ -83,20 +83,20 @@ class Bench:
             time.sleep(1.0)
 
     def record(self) -> str:
-        """Record its telemetry, and count its frames."""
+        """Record the telemetry, and count its frames."""
         log = self._folder / "flight.tlog"
-        told = json.dumps({"connection": self._connection, "intervals_us": _RATES_US})
-        with self._started("mavlink", told, str(log)) as process:
+        request = json.dumps({"connection": self._connection, "intervals_us": _RATES_US})
+        with self._started("mavlink", request, str(log)) as process:
             time.sleep(_RECORD_S)
             process.terminate()
             _, errors = process.communicate(timeout=30)
-        counted = _messages(log)
-        if process.returncode or not counted.get("LOCAL_POSITION_NED") or not counted.get("ATTITUDE"):
-            raise CaseFailed(f"code {process.returncode}, {counted}, {errors.strip()}")
-        return ", ".join(f"{name} {number}" for name, number in sorted(counted.items()))
+        counts = _messages(log)
+        if process.returncode or not counts.get("LOCAL_POSITION_NED") or not counts.get("ATTITUDE"):
+            raise CaseFailed(f"code {process.returncode}, {counts}, {errors.strip()}")
+        return ", ".join(f"{name} {number}" for name, number in sorted(counts.items()))
 
     def out_and_back(self) -> str:
-        """Fly out and back, and land; see that the log agrees with the plan."""
+        """Fly out and back, and land; compare the log with the plan."""
         with self._flight(end="return") as process:
             self._order("climb")
             self._phase(process, "up")
@@ -109,8 +109,8 @@ class Bench:
             raise CaseFailed(f"code {code}, {high_m:.1f} m high, {far_m:.1f} m far, {self._last_words()}")
         return f"{high_m:.1f} m high, {far_m:.1f} m far, landed"
 
-    def lapses(self) -> str:
-        """Stop renewing the orders in the air; see that it lands."""
+    def lease_expires(self) -> str:
+        """Stop renewing the orders in the air; check that the drone lands."""
         with self._flight() as process:
             self._order("climb", lease_s=60.0)
             self._phase(process, "up")
@@ -121,8 +121,8 @@ class Bench:
             raise CaseFailed(f"code {code}, {self._last_words()}")
         return f"landed {time.monotonic() - began_s:.0f} s after the last order"
 
-    def called_off(self) -> str:
-        """End the program in the air by SIGTERM; see that it lands."""
+    def terminated(self) -> str:
+        """Terminate the program in the air by SIGTERM; check that the drone lands."""
         with self._flight() as process:
             self._order("climb")
             self._phase(process, "up")
@@ -153,9 +153,9 @@ class Bench:
 
     @contextmanager
     def _started(self, *words: str) -> "Iterator[subprocess.Popen[str]]":
-        with (self._folder / "words").open("w", encoding="utf-8") as said:
+        with (self._folder / "words").open("w", encoding="utf-8") as stderr:
             argv = (sys.executable, str(self._program), *words)
-            process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=said, text=True)
+            process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=stderr, text=True)
             try:
                 yield process
             finally:
@@ -168,9 +168,9 @@ class Bench:
 
     def _order(self, what: str, lease_s: float = 120.0) -> None:
         self._orders += 1
-        beside = self._folder / "orders.new"
-        beside.write_text(f"{self._orders} {what} {lease_s:g}\n", encoding="ascii")
-        beside.replace(self._folder / "orders")
+        new_file = self._folder / "orders.new"
+        new_file.write_text(f"{self._orders} {what} {lease_s:g}\n", encoding="ascii")
+        new_file.replace(self._folder / "orders")
 
     def _words(self) -> str:
         return (self._folder / "words").read_text(encoding="utf-8")
@@ -189,30 +189,30 @@ class Bench:
     def _flown(self) -> tuple[float, float]:
         """Return the largest height and distance in the log of positions."""
         lines = (self._folder / "fly.jsonl").read_text(encoding="ascii").splitlines()
-        places = [place for line in lines if (place := _place(json.loads(line))) is not None]
-        if not places:
+        positions = [position for line in lines if (position := _place(json.loads(line))) is not None]
+        if not positions:
             raise CaseFailed("no position in its log")
-        return max(up for _, _, up in places), max(math.hypot(ahead, left) for ahead, left, _ in places)
+        return max(up for _, _, up in positions), max(math.hypot(ahead, left) for ahead, left, _ in positions)
 
 
 def _place(line: dict[str, Any]) -> tuple[float, float, float] | None:
-    """Return the position in a line of the log, metres ahead, to the left and up; None for another line."""
+    """Return the position in a line of the log, in metres ahead, left and up, or None for another line."""
     return (line["ahead_m"], line["left_m"], line["up_m"]) if "up_m" in line else None
 
 
 def _messages(log: Path) -> dict[str, int]:
-    """Return how many messages of each kind are in a telemetry log."""
+    """Return the number of messages of each type in a telemetry log."""
     from pymavlink import mavutil  # noqa: PLC0415 (0.3 s)
 
-    counted: dict[str, int] = {}
+    counts: dict[str, int] = {}
     reader = mavutil.mavlink_connection(str(log))
     while (message := reader.recv_match()) is not None:
-        counted[message.get_type()] = counted.get(message.get_type(), 0) + 1
-    return counted
+        counts[message.get_type()] = counts.get(message.get_type(), 0) + 1
+    return counts
 
 
 def rows(connection: str) -> Iterator[Row]:
-    """Yield the results of the cases, as they end."""
+    """Yield the results of the cases as they finish."""
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder, "agent.pyz")
         program.write_bytes(agent.content())
@@ -221,8 +221,8 @@ def rows(connection: str) -> Iterator[Row]:
             "can be armed": bench.check,
             "telemetry is recorded": bench.record,
             "out and back": bench.out_and_back,
-            "orders lapse in the air": bench.lapses,
-            "program ended in the air": bench.called_off,
+            "orders lapse in the air": bench.lease_expires,
+            "program ended in the air": bench.terminated,
         }
         for name, case in cases.items():
             began_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""What processes take of a machine, as the kernel counts it: of memory, and of the processors' time."""
+"""Memory and processor time of processes, from the kernel's counters."""
 
 import os
 import re
@@ -13,11 +13,11 @@ _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True)
 class Memory:
-    """What a process tree takes, in bytes.
+    """Memory of a process tree, in bytes.
 
     Attributes:
-        own: Pages that nobody outside the tree has, each counted once however many processes of the tree share it.
-        pss: Own pages and, of a page that n processes of this machine share, one n-th each.
+        own: Pages that no process outside of the tree has, each counted once.
+        pss: Proportional set size: own pages, and one n-th of each page that n processes of this machine share.
     """
 
     own: int
@@ -27,23 +27,24 @@ class Memory:
     def of(cls, pid: int) -> Self:
         """Return the memory of a process and all its descendants.
 
-        A fork shares anonymous pages, which no other tree can have; file pages, those of programs and libraries, are
-        the tree's own where one process alone has them.
+        Forks share anonymous pages, which belong only to this tree. A file page, of a program or a library, counts as
+        own if only one process has it.
         """
-        found = [_smaps(one) for one in tree(pid)]
-        own_kb = sum(one["Pss_Anon"] + one["Private_Clean"] for one in found)
-        return cls(own_kb * _KB, sum(one["Pss"] for one in found) * _KB)
+        rollups = [_smaps(process) for process in tree(pid)]
+        own_kb = sum(rollup["Pss_Anon"] + rollup["Private_Clean"] for rollup in rollups)
+        return cls(own_kb * _KB, sum(rollup["Pss"] for rollup in rollups) * _KB)
 
 
 def cpu_s(pid: int) -> float:
-    """Return the processors' time of a process and all its descendants, with those that ended and were awaited."""
-    found = 0.0
-    for one in tree(pid):
-        found += sum(_scheduled_ns(thread) for thread in Path(f"/proc/{one}/task").iterdir()) / 1e9
-        # proc(5), fields 16 and 17: whole ticks of the awaited. Field 2, the name in parentheses, may hold spaces.
-        fields = Path(f"/proc/{one}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-        found += sum(map(int, fields[13:15])) / _TICKS_PER_S
-    return found
+    """Return the processor time of a process and all its descendants, with terminated and awaited ones."""
+    total_s = 0.0
+    for process in tree(pid):
+        total_s += sum(_scheduled_ns(thread) for thread in Path(f"/proc/{process}/task").iterdir()) / 1e9
+        # proc(5), fields 16 and 17: whole ticks of awaited children. Field 2, the name in parentheses, may contain
+        # spaces.
+        fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        total_s += sum(map(int, fields[13:15])) / _TICKS_PER_S
+    return total_s
 
 
 def tree(pid: int) -> Iterator[int]:

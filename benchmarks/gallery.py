@@ -1,7 +1,7 @@
 """Pictures of docs/gallery.md, from stored trials: `python -m benchmarks.gallery [--out docs/gallery]`.
 
-Makes a report of the trials in `TRIALS` and saves parts of it as pictures with Debian's Chromium.
-Needs neither root nor a network.
+Makes a report of the trials in `TRIALS` and saves parts of it as pictures with Debian's Chromium. Needs
+neither root nor a network.
 """
 
 import argparse

@@ -1,11 +1,10 @@
-"""What each layer of the radio's model costs: `python -m benchmarks.layers [--json]`, as root.
+"""Cost of each layer of the radio model: `python -m benchmarks.layers [--json]`, as root.
 
-First the engine alone, in virtual time: processor time per packet of 64 bytes of UDP payload between two stations of
-which one always has some to send, as layers are switched on; what that is of the time that the packets take on the
-air (above 100 % a saturated channel does not run in real time); and the time that placing 50 stations takes, where
-shadowing and world do their work. Then all layers with more stations, which hear each other and all send to the
-first. Then the medium: round trips of ping between two namespaces, and what is left of them, at the mean, without the
-delays that the model gave to the packets.
+First the engine alone, in virtual time, as layers are added: processor time per packet of 64 bytes of UDP payload
+between two stations, one of which always has packets to send, and its share of the packets' air time (above 100 % a
+saturated channel does not run in real time). Then all layers with more stations, which are in range of each other and
+send to the first one. Then the medium: round trips of ping between two namespaces, and their mean without the delays
+from the model.
 """
 
 import argparse
@@ -42,9 +41,9 @@ class Layer:
     """A radio.
 
     Attributes:
-        name: What it has beside the one before.
+        name: Its difference from the layer before.
         options: Its options, as in a site file.
-        world: Name of what stands between the stations, None for open ground.
+        world: Name of the world around the stations, None for open ground.
     """
 
     name: str
@@ -52,15 +51,15 @@ class Layer:
     world: str | None = None
 
     def radio(self) -> RadioOptions:
-        """Return its options."""
+        """Return the validated options."""
         return RadioOptions.model_validate(self.options)
 
     def load(self) -> World | None:
-        """Return its world."""
+        """Return the world."""
         return None if self.world is None else load_world(self.world)
 
     def model(self, stations: int) -> RadioModel[int]:
-        """Return it without a medium around it."""
+        """Return the radio model, without a medium."""
         options = self.radio()
         if options.fixed:
             return UniformLinks(1, options)
@@ -93,25 +92,25 @@ def engine(layer: Layer, stations: int, packets: int) -> Figures:
     model.place(0, _places(stations), None)
     for number in range(WAITING * len(senders)):
         model.send(0, senders[number % len(senders)], number, PACKET_BYTES, receiver)
-    # What is made once, tables and streams of draws, is made by then.
+    # The first packets create tables and random streams, which are not measured.
     _carry(model, receiver, packets // 10)
     cpu_s, air_s = _carry(model, receiver, packets)
     return {"cpu_us": 1e6 * cpu_s / packets, "core_percent": 100 * cpu_s / air_s}
 
 
 def _carry(model: RadioModel[int], receiver: str, packets: int) -> tuple[float, float]:
-    """Return the processor time and the virtual time in s that so many packets take; each is followed by another."""
-    arrived, first_ns, now_ns, begun_s = 0, model.next_event_ns() or 0, 0, time.process_time()
+    """Return processor time and virtual time in s of a number of packets; each arrival triggers another one."""
+    arrived, first_ns, now_ns, started_s = 0, model.next_event_ns() or 0, 0, time.process_time()
     while arrived < packets:
         now_ns = model.next_event_ns() or now_ns
         for _, _, number, source, _ in model.deliveries(now_ns):
             arrived += 1
             model.send(now_ns, source, number, PACKET_BYTES, receiver)
-    return time.process_time() - begun_s, (now_ns - first_ns) / 1e9
+    return time.process_time() - started_s, (now_ns - first_ns) / 1e9
 
 
 def round_trips(layer: Layer) -> Figures:
-    """Return round trips in ms through the medium, and what they have beside what the model gives them."""
+    """Return round trips in ms through the medium, and their mean without the delays from the model."""
     with swarm(2, layer.radio(), layer.load()) as (medium, (near, _)):
         near.run("ping", "-c", "3", "10.9.0.2")
         before_ms = _modelled_ms(medium)
@@ -134,9 +133,9 @@ def _parts_ms(parts: DelayParts) -> float:
 
 
 def one_round(packets: int) -> dict[str, Figures]:
-    """Return the figures of one round per layer, and per number of stations with all of them."""
-    found = {layer.name: {**engine(layer, 2, packets), **round_trips(layer)} for layer in LAYERS}
-    return found | {f"all, {count} stations": engine(LAYERS[-1], count, packets) for count in STATIONS}
+    """Return the figures of one round per layer, and per number of stations with all layers."""
+    figures = {layer.name: {**engine(layer, 2, packets), **round_trips(layer)} for layer in LAYERS}
+    return figures | {f"all, {count} stations": engine(LAYERS[-1], count, packets) for count in STATIONS}
 
 
 def main() -> None:
@@ -155,8 +154,11 @@ def main() -> None:
     columns = list(rounds[0][LAYERS[0].name])
     print(f"{'':22}" + "".join(f"{column:>15}" for column in columns))
     for name, first in rounds[0].items():
-        values = {column: statistics.median(one[name][column] for one in rounds) for column in first}
-        print(f"{name:22}" + "".join(f"{values[one]:>15.3g}" if one in values else f"{'':>15}" for one in columns))
+        values = {column: statistics.median(each[name][column] for each in rounds) for column in first}
+        print(
+            f"{name:22}"
+            + "".join(f"{values[column]:>15.3g}" if column in values else f"{'':>15}" for column in columns)
+        )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""What a trial of many repeats takes on the laptop beside the repeats: `python -m benchmarks.ledger`; needs no root.
+"""Overhead of the ledger in trials of many repeats: `python -m benchmarks.ledger`; needs no root.
 
-Trials of one ping each, whose evidence is written here and not by robots: wall time of keeping an attempt (its files,
-the journal, the row, the table, the manifest; all on disk, so the disk counts), as the mean over all attempts of the
-trial and over the last hundred; of opening the trial again as `fieldkit resume` does, which reads all evidence; of
-asking how many repeats are over; and of keeping the next ten attempts. `--keep FOLDER` leaves the trials there, and
-`--open FOLDER` measures those that are there, by another checkout's fieldkit too (`PYTHONPATH`).
+The trials have one ping per repeat, with generated evidence instead of robots. Measured is the wall time, disk
+included, for storing an attempt (files, journal, row, table, manifest), as the mean over all attempts and over the
+last hundred; for opening the trial again as `fieldkit resume` does, which reads all evidence; for reading the number
+of finished repeats; and for storing the next ten attempts. `--keep FOLDER` keeps the trials in that folder, and
+`--open FOLDER` measures existing trials, also with fieldkit of another checkout (`PYTHONPATH`).
 """
 
 import argparse
@@ -33,7 +33,7 @@ REPEATS: Final = (1_000, 5_000, 10_000)
 LAST: Final = 100
 NEXT: Final = 10
 SPARE: Final = 100
-"""Repeats that are planned beyond those that are run, to go on with."""
+"""Repeats that are planned in addition, to be run after reopening."""
 
 _PROCEDURE: Final = """\
 name: small
@@ -62,49 +62,49 @@ def planned(repeats: int) -> Plan:
     return make_plan(request, backend="field", cast=cast, now=datetime.now(UTC))
 
 
-def keep(ledger: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> float:
-    """Make one attempt and return how long fieldkit's own part took, in s."""
-    began_s = time.perf_counter()
-    begun = ledger.begin(repeat)
-    partial = store.open_attempt(folder, repeat)
-    (partial / "ping.txt").write_text(_PING, encoding="ascii")
-    ledger.measured(begun)
-    judged = gates.judge(plan, repeat, AttemptEvidence(partial))
-    ledger.keep(partial, replace(begun, status=Status.VALID), judged.measured)
-    return time.perf_counter() - began_s
+def store_attempt(ledger: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> float:
+    """Make one attempt and return the time of fieldkit's part, in s."""
+    started_s = time.perf_counter()
+    attempt = ledger.begin(repeat)
+    attempt_folder = store.open_attempt(folder, repeat)
+    (attempt_folder / "ping.txt").write_text(_PING, encoding="ascii")
+    ledger.measured(attempt)
+    judged = gates.judge(plan, repeat, AttemptEvidence(attempt_folder))
+    ledger.keep(attempt_folder, replace(attempt, status=Status.VALID), judged.measured)
+    return time.perf_counter() - started_s
 
 
 def run(out: Path, repeats: int) -> Path:
-    """Run a trial of so many repeats, print what they took, and return its folder."""
+    """Run a trial with the given number of repeats, print the times, and return its folder."""
     plan = planned(repeats)
     folder = store.create(out, plan)
     (folder / journal.JOURNAL_FILE).touch()
     ledger = Ledger(plan, folder, Stop())
-    took_s = [keep(ledger, plan, folder, repeat) for repeat in list(plan.order())[:repeats]]
-    began_s = time.perf_counter()
+    times_s = [store_attempt(ledger, plan, folder, repeat) for repeat in list(plan.order())[:repeats]]
+    started_s = time.perf_counter()
     ledger.summarize()
     print(
-        f"{repeats:>7} repeats: {sum(took_s):8.1f} s in all, {1e3 * statistics.fmean(took_s):7.2f} ms each, "
-        f"{1e3 * statistics.fmean(took_s[-LAST:]):7.2f} ms each of the last {LAST}, "
-        f"{time.perf_counter() - began_s:6.2f} s for the summary",
+        f"{repeats:>7} repeats: {sum(times_s):8.1f} s in all, {1e3 * statistics.fmean(times_s):7.2f} ms each, "
+        f"{1e3 * statistics.fmean(times_s[-LAST:]):7.2f} ms each of the last {LAST}, "
+        f"{time.perf_counter() - started_s:6.2f} s for the summary",
         flush=True,
     )
     return folder
 
 
 def reopen(folder: Path) -> None:
-    """Open a trial again, and go on with it."""
+    """Open a trial again, and continue it."""
     plan = store.read_plan(folder)
-    began_s = time.perf_counter()
+    started_s = time.perf_counter()
     ledger = Ledger(plan, folder, Stop())
     opened_s = time.perf_counter()
     done = ledger.done
-    asked_s = time.perf_counter()
-    left = [repeat for repeat in plan.order() if not ledger.is_over(repeat)]
-    took_s = [keep(ledger, plan, folder, repeat) for repeat in left[:NEXT]]
+    counted_s = time.perf_counter()
+    remaining = [repeat for repeat in plan.order() if not ledger.is_over(repeat)]
+    times_s = [store_attempt(ledger, plan, folder, repeat) for repeat in remaining[:NEXT]]
     print(
-        f"{done:>7} repeats: opened in {opened_s - began_s:7.2f} s, asked in {1e3 * (asked_s - opened_s):9.2f} ms, "
-        f"{1e3 * statistics.median(took_s):8.2f} ms each of the next {NEXT} (median)",
+        f"{done:>7} repeats: opened in {opened_s - started_s:7.2f} s, counted in {1e3 * (counted_s - opened_s):9.2f} "
+        f"ms, {1e3 * statistics.median(times_s):8.2f} ms each of the next {NEXT} (median)",
         flush=True,
     )
 
@@ -113,8 +113,8 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, nargs="+", default=REPEATS)
-    parser.add_argument("--keep", type=Path, help="folder that the trials are left in")
-    parser.add_argument("--open", type=Path, help="folder with trials to go on with; none is made")
+    parser.add_argument("--keep", type=Path, help="folder in which the trials are kept")
+    parser.add_argument("--open", type=Path, help="folder with trials to continue; no trial is made")
     options = parser.parse_args()
     if options.open is not None:
         for folder in sorted(options.open.iterdir()):

@@ -1,8 +1,8 @@
-"""When watched programs ran in chosen network namespaces, told by the kernel; what runs there notices nothing.
+"""Lifetimes of watched programs in chosen network namespaces, from kernel events and without effect on the programs.
 
 The kernel reports every exec and exit with its time on the monotonic clock (process events connector,
-linux/cn_proc.h), so that programs started by different means are timed by one definition: from the exec of the
-program to the exit of its process.
+linux/cn_proc.h). So programs that are started in different ways are timed by the same definition: from the exec of
+the program to the exit of its process.
 """
 
 import ctypes
@@ -36,20 +36,20 @@ _HEADERS: Final = struct.Struct("=IHHII IIIIHH")
 _EVENT: Final = struct.Struct("=IIQ II")
 
 _REALTIME_PRIORITY: Final = "10"
-_TOLD_S: Final = 2.0
+_REPORT_S: Final = 2.0
 _INTERPRETERS: Final = (["sh"], ["bash"])
 _ROOT: Final = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
 class Lifetime:
-    """A program that ran.
+    """One execution of a program.
 
     Attributes:
-        program: Which of the watched ones.
+        program: Name of the program.
         argv: Its command line.
-        start_ns: When it was executed, on the monotonic clock.
-        end_ns: When its process ended.
+        start_ns: Time of its exec, on the monotonic clock.
+        end_ns: Time of its exit.
     """
 
     program: str
@@ -59,11 +59,11 @@ class Lifetime:
 
 
 class Lines:
-    """Lines from a pipe, each awaited with a deadline.
+    """Lines from a pipe, read with a deadline.
 
     Args:
         fd: The pipe, which the caller closes.
-        source: What writes it, for messages.
+        source: Name of the writer, for messages.
     """
 
     def __init__(self, fd: int, source: str) -> None:
@@ -75,25 +75,25 @@ class Lines:
         """Return the next line without its end.
 
         Raises:
-            EOFError: The writer ended.
-            TimeoutError: It said nothing in time.
+            EOFError: The writer exited.
+            TimeoutError: It wrote no line in time.
         """
         while b"\n" not in self._pending:
             readable, _, _ = select.select([self._fd], [], [], deadline.remaining_s)
             if not readable:
-                raise TimeoutError(f"{self._source} said nothing in time")
+                raise TimeoutError(f"{self._source} wrote nothing in time")
             data = os.read(self._fd, 1 << 16)
             if not data:
-                raise EOFError(f"{self._source} ended")
+                raise EOFError(f"{self._source} exited")
             self._pending += data
         line, self._pending = self._pending.split(b"\n", 1)
         return line.decode()
 
 
 class Watch:
-    """Watches from entering to leaving the context, in a process of its own.
+    """Watches while the context is open, in a separate process.
 
-    It runs at real-time priority: a short-lived program must be looked at before it ends.
+    It runs at real-time priority, because a short-lived program must be identified before it exits.
 
     Args:
         pids: Processes whose network namespaces are watched.
@@ -111,7 +111,7 @@ class Watch:
             cwd=_ROOT,
         )
         assert self._process.stdout is not None
-        self._lines = Lines(self._process.stdout.fileno(), "the watch over programs")
+        self._lines = Lines(self._process.stdout.fileno(), "the watcher of programs")
 
     def __enter__(self) -> Self:
         try:
@@ -124,23 +124,23 @@ class Watch:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def take(self, count: int, since_ns: int) -> tuple[Lifetime, ...]:
-        """Return `count` programs that started after `since_ns`, in the order in which they ended.
+    def read(self, count: int, since_ns: int) -> tuple[Lifetime, ...]:
+        """Return `count` programs that started after `since_ns`, in the order in which they exited.
 
         Raises:
-            EOFError: The watch ended.
-            TimeoutError: There were not so many: one was gone before it could be looked at, or has not ended.
+            EOFError: The watcher exited.
+            TimeoutError: There were fewer: a program exited before it was identified, or still runs.
         """
-        deadline = Deadline.after(_TOLD_S)
-        found: list[Lifetime] = []
-        while len(found) < count:
+        deadline = Deadline.after(_REPORT_S)
+        lifetimes: list[Lifetime] = []
+        while len(lifetimes) < count:
             program, argv, start_ns, end_ns = json.loads(self._lines.next(deadline))
             if start_ns >= since_ns:
-                found.append(Lifetime(program, tuple(argv), start_ns, end_ns))
-        return tuple(found)
+                lifetimes.append(Lifetime(program, tuple(argv), start_ns, end_ns))
+        return tuple(lifetimes)
 
     def close(self) -> None:
-        """End the watch; does nothing the second time."""
+        """Stop the watcher; a second call has no effect."""
         self._process.kill()
         self._process.wait()
         if self._process.stdout is not None:
@@ -152,14 +152,14 @@ def _namespace(pid: int) -> int:
 
 
 def _events() -> Iterator[tuple[int, int, int]]:
-    """Yield kind, time in ns and process id of every exec and every end of a process."""
+    """Yield kind, time in ns and process id of every exec and exit of a process."""
     with socket.socket(socket.AF_NETLINK, socket.SOCK_DGRAM, _NETLINK_CONNECTOR) as channel:
         channel.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, 4 << 20)
-        _let_through(channel, _EXEC, _EXIT)
+        _filter_events(channel, _EXEC, _EXIT)
         channel.bind((0, _CN_IDX_PROC))
         headers = (_HEADERS.size + 4, _NLMSG_DONE, 0, 0, 0, _CN_IDX_PROC, _CN_VAL_PROC, 0, 0, 4, 0)
         channel.send(_HEADERS.pack(*headers) + struct.pack("=I", _PROC_CN_MCAST_LISTEN))
-        print("ready", flush=True)  # what happens from here on waits in the socket
+        print("ready", flush=True)  # later events wait in the socket
         while True:
             data = channel.recv(1 << 12)
             if len(data) < _HEADERS.size + _EVENT.size:
@@ -169,19 +169,19 @@ def _events() -> Iterator[tuple[int, int, int]]:
                 yield kind, t_ns, process
 
 
-def _let_through(channel: socket.socket, *kinds: int) -> None:
-    """Let the kernel drop events of other kinds: a watch that is woken for nothing comes late where it matters."""
-    # struct sock_filter, linux/filter.h: load the kind (the network's byte order), compare, return all or nothing.
+def _filter_events(channel: socket.socket, *kinds: int) -> None:
+    """Make the kernel drop events of other kinds, since needless wake-ups delay the watcher."""
+    # struct sock_filter, linux/filter.h: load the kind (in network byte order), compare, accept or drop.
     load = [(0x20, 0, 0, _HEADERS.size)]
     compare = [(0x15, len(kinds) - n, 0, socket.htonl(kind)) for n, kind in enumerate(kinds)]
     program = [*load, *compare, (0x06, 0, 0, 0), (0x06, 0, 0, 0xFFFFFFFF)]
-    code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *one) for one in program))
+    code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *instruction) for instruction in program))
     channel.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("HP", len(program), ctypes.addressof(code)))
 
 
 def _identify(pid: int, namespaces: frozenset[int], programs: frozenset[str]) -> tuple[str, list[str]] | None:
-    """Return program and command line of a process that has just been executed, None if it is not watched."""
-    with suppress(OSError):  # gone already
+    """Return name and command line of a process after its exec, or None if it is not watched."""
+    with suppress(OSError):  # it has exited already
         with open(f"/proc/{pid}/cmdline", "rb", buffering=0) as file:  # noqa: PTH123 (a race: pathlib is slower)
             argv = file.read().decode(errors="replace").split("\0")[:-1]
         names = [word.rsplit("/", 1)[-1] for word in argv[:2]]
@@ -192,15 +192,15 @@ def _identify(pid: int, namespaces: frozenset[int], programs: frozenset[str]) ->
 
 
 def main() -> None:
-    """Print each watched program that ended as a JSON line: program, command line, start and end in ns."""
+    """Print each watched program at its exit as a JSON line: program, command line, start and end in ns."""
     namespaces, programs = frozenset(map(int, sys.argv[1].split(","))), frozenset(sys.argv[2:])
     running: dict[int, tuple[str, list[str], int]] = {}
     for kind, t_ns, pid in _events():
         if kind == _EXIT:
-            if ended := running.pop(pid, None):
-                print(json.dumps([*ended, t_ns]), flush=True)
-        elif pid not in running and (found := _identify(pid, namespaces, programs)):
-            running[pid] = (*found, t_ns)
+            if program_start := running.pop(pid, None):
+                print(json.dumps([*program_start, t_ns]), flush=True)
+        elif pid not in running and (identified := _identify(pid, namespaces, programs)):
+            running[pid] = (*identified, t_ns)
 
 
 if __name__ == "__main__":

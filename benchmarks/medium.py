@@ -1,10 +1,10 @@
-"""What the medium costs, beside a bare veth pair in the same run: `python -m benchmarks.medium [--json]`, as root.
+"""Cost of the medium, compared with a bare veth pair: `python -m benchmarks.medium [--json]`, as root.
 
-Two namespaces, no robots in them. Per round and path, in this order: round-trip time at zero delay (ping), TCP
-throughput (iperf3), 64-byte UDP payloads at full rate (iperf3: carried to the receiver's interface, and received by
-its program, which on two cores starves first), and the error of a 5 ms delay: a sender stamps a datagram every 2 ms,
-the receiver's kernel stamps its arrival, both on one clock. What this machine adds by itself shows in the column of
-the bare timer: how late a 5 ms sleep ends at the same priority.
+Two namespaces without robots. Per round and path, in this order: round-trip time at zero delay (ping), TCP throughput
+(iperf3), 64-byte UDP payloads at full rate (iperf3: packets at the receiver's interface, and packets received by its
+program, which on two cores is starved first), and the error of a 5 ms delay: a sender stamps a datagram every 2 ms,
+and the receiver's kernel stamps its arrival on the same clock. The column of the bare timer shows the machine's part:
+the lateness of a 5 ms sleep at the same priority.
 """
 
 import argparse
@@ -37,7 +37,7 @@ Figures = dict[str, float]
 
 
 def radio(delay: str) -> RadioOptions:
-    """Return a radio that does nothing to packets but hold them for `delay`."""
+    """Return options of a radio that only delays packets by `delay`."""
     return RadioOptions.model_validate({"loss": "0%", "delay": delay, "rate": "unlimited"})
 
 
@@ -82,7 +82,7 @@ def measure_throughput(near: Namespace, far: Namespace, seconds: float) -> Figur
 
 
 def packets_in(namespace: Namespace) -> int:
-    """Return how many packets the interfaces of `namespace` have received, loopback aside."""
+    """Return the number of packets that the interfaces of `namespace` received, without loopback."""
     links = json.loads(namespace.run("ip", "-json", "-statistics", "link").stdout)
     return sum(link["stats64"]["rx"]["packets"] for link in links if link["ifname"] != "lo")
 
@@ -123,7 +123,7 @@ def measure_delay(near: Namespace, far: Namespace, probes: int) -> list[float]:
 
 
 def send_probes(probes: int) -> None:
-    """Send datagrams that carry their time of departure, one every 2 ms."""
+    """Send datagrams with their send time, one every 2 ms."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for _ in range(probes):
             sender.sendto(struct.pack("q", time.time_ns()), ("10.9.0.2", PROBE_PORT))
@@ -146,7 +146,7 @@ def receive_probes(probes: int) -> None:
 
 
 def timer_lateness_ms(sleeps: int) -> list[float]:
-    """Return by how much sleeps of 5 ms were late, in ms, in a real-time process of its own."""
+    """Return the lateness in ms of sleeps of 5 ms in a separate real-time process."""
     script = (
         f"import time\nfor _ in range({sleeps}):\n t = time.monotonic_ns(); time.sleep(0.005)\n"
         " print((time.monotonic_ns() - t) / 1e6 - 5)"
@@ -201,14 +201,14 @@ def main() -> None:
     print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}")
     print(f"{'':22}{'veth':>28}{'medium':>28}{'medium/veth':>13}{'bare timer':>28}")
     for name in rounds[0]["medium"]:
-        cells = {path: [figures[name] for one in rounds if name in (figures := one[path])] for path in rounds[0]}
+        cells = {path: [figures[name] for each in rounds if name in (figures := each[path])] for path in rounds[0]}
         ratio = statistics.median(cells["medium"]) / statistics.median(cells["veth"])
         texts = {path: spread(values) for path, values in cells.items()}
         print(f"{name:22}{texts['veth']:>28}{texts['medium']:>28}{ratio:>13.2f}{texts['timer']:>28}")
 
 
 def spread(values: Sequence[float]) -> str:
-    """Return `median (lowest to highest)` of `values`, empty without any."""
+    """Return `median (lowest to highest)` of `values`, or an empty string for no values."""
     if not values:
         return ""
     digits = 0 if min(values) > 100 else 3

@@ -1,8 +1,9 @@
-"""How long a mesh takes to heal: `python -m benchmarks.mesh --out FOLDER [--figure FILE.svg]`, as root.
+"""Time that a mesh takes to heal: `python -m benchmarks.mesh --out FOLDER [--figure FILE.svg]`, as root.
 
-Trials of four layouts and two hello intervals on emulated robots without fading, of five repeats each, run one after
-the other where FOLDER has none yet; 2 hours in all. Then a table of `rtt_gap_s`, with the bound of 13.7 hello
-intervals (docs/studies/mesh.md), and a figure. The row has no other path: its time is from when the robot was back.
+Trials of four layouts and two hello intervals on emulated robots without fading, with five repeats each, run in
+sequence unless FOLDER already has them; 2 hours in all. Then a table of `rtt_gap_s`, with the bound of 13.7 hello
+intervals (docs/studies/mesh.md), and a figure. The layout `row` has no other path, so its time starts when the robot
+is back.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from fieldkit.report.theme import Style
 HERE: Final = Path(__file__).parent
 HELLOS_S: Final = (1, 4)
 BOUND_HELLOS: Final = 13.7
-"""12 hellos missing, the first 1.7 intervals after the last that came; babeld looks once an interval."""
+"""12 missing hellos, the first 1.7 intervals after the last received one; babeld checks once per interval."""
 
 SITE: Final = """\
 backend: emulated
@@ -49,14 +50,14 @@ emulated:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where robots stand.
+    """A layout of robots.
 
     Attributes:
-        label: What it is.
-        procedure: Name of the procedure; those that do not ship stand in `benchmarks/mesh`.
-        distance: From sender to receiver.
-        others: Roles beside sender and receiver.
-        away_s: How long the robot is away without which nothing flows; 0 where there is another way.
+        label: Its description.
+        procedure: Name of the procedure; those that do not ship are in `benchmarks/mesh`.
+        distance: Distance from sender to receiver.
+        others: Further roles.
+        away_s: Time for which the only path is interrupted; 0 if there is another path.
     """
 
     label: str
@@ -67,7 +68,7 @@ class Layout:
 
 
 LAYOUTS: Final = {
-    "ways": Layout("two ways of 4 hops", "mesh_heal", "220m", ("first", "middle", "left", "last")),
+    "ways": Layout("two paths of 4 hops", "mesh_heal", "220m", ("first", "middle", "left", "last")),
     "detour": Layout("3 hops, detour of 4", "mesh_detour", "130m", ("first", "last", "left", "middle", "right")),
     "ring": Layout("ring of six: 2 hops, detour of 4", "mesh_ring", "104m", ("first", "left", "middle", "right")),
     "row": Layout(
@@ -77,7 +78,7 @@ LAYOUTS: Final = {
 
 
 def gaps_s(out: Path, name: str, hello_s: int, repeats: int) -> list[float]:
-    """Return the gap of each valid repeat of a layout; the trial is run first where there is none."""
+    """Return the gap of each valid repeat of a layout; run its trial first unless it exists."""
     layout, lab = LAYOUTS[name], out / f"{name}-{hello_s}s"
     if not (lab / "trials").exists():
         _make_lab(lab, layout, hello_s)
@@ -95,20 +96,22 @@ def _make_lab(lab: Path, layout: Layout, hello_s: int) -> None:
     (lab / "fieldkit.yaml").write_text(SITE.format(roles=roles, hello_s=hello_s), encoding="utf-8")
 
 
-def table(found: Mapping[tuple[str, int], list[float]]) -> str:
+def table(gaps_by_layout: Mapping[tuple[str, int], list[float]]) -> str:
     """Return a Markdown table, a line per layout and hello interval."""
     lines = ["| layout | hello | repeats | least | median | most | bound |", "| --- " * 7 + "|"]
-    for (name, hello_s), gaps in found.items():
-        seconds = (f"{one:.1f} s" for one in (min(gaps), statistics.median(gaps), max(gaps), BOUND_HELLOS * hello_s))
+    for (name, hello_s), gaps in gaps_by_layout.items():
+        seconds = (
+            f"{gap_s:.1f} s" for gap_s in (min(gaps), statistics.median(gaps), max(gaps), BOUND_HELLOS * hello_s)
+        )
         lines.append(f"| {LAYOUTS[name].label} | {hello_s} s | {len(gaps)} | {' | '.join(seconds)} |")
     return "\n".join(lines)
 
 
-def chart(found: Mapping[tuple[str, int], list[float]]) -> Chart:
+def chart(gaps_by_layout: Mapping[tuple[str, int], list[float]]) -> Chart:
     """Return a chart with a panel per hello interval: each repeat, and the bound."""
     panels = []
     for hello_s in HELLOS_S:
-        points = [(place, one) for place, name in enumerate(LAYOUTS, 1) for one in found[name, hello_s]]
+        points = [(place, gap_s) for place, name in enumerate(LAYOUTS, 1) for gap_s in gaps_by_layout[name, hello_s]]
         places, gaps = ([point[axis] for point in points] for axis in (0, 1))
         bound_s = BOUND_HELLOS * hello_s
         series = [
@@ -124,22 +127,22 @@ def chart(found: Mapping[tuple[str, int], list[float]]) -> Chart:
 
 
 def main() -> None:
-    """Run what is missing, print the table, draw."""
+    """Run missing trials, print the table, draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the labs and their trials")
     parser.add_argument("--figure", type=Path, help="SVG file to draw")
-    parser.add_argument("--repeats", type=int, default=5, help="of each trial (default: 5)")
+    parser.add_argument("--repeats", type=int, default=5, help="repeats of each trial (default: 5)")
     options = parser.parse_args()
     load_before = os.getloadavg()[0]
-    found = {
+    gaps_by_layout = {
         (name, hello_s): gaps_s(options.out, name, hello_s, options.repeats)
         for name in LAYOUTS
         for hello_s in HELLOS_S
     }
-    print(table(found))
+    print(table(gaps_by_layout))
     print(f"load {load_before:.1f} before, {os.getloadavg()[0]:.1f} after")
     if options.figure:
-        files.write(options.figure, figures.paper(chart(found), "svg"))
+        files.write(options.figure, figures.paper(chart(gaps_by_layout), "svg"))
 
 
 if __name__ == "__main__":

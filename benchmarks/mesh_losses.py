@@ -1,9 +1,9 @@
-"""How long a mesh takes to find another way: `python -m benchmarks.mesh_losses [--losses N]`, as root.
+"""Time that a mesh takes to find another path: `python -m benchmarks.mesh_losses [--losses N]`, as root.
 
-Three labs at the same time: a way of three hops beside one of four without fading and with it, and beside another of
-three with fading. In each the next robot on the sender's way is lost, until a ping of the sender's is answered by the
-receiver again or the patience ends; then it comes back, until packets go over it again. Then a table of those times.
-With 40 losses it takes about half an hour.
+Three labs run at the same time: a path of three hops with an alternative of four, without and with fading, and with
+an alternative of three with fading. In each lab the sender's next hop is switched off until the receiver answers a
+ping of the sender again, or for at most `PATIENCE_S`; then it is switched on until packets use it again. Then a table
+of these times is printed. 40 losses take about half an hour.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from sim_backends.world.world import load_world
 
 HELLO_S: Final = 0.5
 SETTLE_S: Final = 10.0
-"""From when a robot is back until packets are looked for on it: more than babeld's history of 16 hellos."""
+"""Time after switching a robot on before its route is checked: more than babeld's history of 16 hellos."""
 
 PATIENCE_S: Final = 100.0
 RETURN_S: Final = 600.0
@@ -48,13 +48,13 @@ BESIDE_THREE: Final[Places] = {**THREE_HOPS, "left": (35, 60), "right": (95, 60)
 
 @dataclass(frozen=True)
 class Detour:
-    """A lab with two ways.
+    """A lab with two paths.
 
     Attributes:
-        label: What they are.
-        places: Where robots stand, metres east and north.
-        lost: Who is lost, where the sender's way goes over it.
-        fading: Whether the radio fades.
+        label: Description of the paths.
+        places: Positions of robots, metres east and north.
+        lost: Robots to switch off if they are on the sender's path.
+        fading: True if the radio fades.
     """
 
     label: str
@@ -72,24 +72,24 @@ DETOURS: Final = (
 
 @dataclass(frozen=True)
 class DetourLab:
-    """Its robots, up and at their places.
+    """The running lab of a detour.
 
     Attributes:
-        robots: Each, by its name.
-        shell: The sender's.
+        robots: Robots by name.
+        shell: Shell on the sender.
     """
 
     robots: Mapping[str, EmulatedRobot]
     shell: Shell
 
-    def answered(self, within_s: float) -> bool:
-        """Ask the receiver until it answers; return whether it does in that time."""
-        ask = 'until ping -n -c 1 -W 0.2 "$0" >/dev/null 2>&1; do sleep 0.05; done'
-        argv = ("timeout", str(within_s), "sh", "-c", ask, self._address("receiver"))
+    def is_reachable(self, within_s: float) -> bool:
+        """Ping the receiver until it answers; return True if it does within `within_s`."""
+        script = 'until ping -n -c 1 -W 0.2 "$0" >/dev/null 2>&1; do sleep 0.05; done'
+        argv = ("timeout", str(within_s), "sh", "-c", script, self._address("receiver"))
         return self.shell.run(argv, deadline=Deadline.after(within_s + 60), check=False).exit_code == 0
 
     def next_hop(self) -> str:
-        """Return who is next on the sender's way; empty where it has none."""
+        """Return the next hop on the sender's path, or an empty string without a path."""
         argv = ("ip", "-4", "route", "show", self._address("receiver"), "proto", "babel")
         words = self.shell.run(argv, deadline=Deadline.after(60)).stdout.decode().split()
         via = words[words.index("via") + 1] if "via" in words else ""
@@ -119,61 +119,61 @@ def lab(detour: Detour) -> Iterator[DetourLab]:
             yield DetourLab(up.robots, sender)
 
 
-def heal_s(one: DetourLab, lost: Sequence[str]) -> float | None:
-    """Lose the robot that is next on the way, once it is one of `lost`; return how long nothing was answered.
+def heal_s(lab_robots: DetourLab, lost: Sequence[str]) -> float | None:
+    """Switch off the next hop, once it is one of `lost`; return the time until the receiver answers again.
 
     Returns:
-        Seconds; None where that is longer than the patience.
+        Seconds, or None if it is longer than `PATIENCE_S`.
 
     Raises:
-        TimeoutError: Packets did not go over it before.
+        TimeoutError: Packets did not use one of the robots before.
     """
-    back = Deadline.after(RETURN_S)
+    route_deadline = Deadline.after(RETURN_S)
     time.sleep(SETTLE_S)
-    while (hop := one.next_hop()) not in lost or not one.answered(1.0):
-        if back.expired:
-            raise TimeoutError(f"packets do not go over {' or '.join(lost)}, but over {hop or 'nobody'}")
+    while (hop := lab_robots.next_hop()) not in lost or not lab_robots.is_reachable(1.0):
+        if route_deadline.expired:
+            raise TimeoutError(f"packets do not use {' or '.join(lost)}, but {hop or 'no robot'}")
         time.sleep(1.0)
-    one.robots[hop].switch_off()
-    began_s = time.monotonic()
+    lab_robots.robots[hop].switch_off()
+    started_s = time.monotonic()
     try:
-        return time.monotonic() - began_s if one.answered(PATIENCE_S) else None
+        return time.monotonic() - started_s if lab_robots.is_reachable(PATIENCE_S) else None
     finally:
-        one.robots[hop].switch_on()
+        lab_robots.robots[hop].switch_on()
 
 
-def heals_s(one: DetourLab, detour: Detour, losses: int) -> list[float | None]:
-    """Return `heal_s` of each loss, and say it on the way."""
-    found = []
+def heals_s(lab_robots: DetourLab, detour: Detour, losses: int) -> list[float | None]:
+    """Return `heal_s` of each loss, and print each result."""
+    times_s = []
     for number in range(losses):
-        found.append(heal_s(one, detour.lost))
-        print(f"{detour.label}, fading {detour.fading}, {number + 1}/{losses}: {found[-1]}", file=sys.stderr)
-    return found
+        times_s.append(heal_s(lab_robots, detour.lost))
+        print(f"{detour.label}, fading {detour.fading}, {number + 1}/{losses}: {times_s[-1]}", file=sys.stderr)
+    return times_s
 
 
-def row(detour: Detour, found: Sequence[float | None]) -> str:
+def row(detour: Detour, times_s: Sequence[float | None]) -> str:
     """Return a line of the table."""
     bound_s = BOUND_HELLOS * HELLO_S
-    in_order = sorted(PATIENCE_S if one is None else one for one in found)
-    most = f"not in {PATIENCE_S:g} s" if None in found else f"{in_order[-1]:.1f} s"
-    above = sum(one > bound_s for one in in_order)
+    in_order = sorted(PATIENCE_S if time_s is None else time_s for time_s in times_s)
+    most = f"not in {PATIENCE_S:g} s" if None in times_s else f"{in_order[-1]:.1f} s"
+    above = sum(time_s > bound_s for time_s in in_order)
     fading = "yes" if detour.fading else "no"
-    return f"| {detour.label} | {fading} | {len(found)} | {statistics.median(in_order):.1f} s | {most} | {above} |"
+    return f"| {detour.label} | {fading} | {len(times_s)} | {statistics.median(in_order):.1f} s | {most} | {above} |"
 
 
 def main() -> None:
-    """Lose robots in all labs, and print the table."""
+    """Switch robots off in all labs, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--losses", type=int, default=40, help="how many per lab")
+    parser.add_argument("--losses", type=int, default=40, help="losses per lab")
     options = parser.parse_args()
     load_before = os.getloadavg()[0]
     with ExitStack() as stack:
         labs = [stack.enter_context(lab(detour)) for detour in DETOURS]
         pool = stack.enter_context(ThreadPoolExecutor(len(labs)))
-        found = list(pool.map(heals_s, labs, DETOURS, [options.losses] * len(labs)))
+        times_by_lab = list(pool.map(heals_s, labs, DETOURS, [options.losses] * len(labs)))
     print(f"| detour | fading | losses | median | most | above {BOUND_HELLOS * HELLO_S:.2f} s |")
     print("| --- " * 6 + "|")
-    print("\n".join(map(row, DETOURS, found)))
+    print("\n".join(map(row, DETOURS, times_by_lab)))
     print(f"load {load_before:.1f} before, {os.getloadavg()[0]:.1f} after")
 
 

@@ -1,12 +1,12 @@
-"""Which middleware on a lossy radio: `python -m benchmarks.middleware [--figures docs/studies] [--page PAGE]`.
+"""Compare middlewares on a lossy radio: `python -m benchmarks.middleware [--figures docs/studies] [--page PAGE]`.
 
-As root. Six campaigns of benchmarks/middleware/ run beside each other, for a repeat mostly waits; `--only` takes some
+As root. Six campaigns of benchmarks/middleware/ run in parallel, because a repeat mostly waits; `--only` selects some
 of them, `--full` those that last hours. Stop it at any time: the same command continues where it stopped. Then it
 prints the tables of docs/studies/middleware.md, or writes them into PAGE, and draws its figures.
 
-Two repeats, as the campaigns have, show large differences only. On a quiet machine `--repeats 12` measures each place
-twelve times, in about two and a half hours. Then the repeat is the unit of the intervals.
-`--from-page docs/studies/middleware.md --figures docs/studies` draws the figures from the tables of the page alone.
+Two repeats, as in the campaigns, show only large differences. On a quiet machine `--repeats 12` measures each place
+twelve times, in about two and a half hours. Then the intervals treat the repeat as the independent unit.
+`--from-page docs/studies/middleware.md --figures docs/studies` draws the figures only from the tables of the page.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from fieldkit.report.theme import Style
 LAB: Final = Path(__file__).with_name("middleware")
 ROOT: Final = LAB.parents[1]
 ROS2: Final = ROOT / ".ros2" / "bin" / "python"
-"""A real ROS 2, as `.ci/install --dev` puts it there."""
+"""A real ROS 2, as installed by `.ci/install --dev`."""
 BEGIN: Final = "<!-- written by benchmarks.middleware: from here -->"
 END: Final = "<!-- written by benchmarks.middleware: to here -->"
 
@@ -48,18 +48,18 @@ STYLES: Final[dict[str, Style]] = {
 KINDS: Final = {"best effort": "best effort", "reliable": "reliable"}
 SIZES: Final = {100: "100 B", 1_000: "1 kB", 10_000: "10 kB", 100_000: "100 kB", 1_000_000: "1 MB"}
 DODGE_M: Final = 1.1
-"""Between series at one distance, so that none hides another."""
-AROUND_M: Final = 7.0
+"""Offset between series at the same distance, so that they do not overlap."""
+MARGIN_M: Final = 7.0
 ROBOTS_DODGE: Final = 0.06
-"""Between series at one number of robots."""
+"""Offset between series at the same number of robots."""
 
 
 def lab(folder: Path, repeats: int | None = None) -> None:
-    """Put the lab's files into a folder where it lacks them: a campaign that was begun there keeps its own.
+    """Copy the lab's files into a folder if they are missing: a started campaign keeps its files.
 
     Args:
-        folder: Where to.
-        repeats: How often each place is measured in campaigns of their own; None for what the files say.
+        folder: The folder.
+        repeats: Number of repeats for separate campaigns, or None for the number in the files.
     """
     robots = folder / "robots"
     robots.mkdir(parents=True, exist_ok=True)
@@ -69,37 +69,37 @@ def lab(folder: Path, repeats: int | None = None) -> None:
         if (
             repeats
             and source.stem in CAMPAIGNS
-            and not (made := folder / f"{called(source.stem, repeats)}.yaml").exists()
+            and not (new_file := folder / f"{campaign_name(source.stem, repeats)}.yaml").exists()
         ):
             text = source.read_text(encoding="utf-8")
-            text = re.sub(r"(?m)^name: .*$", f"name: {called(source.stem, repeats)}", text)
-            made.write_text(re.sub(r"(?m)^repeats: .*$", f"repeats: {repeats}", text), encoding="utf-8")
+            text = re.sub(r"(?m)^name: .*$", f"name: {campaign_name(source.stem, repeats)}", text)
+            new_file.write_text(re.sub(r"(?m)^repeats: .*$", f"repeats: {repeats}", text), encoding="utf-8")
     (robots / "ros2_burger.yaml").write_text(ros2_robot(), encoding="utf-8")
 
 
-def called(campaign: str, repeats: int | None) -> str:
-    """Return the name of a campaign with its own number of repeats: `dds-12`."""
+def campaign_name(campaign: str, repeats: int | None) -> str:
+    """Return the name of a campaign with a separate number of repeats: `dds-12`."""
     return f"{campaign}-{repeats}" if repeats else campaign
 
 
 def ros2_robot() -> str:
     """Return the profile of a robot of the lab that has a real ROS 2."""
     text = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
-    for known, other in (
+    for old, new in (
         ("name: turtlebot3_burger", "name: ros2_burger"),
         ("variant: ros1", "variant: ros2"),
         ("  ping: ping", f"  ping: ping\n  python: {ROS2}"),
     ):
-        if known not in text:
-            raise ValueError(f"the profile of a TurtleBot has no {known!r} any more")
-        text = text.replace(known, other, 1)
+        if old not in text:
+            raise ValueError(f"the profile of a TurtleBot no longer contains {old!r}")
+        text = text.replace(old, new, 1)
     return text
 
 
 def run(folder: Path, names: Sequence[str]) -> None:
-    """Run campaigns, or go on with them, each with its log beside it; say which did not end well.
+    """Run or continue campaigns, each with a log file; report those that failed.
 
-    Repeats whose packets were too late on a busy machine are void, and what is valid counts all the same.
+    Repeats whose packets were late on a busy machine are void; the valid ones still count.
     """
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     running = []
@@ -113,34 +113,42 @@ def run(folder: Path, names: Sequence[str]) -> None:
             print(f"{name}: exit code {process.returncode}, see {folder / name}.log", file=sys.stderr)
 
 
-def by_distance(found: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> Chart:
+def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> Chart:
     """Return a chart of two robots: a row of panels per size, best effort on the left and reliable on the right."""
-    two = [one for one in found.cells if one.robots == 2]
-    ends = [one.distance_m for one in two] or [0.0]
+    pairs = [cell for cell in findings.cells if cell.robots == 2]
+    distances_m = [cell.distance_m for cell in pairs] or [0.0]
     panels = []
     for size in BYTES:
-        for kind, how in KINDS.items():
+        for kind, quality in KINDS.items():
             series = []
             for rank, label in enumerate(STYLES):
-                mine = [one for one in two if (one.kind, one.who, one.size_bytes) == (kind, label, size)]
+                series_cells = [
+                    cell for cell in pairs if (cell.kind, cell.middleware, cell.size_bytes) == (kind, label, size)
+                ]
                 shift_m = (rank - (len(STYLES) - 1) / 2) * DODGE_M
-                series.append(_series(label, [(one.distance_m + shift_m, one) for one in mine], drawn))
-            panel = drawn.panel(f"{SIZES[size]}, {how}{_counted(two, size)}", "distance (m)", series)
-            panels.append(replace(panel, left=min(ends) - AROUND_M, right=max(ends) + AROUND_M))
+                series.append(_series(label, [(cell.distance_m + shift_m, cell) for cell in series_cells], drawn))
+            panel = drawn.panel(f"{SIZES[size]}, {quality}{_counted(pairs, size)}", "distance (m)", series)
+            panels.append(replace(panel, left=min(distances_m) - MARGIN_M, right=max(distances_m) + MARGIN_M))
     return Chart(name=name, title=name, caption="", panels=panels)
 
 
-def by_robots(found: MiddlewareFindings) -> Chart:
-    """Return a chart of how loss and delay grow with the robots that publish to one."""
+def by_robots(findings: MiddlewareFindings) -> Chart:
+    """Return a chart of loss and delay by the number of robots that publish to one."""
     panels = []
     for drawn in (LOST, LATE):
-        for metres in sorted({one.distance_m for one in found.cells if one.robots > 2}):
-            for size in sorted({one.size_bytes for one in _beside(found, metres)}):
-                mine = [one for one in _beside(found, metres) if one.size_bytes == size]
-                numbers = sorted({one.robots for one in mine})
+        for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
+            for size in sorted({cell.size_bytes for cell in _comparable(findings, metres)}):
+                size_cells = [cell for cell in _comparable(findings, metres) if cell.size_bytes == size]
+                numbers = sorted({cell.robots for cell in size_cells})
                 series = [
                     _series(
-                        label, [(one.robots + ROBOTS_DODGE * rank, one) for one in mine if one.who == label], drawn
+                        label,
+                        [
+                            (cell.robots + ROBOTS_DODGE * rank, cell)
+                            for cell in size_cells
+                            if cell.middleware == label
+                        ],
+                        drawn,
                     )
                     for rank, label in enumerate(STYLES)
                 ]
@@ -150,14 +158,14 @@ def by_robots(found: MiddlewareFindings) -> Chart:
 
 
 def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn: "DrawnFigure") -> Series:
-    """Return the points of a middleware with their intervals; no line joins them, for these are too wide."""
-    known = sorted(((x, cell) for x, cell in points if drawn.value(cell) is not None), key=lambda pair: pair[0])
-    ends = [drawn.interval(cell) for _, cell in known]
+    """Return the points of a middleware with their intervals; no line joins them, as intervals are too wide."""
+    measured = sorted(((x, cell) for x, cell in points if drawn.value(cell) is not None), key=lambda pair: pair[0])
+    ends = [drawn.interval(cell) for _, cell in measured]
     return Series(
         label,
         STYLES[label],
-        [x for x, _ in known],
-        [drawn.value(cell) or 0.0 for _, cell in known],
+        [x for x, _ in measured],
+        [drawn.value(cell) or 0.0 for _, cell in measured],
         low=[low for low, _ in ends],
         high=[high for _, high in ends],
         join="none",
@@ -165,7 +173,7 @@ def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn: "
 
 
 def _counted(cells: Sequence[MiddlewareCell], size: int) -> str:
-    """Return of how many samples and repeats each point of a size is: `, n = 80 (2 repeats)`."""
+    """Return the number of samples and repeats of each point of a size: `, n = 80 (2 repeats)`."""
     counts = sorted({(cell.samples, cell.repeats) for cell in cells if cell.size_bytes == size})
     if not counts or not counts[-1][0]:
         return ""
@@ -174,11 +182,11 @@ def _counted(cells: Sequence[MiddlewareCell], size: int) -> str:
     return f", n = {number} ({most[1]} repeats)"
 
 
-def _beside(found: MiddlewareFindings, distance_m: float) -> list[MiddlewareCell]:
-    """Return what was measured of several robots at a place, and of two with the same settings."""
-    there = [one for one in found.cells if one.distance_m == distance_m and one.kind == "reliable"]
-    alike = {(one.who, one.size_bytes) for one in there if one.robots > 2}
-    return [one for one in there if (one.who, one.size_bytes) in alike]
+def _comparable(findings: MiddlewareFindings, distance_m: float) -> list[MiddlewareCell]:
+    """Return the cells of several robots at a distance, and those of two robots with the same settings."""
+    at_distance = [cell for cell in findings.cells if cell.distance_m == distance_m and cell.kind == "reliable"]
+    settings = {(cell.middleware, cell.size_bytes) for cell in at_distance if cell.robots > 2}
+    return [cell for cell in at_distance if (cell.middleware, cell.size_bytes) in settings]
 
 
 def _lost(cell: MiddlewareCell) -> float | None:
@@ -200,15 +208,15 @@ def _late(cell: MiddlewareCell) -> float | None:
 
 @dataclass(frozen=True)
 class DrawnFigure:
-    """A figure of cells as panels have it.
+    """A figure of cells for panels.
 
     Attributes:
         y_label: Its name and unit.
-        value: Takes it of a cell.
-        interval: Takes its 95 % interval, if there is one.
+        value: Returns its value of a cell.
+        interval: Returns its 95 % interval of a cell, if there is one.
         bottom: Lower end of its axis.
-        top: Upper end.
-        log: Whether that is logarithmic.
+        top: Upper end of its axis.
+        log: True for a logarithmic axis.
     """
 
     y_label: str
@@ -219,7 +227,7 @@ class DrawnFigure:
     log: bool = False
 
     def panel(self, title: str, x_label: str, series: Sequence[Series]) -> Panel:
-        """Return a panel of series of it."""
+        """Return a panel of series of this figure."""
         return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
 
 
@@ -229,65 +237,70 @@ LATE: Final = DrawnFigure("delay, 95 % (ms)", _late, _no_interval, 1.0, 10_000.0
 
 BIMODAL: Final = " *"
 BIMODAL_NOTE: Final = (
-    "`*`: not a rate. The loss is bimodal, a repeat loses few or nearly all "
+    "`*`: not a rate. The loss is bimodal: a repeat loses few or nearly all "
     "([every repeat](middleware-link.md#images-over-zenoh-every-repeat))."
 )
 
 
-def tables(found: MiddlewareFindings, conditions: str) -> Iterator[str]:
-    """Yield the lines that stand in docs/studies/middleware.md."""
+def tables(findings: MiddlewareFindings, conditions: str) -> Iterator[str]:
+    """Yield the lines for docs/studies/middleware.md."""
     yield conditions
     yield ""
-    yield "Two robots: samples lost, and the delay that 95 % of the others keep; - where the clocks do not tell it."
+    yield "Two robots: samples lost, and the delay of the others (95 %); - if clocks are not comparable."
     yield BIMODAL_NOTE
     yield ""
-    two = [one for one in found.cells if one.robots == 2]
-    yield from _table(two, "distance_m", lambda metres: f"{metres:g} m", _loss_and_delay)
+    pairs = [cell for cell in findings.cells if cell.robots == 2]
+    yield from _table(pairs, "distance_m", lambda metres: f"{metres:g} m", _loss_and_delay)
     yield ""
     yield "Best effort, samples lost (and `1 - (1 - p)^n` of the n packets of a sample of which a share p was lost):"
     yield ""
-    fragmented = [one for one in two if one.expected_loss is not None and one.size_bytes >= 10_000]
-    yield from _table(fragmented, "distance_m", lambda metres: f"{metres:g} m", _beside_expected)
-    for metres in sorted({one.distance_m for one in found.cells if one.robots > 2}):
+    fragmented = [cell for cell in pairs if cell.expected_loss is not None and cell.size_bytes >= 10_000]
+    yield from _table(fragmented, "distance_m", lambda metres: f"{metres:g} m", _with_expected)
+    for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
         yield ""
         yield f"Robots that publish to one at {metres:g} m, all streams together; delay of the first:"
         yield ""
-        yield from _table(_beside(found, metres), "robots", lambda number: f"{number} robots", _loss_and_delay)
+        yield from _table(_comparable(findings, metres), "robots", lambda number: f"{number} robots", _loss_and_delay)
 
 
 def _table(
     cells: Sequence[MiddlewareCell], across: str, head: Callable[[float], str], text: Callable[[MiddlewareCell], str]
 ) -> Iterator[str]:
-    columns = sorted({getattr(one, across) for one in cells})
+    columns = sorted({getattr(cell, across) for cell in cells})
     yield "| " + " | ".join(["data", "kind", "middleware", *map(head, columns)]) + " |"
     yield "| " + " | ".join(["---"] * (3 + len(columns))) + " |"
-    rows = {(one.size_bytes, one.kind, one.who) for one in cells}
-    for size, kind, who in sorted(rows, key=lambda row: (row[0], row[1], list(STYLES).index(row[2]))):
-        mine = {
-            getattr(one, across): one for one in cells if (one.size_bytes, one.kind, one.who) == (size, kind, who)
+    rows = {(cell.size_bytes, cell.kind, cell.middleware) for cell in cells}
+    for size, kind, name in sorted(rows, key=lambda row: (row[0], row[1], list(STYLES).index(row[2]))):
+        by_column = {
+            getattr(cell, across): cell
+            for cell in cells
+            if (cell.size_bytes, cell.kind, cell.middleware) == (size, kind, name)
         }
-        said = [text(mine[column]) if column in mine else "" for column in columns]
-        yield "| " + " | ".join([SIZES[size], kind, who, *said]) + " |"
+        texts = [text(by_column[column]) if column in by_column else "" for column in columns]
+        yield "| " + " | ".join([SIZES[size], kind, name, *texts]) + " |"
 
 
 def _loss_and_delay(cell: MiddlewareCell) -> str:
     lost, late = _lost(cell), _late(cell)
     if lost is None:
         return "not found"
-    is_bimodal = (cell.who, cell.kind) == ("Zenoh", "reliable") and cell.size_bytes >= middleware_page.IMAGE_BYTES
+    is_bimodal = (cell.middleware, cell.kind) == (
+        "Zenoh",
+        "reliable",
+    ) and cell.size_bytes >= middleware_page.IMAGE_BYTES
     return f"{lost:.1f} %, " + ("-" if late is None else f"{late:.0f} ms") + BIMODAL * is_bimodal
 
 
-def _beside_expected(cell: MiddlewareCell) -> str:
+def _with_expected(cell: MiddlewareCell) -> str:
     lost, expected = _lost(cell), cell.expected_loss
     return "" if lost is None or expected is None else f"{lost:.0f} % ({100 * expected:.0f})"
 
 
-def put(page: Path, lines: Sequence[str]) -> None:
-    """Put tables into a page, between its two marks.
+def write_tables(page: Path, lines: Sequence[str]) -> None:
+    """Write tables into a page, between its two markers.
 
     Raises:
-        ValueError: It has no such marks.
+        ValueError: It has no such markers.
     """
     text = page.read_text(encoding="utf-8")
     before, after = text.index(BEGIN) + len(BEGIN), text.index(END)
@@ -295,46 +308,48 @@ def put(page: Path, lines: Sequence[str]) -> None:
 
 
 def main() -> None:
-    """Run or go on, print the tables or put them into the page, draw."""
+    """Run or continue the campaigns, print the tables or write them into the page, draw the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("middleware"), help="folder of the lab and its trials")
     parser.add_argument("--figures", type=Path, help="write middleware-loss, -delay and -robots.svg there")
-    parser.add_argument("--page", type=Path, help="put the tables into this page")
+    parser.add_argument("--page", type=Path, help="write the tables into this page")
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--full", action="store_true", help="the campaigns that take hours")
-    size.add_argument("--repeats", type=int, help="how often each place is measured, in campaigns of their own")
-    parser.add_argument("--only", nargs="+", choices=CAMPAIGNS, default=CAMPAIGNS, help="run these; all are read")
-    parser.add_argument("--no-run", action="store_true", help="read what is there")
+    size.add_argument("--repeats", type=int, help="repeats at each place, in separate campaigns")
+    parser.add_argument(
+        "--only", nargs="+", choices=CAMPAIGNS, default=CAMPAIGNS, help="run only these; all are read"
+    )
+    parser.add_argument("--no-run", action="store_true", help="read the existing results")
     parser.add_argument("--from-page", type=Path, help="draw the figures from the tables of this page, run nothing")
     options = parser.parse_args()
     if options.from_page:
         draw(MiddlewareFindings(middleware_page.cells(options.from_page), "", 0.0, 0.0), options.figures)
         return
     prefix = "full-" if options.full else ""
-    names = [f"{prefix}{called(one, options.repeats)}" for one in CAMPAIGNS]
+    names = [f"{prefix}{campaign_name(name, options.repeats)}" for name in CAMPAIGNS]
     if not options.no_run:
         lab(options.out, options.repeats)
-        run(options.out, [f"{prefix}{called(one, options.repeats)}" for one in options.only])
-    found = read(options.out, names)
+        run(options.out, [f"{prefix}{campaign_name(name, options.repeats)}" for name in options.only])
+    findings = read(options.out, names)
     conditions = (
-        f"{time.strftime('%Y-%m-%d', time.gmtime(found.ended_s))}: {found.ended}; packets handed over late by up to "
-        f"{1e3 * found.late_s:.1f} ms; load average {os.getloadavg()[2]:.1f} when this was written."
+        f"{time.strftime('%Y-%m-%d', time.gmtime(findings.ended_s))}: {findings.ended}; packets handed over late by "
+        f"up to {1e3 * findings.late_s:.1f} ms; load average {os.getloadavg()[2]:.1f} when this was written."
     )
-    lines = list(tables(found, conditions))
+    lines = list(tables(findings, conditions))
     if options.page:
-        put(options.page, lines)
+        write_tables(options.page, lines)
     else:
         print("\n".join(lines))
     if options.figures:
-        draw(found, options.figures)
+        draw(findings, options.figures)
 
 
-def draw(found: MiddlewareFindings, folder: Path) -> None:
+def draw(findings: MiddlewareFindings, folder: Path) -> None:
     """Write the figures of docs/studies/middleware.md into a folder."""
     for chart in (
-        by_distance(found, "middleware-loss", LOST),
-        by_distance(found, "middleware-delay", LATE),
-        by_robots(found),
+        by_distance(findings, "middleware-loss", LOST),
+        by_distance(findings, "middleware-delay", LATE),
+        by_robots(findings),
     ):
         files.write(folder / f"{chart.name}.svg", figures.paper(chart, "svg"))
 

@@ -1,8 +1,8 @@
-"""What a move costs the medium, by the number of robots: `python -m benchmarks.moves [--json]`, as root.
+"""Cost of a move in the medium, by the number of robots: `python -m benchmarks.moves [--json]`, as root.
 
-Per world and number of robots the medium is told a place of one robot 0.1 m further, again and again: processor time
-that it spends on each, and how long the lab waits for its answer. While it does that it carries no packet. The
-yardstick is the same with every robot elsewhere each time, as if all links were looked at at every step.
+Per world and number of robots, one robot is moved repeatedly by 0.1 m. Measured are the medium's processor time per
+move, and the time until its answer, during which it carries no packets. The reference moves all robots in each step,
+so that all links are computed.
 """
 
 import argparse
@@ -29,8 +29,8 @@ _TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
 Figures = dict[str, float]
 
 
-def moved(world: str, size: int, radio: RadioOptions, *, everybody: bool) -> Figures:
-    """Return what a step costs among `size` robots, 5 m apart, of whom one moves, or everybody."""
+def moved(world: str, size: int, radio: RadioOptions, *, move_all: bool) -> Figures:
+    """Return the cost of a step with `size` robots, 5 m apart, of which one or all move."""
     with ExitStack() as stack:
         medium = stack.enter_context(MediumClient(radio, load_world(world), seed=1))
         places: dict[str, Vector] = {}
@@ -44,12 +44,12 @@ def moved(world: str, size: int, radio: RadioOptions, *, everybody: bool) -> Fig
         waited_s: list[float] = []
         before_s = _processor_s(medium.pid)
         for step in range(1, STEPS + 1):
-            gone_m = 0.1 * (step % 100)
-            for name in places if everybody else ("r0",):
-                places[name] = gone_m, *places[name][1:]
-            begun_s = time.monotonic()
+            offset_m = 0.1 * (step % 100)
+            for name in places if move_all else ("r0",):
+                places[name] = offset_m, *places[name][1:]
+            started_s = time.monotonic()
             medium.place(places, velocities_m_s={"r0": (1.0, 0.0, 0.0)})
-            waited_s.append(time.monotonic() - begun_s)
+            waited_s.append(time.monotonic() - started_s)
         return {
             "processor_ms": (_processor_s(medium.pid) - before_s) / STEPS * 1e3,
             "answer_median_ms": statistics.median(waited_s) * 1e3,
@@ -74,9 +74,9 @@ def main() -> None:
     for world in WORLDS:
         for name, radio in radios.items():
             for size in options.sizes:
-                for who in ("one", "everybody"):
-                    key = f"{world}, {name}, {size} robots, {who} moves"
-                    table[key] = moved(world, size, radio, everybody=who == "everybody")
+                for moving in ("one", "all"):
+                    key = f"{world}, {name}, {size} robots, {moving} moving"
+                    table[key] = moved(world, size, radio, move_all=moving == "all")
                     if not options.json:
                         print(f"{key:44}" + "".join(f"{what} {value:8.3f}  " for what, value in table[key].items()))
     if options.json:

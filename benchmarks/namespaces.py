@@ -1,4 +1,4 @@
-"""Bare network namespaces for benchmarks and tests: no robot in them, gone with the process that made them."""
+"""Bare network namespaces for benchmarks and tests: without robots, removed with the process that made them."""
 
 import socket
 import subprocess
@@ -15,7 +15,7 @@ _OPEN_TUN: Final = (
 
 
 class Namespace:
-    """A network namespace held by one process, which dies with the thread that made it; use as a context manager."""
+    """A network namespace, held by a process that is killed with its creating thread; use as a context manager."""
 
     def __init__(self) -> None:
         script = "ip link set lo up && echo ready && exec sleep infinity"
@@ -44,13 +44,13 @@ class Namespace:
         return ["nsenter", f"--net=/proc/{self.pid}/ns/net", "--", *argv]
 
     def run(self, *argv: str, timeout_s: float = 20.0) -> subprocess.CompletedProcess[str]:
-        """Run a command in the namespace to its end, whatever its exit code."""
+        """Run a command in the namespace to its end, and do not check its exit code."""
         return subprocess.run(
             self.inside(argv), capture_output=True, text=True, timeout=timeout_s, check=False, cwd=_ROOT
         )
 
     def ip(self, *words: str) -> None:
-        """Run `ip` in the namespace; raises `CalledProcessError` when it fails."""
+        """Run `ip` in the namespace; raises `CalledProcessError` if it fails."""
         self.run("ip", *words).check_returncode()
 
     def start(self, *argv: str, pass_fds: Sequence[int] = ()) -> subprocess.Popen[str]:
@@ -58,7 +58,7 @@ class Namespace:
         return subprocess.Popen(self.inside(argv), stdout=subprocess.PIPE, text=True, pass_fds=pass_fds, cwd=_ROOT)
 
     def tun(self, name: str, address: str) -> int:
-        """Create the TUN interface `name` in the namespace, raise it with `address`, return its descriptor."""
+        """Create the TUN interface `name` in the namespace, bring it up with `address`, return its descriptor."""
         ours, theirs = socket.socketpair()
         with ours, theirs:
             argv = [sys.executable, "-c", _OPEN_TUN, str(theirs.fileno()), name]
@@ -73,12 +73,12 @@ class Namespace:
     def veth(self, peer: "Namespace", address: str, peer_address: str) -> None:
         """Connect this namespace with `peer` by a veth pair, both ends named `wire0`."""
         self.ip("link", "add", "wire0", "type", "veth", "peer", "name", "wire0", "netns", str(peer.pid))
-        for end, own_address in ((self, address), (peer, peer_address)):
-            end.ip("address", "add", own_address, "dev", "wire0")
+        for end, end_address in ((self, address), (peer, peer_address)):
+            end.ip("address", "add", end_address, "dev", "wire0")
             end.ip("link", "set", "wire0", "up")
 
     def close(self) -> None:
-        """End the holder, and the namespace when nothing else runs in it; does nothing the second time."""
+        """Kill the holder, which removes an otherwise empty namespace; a second call has no effect."""
         self._holder.kill()
         self._holder.wait()
         if self._holder.stdout is not None:

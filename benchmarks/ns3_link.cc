@@ -1,6 +1,6 @@
-// What ns-3 says of 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py. `errors`: per mode and ratio the error of a
-// frame; `link`: goodput in Mbit/s of saturated stations that send UDP to one receiver, all equally far from each other;
-// `udp` and `tcp`: goodput and loss of a stream at a rate, or as fast as TCP lets it, and what TCP's sender did when.
+// Results of ns-3 for 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py. `errors`: frame error by mode and SNR; `link`:
+// goodput in Mbit/s of saturated stations that send UDP to one receiver, all with the same distance from each other; `udp`
+// and `tcp`: goodput and loss of a stream at a rate, or at the full rate of TCP, and the events of the TCP sender.
 
 #include "ns3/applications-module.h"
 #include "ns3/core-module.h"
@@ -20,9 +20,9 @@ const double kTxPowerDbm = 17;
 const double kNoiseFigureDb = 6;
 const double kWarmUpS = 1;
 
-// A congestion control whose window opens by what an ACK shows to have newly arrived. ns-3 counts anew what a SACK told of
-// before, which makes the window jump after a timeout (RFC 3465, 2.3: at most a segment) and where a recovery ends (RFC
-// 6937, 3: at the threshold), and its CUBIC lets slow start pass the threshold (RFC 5681, 3.1).
+// A congestion control whose window grows only by newly acknowledged data. ns-3 counts SACKed data again when it is ACKed,
+// so its window jumps after a timeout (RFC 3465, 2.3: at most a segment) and at the end of a recovery (RFC 6937, 3: at the
+// threshold), and its CUBIC continues slow start beyond the threshold (RFC 5681, 3.1).
 template <class Control> class Counting : public Control
 {
   public:
@@ -119,7 +119,7 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     phy.Set("TxPowerStart", DoubleValue(kTxPowerDbm));
     phy.Set("TxPowerEnd", DoubleValue(kTxPowerDbm));
     phy.Set("RxNoiseFigure", DoubleValue(kNoiseFigureDb));
-    // 802.11a sends as 802.11g does, but in its own band; what the path loses is given, whatever the band.
+    // 802.11a sends like 802.11g, but in another band; the path loss is an option, independent of the band.
     auto standard = StandardOf(options.mode);
     bool high = standard == WIFI_STANDARD_80211a;
     phy.Set("ChannelSettings", StringValue(high ? "{0, 20, BAND_5GHZ, 0}" : "{0, 20, BAND_2_4GHZ, 0}"));
@@ -159,7 +159,7 @@ double Goodput(const Options& options)
     NodeContainer nodes;
     nodes.Create(options.stations + 1 + (options.relay ? 1 : 0));
     auto devices = Install(options, nodes);
-    // ns-3 keeps the long slot of 802.11b; no station of that kind is near.
+    // ns-3 uses the long slot of 802.11b, but there are no such stations.
     Config::Set("/NodeList/*/DeviceList/*/$ns3::WifiNetDevice/Phy/Slot", TimeValue(MicroSeconds(9)));
     MobilityHelper mobility;
     mobility.Install(nodes);
@@ -185,7 +185,7 @@ double Goodput(const Options& options)
     return bits / options.seconds / 1e6;
 }
 
-// What is lost, by comma-separated numbers of packets from 0, counted as they arrive.
+// Lost packets, by comma-separated numbers from 0, in the order of arrival.
 Ptr<ErrorModel> Losing(const std::string& numbers)
 {
     std::list<uint32_t> lost;
@@ -199,7 +199,7 @@ Ptr<ErrorModel> Losing(const std::string& numbers)
     return losses;
 }
 
-// A cable that loses the packets it is told to.
+// A cable that loses given packets.
 Ipv4InterfaceContainer Cable(const Options& options, NodeContainer& nodes)
 {
     nodes.Create(2);
@@ -217,7 +217,7 @@ Ipv4InterfaceContainer Cable(const Options& options, NodeContainer& nodes)
     return interfaces;
 }
 
-// Packets wait in the queue of the MAC alone, and as long as they have to.
+// Packets wait only in the queue of the MAC, without a time limit.
 Ipv4InterfaceContainer Pair(const Options& options, NodeContainer& nodes)
 {
     if (options.cable)
@@ -254,7 +254,7 @@ void Udp(const Options& options)
     source->TraceConnectWithoutContext("Tx", Callback<void, Ptr<const Packet>>([&](Ptr<const Packet> packet) {
         sent += packet->GetSize();
     }));
-    // What waits then still arrives.
+    // Queued packets still arrive.
     Simulator::Stop(Seconds(options.seconds + 5));
     Simulator::Run();
     double arrived = received->GetTotalRx();
@@ -269,7 +269,7 @@ template <class... Values> void Print(Values... values)
     std::cout << "\n";
 }
 
-// Prints what the sender does: when in ns, what, and how many bytes, ns, or the state's number.
+// Prints the events of the sender: time in ns, kind, and bytes, ns or the number of the state.
 void Trace(Ptr<Socket> socket, bool everything)
 {
     socket->TraceConnectWithoutContext(
@@ -298,7 +298,7 @@ void Trace(Ptr<Socket> socket, bool everything)
 
 void Tcp(const Options& options)
 {
-    // As Linux, but for HyStart, which the model has not.
+    // Like Linux, without HyStart, which the model lacks.
     Config::SetDefault("ns3::TcpL4Protocol::SocketType", TypeIdValue(TypeId::LookupByName(options.control)));
     Config::SetDefault("ns3::TcpL4Protocol::RecoveryType", TypeIdValue(TypeId::LookupByName(options.recovery)));
     Config::SetDefault("ns3::TcpCubic::HyStart", BooleanValue(false));
@@ -319,7 +319,7 @@ void Tcp(const Options& options)
     BulkSendHelper helper("ns3::TcpSocketFactory", to);
     helper.SetAttribute("SendSize", UintegerValue(1448));
     auto source = DynamicCast<BulkSendApplication>(helper.Install(nodes.Get(0)).Get(0));
-    // It makes its socket when it starts.
+    // The application creates its socket at its start.
     Simulator::Schedule(NanoSeconds(1), [&] { Trace(source->GetSocket(), options.cable); });
     Simulator::Stop(Seconds(options.seconds));
     Simulator::Run();
@@ -357,18 +357,18 @@ int main(int argc, char** argv)
     command.AddValue("mode", "ns-3's name of the mode", options.mode);
     command.AddValue("stations", "that send", options.stations);
     command.AddValue("payload", "bytes", options.payload);
-    command.AddValue("seconds", "measured", options.seconds);
-    command.AddValue("loss", "between any two, dB", options.loss_db);
-    command.AddValue("relay", "through an access point", options.relay);
+    command.AddValue("seconds", "duration of the measurement", options.seconds);
+    command.AddValue("loss", "path loss between any two stations, dB", options.loss_db);
+    command.AddValue("relay", "send through an access point", options.relay);
     command.AddValue("adapt", "choose the mode by Minstrel", options.adapt);
-    command.AddValue("control", "of congestion, of TCP", options.control);
-    command.AddValue("recovery", "from losses, of TCP", options.recovery);
-    command.AddValue("rate", "of the UDP stream, Mbit/s", options.rate_mbit_s);
-    command.AddValue("queue", "packets that wait", options.queue);
-    command.AddValue("cable", "in place of a radio; TCP tells all that it does", options.cable);
-    command.AddValue("delay", "of the cable, ms", options.delay_ms);
-    command.AddValue("lost-data", "numbers of the packets to the receiver that the cable loses", options.lost_data);
-    command.AddValue("lost-acks", "of those to the sender", options.lost_acks);
+    command.AddValue("control", "congestion control of TCP", options.control);
+    command.AddValue("recovery", "loss recovery of TCP", options.recovery);
+    command.AddValue("rate", "rate of the UDP stream, Mbit/s", options.rate_mbit_s);
+    command.AddValue("queue", "queue limit, packets", options.queue);
+    command.AddValue("cable", "use a cable instead of a radio, and print all TCP events", options.cable);
+    command.AddValue("delay", "delay of the cable, ms", options.delay_ms);
+    command.AddValue("lost-data", "numbers of the packets to the receiver that the cable drops", options.lost_data);
+    command.AddValue("lost-acks", "numbers of the packets to the sender that the cable drops", options.lost_acks);
     command.Parse(argc, argv);
     // A device registers the modes.
     NodeContainer none;

@@ -1,4 +1,4 @@
-"""A repeat's own time: its wall time less what the tools took on the robots, by phase."""
+"""The own time of a repeat by phase: its wall time minus the time of the tools on the robots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Final
 from benchmarks.lifetimes import Lifetime
 
 TOOLS: Final = {"rosbag": 1, "tcpdump": 2, "nc.traditional": 2, "ping": 1, "tar": 2}
-"""What runs on the robots in one repeat, and how often."""
+"""Tools on the robots in one repeat, and their numbers."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Repeat:
         peer: `fieldkit` or `script`.
         protocol: Protocol under test.
         own_ms: Own time per phase, in ms.
-        trips: Round trips over control links in sequence; 0 where nobody counts them.
+        trips: Sequential round trips over control links; 0 if they are not counted.
     """
 
     peer: str
@@ -33,13 +33,13 @@ class Repeat:
 
 
 def own_time_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Sequence[Lifetime]) -> dict[str, float]:
-    """Return a repeat's wall time less what the tools took, in ms, split by phase.
+    """Return the wall time of a repeat minus the time of the tools, in ms, split by phase.
 
     Args:
         start_ns: Start of the repeat.
-        phases: When each phase began.
+        phases: Start of each phase.
         end_ns: End of the repeat.
-        tools: What ran on the robots meanwhile.
+        tools: Tools that ran on the robots during the repeat.
     """
     by_name = {tool.program: tool for tool in tools}
     record, ping = by_name["rosbag"], by_name["ping"]
@@ -60,11 +60,11 @@ def own_time_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Seque
 
 
 def listener_and_sender(tools: Sequence[Lifetime]) -> tuple[Lifetime, Lifetime]:
-    """Return the two nc of a repeat."""
+    """Return the listening and the sending nc of a repeat."""
     first, second = (tool for tool in tools if tool.program == "nc.traditional")
     return (first, second) if "-l" in first.argv else (second, first)
 
 
 def command_lines(tools: Sequence[Lifetime]) -> frozenset[tuple[str, ...]]:
-    """Return the command lines of the tools that are measured; tar only carries, so it is not among them."""
+    """Return the command lines of the measured tools; tar only transports files and is not one of them."""
     return frozenset(tool.argv for tool in tools if tool.program != "tar")

@@ -1,4 +1,4 @@
-"""What a researcher writes without fieldkit: `python -m benchmarks.pandas_peer FOLDER` prints JSON."""
+"""Aggregation without fieldkit, as a researcher writes it: `python -m benchmarks.pandas_peer FOLDER` prints JSON."""
 
 import json
 import sys
@@ -14,14 +14,14 @@ from fieldkit.core.columns import Kind
 from fieldkit.trial.columns import trial_columns
 
 RESAMPLES: Final = 999
-"""A tenth of scipy's default, which would be slower by as much."""
+"""A tenth of scipy's default, which would take ten times as long."""
 
 
 def main() -> None:
     """Print mean, median, 95th percentile and a bootstrap interval of every quantity of every cell."""
     tables = sorted(Path(sys.argv[1]).glob("*/trial.csv"))
     rows = pd.concat([pd.read_csv(path, dtype={"distance_m": float}) for path in tables], ignore_index=True)
-    found = []
+    results = []
     for key, cell in rows[rows["status"] == "valid"].groupby(list(DEFAULT_BY)):
         for quantity in quantities(trial_columns()):
             values = cell[quantity.name].dropna().to_numpy(dtype=float)
@@ -30,8 +30,8 @@ def main() -> None:
                 (values,), statistic, n_resamples=RESAMPLES, method="percentile", rng=1
             ).confidence_interval
             figures = values.mean(), np.median(values), np.percentile(values, 95), interval.low, interval.high
-            found.append([list(map(str, key)), quantity.name, len(values), *map(float, figures)])
-    print(json.dumps(found))
+            results.append([list(map(str, key)), quantity.name, len(values), *map(float, figures)])
+    print(json.dumps(results))
 
 
 if __name__ == "__main__":

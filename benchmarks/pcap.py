@@ -1,15 +1,15 @@
-"""From two captures of a transfer to its losses and times, beside other readers: `python -m benchmarks.pcap`.
+"""Compute losses and times of a transfer from two captures, compared with other readers: `python -m benchmarks.pcap`.
 
-A UDP transfer of 200,000 IP packets, of which a tenth is lost: fragments of 8,192-byte datagrams, 128 bytes kept of
-each, as a trial captures them. Each peer reads both captures into columns and matches the packets by identification
-and offset; in every round all peers run in turn, and all must find the same losses. fieldkit does all that
-`fieldkit.measure.transfers.figures` does with captures: losses of packets, datagrams and bytes, the transfer's time,
-the paper's counts. The peers, dpkt, tshark and scapy, count lost packets only. scapy would take minutes and reads the
-first packets; tshark is left out where it is not installed. Time is that of the processor, children included, so that
-a busy machine disturbs it less.
+The captures are of a UDP transfer of 200,000 IP packets with a loss of 10 %: fragments of 8,192-byte datagrams, with
+128 bytes captured of each, as in a trial. Each peer reads both captures into columns and matches the packets by
+identification and offset; in every round all peers run in turn, and all must compute the same losses. fieldkit does
+all that `fieldkit.measure.transfers.figures` does with captures: losses of packets, datagrams and bytes, the
+transfer's time, the paper's counts. The peers, dpkt, tshark and scapy, only count lost packets. scapy would take
+minutes and reads only the first packets; tshark is omitted if it is not installed. Times are processor times,
+children included, which other load disturbs less.
 
-At the end fieldkit streams a sparse file of 10 GB in a process of its own, whose peak memory is printed. With
-`--whole MIB` it also reads a capture of this size into columns, as a trial does, in another process.
+At the end fieldkit streams a sparse file of 10 GB in a separate process, whose peak memory is printed. With `--whole
+MIB` another process reads a capture of this size into columns, as a trial does.
 """
 
 import argparse
@@ -54,14 +54,14 @@ from fieldkit.measure.captures import pcap
 def peak_kb():
     return int(re.search(r"VmHWM:\\s+(\\d+)", pathlib.Path("/proc/self/status").read_text())[1])
 before = peak_kb()
-print(json.dumps([sum(len(one.packets) for one in pcap.stream(pathlib.Path(sys.argv[1]))), before, peak_kb()]))
+print(json.dumps([sum(len(part.packets) for part in pcap.stream(pathlib.Path(sys.argv[1]))), before, peak_kb()]))
 """
-"""Prints how many packets a file has, and this process's peak memory before and after reading them."""
+"""Prints the number of packets of a file, and the peak memory of this process before and after reading them."""
 
-READ: Final = STREAM.replace("sum(len(one.packets) for one in pcap.stream(", "len(pcap.read(").replace(
+READ: Final = STREAM.replace("sum(len(part.packets) for part in pcap.stream(", "len(pcap.read(").replace(
     "sys.argv[1])))", "sys.argv[1])).packets)"
 )
-"""The same, all packets kept as columns."""
+"""The same with all packets kept as columns."""
 
 Peer = Callable[[Path, Path], int]
 Key = tuple[int, int]
@@ -85,18 +85,18 @@ def record(index: int, frame: bytes, wire_bytes: int) -> bytes:
 
 
 def write_captures(folder: Path) -> tuple[Path, Path]:
-    """Write what sender and receiver captured."""
+    """Write the captures of sender and receiver."""
     draw = random.Random(1)
     sent = [record(index, frame, 1514) for index, frame in enumerate(islice(fragments(), PACKETS))]
-    came = [one for one in sent if draw.random() >= LOSS]
+    received = [frame for frame in sent if draw.random() >= LOSS]
     paths = folder / "sender.pcap", folder / "receiver.pcap"
-    for path, records in zip(paths, (sent, came), strict=True):
+    for path, records in zip(paths, (sent, received), strict=True):
         path.write_bytes(FILE_HEADER + b"".join(records))
     return paths
 
 
 def by_fieldkit(sender: Path, receiver: Path) -> int:
-    """Return how many packets were lost."""
+    """Return the number of lost packets."""
     sent, received = pcap.read(sender).packets, pcap.read(receiver).packets
     paper.frames_from(sent, TRANSFER.sender_address, TRANSFER.port)
     paper.frames_to(received, TRANSFER.receiver_address, TRANSFER.port)
@@ -105,12 +105,12 @@ def by_fieldkit(sender: Path, receiver: Path) -> int:
 
 
 def lost(sent: Iterable[Key], received: Iterable[Key]) -> int:
-    """Return how many keys did not arrive as often as they were sent."""
+    """Return the number of keys that arrived less often than they were sent."""
     return (Counter(sent) - Counter(received)).total()
 
 
 def by_dpkt(sender: Path, receiver: Path) -> int:
-    """Return how many packets were lost."""
+    """Return the number of lost packets."""
     return lost(*(list(_keys_by_dpkt(path)) for path in (sender, receiver)))
 
 
@@ -122,7 +122,7 @@ def _keys_by_dpkt(path: Path) -> Iterator[Key]:
 
 
 def by_tshark(sender: Path, receiver: Path) -> int:
-    """Return how many packets were lost."""
+    """Return the number of lost packets."""
     return lost(*(list(_keys_by_tshark(path)) for path in (sender, receiver)))
 
 
@@ -146,7 +146,7 @@ def _keys_by_tshark(path: Path) -> Iterator[Key]:
 
 
 def by_scapy(sender: Path, receiver: Path) -> int:
-    """Return how many of the first packets were lost."""
+    """Return the number of lost packets among the first ones."""
     sent = list(_keys_by_scapy(sender))
     return lost(sent, _keys_by_scapy(receiver))
 
@@ -160,7 +160,7 @@ def _keys_by_scapy(path: Path) -> Iterator[Key]:
 
 
 def first_packets(source: Path, count: int) -> Path:
-    """Write a file of the first packets of another."""
+    """Write a file with the first packets of another one."""
     record_bytes = 16 + len(next(fragments()))
     path = source.with_name(f"first-{source.name}")
     path.write_bytes(source.read_bytes()[: len(FILE_HEADER) + count * record_bytes])
@@ -168,7 +168,7 @@ def first_packets(source: Path, count: int) -> Path:
 
 
 def write_big(path: Path) -> int:
-    """Write a sparse capture of 10 GB, super-frames kept whole; return how many packets it has."""
+    """Write a sparse capture of 10 GB with unshortened super-frames; return its number of packets."""
     head = bytes(12) + b"\x08\x00" + struct.pack(">BBHHHBBH", 0x45, 0, 0, 1, 0, 64, 6, 0) + bytes((10, 0, 0, 1) * 2)
     kept = 262_144
     count = BIG_BYTES // (16 + kept)
@@ -183,7 +183,7 @@ def write_big(path: Path) -> int:
 
 
 def big_file(folder: Path) -> dict[str, float]:
-    """Return what a file of 10 GB takes."""
+    """Return the cost of streaming a file of 10 GB."""
     path = folder / "big.pcap"
     expected = write_big(path)
     start = time.perf_counter()
@@ -198,7 +198,7 @@ def big_file(folder: Path) -> dict[str, float]:
 
 
 def whole_file(folder: Path, mib: int) -> dict[str, float]:
-    """Return what it takes to read a capture of `mib` MiB into columns."""
+    """Return the cost of reading a capture of `mib` MiB into columns."""
     path = folder / "whole.pcap"
     part, written = list(islice(fragments(), 60_000)), 0
     with path.open("wb") as file:
@@ -221,32 +221,40 @@ def whole_file(folder: Path, mib: int) -> dict[str, float]:
 
 
 def processor_s() -> float:
-    """Return the seconds of processor time that this process and its ended children took."""
+    """Return the processor time of this process and its terminated children, in s."""
     return sum(
         usage.ru_utime + usage.ru_stime
-        for usage in (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        for usage in (resource.getrusage(scope) for scope in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     )
 
 
 def rates(folder: Path, rounds: int) -> dict[str, list[float]]:
     """Return packets per second of processor time by peer and round."""
-    whole = write_captures(folder)
-    some = first_packets(whole[0], SCAPY_PACKETS), first_packets(whole[1], int(SCAPY_PACKETS * (1 - LOSS)))
-    peers: dict[str, tuple[Peer, tuple[Path, Path]]] = {"fieldkit": (by_fieldkit, whole), "dpkt": (by_dpkt, whole)}
+    all_captures = write_captures(folder)
+    first_captures = (
+        first_packets(all_captures[0], SCAPY_PACKETS),
+        first_packets(all_captures[1], int(SCAPY_PACKETS * (1 - LOSS))),
+    )
+    peers: dict[str, tuple[Peer, tuple[Path, Path]]] = {
+        "fieldkit": (by_fieldkit, all_captures),
+        "dpkt": (by_dpkt, all_captures),
+    }
     if shutil.which("tshark"):
-        peers["tshark"] = (by_tshark, whole)
-    peers["scapy"] = (by_scapy, some)
-    packets = {captures: sum(pcap.read(path).frames for path in captures) for captures in (whole, some)}
-    expected = {captures: by_fieldkit(*captures) for captures in (whole, some)}
-    found: dict[str, list[float]] = {name: [] for name in peers}
+        peers["tshark"] = (by_tshark, all_captures)
+    peers["scapy"] = (by_scapy, first_captures)
+    packets = {
+        captures: sum(pcap.read(path).frames for path in captures) for captures in (all_captures, first_captures)
+    }
+    expected = {captures: by_fieldkit(*captures) for captures in (all_captures, first_captures)}
+    rates_by_peer: dict[str, list[float]] = {name: [] for name in peers}
     for _ in range(rounds):
         for name, (peer, captures) in peers.items():
             start = processor_s()
             losses = peer(*captures)
-            found[name].append(packets[captures] / (processor_s() - start))
+            rates_by_peer[name].append(packets[captures] / (processor_s() - start))
             if losses != expected[captures]:
-                raise RuntimeError(f"{name} found {losses} packets lost, fieldkit {expected[captures]}")
-    return found
+                raise RuntimeError(f"{name} counted {losses} lost packets, fieldkit {expected[captures]}")
+    return rates_by_peer
 
 
 def main() -> None:
@@ -258,17 +266,17 @@ def main() -> None:
     arguments = parser.parse_args()
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as name:
-        found = rates(Path(name), arguments.rounds)
+        rates_by_peer = rates(Path(name), arguments.rounds)
         big = big_file(Path(name))
         if arguments.whole:
             big |= whole_file(Path(name), arguments.whole)
     if arguments.json:
-        print(json.dumps({"load": load, "packets_s": found, "big": big}))
+        print(json.dumps({"load": load, "packets_s": rates_by_peer, "big": big}))
         return
     print(f"load average before: {load:.2f} on {os.cpu_count()} cores\n")
     print("| | packets/s, median (lowest to highest) | fieldkit is faster by |\n| --- | --- | --- |")
-    for peer, values in found.items():
-        ratios = [ours / theirs for ours, theirs in zip(found["fieldkit"], values, strict=True)]
+    for peer, values in rates_by_peer.items():
+        ratios = [ours / theirs for ours, theirs in zip(rates_by_peer["fieldkit"], values, strict=True)]
         spread = f"{statistics.median(values):,.0f} ({min(values):,.0f} to {max(values):,.0f})"
         print(f"| {peer} | {spread} | {statistics.median(ratios):,.1f} |")
     print("\n" + ", ".join(f"{key} {value:,.1f}" for key, value in big.items()))

@@ -1,8 +1,7 @@
-"""The radio beside ns-3, on the same links: `python -m benchmarks.radio_vs_ns3 [--figure FILE] [--json]`.
+"""The radio model compared with ns-3 on equal links: `python -m benchmarks.radio_vs_ns3 [--figure FILE] [--json]`.
 
-Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. Both give stations the same power, noise, path
-loss, sizes and slots; ns-3 runs its DCF, its receiver and the error model named NIST. Frames are not aggregated in
-either.
+Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. Stations have the same power, noise, path loss,
+sizes and slots in both; ns-3 runs its DCF, its receiver and its NIST error model. Neither aggregates frames.
 """
 
 import argparse
@@ -33,29 +32,29 @@ PAYLOAD_BYTES: Final = 1000
 SECONDS: Final = 10.0
 TX_POWER_DBM, SENSITIVITY_DBM = 17.0, -82.0
 NOISE_DBM: Final = 10 * math.log10(1.3803e-23 * 290 * 20e6 * 1e3) + 6
-"""-94.97 dBm, as ns-3 works it out: thermal noise of 20 MHz at 290 K, by its constant of Boltzmann, and a noise
-figure of 6 dB. At -95 dBm up to 7 datagrams of 100 less are lost at a link's edge."""
+"""-94.97 dBm, as ns-3 computes it: thermal noise of 20 MHz at 290 K, with its value of the Boltzmann constant, and a
+noise figure of 6 dB. With -95 dBm up to 7 % fewer datagrams are lost at the edge of a link."""
 DISTANCES_M: Final = (5, 10, 20, 30, 40, 50, 60, 70, 80, 90)
 STATIONS: Final = (1, 2, 5, 10)
 FIXED: Final = tuple(mode for mode in G_MODES if mode.name in {"g6", "g24", "g54"})
 
 Row = tuple[str, float, float]
-"""What was measured, by ns-3, by us."""
+"""Name of the measurement, the value of ns-3, and the value of the radio model."""
 
 
 def ns3_name(mode: WifiMode) -> str:
-    """Return what ns-3 calls a mode."""
+    """Return the name of a mode in ns-3."""
     return f"HtMcs{mode.name[1:]}" if mode.ht else f"ErpOfdmRate{mode.name[1:]}Mbps"
 
 
 @dataclass(frozen=True)
 class Ns3:
-    """The ns-3 program; a call runs it with options and gives its output."""
+    """The ns-3 program; a call runs it with options and returns its output."""
 
     program: Path
 
     def __call__(self, **options: object) -> str:
-        """Return what it prints, run with these options."""
+        """Run the program with these options and return its output."""
         words = [f"--{name}={value}" for name, value in options.items()]
         return subprocess.run([self.program, *words], check=True, timeout=600, capture_output=True, text=True).stdout
 
@@ -69,7 +68,7 @@ def build(folder: Path) -> Ns3:
 
 
 def packet_errors(ns3: Ns3) -> dict[str, list[tuple[float, float, float]]]:
-    """Return per mode the ratio in dB, and the error of 1000 bytes by ns-3 and by us."""
+    """Return per mode the SNR in dB and the packet error of 1000 bytes, of ns-3 and of the radio model."""
     curves = {}
     for mode in (*G_MODES, *N_MODES):
         lines = ns3(what="errors", mode=ns3_name(mode), payload=PAYLOAD_BYTES).splitlines()
@@ -79,7 +78,7 @@ def packet_errors(ns3: Ns3) -> dict[str, list[tuple[float, float, float]]]:
 
 
 def shift_db(curve: Sequence[tuple[float, float, float]]) -> float:
-    """Return the largest shift between the two curves at errors of 50, 10 and 1 %, ours minus ns-3's."""
+    """Return the largest shift between the two curves at errors of 50, 10 and 1 %, model minus ns-3."""
 
     def at(level: float, column: int) -> float:
         return next(point[0] for point in curve if point[column] < level)
@@ -90,12 +89,12 @@ def shift_db(curve: Sequence[tuple[float, float, float]]) -> float:
 def goodput_mbit_s(
     distance_m: float, *, stations: int = 1, mode: WifiMode | None = None, relay: bool = False
 ) -> float:
-    """Return what saturated stations carry by our model, all `distance_m` away from each other."""
+    """Return the goodput of saturated stations in the radio model, all `distance_m` apart."""
     names = [f"s{n}" for n in range(stations)] + ["receiver"] + ["relay"] * relay
     antennas = {name: Antenna("802.11g", TX_POWER_DBM, SENSITIVITY_DBM) for name in names}
     options = RadioOptions(fading=False, noise_floor_dbm=NOISE_DBM, mode=mode.name if mode else None)
     space = _Equidistant(1, antennas, options)
-    space.stand(distance_m)
+    space.set_distance(distance_m)
     wifi: Wifi[str] = Wifi(space, 1)
     wifi.relay("relay" if relay else None)
     arrived = dropped = 0
@@ -106,7 +105,7 @@ def goodput_mbit_s(
         for at_ns, _, name, _, _ in wifi.deliveries(now_ns):
             arrived += 1
             wifi.send(at_ns, name, name, PAYLOAD_BYTES + 28, "receiver")
-        # What was given up is sent again, so that the queue never runs dry.
+        # A dropped packet is replaced by a new one, so that the queues stay full.
         lost = sum(counters.lost for counters in wifi.counters().values())
         while dropped < lost:
             dropped += 1
@@ -115,46 +114,46 @@ def goodput_mbit_s(
 
 
 class _Equidistant(WorldChannel):
-    """Every two stations are equally far from each other, as on no plane: so are ns-3's here."""
+    """All pairs of stations have the same distance, which is impossible in a plane, as in the ns-3 program."""
 
-    def stand(self, distance_m: float) -> None:
+    def set_distance(self, distance_m: float) -> None:
         count = len(self.names)
         self.use_losses(np.where(np.eye(count, dtype=bool), np.inf, path_loss_db(distance_m)))
 
 
 def path_loss_db(distance_m: float) -> float:
-    """Return the log-distance loss with exponent 3 that both are given."""
+    """Return the log-distance path loss with exponent 3, used in both."""
     return 20 * math.log10(4 * math.pi * CHANNEL_6_HZ / 299_792_458.0) + 30 * math.log10(distance_m)
 
 
 def rows(ns3: Ns3) -> list[Row]:
-    """Return goodputs in Mbit/s: against distance, for contending stations, through an access point."""
+    """Return goodputs in Mbit/s over distance, for contending stations, and through an access point."""
 
     def theirs(**options: object) -> float:
         return float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
 
-    found: list[Row] = []
+    results: list[Row] = []
     for mode in FIXED:
         for distance_m in DISTANCES_M:
-            of = theirs(loss=path_loss_db(distance_m), mode=ns3_name(mode))
-            found.append((f"{mode.name}, {distance_m} m", of, goodput_mbit_s(distance_m, mode=mode)))
+            ns3_value = theirs(loss=path_loss_db(distance_m), mode=ns3_name(mode))
+            results.append((f"{mode.name}, {distance_m} m", ns3_value, goodput_mbit_s(distance_m, mode=mode)))
     for distance_m in DISTANCES_M:
-        of = theirs(loss=path_loss_db(distance_m), adapt=1)
-        found.append((f"minstrel, {distance_m} m", of, goodput_mbit_s(distance_m)))
+        ns3_value = theirs(loss=path_loss_db(distance_m), adapt=1)
+        results.append((f"minstrel, {distance_m} m", ns3_value, goodput_mbit_s(distance_m)))
     for mode in (FIXED[0], FIXED[-1]):
         for stations in STATIONS:
-            of = theirs(loss=path_loss_db(5), mode=ns3_name(mode), stations=stations)
+            ns3_value = theirs(loss=path_loss_db(5), mode=ns3_name(mode), stations=stations)
             ours = goodput_mbit_s(5, stations=stations, mode=mode)
-            found.append((f"{mode.name}, {stations} contending", of, ours))
-        of = theirs(loss=path_loss_db(5), mode=ns3_name(mode), relay=1)
-        found.append((f"{mode.name}, through an access point", of, goodput_mbit_s(5, mode=mode, relay=True)))
-    return found
+            results.append((f"{mode.name}, {stations} contending", ns3_value, ours))
+        ns3_value = theirs(loss=path_loss_db(5), mode=ns3_name(mode), relay=1)
+        results.append((f"{mode.name}, through an access point", ns3_value, goodput_mbit_s(5, mode=mode, relay=True)))
+    return results
 
 
 def main() -> None:
-    """Run both, print the table, and draw the figure where asked for."""
+    """Run both, print the table, and draw the figure if `--figure` is given."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true", help="single values")
+    parser.add_argument("--json", action="store_true", help="print single values")
     parser.add_argument("--figure", type=Path, help="write the curves of both to this SVG file")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -175,8 +174,8 @@ def main() -> None:
 
 
 def draw(path: Path, curves: dict[str, list[tuple[float, float, float]]], goodputs: Sequence[Row]) -> None:
-    """Draw the curves of both, theirs as lines and ours as marks."""
-    import matplotlib as mpl  # noqa: PLC0415 (only who wants the figure needs it)
+    """Draw the curves of ns-3 as lines and of the radio model as marks."""
+    import matplotlib as mpl  # noqa: PLC0415 (needed only for the figure)
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     mpl.rcParams["svg.hashsalt"] = "radio_vs_ns3"
@@ -190,10 +189,10 @@ def draw(path: Path, curves: dict[str, list[tuple[float, float, float]]], goodpu
     left.set(xlabel="signal to noise (dB)", ylabel="share of frames lost", yscale="log", ylim=(1e-3, 1.2))
     left.legend(title="Mbit/s", fontsize="small")
     for number, name in enumerate(["g6", "g24", "g54", "minstrel"]):
-        own = [row for row in goodputs if row[0].startswith(f"{name}, ") and row[0].endswith(" m")]
-        distances_m = [float(row[0].split()[1]) for row in own]
-        right.plot(distances_m, [row[1] for row in own], color=f"C{number}", label=name)
-        right.plot(distances_m, [row[2] for row in own], "o", color=f"C{number}", markerfacecolor="none")
+        name_rows = [row for row in goodputs if row[0].startswith(f"{name}, ") and row[0].endswith(" m")]
+        distances_m = [float(row[0].split()[1]) for row in name_rows]
+        right.plot(distances_m, [row[1] for row in name_rows], color=f"C{number}", label=name)
+        right.plot(distances_m, [row[2] for row in name_rows], "o", color=f"C{number}", markerfacecolor="none")
     right.set(xlabel="distance (m)", ylabel="saturated UDP goodput (Mbit/s)", ylim=(-1, 33))
     right.legend(title="ns-3: lines; ours: marks", fontsize="small", loc="upper right", ncols=2)
     figure.savefig(path, metadata={"Date": None})

@@ -1,8 +1,8 @@
-"""Control links of a chosen round-trip time, as bad Wi-Fi has, which count the round trips that happen in sequence.
+"""Control links with a given round-trip time, as on bad Wi-Fi, which count sequential round trips.
 
-Streams are carried over loopback by one thread that holds every byte back for half a round trip. Trips are counted as
-logical clocks count: what this computer sends is one trip later than all that it has received, over any of the
-links, and what a robot sends is as late as all that it has received. Whatever goes side by side counts once.
+One thread carries streams over loopback and delays every byte by half a round trip. Trips are counted like logical
+clocks: data from this computer has a trip number one above the highest received over any link, and data from a robot
+has the highest number that the robot received. So parallel round trips count once.
 """
 
 import contextlib
@@ -26,13 +26,13 @@ _CONNECT_S: Final = 10.0
 
 
 @dataclass(eq=False)
-class _Way:
+class _Direction:
     """One direction of a stream.
 
     Attributes:
-        source: Where bytes come from.
-        sink: Where they go.
-        flight: What is under way: when it is due, its trip, and the bytes, none for the end.
+        source: Socket from which bytes are read.
+        sink: Socket to which they are written.
+        flight: Delayed chunks: due time, trip number, and the bytes, empty for the end.
     """
 
     source: socket.socket
@@ -43,18 +43,18 @@ class _Way:
 
 @dataclass(eq=False)
 class _Stream:
-    """Both directions of a stream: `there` to the robot, `back` to this computer; `trip` is the robot's."""
+    """Both directions of a stream: `there` to the robot, `back` to this computer; `trip` is the robot's number."""
 
-    there: _Way
-    back: _Way
+    there: _Direction
+    back: _Direction
     trip: int = 0
 
 
 class SlowLinks:
-    """Carries streams slowly; use as a context manager.
+    """Carries streams with a delay; use as a context manager.
 
     Args:
-        round_trip_s: How long from a byte to the answer of a robot that answers at once.
+        round_trip_s: Round-trip time in seconds.
     """
 
     def __init__(self, round_trip_s: float) -> None:
@@ -64,7 +64,7 @@ class SlowLinks:
         self._listeners: dict[socket.socket, Connect] = {}
         self._lock = threading.Lock()
         self._wake, self._woken = socket.socketpair()
-        self._over = False
+        self._closed = False
         self._thread = threading.Thread(target=self._run, name="slow links")
 
     def __enter__(self) -> Self:
@@ -72,23 +72,23 @@ class SlowLinks:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._over = True
+        self._closed = True
         self._wake.send(b"x")
         self._thread.join()
         for stream in list(self._streams):
             self._end(stream)
-        for one in (*self._listeners, self._wake, self._woken):
-            one.close()
+        for opened in (*self._listeners, self._wake, self._woken):
+            opened.close()
 
     def carry(self, far: socket.socket) -> socket.socket:
-        """Return the near end of a new stream that leads to `far`."""
+        """Return the near end of a new stream to `far`."""
         with socket.create_server(("127.0.0.1", 0)) as listener:
             near = socket.create_connection(listener.getsockname(), _CONNECT_S)
             self._add(listener.accept()[0], far)
         return near
 
     def port(self, connect: Connect) -> int:
-        """Return a loopback port whose streams lead to where `connect` does."""
+        """Return a loopback port whose streams are connected by `connect`."""
         listener = socket.create_server(("127.0.0.1", 0))
         with self._lock:
             self._listeners[listener] = connect
@@ -101,56 +101,60 @@ class SlowLinks:
             end.settimeout(_CONNECT_S)
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with self._lock:
-            self._streams.append(_Stream(_Way(near, far), _Way(far, near)))
+            self._streams.append(_Stream(_Direction(near, far), _Direction(far, near)))
         self._wake.send(b"x")
 
     def _run(self) -> None:
-        while not self._over:
+        while not self._closed:
             with self._lock:
-                sources = {way.source: (stream, way) for stream, way in self._ways() if self._takes(way)}
-                due_s = [way.flight[0][0] for _, way in self._ways() if way.flight]
+                sources = {
+                    direction.source: (stream, direction)
+                    for stream, direction in self._directions()
+                    if self._is_readable(direction)
+                }
+                due_s = [direction.flight[0][0] for _, direction in self._directions() if direction.flight]
                 listeners = dict(self._listeners)
             wait_s = max(0.0, min(due_s) - time.monotonic()) if due_s else None
             readable, _, _ = select.select([self._woken, *listeners, *sources], [], [], wait_s)
-            for one in readable:
-                if one is self._woken:
-                    one.recv(_CHUNK)
-                elif one in listeners:
-                    self._add(one.accept()[0], listeners[one](_CONNECT_S))
+            for ready in readable:
+                if ready is self._woken:
+                    ready.recv(_CHUNK)
+                elif ready in listeners:
+                    self._add(ready.accept()[0], listeners[ready](_CONNECT_S))
                 else:
-                    self._take(*sources[one])
-            for stream, way in self._ways():
-                self._deliver(stream, way)
+                    self._read(*sources[ready])
+            for stream, direction in self._directions():
+                self._deliver(stream, direction)
 
-    def _ways(self) -> Iterator[tuple[_Stream, _Way]]:
+    def _directions(self) -> Iterator[tuple[_Stream, _Direction]]:
         for stream in list(self._streams):
             yield stream, stream.there
             yield stream, stream.back
 
-    def _takes(self, way: _Way) -> bool:
-        return not way.ended and len(way.flight) < _IN_FLIGHT
+    def _is_readable(self, direction: _Direction) -> bool:
+        return not direction.ended and len(direction.flight) < _IN_FLIGHT
 
-    def _take(self, stream: _Stream, way: _Way) -> None:
-        trip = self.trips + 1 if way is stream.there else stream.trip
+    def _read(self, stream: _Stream, direction: _Direction) -> None:
+        trip = self.trips + 1 if direction is stream.there else stream.trip
         try:
-            chunk = way.source.recv(_CHUNK)
+            chunk = direction.source.recv(_CHUNK)
         except OSError:
             chunk = b""
-        way.ended = not chunk
-        way.flight.append((time.monotonic() + self._delay_s, trip, chunk))
+        direction.ended = not chunk
+        direction.flight.append((time.monotonic() + self._delay_s, trip, chunk))
 
-    def _deliver(self, stream: _Stream, way: _Way) -> None:
-        while way.flight and way.flight[0][0] <= time.monotonic():
-            _, trip, chunk = way.flight.popleft()
+    def _deliver(self, stream: _Stream, direction: _Direction) -> None:
+        while direction.flight and direction.flight[0][0] <= time.monotonic():
+            _, trip, chunk = direction.flight.popleft()
             if not chunk:
                 self._end(stream)
                 return
-            if way is stream.there:
+            if direction is stream.there:
                 stream.trip = max(stream.trip, trip)
             else:
                 self.trips = max(self.trips, trip)
             try:
-                way.sink.sendall(chunk)
+                direction.sink.sendall(chunk)
             except OSError:
                 self._end(stream)
                 return
@@ -164,7 +168,7 @@ class SlowLinks:
 
 @contextlib.contextmanager
 def slow_control(round_trip_s: float) -> Iterator[SlowLinks]:
-    """Let every control connection to an emulated robot go over slow links, of labs that are opened meanwhile."""
+    """Route every control connection to emulated robots over slow links, in labs that are opened in the body."""
     direct = EmulatedRobot.connect
     with (
         SlowLinks(round_trip_s) as slow,

@@ -1,9 +1,9 @@
-"""What a command takes before it does anything: `python -m benchmarks.startup`; needs no root.
+"""Start-up time of commands: `python -m benchmarks.startup`; needs no root.
 
-Each command of fieldkit runs in turn with its yardsticks: Python that does nothing, `git --version`, and Python that
-imports the libraries which the command needs, and nothing of fieldkit. Time is wall time and that of the processor,
-memory the peak of the process, of which less than this benchmark's own 16 MB cannot be told. The figure is fieldkit's
-processor time less that of its libraries. `--peer PYTHON` runs another checkout's fieldkit, by its Python.
+Each command of fieldkit runs in turn with its references: Python that does nothing, `git --version`, and Python that
+only imports the libraries of the command. Measured are wall time, processor time and the peak memory of the process;
+the latter is at least the 16 MB of this benchmark. The main figure is fieldkit's processor time minus that of its
+libraries. `--peer PYTHON` runs fieldkit of another checkout with that Python.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from typing import Final
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 _TABLE: Final = _ROOT / "tests" / "data" / "fieldkit" / "1" / "trial.csv"
-# A checkout's modules are compiled by their first run only, as those of its libraries were when they were installed.
+# Bytecode is written, so that only the first run compiles the modules of a checkout.
 _COMPILED: Final = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 _LINE: Final = "fieldkit tr"
 _TAB: Final = {
@@ -30,10 +30,10 @@ _TAB: Final = {
     "COMP_LINE": _LINE,
     "COMP_POINT": str(len(_LINE)),
 }
-# Without it numpy's OpenBLAS starts a thread per core, which spins: fieldkit is not to be credited with that.
+# By default OpenBLAS starts a thread per core that spins. fieldkit disables this, so the reference must, too.
 _ONE_THREAD: Final = {"OPENBLAS_NUM_THREADS": "1"}
 _SHOW: Final = "rich.console, rich.live, rich.table, rich.text"
-# pydantic imports the modules behind its names when they are asked for.
+# pydantic imports the modules of its names at first access.
 _CHECK: Final = "yaml, pydantic; from pydantic import BaseModel, Field, PlainSerializer, StrictInt, TypeAdapter"
 
 
@@ -43,8 +43,8 @@ class Command:
 
     Attributes:
         words: Its arguments.
-        libraries: What it needs of others, as words of an import statement.
-        environment: What the shell sets for it.
+        libraries: Libraries that it needs, as operands of an import statement.
+        environment: Variables that the shell sets for it.
     """
 
     words: Sequence[str]
@@ -58,7 +58,7 @@ COMMANDS: Final = {
     "trial --help": Command(["trial", "--help"], "argparse"),
     "fieldkit tr<TAB>": Command([], "argparse, argcomplete", _TAB),
     "columns": Command(["columns"], f"argparse, numpy, {_SHOW}, {_CHECK}"),
-    # pydantic imports importlib.metadata when it builds its first model.
+    # pydantic imports importlib.metadata for its first model.
     "trial --dry-run": Command(
         ["trial", "los", "30ft", "--backend", "emulated", "--dry-run"],
         f"argparse, numpy, importlib.metadata, {_SHOW}, {_CHECK}",
@@ -69,7 +69,7 @@ COMMANDS: Final = {
 
 @dataclass(frozen=True)
 class Cost:
-    """What one run took.
+    """Cost of one run.
 
     Attributes:
         wall_s: Wall time.
@@ -85,7 +85,7 @@ class Cost:
 def measure(argv: Sequence[str], environment: Mapping[str, str]) -> Cost:
     """Run a command in an empty folder to its end."""
     with tempfile.TemporaryDirectory() as folder:
-        began_s = time.perf_counter()
+        started_s = time.perf_counter()
         process = subprocess.Popen(
             argv,
             cwd=folder,
@@ -95,7 +95,7 @@ def measure(argv: Sequence[str], environment: Mapping[str, str]) -> Cost:
             stderr=subprocess.DEVNULL,
         )
         _, status, usage = os.wait4(process.pid, 0)
-        wall_s = time.perf_counter() - began_s
+        wall_s = time.perf_counter() - started_s
         process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         raise RuntimeError(f"{' '.join(argv)}: exit code {process.returncode}")
@@ -103,31 +103,36 @@ def measure(argv: Sequence[str], environment: Mapping[str, str]) -> Cost:
 
 
 def runs(peer: str | None) -> dict[str, tuple[Sequence[str], Mapping[str, str]]]:
-    """Return what is run in each round: argument lists and environments by name."""
-    found: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {
+    """Return the argument lists and environments to run in each round, by name."""
+    commands: dict[str, tuple[Sequence[str], Mapping[str, str]]] = {
         "python -c pass": ([sys.executable, "-c", "pass"], {}),
         "git --version": (["git", "--version"], {}),
     }
     for name, command in COMMANDS.items():
-        found[name] = ([sys.executable, "-m", "fieldkit", *command.words], command.environment)
-        found[f"{name}: libraries"] = ([sys.executable, "-c", f"import {command.libraries}"], _ONE_THREAD)
+        commands[name] = ([sys.executable, "-m", "fieldkit", *command.words], command.environment)
+        commands[f"{name}: libraries"] = ([sys.executable, "-c", f"import {command.libraries}"], _ONE_THREAD)
         if peer is not None and not command.environment:
-            found[f"{name}: peer"] = ([peer, "-m", "fieldkit", *command.words], {})
-    return found
+            commands[f"{name}: peer"] = ([peer, "-m", "fieldkit", *command.words], {})
+    return commands
 
 
 def table(costs: Mapping[str, Sequence[Cost]]) -> str:
     """Return the medians as a Markdown table."""
 
-    def median(name: str, what: str) -> float:
-        return statistics.median(float(getattr(cost, what)) for cost in costs[name])
+    def median(name: str, attribute: str) -> float:
+        return statistics.median(float(getattr(cost, attribute)) for cost in costs[name])
 
-    lines = ["| | wall (ms) | processor (ms) | peak (MB) | less libraries (ms) |", "| --- | --- | --- | --- | --- |"]
+    lines = [
+        "| | wall (ms) | processor (ms) | peak (MB) | without libraries (ms) |",
+        "| --- | --- | --- | --- | --- |",
+    ]
     for name in costs:
-        wall, processor = (round(1000 * median(name, what)) for what in ("wall_s", "processor_s"))
-        yardstick = f"{name}: libraries"
-        own = f"{processor - round(1000 * median(yardstick, 'processor_s'))}" if yardstick in costs else ""
-        lines.append(f"| {name} | {wall} | {processor} | {median(name, 'peak_mb'):.0f} | {own} |")
+        wall, processor = (round(1000 * median(name, attribute)) for attribute in ("wall_s", "processor_s"))
+        reference = f"{name}: libraries"
+        without_libraries = (
+            f"{processor - round(1000 * median(reference, 'processor_s'))}" if reference in costs else ""
+        )
+        lines.append(f"| {name} | {wall} | {processor} | {median(name, 'peak_mb'):.0f} | {without_libraries} |")
     return "\n".join(lines)
 
 
@@ -135,7 +140,7 @@ def main() -> None:
     """Run the rounds and print the medians."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=10, help="default 10")
-    parser.add_argument("--json", action="store_true", help="the single values")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON")
     parser.add_argument("--peer", metavar="PYTHON", help="Python of another checkout's environment")
     arguments = parser.parse_args()
     chosen = runs(arguments.peer)

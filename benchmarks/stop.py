@@ -1,9 +1,9 @@
 """Time until a moving robot stops: `python -m benchmarks.stop`, as root; needs Debian's ROS 1.
 
-An emulated robot, which is a real one for fieldkit, drives at 0.6 m/s. In each round these run in turn, each from a
-new process to its end: OpenSSH's `ssh ROBOT true` and `fieldkit stop` of a robot that nothing moves, both against the
-other robot; then `fieldkit stop` of the robot that drives. Times are from the start of the process; the motion of the
-robot is from the record that its base writes 50 times a second, and not from what fieldkit reports.
+An emulated robot, which fieldkit treats as a real one, drives at 0.6 m/s. Each round runs in sequence, each in a new
+process: OpenSSH's `ssh ROBOT true` and `fieldkit stop`, both for another robot that no program moves; then `fieldkit
+stop` for the driving robot. Times are from the start of the process. The robot's motion is from the log of its base
+with 50 samples per second, independent of fieldkit's report.
 """
 
 import argparse
@@ -26,15 +26,15 @@ from tests.helpers.runs import finish, start
 
 _WAY_M: Final = 25.0
 _BRAKES: Final = 0.9
-"""A robot below this share of its speed brakes: it has received a velocity of zero."""
+"""Below this share of its speed a robot counts as braking: it has received a velocity of zero."""
 _LONG_S: Final = 60.0
 FIGURES: Final = {
     "ssh": "`ssh box-1 true` (OpenSSH)",
-    "idle": "`fieldkit stop box-1`, which nothing moves",
+    "idle": "`fieldkit stop box-1`, which no program moves",
     "brakes": "`fieldkit stop rover-1`, until the base brakes",
     "stands": "until the robot is stationary",
     "said": "until `stopped (standing)` is printed",
-    "ended": "until the command has ended",
+    "ended": "until the command has exited",
 }
 
 
@@ -45,33 +45,33 @@ def measure(lab: RoverLab, out: str) -> dict[str, float]:
         trial = start(lab.folder, "trial", "drive", "5m", "--yes", "--allow-motion", "--out", out)
         try:
             lab.wait_until_it_drives()
-            times = {"ssh": _took_s(ssh_words(lab)), "idle": _took_s(_stop_words("box-1"))}
+            times = {"ssh": _duration_s(ssh_words(lab)), "idle": _duration_s(_stop_words("box-1"))}
             before_m_s = sampler.samples[-1].speed_m_s
-            began_s = time.monotonic()
+            started_s = time.monotonic()
             with subprocess.Popen(_stop_words("rover-1"), stdout=subprocess.PIPE, text=True) as stop:
                 assert stop.stdout is not None
                 line = stop.stdout.readline()
-                times["said"] = time.monotonic() - began_s
+                times["said"] = time.monotonic() - started_s
                 code = stop.wait(_LONG_S)
-                times["ended"] = time.monotonic() - began_s
+                times["ended"] = time.monotonic() - started_s
             if code != 0 or line != "rover-1: stopped (standing)\n":
-                raise SystemExit(f"fieldkit stop ended with {code}: {line!r}")
+                raise SystemExit(f"fieldkit stop exited with {code}: {line!r}")
             finish(trial)
         finally:
             trial.kill()
             trial.wait()
         samples = list(sampler.samples)
-    stands_s = stopped_s(samples, began_s)
+    stationary_s = stopped_s(samples, started_s)
     brakes_s = next(
-        sample.at_s - began_s
+        sample.at_s - started_s
         for sample in samples
-        if sample.at_s > began_s and sample.speed_m_s < _BRAKES * before_m_s
+        if sample.at_s > started_s and sample.speed_m_s < _BRAKES * before_m_s
     )
-    return times | {"brakes": brakes_s, "stands": stands_s if stands_s is not None else float("nan")}
+    return times | {"brakes": brakes_s, "stands": stationary_s if stationary_s is not None else float("nan")}
 
 
 def ssh_words(lab: RoverLab) -> tuple[str, ...]:
-    """Return OpenSSH's command to a robot with the key and the pinned host key of the site file."""
+    """Return the OpenSSH command to a robot with the key and the pinned host key of the site file."""
     site = (lab.folder / "fieldkit.yaml").read_text(encoding="utf-8")
     entry = re.search(r"box-1: .*port: (\d+), .*key: (\S+), host_key: ([^}]+)}", site)
     assert entry is not None
@@ -87,16 +87,16 @@ def _stop_words(robot: str) -> tuple[str, ...]:
     return (sys.executable, "-m", "fieldkit", "stop", robot)
 
 
-def _took_s(words: Sequence[str]) -> float:
-    began_s = time.monotonic()
+def _duration_s(words: Sequence[str]) -> float:
+    started_s = time.monotonic()
     subprocess.run(words, check=True, stdout=subprocess.DEVNULL, timeout=_LONG_S)
-    return time.monotonic() - began_s
+    return time.monotonic() - started_s
 
 
 def main() -> int:
     """Print a table of medians, lowest and highest values."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="single values")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON")
     parser.add_argument("--rounds", type=int, default=9)
     options = parser.parse_args()
     load = os.getloadavg()[0]

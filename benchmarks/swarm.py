@@ -1,13 +1,12 @@
-"""The medium and its robots by their number, beside EMANE's figures: `python -m benchmarks.swarm [--json]`, as root.
+"""Cost of the medium by the number of robots, with EMANE's figures: `python -m benchmarks.swarm [--json]`, as root.
 
-Per number of robots, over fixed links that do nothing and over Wi-Fi, and over a bare veth pair: round trips between
-two of them, how late the medium was with their packets, 64-byte UDP payloads at full rate and, for 2 and 10, TCP,
-between the same two. The others are silent on the medium; a frame that is not theirs should cost nothing: what one
-costs the medium in processor time shows at 2,000 packets/s. Then every two neighbours are a pair of which one sends
-to the other, over fixed links as fast as they can, over Wi-Fi 2,000 packets/s in all, about a third of what the
-channel carries. These robots are bare namespaces.
-Then whole robots, with SSH server and sensors: time until all serve, the processors' time that it took, and of each
-robot the memory beyond shared pages (own), and with its part of those (PSS).
+Measured per number of robots, over ideal fixed links, over Wi-Fi and over a bare veth pair: round trips between two
+robots, the lateness of their packets in the medium, 64-byte UDP payloads at full rate and, for 2 and 10 robots, TCP.
+The other robots are silent and should not add cost; the processor time per frame is measured at 2,000 packets/s. Then
+all neighbours form pairs, in each of which one sends to the other: over fixed links at full rate, over Wi-Fi 2,000
+packets/s in all, about a third of the channel's capacity. These robots are bare namespaces. Then whole robots, with
+SSH server and sensors: start-up time, its processor time, and the memory per robot without shared pages (own) and
+with a proportional part of them (PSS).
 """
 
 import argparse
@@ -41,10 +40,10 @@ SIZES: Final = (2, 10, 30, 50)
 TCP_SIZES: Final = (2, 10)
 RADIOS: Final = {"fixed": radio("0ms"), "wifi": RadioOptions(fading=False)}
 PINGS: Final = 300
-# Packets/s of those that talk, in all; 0 is as many as they can.
+# Packets/s of all senders together; 0 is full rate.
 ONE_TALKS: Final = 2_000
 ALL_TALK: Final = {"fixed": 0, "wifi": 2_000}
-BESIDE: Final = {
+REFERENCE: Final = {
     "rtt_median_ms": ("0.85", "2.0", "3.9", "6.0"),
     "rtt_p99_ms": ("4.3", "5.0", "5.6", "8.5"),
     "packets_s": ("30,000", "10,000", "2,000-3,000", "1,000"),
@@ -58,8 +57,8 @@ TALK_SCRIPT: Final = f"""
 import socket, sys, time
 address, seconds, packets_s = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
 with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-    begun_s, sent = time.monotonic(), 0
-    while (passed_s := time.monotonic() - begun_s) < seconds:
+    started_s, sent = time.monotonic(), 0
+    while (passed_s := time.monotonic() - started_s) < seconds:
         if packets_s and sent > passed_s * packets_s:
             time.sleep(sent / packets_s - passed_s)
         sender.sendto(bytes({PAYLOAD_BYTES}), (address, 9))
@@ -73,7 +72,7 @@ Figures = dict[str, float]
 def swarm(
     size: int, options: RadioOptions, world: World | None = None
 ) -> Iterator[tuple[MediumClient, list[Namespace]]]:
-    """Yield `size` namespaces in a row, 0.5 m apart; the second has the address 10.9.0.2."""
+    """Yield a medium with `size` namespaces in a row, 0.5 m apart; the second has the address 10.9.0.2."""
     with ExitStack() as stack:
         medium = stack.enter_context(MediumClient(options, world, seed=1))
         spaces = [stack.enter_context(Namespace()) for _ in range(size)]
@@ -87,7 +86,7 @@ def swarm(
 
 
 def carried(size: int, options: RadioOptions, seconds: float) -> Figures:
-    """Return what the medium does for two of `size` robots."""
+    """Return the figures of the medium for two of `size` robots."""
     with swarm(size, options) as (medium, (near, far, *_)):
         near.run("ping", "-c", "3", "10.9.0.2")
         before = Counter(medium.stats().late)
@@ -100,7 +99,7 @@ def carried(size: int, options: RadioOptions, seconds: float) -> Figures:
 
 
 def wired(seconds: float) -> Figures:
-    """Return what a veth pair does."""
+    """Return the figures of a veth pair."""
     with veth_path() as (near, far):
         near.run("ping", "-c", "3", "10.9.0.2")
         return round_trips(near) | throughput(near, far, seconds) | tcp(near, far, seconds)
@@ -114,14 +113,14 @@ def round_trips(near: Namespace) -> Figures:
 
 
 def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
-    """Return how late the medium was with packets since it had been late `before`."""
+    """Return the lateness of the medium's packets since the counts `before`."""
     late = Lateness(bound_ns=1, packets=Counter(medium.stats().late) - before)
     shares = {"median": 0.5, "p99": 0.99, "max": 1.0}
     return {f"late_{word}_ms": (quantile_ns(late, share) or 0) / 1e6 for word, share in shares.items()}
 
 
 def throughput(near: Namespace, far: Namespace, seconds: float) -> Figures:
-    """Return how many small packets per second `far` gets."""
+    """Return the rate of small packets that `far` receives."""
     with listening_iperf(far):
         arrived = packets_in(far)
         udp = iperf(near, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
@@ -129,52 +128,52 @@ def throughput(near: Namespace, far: Namespace, seconds: float) -> Figures:
 
 
 def tcp(near: Namespace, far: Namespace, seconds: float) -> Figures:
-    """Return what TCP carries."""
+    """Return the throughput of TCP."""
     with listening_iperf(far):
         return {"tcp_mbit_s": iperf(near, seconds)["sum_received"]["bits_per_second"] / 1e6}
 
 
 def talking(size: int, options: RadioOptions, seconds: float, packets_s: int, pairs: int) -> Figures:
-    """Return what becomes of packets between so many pairs of `size` robots, and what each costs the medium."""
+    """Return the received packets between pairs of `size` robots, and the cost per packet in the medium."""
     with swarm(size, options) as (medium, spaces):
         senders, receivers = spaces[: 2 * pairs : 2], spaces[1 : 2 * pairs : 2]
         each = str(packets_s / len(senders))
         before, arrived = Counter(medium.stats().late), sum(map(packets_in, receivers))
-        begun_s, cpu_before_s = time.monotonic(), cpu_s(medium.pid)
-        talks = [
+        started_s, cpu_before_s = time.monotonic(), cpu_s(medium.pid)
+        senders_running = [
             sender.start(sys.executable, "-c", TALK_SCRIPT, f"10.9.0.{2 * number + 2}", str(seconds), each)
             for number, sender in enumerate(senders)
         ]
-        for talk in talks:
-            talk.communicate(timeout=10 * seconds + 60)
-        taken_s, spent_s = time.monotonic() - begun_s, cpu_s(medium.pid) - cpu_before_s
+        for process in senders_running:
+            process.communicate(timeout=10 * seconds + 60)
+        lasted_s, spent_s = time.monotonic() - started_s, cpu_s(medium.pid) - cpu_before_s
         arrived = sum(map(packets_in, receivers)) - arrived
-        figures = {"packets_s": arrived / taken_s, "cpu_us": 1e6 * spent_s / arrived}
+        figures = {"packets_s": arrived / lasted_s, "cpu_us": 1e6 * spent_s / arrived}
         return figures | lateness(medium, before)
 
 
 def started(size: int) -> Figures:
-    """Return what `size` whole robots take to serve, the lab's side included, and the mean memory of one."""
+    """Return the start-up cost of `size` whole robots, including the lab, and the mean memory of a robot."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     login, host_key = KeyPair.make(), KeyPair.make()
     spec = robot_spec(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=login, host_key=host_key)
-    begun_s, begun_cpu_s = time.monotonic(), time.process_time()
+    started_s, started_cpu_s = time.monotonic(), time.process_time()
     with ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(8))
         robots = [
             stack.enter_context(EmulatedRobot(replace(spec, name=f"r{number}"))) for number in range(1, size + 1)
         ]
         list(pool.map(_serve, robots))
-        taken_s = time.monotonic() - begun_s
-        processors_s = time.process_time() - begun_cpu_s + sum(cpu_s(robot.pid) for robot in robots)
+        lasted_s = time.monotonic() - started_s
+        processors_s = time.process_time() - started_cpu_s + sum(cpu_s(robot.pid) for robot in robots)
         memory = [Memory.of(robot.pid) for robot in robots]
         for robot in robots:
             robot.hang_up()
     return {
-        "start_s": taken_s,
+        "start_s": lasted_s,
         "cpu_s": processors_s,
-        "own_mb": statistics.mean(one.own for one in memory) / 1e6,
-        "pss_mb": statistics.mean(one.pss for one in memory) / 1e6,
+        "own_mb": statistics.mean(robot_memory.own for robot_memory in memory) / 1e6,
+        "pss_mb": statistics.mean(robot_memory.pss for robot_memory in memory) / 1e6,
     }
 
 
@@ -185,17 +184,19 @@ def _serve(robot: EmulatedRobot) -> None:
 
 
 def show(table: dict[str, dict[int, Figures]], veth: Figures, sizes: Sequence[int]) -> None:
-    """Print what was measured, and EMANE's figures below."""
+    """Print the results, and EMANE's figures below."""
     print(f"{'':29}" + "".join(f"{size:>14}" for size in sizes))
     for path, by_size in table.items():
         for name in by_size[sizes[0]]:
             values = [by_size[size].get(name) for size in sizes]
-            print(f"{path:11}{name:18}" + "".join(f"{'' if one is None else f'{one:.6g}':>14}" for one in values))
+            print(
+                f"{path:11}{name:18}" + "".join(f"{'' if value is None else f'{value:.6g}':>14}" for value in values)
+            )
     for name, value in veth.items():
         print(f"{'veth':11}{name:18}{value:>14.6g}")
-    for name, figures in BESIDE.items():
-        known = dict(zip(SIZES, figures, strict=True))
-        print(f"{'EMANE':11}{name:18}" + "".join(f"{known.get(size, ''):>14}" for size in sizes))
+    for name, figures in REFERENCE.items():
+        emane_by_size = dict(zip(SIZES, figures, strict=True))
+        print(f"{'EMANE':11}{name:18}" + "".join(f"{emane_by_size.get(size, ''):>14}" for size in sizes))
 
 
 def main() -> None:
@@ -207,12 +208,13 @@ def main() -> None:
     options = parser.parse_args()
     print(f"load before: {os.getloadavg()[0]:.2f}")
     table = {
-        name: {size: carried(size, one, options.seconds) for size in options.sizes} for name, one in RADIOS.items()
+        name: {size: carried(size, radio_options, options.seconds) for size in options.sizes}
+        for name, radio_options in RADIOS.items()
     }
-    for name, one in RADIOS.items():
-        for who, rate in (("one", ONE_TALKS), ("all", ALL_TALK[name])):
-            table[f"{name}, {who}"] = {
-                size: talking(size, one, options.seconds, rate, 1 if who == "one" else size // 2)
+    for name, radio_options in RADIOS.items():
+        for senders, rate in (("one", ONE_TALKS), ("all", ALL_TALK[name])):
+            table[f"{name}, {senders}"] = {
+                size: talking(size, radio_options, options.seconds, rate, 1 if senders == "one" else size // 2)
                 for size in options.sizes
             }
     veth = wired(options.seconds)

@@ -1,8 +1,9 @@
-"""TCP of the co-simulation beside this machine's kernel: `python -m benchmarks.tcp_vs_kernel`, as root.
+"""TCP of the co-simulation compared with this machine's kernel: `python -m benchmarks.tcp_vs_kernel`, as root.
 
-One station sends to another as fast as TCP lets it, over links of one rate, delay and loss each way: the kernel by
-iperf3 between two namespaces on the emulated backend's medium, the co-simulation over the same link model. Each pair
-of runs has its own seed. A row has the mean goodputs, and the ratio of ours to the kernel's with its 95 % interval.
+One station sends to another at the full rate of TCP, over links with the same rate, delay and loss in both
+directions: the kernel with iperf3 between two namespaces on the medium of the emulated backend, the co-simulation
+over the same link model. Each run has a different seed. A row has the mean goodputs, and the ratio of the
+co-simulation to the kernel with its 95 % interval.
 """
 
 import argparse
@@ -29,7 +30,7 @@ from sim_backends.world.motion import State
 
 LOSSES: Final = ("0.1%", "1%", "5%")
 DELAYS: Final = ("10ms", "50ms")
-"""Of each link, so that a round trip takes twice that."""
+"""Delay of each link; a round trip takes twice that."""
 RATE: Final = "100Mbit/s"
 KERNEL: Final = "cubic"
 MESSAGE_BYTES: Final = 10 * TcpOptions().segment_bytes
@@ -38,7 +39,7 @@ _SAFELY_BIT_S: Final = 100_000_000
 
 @dataclass(frozen=True)
 class Link:
-    """What a link does in both directions: share of packets lost and delay, as a site file has them."""
+    """Loss and delay of a link in both directions, as in a site file."""
 
     loss: str
     delay: str
@@ -91,7 +92,9 @@ def row(link: Link, kernel_runs: Sequence[float], controls: Sequence[Congestion]
 def main() -> None:
     """Measure and print a row per link."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=12, help="of the kernel per link; ours has twice as many")
+    parser.add_argument(
+        "--runs", type=int, default=12, help="runs of the kernel per link; the co-simulation has twice as many"
+    )
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--together", type=int, default=4, help="runs of the kernel at the same time")
     parser.add_argument("--kernel", default=KERNEL, help="congestion control of the kernel")

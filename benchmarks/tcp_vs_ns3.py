@@ -1,8 +1,9 @@
-"""TCP beside ns-3's over a cable that loses the same packets in both: `python -m benchmarks.tcp_vs_ns3`.
+"""TCP of the co-simulation compared with ns-3's, with equal losses on a cable: `python -m benchmarks.tcp_vs_ns3`.
 
-Needs what `radio_vs_ns3` needs. One station sends to another as fast as it may, and packets are lost by their
-numbers, so that whatever differs is TCP. Losses are written down, and the windows after them are printed, or come by
-chance, alike for all, and goodputs are. `--events PATTERN CONTROL` prints what both do where they first part.
+Has the requirements of `radio_vs_ns3`. One station sends to another at full rate, and packets are lost by their
+numbers, so that all differences are due to TCP. With fixed loss patterns the windows after the losses are printed,
+with random losses, equal for all peers, the goodputs. `--events PATTERN CONTROL` prints the events around the first
+difference.
 """
 
 import argparse
@@ -37,11 +38,11 @@ SEGMENT_BYTES: Final = TcpOptions().segment_bytes
 
 @dataclass(frozen=True)
 class Losses:
-    """Which packets the cable loses, by their numbers from 0, those that open the connection counted.
+    """Packets that the cable loses, by their numbers from 0, the handshake included.
 
     Attributes:
-        data: Of those to the receiver: 0 is the SYN, 1 the ACK of its answer, 2 the first with data.
-        acks: Of those to the sender: 0 is the SYN-ACK.
+        data: Lost packets to the receiver: 0 is the SYN, 1 the ACK of the handshake, 2 the first with data.
+        acks: Lost packets to the sender: 0 is the SYN-ACK.
     """
 
     data: Collection[int]
@@ -54,7 +55,7 @@ PATTERNS: Final = {
     "burst of 20": Losses(range(100, 120)),
     "burst of 110": Losses(range(100, 210)),
 }
-"""The longest takes the rest of a window with all that its ACKs let go, and what is sent again twice."""
+"""The longest burst is the rest of a window, all packets that its ACKs release, and retransmissions twice."""
 
 CHANCES: Final = {
     "2 % of data": (0.02, 0.0, SECONDS),
@@ -62,16 +63,21 @@ CHANCES: Final = {
     "7 % each way": (0.07, 0.07, SECONDS),
     "40 % of data": (0.4, 0.0, 100.0),
 }
-"""Shares of packets that are lost each way, and for how many seconds; data is lost as at 20 m behind the wall of
-`cosim_vs_ns3`, and as at 47 m in sight."""
+"""Loss shares of data and of ACKs, and the duration in seconds.
 
-PEERS: Final = {"ns-3": "ns3::{}", "mended": "Counting{}", "no clamp": "Counting{}"}
-"""What a congestion control is called in ns-3, in the mended one, and in that whose CUBIC opens after a timeout by a
-segment for 255 acknowledged, the least that it can be told, in place of 20."""
+The losses of data are like those at 20 m behind the wall of `cosim_vs_ns3`, and at 47 m in sight.
+"""
+
+PEERS: Final = {"ns-3": "ns3::{}", "corrected": "Counting{}", "no clamp": "Counting{}"}
+"""Class names of congestion controls in ns-3, in the corrected variant, and in that without the clamp of CUBIC.
+
+With the clamp the window grows by at least a segment per 20 acknowledged ones after a timeout. Without it this is a
+segment per 255, the largest value that can be set.
+"""
 
 
 def by_chance(seed: int, data: float, acks: float) -> Losses:
-    """Return losses of these shares; the handshake meets none, as it says nothing about the window."""
+    """Return random losses of these shares, without losses in the handshake, which does not affect the window."""
     draws = np.random.default_rng(seed).random((2, MOST_PACKETS))
     draws[:, :2] = 1
     lost = [np.flatnonzero(row < share).tolist() for row, share in zip(draws, (data, acks), strict=True)]
@@ -80,11 +86,11 @@ def by_chance(seed: int, data: float, acks: float) -> Losses:
 
 @dataclass(frozen=True)
 class Run:
-    """What a sender did.
+    """A run of a sender.
 
     Attributes:
-        events: When in ns, what (`window`, `threshold`, `timeout`, `sent`), and its value: in segments, the timeout
-            in ms, and which segment was sent, from 0.
+        events: Time in ns, kind (`window`, `threshold`, `timeout`, `sent`) and value: segments, for the timeout ms,
+            and for `sent` the number of the segment from 0.
         mbit_s: Its goodput.
     """
 
@@ -93,17 +99,17 @@ class Run:
 
     @property
     def sent(self) -> list[tuple[int, float]]:
-        """When each segment was sent, and which."""
-        return [(at_ns, value) for at_ns, what, value in self.events if what == "sent"]
+        """Time and number of each sent segment."""
+        return [(at_ns, value) for at_ns, kind, value in self.events if kind == "sent"]
 
     def window_at(self, at_s: float) -> float:
         """Return the congestion window at a time, in segments."""
-        before = (value for at_ns, what, value in reversed(self.events) if what == "window" and at_ns <= at_s * 1e9)
+        before = (value for at_ns, kind, value in reversed(self.events) if kind == "window" and at_ns <= at_s * 1e9)
         return next(before, math.nan)
 
 
 def ours(control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
-    """Return what our sender does."""
+    """Return a run of the co-simulation's sender."""
     samples: list[TcpSample] = []
     wire = ScriptedWire(
         DELAY_MS * 1_000_000,
@@ -116,11 +122,11 @@ def ours(control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
         transport.send(Packet(number, "a", "b", SEGMENT_BYTES, ("stream", number), 0, 0, "tcp"))
     wire.run(round(seconds * 1e9))
     events: list[tuple[int, str, float]] = []
-    for one in samples:
-        events.append((one.at_ns, "window", one.window_bytes / SEGMENT_BYTES))
-        events.append((one.at_ns, "timeout", one.timeout_ns / 1e6))
-        if one.threshold_bytes is not None:
-            events.append((one.at_ns, "threshold", one.threshold_bytes / SEGMENT_BYTES))
+    for sample in samples:
+        events.append((sample.at_ns, "window", sample.window_bytes / SEGMENT_BYTES))
+        events.append((sample.at_ns, "timeout", sample.timeout_ns / 1e6))
+        if sample.threshold_bytes is not None:
+            events.append((sample.at_ns, "threshold", sample.threshold_bytes / SEGMENT_BYTES))
     for packet in wire.transmitted:
         segment = packet.packet.body[1]
         if segment.length:
@@ -130,7 +136,7 @@ def ours(control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
 
 
 def theirs(ns3: Ns3, peer: str, control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
-    """Return what the sender of one of the `PEERS` does."""
+    """Return a run of the sender of one of the `PEERS`."""
     lost = {"lost-data": losses.data, "lost-acks": losses.acks}
     options: dict[str, object] = {name: ",".join(map(str, numbers)) for name, numbers in lost.items() if numbers}
     if peer == "no clamp":
@@ -148,31 +154,33 @@ def theirs(ns3: Ns3, peer: str, control: Control, losses: Losses, seconds: float
     units = {"window": SEGMENT_BYTES, "threshold": SEGMENT_BYTES, "timeout": 1e6, "sent": SEGMENT_BYTES, "state": 1}
     words = (line.split() for line in lines[:-1])
     events = [
-        (int(at_ns), what, int(value) // SEGMENT_BYTES if what == "sent" else int(value) / units[what])
-        for at_ns, what, value in words
+        (int(at_ns), kind, int(value) // SEGMENT_BYTES if kind == "sent" else int(value) / units[kind])
+        for at_ns, kind, value in words
     ]
     return Run(events, float(lines[-1].split()[0]))
 
 
-def parting_ns(one: Run, other: Run) -> int | None:
-    """Return when two senders first sent different segments; None if they never did."""
-    for mine, its in zip_longest(one.sent, other.sent):
-        if mine is None or its is None:
-            return (mine or its)[0]
-        if mine[1] != its[1]:
-            return min(mine[0], its[0])
+def first_difference_ns(first: Run, second: Run) -> int | None:
+    """Return the time at which two senders first sent different segments, or None if they never did."""
+    for a, b in zip_longest(first.sent, second.sent):
+        if a is None or b is None:
+            return (a or b)[0]
+        if a[1] != b[1]:
+            return min(a[0], b[0])
     return None
 
 
-def paired_ratio(mine: np.ndarray, its: np.ndarray) -> tuple[float, float]:
-    """Return the ratio of means of runs, shape (runs,), that met the same losses, and half of its 95 % interval."""
-    ratio = float(mine.mean() / its.mean())
-    error = float((mine - ratio * its).std(ddof=1) / its.mean() / math.sqrt(len(mine)))
-    return ratio, float(student.ppf(0.975, len(mine) - 1)) * error
+def paired_ratio(ours_mbit_s: np.ndarray, peers_mbit_s: np.ndarray) -> tuple[float, float]:
+    """Return the ratio of means of runs with equal losses, each of shape (runs,), and half of its 95 % interval."""
+    ratio = float(ours_mbit_s.mean() / peers_mbit_s.mean())
+    error = float(
+        (ours_mbit_s - ratio * peers_mbit_s).std(ddof=1) / peers_mbit_s.mean() / math.sqrt(len(ours_mbit_s))
+    )
+    return ratio, float(student.ppf(0.975, len(ours_mbit_s) - 1)) * error
 
 
 def pattern_lines(ns3: Ns3) -> Iterator[str]:
-    """Yield windows after losses that are written down."""
+    """Yield windows after fixed loss patterns."""
     yield f"{'segments after (s)':32}" + " ".join(f"{at_s:6}" for at_s in AT_S)
     for control in CONTROLS:
         for name, losses in PATTERNS.items():
@@ -183,41 +191,43 @@ def pattern_lines(ns3: Ns3) -> Iterator[str]:
 
 
 def chance_lines(ns3: Ns3) -> Iterator[str]:
-    """Yield goodputs where losses come by chance, the same to all."""
+    """Yield goodputs under random losses, the same for all."""
     for control in CONTROLS:
         for name, (data, acks, seconds) in CHANCES.items():
-            found: dict[str, list[float]] = {peer: [] for peer in (*PEERS, "ours")}
+            goodputs: dict[str, list[float]] = {peer: [] for peer in (*PEERS, "ours")}
             for seed in range(SEEDS):
                 losses = by_chance(seed, data, acks)
                 for peer in PEERS:
-                    found[peer].append(theirs(ns3, peer, control, losses, seconds).mbit_s)
-                found["ours"].append(ours(control, losses, seconds).mbit_s)
-            mbit_s = {peer: np.array(values) for peer, values in found.items()}
+                    goodputs[peer].append(theirs(ns3, peer, control, losses, seconds).mbit_s)
+                goodputs["ours"].append(ours(control, losses, seconds).mbit_s)
+            mbit_s = {peer: np.array(values) for peer, values in goodputs.items()}
             means = " ".join(f"{peer} {values.mean():.3f}" for peer, values in mbit_s.items())
             ratios = (paired_ratio(mbit_s["ours"], mbit_s[peer]) for peer in PEERS)
-            yield f"{control:9}{name:14}{means} | ours by " + " ".join(
-                "{:.2f} ({:.2f})".format(*one) for one in ratios
+            yield f"{control:9}{name:14}{means} | ours relative to peers " + " ".join(
+                "{:.2f} ({:.2f})".format(*pair) for pair in ratios
             )
 
 
 def event_lines(ns3: Ns3, name: str, control: Control) -> Iterator[str]:
-    """Yield what ns-3 as it is and our sender do about the time when they part."""
+    """Yield the events of the unchanged ns-3 and of the co-simulation's sender around their first difference."""
     runs = {"ns-3": theirs(ns3, "ns-3", control, PATTERNS[name]), "ours": ours(control, PATTERNS[name])}
-    at_ns = parting_ns(*runs.values())
+    at_ns = first_difference_ns(*runs.values())
     if at_ns is None:
-        yield "they send the same"
+        yield "both send the same segments"
         return
     around_ns = 5_000_000
     for peer, run in runs.items():
-        for event_ns, what, value in run.events:
+        for event_ns, kind, value in run.events:
             if abs(event_ns - at_ns) <= around_ns:
-                yield f"{peer:6}{event_ns / 1e6:10.3f} ms  {what:10}{value:.2f}"
+                yield f"{peer:6}{event_ns / 1e6:10.3f} ms  {kind:10}{value:.2f}"
 
 
 def main() -> None:
     """Print both tables, or the events of one pattern."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--events", nargs=2, metavar=("PATTERN", "CONTROL"), help="where both senders first part")
+    parser.add_argument(
+        "--events", nargs=2, metavar=("PATTERN", "CONTROL"), help="print events around the first difference"
+    )
     arguments = parser.parse_args()
     if arguments.events and (arguments.events[0] not in PATTERNS or arguments.events[1] not in get_args(Control)):
         parser.error(f"patterns: {', '.join(PATTERNS)}; controls: {', '.join(CONTROLS)}")

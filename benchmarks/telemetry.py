@@ -1,12 +1,12 @@
-"""What the sampler of a robot's link costs: `python -m benchmarks.telemetry [--json] [--seconds N]`, needs no root.
+"""Cost of the sampler of a robot's link: `python -m benchmarks.telemetry [--json] [--seconds N]`, needs no root.
 
-The sampler runs as on a robot, by each shell that is here, with the real `iw` (`apt-get install iw`). Where the
-kernel has no Wi-Fi, `iw` ends when it has found out, and the sampler is given a station's text in its place; a kernel
-that has one adds what its driver takes. The yardstick is a loop of the same shell that calls `iw` three times, sleeps
-0.2 s, and does it again. Processor time is the kernel's count of the shell and all that it ran, per second.
+The sampler runs as on a robot, in each installed shell, with the real `iw` (`apt-get install iw`). Without Wi-Fi in
+the kernel `iw` fails early, and the sampler gets a stored station text instead; with Wi-Fi the cost of the driver is
+added. The reference is a loop in the same shell that calls `iw` three times and sleeps 0.2 s. Processor time is the
+kernel's count for the shell and its children, per second.
 
-A slower computer is played by an `iw` that runs so many times: the sampler then calls it less often, and keeps to its
-share.
+A slower computer is simulated by an `iw` that runs several times. The sampler must then call it less often to stay
+within its share of the processor.
 """
 
 import argparse
@@ -43,7 +43,7 @@ Station f0:99:bf:0e:86:98 (on wlan0)
 \tassociated:\tyes
 \tconnected time:\t233 seconds
 """
-# Defined before the script's own functions: where these say `iw`, the real one runs, so many times.
+# A function that replaces `iw` in the script and runs the real one SLOWER times.
 _IW: Final = """\
 iw() {
     times=0
@@ -60,26 +60,26 @@ done
 
 
 def measure(shell: Sequence[str], text: str, words: Sequence[str], seconds: float) -> tuple[float, int]:
-    """Run a script in a folder as an attempt's; return processor time in ms per second, and the number of samples."""
+    """Run a script in a folder like an attempt's; return processor time in ms per second, and the sample count."""
     with tempfile.TemporaryDirectory() as folder:
         jobs = Path(folder, ".jobs", "link")
         jobs.mkdir(parents=True)
         os.mkfifo(jobs / "end")
         Path(folder, ".began").write_text("- benchmark\n", encoding="ascii")
-        script, told = Path(folder, "script.sh"), Path(folder, "told")
+        script, output = Path(folder, "script.sh"), Path(folder, "output")
         script.write_text(text, encoding="utf-8")
         path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
         environment = os.environ | {"STATION": _STATION, "PATH": path}
-        before, began_s = _children_s(), time.monotonic()
-        with told.open("wb") as out:
+        before, started_s = _children_s(), time.monotonic()
+        with output.open("wb") as out:
             running = subprocess.Popen(
                 (*shell, str(script), *words), cwd=folder, stdout=out, stderr=subprocess.DEVNULL, env=environment
             )
             time.sleep(seconds)
             running.terminate()
             running.wait()
-        used_s, lasted_s = _children_s() - before, time.monotonic() - began_s
-        return 1e3 * used_s / lasted_s, told.read_bytes().count(b"signal:")
+        used_s, lasted_s = _children_s() - before, time.monotonic() - started_s
+        return 1e3 * used_s / lasted_s, output.read_bytes().count(b"signal:")
 
 
 def _children_s() -> float:
@@ -88,33 +88,31 @@ def _children_s() -> float:
 
 
 def main() -> int:
-    """Print a line per shell and slowness."""
+    """Print a line per shell and factor of slowness."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="single values")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each run")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of each run")
     options = parser.parse_args()
     if shutil.which("iw", path=f"{os.environ['PATH']}:/usr/sbin:/sbin") is None:
         print("there is no iw: apt-get install iw", file=sys.stderr)
         return 2
-    found: list[dict[str, float | str | int]] = []
+    rows: list[dict[str, float | str | int]] = []
     for name, shell in SHELLS.items():
         if shutil.which(shell[0]) is None:
             continue
         loop = measure(shell, _IW.replace("SLOWER", "1") + _LOOP, (), options.seconds)
-        found.append({"shell": name, "what": "loop of iw", "slower": 1, "ms_per_s": loop[0], "samples": loop[1]})
+        rows.append({"shell": name, "what": "loop of iw", "slower": 1, "ms_per_s": loop[0], "samples": loop[1]})
         for slower in SLOWER:
             text = _IW.replace("SLOWER", str(slower)) + SCRIPT.decode()
             used = measure(shell, text, ("sample", "wlan0", "-"), options.seconds)
-            found.append(
-                {"shell": name, "what": "sampler", "slower": slower, "ms_per_s": used[0], "samples": used[1]}
-            )
+            rows.append({"shell": name, "what": "sampler", "slower": slower, "ms_per_s": used[0], "samples": used[1]})
     if options.json:
-        print(json.dumps(found))
+        print(json.dumps(rows))
         return 0
     print(f"{'shell':12} {'what':12} {'iw slower':>9} {'ms/s':>7} {'samples/s':>9}")
-    for one in found:
-        rate = int(one["samples"]) / options.seconds
-        print(f"{one['shell']:12} {one['what']:12} {one['slower']:>9} {one['ms_per_s']:7.2f} {rate:9.2f}")
+    for row in rows:
+        rate = int(row["samples"]) / options.seconds
+        print(f"{row['shell']:12} {row['what']:12} {row['slower']:>9} {row['ms_per_s']:7.2f} {rate:9.2f}")
     return 0
 
 

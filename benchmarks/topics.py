@@ -1,14 +1,13 @@
-"""What the step `topics` adds to a message: `python -m benchmarks.topics [--json] [--rounds N]`; it needs rosmaster.
+"""Delay that the step `topics` adds to messages: `python -m benchmarks.topics [--json] [--rounds N]`, with rosmaster.
 
-The agent that the step starts on robots (`agent publish`, `agent subscribe`) beside plain pairs of CycloneDDS, Zenoh
-and rospy on loopback, one middleware after the other. In each round all programs begin anew, since where and beside
-what a program runs makes more of a difference than the next thousand messages. The pairs of a middleware then send at
-the same time, 1,000 bytes at nearly 200 Hz: rates are a little apart, so that in the course of seconds each meets the
-others, and whatever else the machine does, at every moment of its period; they change places from round to round.
-Medians are taken over the time in which all sent; a ratio is the geometric mean over rounds. In every third round
-each pair then sends for a second as fast as it goes, one after the other.
+The agent that the step starts on robots (`agent publish`, `agent subscribe`) is compared with plain pairs of
+CycloneDDS, Zenoh and rospy on loopback, one middleware after the other. Each round restarts all programs, because
+their placement on the machine has more effect than further messages. The pairs of a middleware then send at the same
+time, 1,000 bytes at nearly 200 Hz. Their rates differ slightly, so that over seconds the phases between the pairs and
+other load vary, and are exchanged between rounds. Medians are over the time in which all pairs send; a ratio is the
+geometric mean over rounds. In every third round each pair then sends for a second at full rate, in sequence.
 
-A delay runs from before a sample is made until a subscriber's Python has it.
+A delay is from the creation of a sample until the subscriber's Python code has it.
 """
 
 import argparse
@@ -33,26 +32,26 @@ from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
 
 PLAIN: Final = {"dds": ("plain",), "zenoh": ("plain", "attached"), "ros1": ("plain",)}
-"""Pairs beside the agent's, of each middleware."""
+"""Pairs of each middleware that are compared with the agent's."""
 RATES_HZ: Final = (200.0, 197.0, 203.0)
 LASTS_S: Final = 4.0
 BURST_S: Final = 1.0
 BURST_EVERY: Final = 3
 FASTEST_HZ: Final = 1e9
-"""No sample is early then."""
+"""At this rate no sample waits for its send time."""
 _DOMAIN: Final = 62
 
 Times = Sequence[tuple[int, int]]
-"""When each message arrived, and how late, in nanoseconds."""
+"""Arrival time and delay of each message, in nanoseconds."""
 
 
 class AgentPair:
-    """The two ends that a step `topics` has on two robots, for one stream after the other.
+    """The two ends of a step `topics`, for streams in sequence.
 
     Args:
         over: The middleware.
-        master_port: Of the ROS master.
-        folder: For logs.
+        master_port: Port of the ROS master.
+        folder: Folder for logs.
     """
 
     def __init__(self, over: str, master_port: int, folder: Path) -> None:
@@ -60,43 +59,46 @@ class AgentPair:
 
     @contextmanager
     def stream(self, lasts_s: float, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
-        """Stream while the body runs, and until it is over; yield the publisher, which is up."""
+        """Stream while the body runs, until the stream ends; yield the running publisher."""
         port = free_port()
         with self._end("subscribe", port, lasts_s, rate_hz) as subscriber:
             with self._end("publish", port, lasts_s, rate_hz) as publisher:
                 yield publisher
                 if publisher.wait() != 0:
-                    raise RuntimeError(f"the publisher over {self._over} ended with {publisher.returncode}")
+                    raise RuntimeError(f"the publisher over {self._over} exited with {publisher.returncode}")
             subscriber.terminate()
 
     def arrived(self) -> Times:
-        """Return what arrived of the last stream."""
+        """Return the arrivals of the last stream."""
         samples = topic_log.read(self._log("subscribe")).samples
         return list(zip(samples.at_ns.tolist(), (samples.at_ns - samples.sent_ns).tolist(), strict=True))
 
     @contextmanager
     def _end(self, verb: str, port: int, lasts_s: float, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
-        told = json.dumps({"network": self._network(verb, port), "topic": self._topic(verb), "stream": {
+        request = json.dumps({"network": self._network(verb, port), "topic": self._topic(verb), "stream": {
             "over": self._over, "size_bytes": SIZE, "rate_hz": rate_hz, "duration_s": lasts_s, "patience_s": 20.0,
         }})  # fmt: skip
-        command = (sys.executable, "-m", "fieldkit.agent", verb, told, str(self._log(verb)))
+        command = (sys.executable, "-m", "fieldkit.agent", verb, request, str(self._log(verb)))
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
             assert process.stderr is not None
-            if not (said := process.stderr.readline()).startswith("up,"):
-                raise RuntimeError(said + process.stderr.read())
+            if not (first_line := process.stderr.readline()).startswith("up,"):
+                raise RuntimeError(first_line + process.stderr.read())
             yield process
 
     def _network(self, verb: str, port: int) -> dict[str, Any]:
         shared: dict[str, Any] = {"address": HOST, "domain": _DOMAIN, "node": f"harness_{verb}"}
         if self._over == "ros1":
-            settings = {"tcp_nodelay": "1"}  # as the plain pair has it
+            settings = {"tcp_nodelay": "1"}  # as in the plain pair
             return shared | {"discovery": "master", "server": HOST, "port": self._master_port, "settings": settings}
         settings = {}
         if self._over == "zenoh":
-            # One end listens and the other connects, as those of the plain pair do.
-            there = json.dumps([f"tcp/{HOST}:{port}"])
-            hears = verb == "subscribe"
-            settings = {"listen/endpoints": there if hears else "[]", "connect/endpoints": "[]" if hears else there}
+            # One end listens and the other connects, as in the plain pair.
+            locators = json.dumps([f"tcp/{HOST}:{port}"])
+            is_subscriber = verb == "subscribe"
+            settings = {
+                "listen/endpoints": locators if is_subscriber else "[]",
+                "connect/endpoints": "[]" if is_subscriber else locators,
+            }
         return shared | {"discovery": "peers", "peers": [HOST], "settings": settings}
 
     def _topic(self, verb: str) -> dict[str, Any]:
@@ -108,36 +110,38 @@ class AgentPair:
         return self._folder / f"{self._over}-{verb}.bin"
 
 
-def at_once(plain: Sequence[Running], own: AgentPair, rates_hz: Sequence[float]) -> list[Times]:
-    """Let all pairs of a middleware send at the same time; return what arrived over each while all sent.
+def stream_together(plain: Sequence[Running], agent_pair: AgentPair, rates_hz: Sequence[float]) -> list[Times]:
+    """Send over all pairs of a middleware at the same time; return the arrivals of each while all pairs sent.
 
     Args:
         plain: The plain pairs.
-        own: The agent's.
-        rates_hz: Of each, the agent's last.
+        agent_pair: The agent's pair.
+        rates_hz: Rates of the pairs, the agent's last.
     """
-    with own.stream(LASTS_S, rates_hz[-1]):
-        came = together(lambda one: one[0].run(LASTS_S, one[1])[1], list(zip(plain, rates_hz, strict=False)))
-    streams = [*came, own.arrived()]
-    begun_ns = max(times[0][0] for times in streams)
-    ended_ns = min(times[-1][0] for times in streams)
-    return [[one for one in times if begun_ns <= one[0] <= ended_ns] for times in streams]
+    with agent_pair.stream(LASTS_S, rates_hz[-1]):
+        plain_arrivals = together(
+            lambda pair: pair[0].run(LASTS_S, pair[1])[1], list(zip(plain, rates_hz, strict=False))
+        )
+    streams = [*plain_arrivals, agent_pair.arrived()]
+    first_ns = max(times[0][0] for times in streams)
+    last_ns = min(times[-1][0] for times in streams)
+    return [[arrival for arrival in times if first_ns <= arrival[0] <= last_ns] for times in streams]
 
 
-def one_round(over: str, number: int, own: AgentPair, environment: dict[str, str]) -> dict[str, Any]:
-    """Return what was measured of a middleware in a round: by pair the median delay, and how many went."""
+def one_round(over: str, number: int, agent_pair: AgentPair, environment: dict[str, str]) -> dict[str, Any]:
+    """Return the results of a middleware in a round: median delay and rate of a burst, by pair."""
     pairs = (*PLAIN[over], "agent")
     rates_hz = [RATES_HZ[(place + number) % len(pairs)] for place in range(len(pairs))]
     with ExitStack() as stack:
         ways = [f"{over} {pair}" for pair in PLAIN[over]]
         plain = [Running(stack, Way(way, way, way), environment) for way in ways]
-        delays = at_once(plain, own, rates_hz)
+        delays = stream_together(plain, agent_pair, rates_hz)
         bursts: list[Times] = []
         if number % BURST_EVERY == 0:
-            bursts = [one.run(BURST_S, 0)[1] for one in plain]
-            with own.stream(BURST_S, FASTEST_HZ):
+            bursts = [pair.run(BURST_S, 0)[1] for pair in plain]
+            with agent_pair.stream(BURST_S, FASTEST_HZ):
                 pass
-            bursts.append(own.arrived())
+            bursts.append(agent_pair.arrived())
     return {
         "round": number,
         "over": over,
@@ -147,7 +151,7 @@ def one_round(over: str, number: int, own: AgentPair, environment: dict[str, str
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Return what was measured in each round of each middleware."""
+    """Return the results of each middleware in each round."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         port = free_port()
@@ -161,41 +165,43 @@ def measure(rounds: int) -> list[dict[str, Any]]:
         master = stack.enter_context(subprocess.Popen(command, stdout=log, stderr=log, env=environment))
         stack.callback(master.terminate)
         agents = {over: AgentPair(over, port, folder) for over in PLAIN}
-        return [one_round(over, number, own, environment) for number in range(rounds) for over, own in agents.items()]
+        return [
+            one_round(over, number, pair, environment) for number in range(rounds) for over, pair in agents.items()
+        ]
 
 
-def _per_s(came: Times) -> float:
-    return (len(came) - 1) / ((came[-1][0] - came[0][0]) / 1e9)
+def _per_s(arrivals: Times) -> float:
+    return (len(arrivals) - 1) / ((arrivals[-1][0] - arrivals[0][0]) / 1e9)
 
 
-def ratio(rows: Sequence[dict[str, Any]], pair: str, beside: str) -> str:
-    """Return how long a pair's delay is beside another's in the same round, with its interval at 95 %."""
-    logs = [math.log(one["delay_ms"][pair] / one["delay_ms"][beside]) for one in rows]
-    found = statistics.means([logs])
-    value, low, high = (math.exp(one[0]) for one in (found.value, found.low, found.high))
+def ratio(rows: Sequence[dict[str, Any]], pair: str, reference: str) -> str:
+    """Return the ratio of a pair's delay to that of another pair in the same round, with its 95 % interval."""
+    logs = [math.log(row["delay_ms"][pair] / row["delay_ms"][reference]) for row in rows]
+    mean = statistics.means([logs])
+    value, low, high = (math.exp(column[0]) for column in (mean.value, mean.low, mean.high))
     return f"{value:.3f} [{low:.3f}, {high:.3f}]"
 
 
 def main() -> int:
     """Print a line per pair."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="single values")
-    parser.add_argument("--rounds", type=int, default=8, help="how often each pair is measured")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON")
+    parser.add_argument("--rounds", type=int, default=8, help="measurements of each pair")
     options = parser.parse_args()
-    found = measure(options.rounds)
+    results = measure(options.rounds)
     if options.json:
-        print(json.dumps(found))
+        print(json.dumps(results))
         return 0
-    print(f"{'over':6}{'pair':10}{'delay, ms':>26}{'beside plain':>24}{'beside attached':>24}{'messages/s':>26}")
+    print(f"{'over':6}{'pair':10}{'delay, ms':>26}{'by plain':>24}{'by attached':>24}{'messages/s':>26}")
     for over, plain in PLAIN.items():
-        rows = [one for one in found if one["over"] == over]
+        rows = [row for row in results if row["over"] == over]
         for pair in (*plain, "agent"):
-            delays = spread([one["delay_ms"][pair] for one in rows])
+            delays = spread([row["delay_ms"][pair] for row in rows])
             ratios = [
                 ratio(rows, pair, other) if other in plain and other != pair else "" for other in PLAIN["zenoh"]
             ]
-            bursts = spread([one["per_s"][pair] for one in rows if one["per_s"]])
-            print(f"{over:6}{pair:10}{delays:>26}" + "".join(f"{one:>24}" for one in ratios) + f"{bursts:>26}")
+            bursts = spread([row["per_s"][pair] for row in rows if row["per_s"]])
+            print(f"{over:6}{pair:10}{delays:>26}" + "".join(f"{text:>24}" for text in ratios) + f"{bursts:>26}")
     return 0
 
 

@@ -1,16 +1,16 @@
-"""fieldkit's own time per repeat, beside a bash script: `python -m benchmarks.trial_overhead [--json]`, as root.
+"""Overhead of fieldkit per repeat, compared with a script: `python -m benchmarks.trial_overhead [--json]`, as root.
 
-Both do the same steps on the same emulated robots, repeat by repeat in turn: make a folder and note the host's state
-on both robots, record, capture on both ends, send the bag across, drain, ping, note the state again, fetch all files
-and check their hashes. Own time is the wall time of a repeat less what the tools take: the recorder's process, from
-the start of the sending nc to the end of the listening one, and ping's process. The kernel tells these times
-(`benchmarks.lifetimes`), for both alike; that both run the same command lines is checked in every repeat.
+Both run the same steps on the same emulated robots, in alternating repeats: create a folder and log the host's state
+on both robots, record, capture at both ends, send the bag, drain, ping, log the state again, fetch all files and
+check their hashes. Own time is the wall time of a repeat minus the time of the tools: the recorder's process, the
+time from the start of the sending nc to the end of the listening one, and the process of ping. These times are from
+kernel events (`benchmarks.lifetimes`) for both peers. Each repeat checks that both run the same command lines.
 
-All of it is measured twice: over control links that cost nothing, and over links with 100 ms of round trip, as bad
-Wi-Fi has, the same for both peers. On these the round trips that happen in sequence are counted, too.
+All of it is measured twice for both peers: over control links without delay, and with a round trip of 100 ms, as on
+bad Wi-Fi. On the latter, sequential round trips are counted, too.
 
-The script is `trial_overhead.sh`, over OpenSSH connections that stay up. It does less than fieldkit: it looks into
-neither bag nor captures, computes no loss, and keeps no journal, intervals or manifest.
+The script is `trial_overhead.sh`, over persistent OpenSSH connections. It does less than fieldkit: it does not
+inspect bag and captures, computes no loss, and writes no journal, intervals or manifest.
 """
 
 import argparse
@@ -57,7 +57,7 @@ emulated:
   ros: builtin
   radio: {loss: 0%, delay: 1ms, rate: 50Mbit/s}
 """
-# The steps of procedures/los.yaml, with less to wait for between them.
+# The steps of procedures/los.yaml, with shorter waits.
 PROCEDURE: Final = """\
 name: overhead
 summary: the paper's steps, quicker
@@ -83,14 +83,14 @@ SCRIPT_LIMIT_S: Final = 120.0
 
 @dataclass
 class Turns:
-    """fieldkit and the script in turn; as a trial's sink it lets the script run whenever a repeat has ended.
+    """Alternates fieldkit and the script. As the sink of a trial it runs the script after each repeat.
 
     Attributes:
-        watch: Sees the tools on the robots.
+        watch: Watches the tools on the robots.
         script: The other peer.
-        repeats: What was measured; the first of each peer and protocol warms up and is not in it.
-        unseen: Repeats that could not be timed, for a tool ended before the watch had looked at it.
-        slow: The control links, where they are slow.
+        repeats: The results, without the first repeat of each peer and protocol, which is a warm-up.
+        unseen: Number of repeats without times, because a tool exited before the watcher identified it.
+        slow: The slow control links, if any.
     """
 
     watch: Watch
@@ -103,7 +103,7 @@ class Turns:
     _phases: dict[str, int] = field(default_factory=dict)
 
     def __call__(self, event: Event) -> None:
-        """Take note of an event of the trial."""
+        """Process an event of the trial."""
         now_ns = time.monotonic_ns()
         match event:
             case PhaseStarted(name=name, repeat=repeat) if repeat:
@@ -113,22 +113,22 @@ class Turns:
                 if status is not Status.VALID:
                     raise RuntimeError(f"{repeat} is {status}: {reason}")
                 protocol, number = repeat.split("-")
-                tools = self._keep("fieldkit", protocol, int(number), now_ns)
-                self._let_script_run(protocol, int(number), tools)
-                self._start_over()
+                tools = self._store("fieldkit", protocol, int(number), now_ns)
+                self._run_script(protocol, int(number), tools)
+                self._restart_timing()
             case _:
                 pass
 
-    def _let_script_run(self, protocol: str, number: int, expected: Sequence[Lifetime]) -> None:
-        self._start_over()
+    def _run_script(self, protocol: str, number: int, expected: Sequence[Lifetime]) -> None:
+        self._restart_timing()
         for phase in self.script.repeat(protocol, number, SCRIPT_LIMIT_S):
             self._phases[phase] = time.monotonic_ns()
-        tools = self._keep("script", protocol, number, time.monotonic_ns())
+        tools = self._store("script", protocol, number, time.monotonic_ns())
         ours, theirs = command_lines(expected), command_lines(tools)
         if ours and theirs and ours != theirs:
             raise RuntimeError(f"the peers differ: fieldkit ran {ours - theirs}, the script {theirs - ours}")
 
-    def _start_over(self) -> None:
+    def _restart_timing(self) -> None:
         self._phases = {}
         self._start_trips = self._trips()
         self._start_ns = time.monotonic_ns()
@@ -136,10 +136,10 @@ class Turns:
     def _trips(self) -> int:
         return 0 if self.slow is None else self.slow.trips
 
-    def _keep(self, peer: str, protocol: str, number: int, end_ns: int) -> tuple[Lifetime, ...]:
+    def _store(self, peer: str, protocol: str, number: int, end_ns: int) -> tuple[Lifetime, ...]:
         trips = self._trips() - self._start_trips
         try:
-            tools = self.watch.take(sum(TOOLS.values()), self._start_ns)
+            tools = self.watch.read(sum(TOOLS.values()), self._start_ns)
         except TimeoutError:
             self.unseen += 1
             return ()
@@ -151,7 +151,7 @@ class Turns:
 
 @contextmanager
 def open_match(testbed: EmulatedTestbed, out: Path, record_s: float, slow: SlowLinks | None) -> Iterator[Turns]:
-    """Yield both peers, ready on the robots of `testbed`; the script keeps its evidence in `out`."""
+    """Yield both peers, connected to the robots of `testbed`; the script writes its evidence to `out`."""
     addresses = [testbed.robots[role].spec.ip for role in ROLES]
     with ExitStack() as stack:
         connections = stack.enter_context(connected(testbed, ROLES, slow))
@@ -161,7 +161,7 @@ def open_match(testbed: EmulatedTestbed, out: Path, record_s: float, slow: SlowL
 
 
 def measure(rounds: int, record_s: float, round_trip_s: float) -> Turns:
-    """Return what `rounds` rounds gave: per protocol one repeat by fieldkit and one by the script."""
+    """Return the results of `rounds` rounds: one repeat by fieldkit and one by the script per protocol."""
     document = schema.parse(SITE, source="site")
     backend = EmulatedBackend(schema.validate(document, Site), document)
     procedure = schema.validate(schema.parse(PROCEDURE, source="procedure"), Procedure)
@@ -180,21 +180,24 @@ def measure(rounds: int, record_s: float, round_trip_s: float) -> Turns:
 
 
 def show(repeats: Sequence[Repeat]) -> None:
-    """Print own time per repeat and where it goes."""
+    """Print own time per repeat and by phase."""
     print(f"{'own time, ms':22}{'fieldkit':>22}{'script':>22}{'fieldkit/script':>17}")
     for protocol in Protocol:
-        totals = {peer: [one.total_ms for one in chosen(repeats, peer, protocol)] for peer in PEERS}
+        totals = {peer: [repeat.total_ms for repeat in chosen(repeats, peer, protocol)] for peer in PEERS}
         ratio = statistics.median(totals["fieldkit"]) / statistics.median(totals["script"])
         print(f"{protocol:22}{spread(totals['fieldkit']):>22}{spread(totals['script']):>22}{ratio:>17.2f}")
     for protocol in Protocol:
-        trips = {peer: [one.trips for one in chosen(repeats, peer, protocol)] for peer in PEERS}
+        trips = {peer: [repeat.trips for repeat in chosen(repeats, peer, protocol)] for peer in PEERS}
         if any(trips["fieldkit"]):
             name = f"{protocol}, round trips"
             print(f"{name:22}{spread(trips['fieldkit']):>22}{spread(trips['script']):>22}")
-    print(f"\n{'median by phase, ms':22}" + "".join(f"{f'{peer} {one}':>15}" for peer in PEERS for one in Protocol))
+    print(
+        f"\n{'median by phase, ms':22}"
+        + "".join(f"{f'{peer} {protocol}':>15}" for peer in PEERS for protocol in Protocol)
+    )
     for phase in repeats[0].own_ms:
         cells = (
-            statistics.median(one.own_ms[phase] for one in chosen(repeats, peer, protocol))
+            statistics.median(repeat.own_ms[phase] for repeat in chosen(repeats, peer, protocol))
             for peer in PEERS
             for protocol in Protocol
         )
@@ -203,7 +206,7 @@ def show(repeats: Sequence[Repeat]) -> None:
 
 def chosen(repeats: Sequence[Repeat], peer: str, protocol: Protocol) -> list[Repeat]:
     """Return the repeats of one peer with one protocol."""
-    return [one for one in repeats if (one.peer, one.protocol) == (peer, protocol)]
+    return [repeat for repeat in repeats if (repeat.peer, repeat.protocol) == (peer, protocol)]
 
 
 def spread(values: Sequence[float]) -> str:
@@ -212,7 +215,7 @@ def spread(values: Sequence[float]) -> str:
 
 
 def leave(_number: int, _frame: FrameType | None) -> None:
-    """Unwind on SIGTERM, so that nothing is left behind."""
+    """Exit on SIGTERM with clean-up."""
     sys.exit(143)
 
 
@@ -223,7 +226,10 @@ def main() -> None:
     parser.add_argument("--record", default="1s", help="length of every recording (default: 1s)")
     parser.add_argument("--json", action="store_true")
     parser.add_argument(
-        "--round-trips", nargs="+", default=["0s", "100ms"], help="of the control links (default: 0s 100ms)"
+        "--round-trips",
+        nargs="+",
+        default=["0s", "100ms"],
+        help="round-trip times of the control links (default: 0s 100ms)",
     )
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, leave)
@@ -232,7 +238,7 @@ def main() -> None:
         load_before = os.getloadavg()[0]
         match = measure(options.rounds, parse_duration_s(options.record), parse_duration_s(text))
         if options.json:
-            repeats = [asdict(one) for one in match.repeats]
+            repeats = [asdict(repeat) for repeat in match.repeats]
             rows.append({"round_trip": text, "load_before": load_before, "unseen": match.unseen, "repeats": repeats})
             continue
         print(f"control links with {text} of round trip")

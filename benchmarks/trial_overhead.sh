@@ -1,10 +1,10 @@
 #!/bin/bash
-# The steps of a trial as a careful person scripts them, over OpenSSH connections that are up (ControlMaster):
+# The steps of a trial as a shell script, over persistent OpenSSH connections (ControlMaster):
 #
 #   trial_overhead.sh SSH_CONFIG OUT SENDER_ADDRESS RECEIVER_ADDRESS RECORD_S IDLE_S PINGS PING_INTERVAL_S
 #
-# Reads `PROTOCOL NUMBER` a line, runs that repeat, says each phase as it begins, and `done`. A repeat's evidence is
-# OUT/PROTOCOL-NUMBER/{sender,receiver}/, checked against its hashes; a line goes to OUT/trial.csv.
+# Reads lines `PROTOCOL NUMBER`, runs that repeat, and prints the name of each phase at its start, and `done`. Evidence of
+# a repeat is in OUT/PROTOCOL-NUMBER/{sender,receiver}/, checked against its hashes; a line is appended to OUT/trial.csv.
 set -euo pipefail
 
 config=$1 out=$2 sender=$3 receiver=$4 record_s=$5 idle_s=$6 pings=$7 interval_s=$8
@@ -12,7 +12,7 @@ port=1234 port_hex=04D2 old=
 
 on() { ssh -F "$config" "$1" "$2" </dev/null; } # robot, command line for its shell
 
-both() { # command line for either robot, run at once; `$me` is its role
+both() { # command line for both robots, run in parallel; `$me` is the role
     on sender "me=sender; $1" &
     on receiver "me=receiver; $1"
     wait $!
@@ -27,9 +27,9 @@ state='state() {
     ! command -v iw >/dev/null || iw dev wlan0 station dump
 }'
 
-# Between the start of the sender and the end of the listener nothing crosses a control connection: the listener's
-# session is silent until it ends, and the sender's reports only when its standard input has ended too.
-transfer() { # options of both nc, of the listener
+# No data is on a control connection between the start of the sender and the exit of the listener: the listener's session
+# is silent until it exits, and the sender's session exits only after the end of its standard input.
+transfer() { # options of both nc, options of the listener
     on receiver "cd $run && exec nc.traditional $1 -l -p $port $2 </dev/null >recv.bag 2>receiver-listen.log" &
     local listener=$!
     on receiver "until grep -qsE ':$port_hex [0-9A-F]+:0000 (0A|07) ' /proc/net/tcp /proc/net/udp; do sleep 0.002; done"
@@ -43,14 +43,14 @@ transfer() { # options of both nc, of the listener
     wait $sender_session
 }
 
-collect() { # robot: fetch its files and check what arrived
+collect() { # robot: fetch its files and check them
     mkdir -p "$folder/$1"
     on "$1" "cd $run && rm -f ./*.pid; $state; state >$1-after.txt; sha256sum * >.sums && mv .sums SHA256SUMS && \
         tar -cf - *" | tar -xf - -C "$folder/$1"
     (cd "$folder/$1" && sha256sum --quiet -c SHA256SUMS)
 }
 
-check_capture() { # log: nothing dropped, all that matched written
+check_capture() { # log: no packet was dropped, all matching packets were written
     awk '/listening on/ {up = 1} /packets? captured/ {captured = $1} /received by filter/ {received = $1}
         /dropped by/ {dropped += $1} END {exit !(up && captured != "" && captured == received && !dropped)}' "$1"
 }
@@ -81,7 +81,7 @@ repeat() { # protocol, number
     local payload=502
     [ "$1" = tcp ] || payload=8192
     on sender "cd $run && LC_ALL=C ping -n -D -c $pings -i $interval_s -s $payload -W 2 $receiver \
-        >ping.txt 2>sender-ping.log" || [ $? = 1 ] # 1: replies are missing, which is a measurement
+        >ping.txt 2>sender-ping.log" || [ $? = 1 ] # 1: replies are missing, which is a valid result
 
     echo collect evidence
     collect sender &

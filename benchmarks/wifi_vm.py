@@ -2,21 +2,21 @@
 
     apt-get install --no-install-recommends qemu-system-x86 mmdebstrap cpio kmod openssh-client
 
-FOLDER becomes a lab: the machine's kernel and files, made from Debian's packages where they are missing, a site file
+FOLDER becomes a lab with the machine's kernel and files, built from Debian packages if they are missing, a site file
 and a key. The radios are those of mac80211_hwsim: cfg80211, mac80211, hostapd and wpa_supplicant are as on a robot,
-and only the air is made up; it loses nothing. The robots are two TurtleBots with ROS 1, and a drone that runs the
+and only the channel is simulated, without loss. The robots are two TurtleBots with ROS 1, and a drone that runs the
 access point.
 
 While it runs, `fieldkit check` and `fieldkit trial los 30ft` work in FOLDER as with robots in the field. As root,
-`ssh -i key -p PORT root@127.0.0.1` gets into a robot; there
+`ssh -i key -p PORT root@127.0.0.1` logs in on a robot; there
 
-    network cell|roaming|adhoc|nothing     changes what its radio is part of
-    link-cost SECONDS                      measures what sampling its link costs
+    network cell|roaming|adhoc|nothing     changes the network of its radio
+    link-cost SECONDS                      measures the cost of sampling its link
 
-(benchmarks/wifi_vm/root/usr/local/sbin). It ends by Ctrl-C, and with `--then COMMAND...` with that command, run in
-FOLDER. Where this machine's processor can run another machine (vmx or svm among its flags) KVM does it. Else the
-processor is emulated in software, and a machine with little else to do is needed: beside ten busy processes a login
-alone takes longer than fieldkit's 8 s.
+(benchmarks/wifi_vm/root/usr/local/sbin). It runs until Ctrl-C, or with `--then COMMAND...` until that command, run in
+FOLDER, exits. KVM is used if the processor supports virtualisation (vmx or svm among its flags). Otherwise the
+processor is emulated in software, which needs a mostly idle machine: with ten busy processes a login takes longer
+than fieldkit's timeout of 8 s.
 """
 
 import argparse
@@ -42,7 +42,7 @@ BOOT_S: Final = 600.0
 
 
 def build(lab: Path) -> None:
-    """Make `vmlinuz`, `root.cpio` and the key of a lab from Debian's packages and the folder beside this file."""
+    """Make `vmlinuz`, `root.cpio` and the key of a lab from Debian packages and the folder next to this file."""
     root, kernel = lab / "root", lab / "kernel"
     for folder in (root, kernel):
         shutil.rmtree(folder, ignore_errors=True)
@@ -56,14 +56,14 @@ def build(lab: Path) -> None:
     shutil.copy(lab / "key.pub", root / "etc/ssh/lab.pub")
 
     kernel.mkdir()
-    depends = _said("apt-cache", "depends", "linux-image-amd64")
+    depends = _output("apt-cache", "depends", "linux-image-amd64")
     package = next(word for word in depends.split()[1:] if word.startswith("linux-image-"))
     _run("apt-get", "download", package, cwd=kernel)
     (archive,) = kernel.glob("*.deb")
     _run("dpkg-deb", "-x", str(archive), str(kernel))
     version = package.removeprefix("linux-image-")
     _run("depmod", "-b", str(kernel), version)
-    needed = _said("modprobe", "-d", str(kernel), "-S", version, "-a", "--show-depends", *MODULES.split())
+    needed = _output("modprobe", "-d", str(kernel), "-S", version, "-a", "--show-depends", *MODULES.split())
     modules = {Path(line.split()[1]) for line in needed.splitlines() if line.startswith("insmod ")}
     for path in (*modules, *kernel.glob("lib/modules/*/modules.*")):
         to = root / path.relative_to(kernel)
@@ -82,13 +82,13 @@ def _run(*argv: str, cwd: Path | None = None) -> None:
     subprocess.run(argv, check=True, cwd=cwd)
 
 
-def _said(*argv: str) -> str:
+def _output(*argv: str) -> str:
     return subprocess.run(argv, check=True, capture_output=True, text=True).stdout
 
 
 @contextmanager
 def running(lab: Path) -> Iterator[Sequence[int]]:
-    """Start the machine, and end it afterwards; gives the robots' SSH ports on this machine, as in `ROBOTS`."""
+    """Start the machine, and stop it afterwards; yield the robots' SSH ports here, in the order of `ROBOTS`."""
     ports = _free_ports(len(ROBOTS))
     argv = ["qemu-system-x86_64", *_accelerators(), "-cpu", "max", "-smp", "2", "-m", "3G"]
     argv += ["-kernel", "vmlinuz", "-initrd", "root.cpio", "-append", "console=ttyS0 rdinit=/init quiet"]
@@ -110,10 +110,10 @@ def running(lab: Path) -> Iterator[Sequence[int]]:
 
 
 def _accelerators() -> Sequence[str]:
-    """Return QEMU's options for what runs the machine's instructions: the first that works is taken.
+    """Return QEMU's options for the accelerator; QEMU uses the first one that works.
 
-    /dev/kvm alone is not enough. Inside a virtual machine it may be KVM without the processor's help (PVM), which
-    interprets kernels that were not made for it one instruction at a time: far slower than QEMU's own emulation.
+    /dev/kvm is not sufficient. Inside of a virtual machine it may be KVM without hardware support (PVM), which
+    interprets unmodified kernels instruction by instruction, far slower than QEMU's emulation.
     """
     flags = Path("/proc/cpuinfo").read_text(encoding="ascii").split()
     kvm = ("-accel", "kvm") if {"vmx", "svm"} & set(flags) else ()
@@ -122,17 +122,17 @@ def _accelerators() -> Sequence[str]:
 
 def _free_ports(count: int) -> Sequence[int]:
     with ExitStack() as stack:
-        taken = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for one in taken:
-            one.bind(("127.0.0.1", 0))
-        return [one.getsockname()[1] for one in taken]
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for opened in sockets:
+            opened.bind(("127.0.0.1", 0))
+        return [opened.getsockname()[1] for opened in sockets]
 
 
 def _greets(port: int) -> bool:
-    """Return whether an SSH server answers behind a port, which the machine accepts for from the beginning."""
+    """Return True if an SSH server answers on a port; QEMU accepts connections before the server is up."""
     try:
-        with socket.create_connection(("127.0.0.1", port), timeout=30) as there:
-            return there.recv(4) == b"SSH-"
+        with socket.create_connection(("127.0.0.1", port), timeout=30) as connection:
+            return connection.recv(4) == b"SSH-"
     except OSError:
         return False
 
@@ -149,19 +149,19 @@ def write_site(lab: Path, ports: Sequence[int]) -> None:
 
 
 def main() -> int:
-    """Build what is missing, start the machine, run a command or wait."""
+    """Build missing files, start the machine, run a command or wait."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("lab", type=Path, metavar="FOLDER", help="1 GB of disk")
-    parser.add_argument("--then", nargs=argparse.REMAINDER, help="run this in FOLDER, and end with it")
+    parser.add_argument("lab", type=Path, metavar="FOLDER", help="needs 1 GB of disk space")
+    parser.add_argument("--then", nargs=argparse.REMAINDER, help="run this in FOLDER, then exit")
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the machine ends, too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the machine is stopped, too
     lab: Path = options.lab.resolve()
     lab.mkdir(parents=True, exist_ok=True)
     if not (lab / "vmlinuz").exists():
         build(lab)
     with running(lab) as ports:
         write_site(lab, ports)
-        print(f"the robots are up: cd {lab} && fieldkit check   # Ctrl-C here ends them", flush=True)
+        print(f"the robots are up: cd {lab} && fieldkit check   # Ctrl-C here stops them", flush=True)
         try:
             if options.then:
                 return subprocess.run(options.then, cwd=lab, check=False).returncode

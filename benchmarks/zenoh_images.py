@@ -1,8 +1,9 @@
-"""Images of 1 MB over Zenoh, every repeat: `python -m benchmarks.zenoh_images [--rounds N] [--page P]`.
+"""Losses of images of 1 MB over Zenoh, per repeat: `python -m benchmarks.zenoh_images [--rounds N] [--page P]`.
 
-As root. Two emulated robots of a lab of their own, 20 m apart. The agent of the step `topics` beside a plain pair of
-Zenoh sessions in the same robots (benchmarks/zenoh_plain.py, which imports nothing of fieldkit), by several settings;
-each round runs all of them, in turn. Losses of this stream are bimodal, so no mean is printed: each repeat is.
+As root. Two emulated robots of a separate lab, 20 m apart. The agent of the step `topics` is compared with a plain
+pair of Zenoh sessions on the same robots (benchmarks/zenoh_plain.py, which imports nothing of fieldkit), with several
+settings; each round runs all of them in turn. Losses of this stream are bimodal, so each repeat is printed and no
+mean.
 
 A repeat takes 11 s, a round of six settings about 70 s.
 """
@@ -36,8 +37,8 @@ SAMPLES: Final = 16
 PUBLISHER: Final = ("rover-1", "10.42.0.1")
 SUBSCRIBER: Final = ("base", "10.42.0.5")
 WAITS: Final = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"
-"""Microseconds that a publisher with DROP waits for room in its queue, of a sample in fragments; 50,000 by default
-(Zenoh 1.9, DEFAULT_CONFIG.json5)."""
+"""Microseconds for which a publisher with DROP waits for space in its queue, for a fragmented sample; 50,000 by
+default (Zenoh 1.9, DEFAULT_CONFIG.json5)."""
 LONG_WAIT_US: Final = 500_000
 _PORT: Final = 7447
 _DOMAIN: Final = 42
@@ -50,7 +51,7 @@ class ImageSetting:
     Attributes:
         label: Row of the table.
         profile: Quality of service of the agent; empty for the plain pair.
-        settings: Zenoh's own settings by their path, as the step `topics` has them.
+        settings: Settings of Zenoh by their path, as in the step `topics`.
     """
 
     label: str
@@ -69,7 +70,7 @@ SETTINGS: Final = (
 
 
 class ImageLab:
-    """Two robots of a lab that is up.
+    """Two robots of a running lab.
 
     Args:
         folder: Folder of the lab.
@@ -80,7 +81,7 @@ class ImageLab:
         self._python = str(Path(sys.executable))
 
     def command(self, robot: str, *argv: str) -> list[str]:
-        """Return a command that runs another on a robot."""
+        """Return the command that runs another command on a robot."""
         placed = ("env", f"PYTHONPATH={ROOT}", *argv)
         return ["ssh", "-F", str(self._folder / "lab.ssh"), robot, shlex.join(placed)]
 
@@ -98,16 +99,16 @@ class ImageLab:
     def _plain(self, setting: ImageSetting) -> tuple[list[int], list[int]]:
         ends = {}
         for verb, listens in (("subscribe", True), ("publish", False)):
-            there = [f"tcp/{SUBSCRIBER[1]}:{_PORT}"]
+            locators = [f"tcp/{SUBSCRIBER[1]}:{_PORT}"]
             config: dict[str, Any] = {
                 "mode": "peer",
                 "scouting/multicast/enabled": False,
-                "listen/endpoints": there if listens else [],
-                "connect/endpoints": [] if listens else there,
+                "listen/endpoints": locators if listens else [],
+                "connect/endpoints": [] if listens else locators,
             }
             config |= {path: json.loads(text) for path, text in setting.settings.items()}
-            told = {"config": config, "key": "images", "bytes": BYTES, "rate": RATE_HZ, "samples": SAMPLES}
-            ends[verb] = (str(PLAIN), verb, json.dumps(told))
+            request = {"config": config, "key": "images", "bytes": BYTES, "rate": RATE_HZ, "samples": SAMPLES}
+            ends[verb] = (str(PLAIN), verb, json.dumps(request))
         return self._stream(ends, "up")
 
     def _agent(self, setting: ImageSetting) -> tuple[list[int], list[int]]:
@@ -124,12 +125,12 @@ class ImageLab:
                 domain=_DOMAIN,
                 node=node,
             )
-            told = {
+            request = {
                 "network": {**network, "discovery": "multicast", "settings": dict(setting.settings)},
                 "topic": topic,
                 "stream": {**stream, "patience_s": 20.0},
             }
-            ends[verb] = ("-m", "fieldkit.agent", verb, json.dumps(told), f"{verb}.bin")
+            ends[verb] = ("-m", "fieldkit.agent", verb, json.dumps(request), f"{verb}.bin")
         self._stream(ends, "up,")
         return self._logged(PUBLISHER[0], "publish"), self._logged(SUBSCRIBER[0], "subscribe")
 
@@ -139,11 +140,11 @@ class ImageLab:
         path.write_bytes(data)
         log = topic_log.read(path)
         if not log.whole:
-            raise RuntimeError(f"{path} is not whole")
+            raise RuntimeError(f"{path} is incomplete")
         return [int(number) for number in log.samples.sequence]
 
     def _stream(self, ends: Mapping[str, Sequence[str]], up: str) -> tuple[list[int], list[int]]:
-        """Run both ends; return the numbers that the plain ones print, empty for the agent's."""
+        """Run both ends; return the numbers that plain ends print, or empty lists for the agent's."""
         pid = "echo pid $$; exec " + shlex.join((self._python, "-u", *ends["subscribe"])) + " 2>&1"
         with subprocess.Popen(
             self.command(SUBSCRIBER[0], "sh", "-c", pid),
@@ -155,12 +156,12 @@ class ImageLab:
             number = subscriber.stdout.readline().split()[1]
             while not (line := subscriber.stdout.readline()).startswith(up):
                 if not line:
-                    raise RuntimeError("the subscriber ended before it was up")
+                    raise RuntimeError("the subscriber exited before it was up")
             publish = self.command(PUBLISHER[0], self._python, *ends["publish"])
             sent = subprocess.run(publish, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
             subprocess.run(self.command(SUBSCRIBER[0], "kill", "-TERM", number), check=True)
-            came, _ = subscriber.communicate()
-        return _numbers(sent.stdout), _numbers(came)
+            received, _ = subscriber.communicate()
+        return _numbers(sent.stdout), _numbers(received)
 
 
 def _numbers(text: str) -> list[int]:
@@ -168,15 +169,15 @@ def _numbers(text: str) -> list[int]:
 
 
 def measure(folder: Path, rounds: int) -> dict[str, list[list[int]]]:
-    """Return the images lost in each repeat by setting, of rounds that run all of them.
+    """Return the images lost in each repeat by setting.
 
     Args:
         folder: An empty folder, for the lab.
-        rounds: How many repeats of each.
+        rounds: Number of repeats of each setting.
     """
     text = (LAB / "fieldkit.yaml").read_text(encoding="utf-8").replace("ros: debian", "ros: builtin")
     (folder / "fieldkit.yaml").write_text(text, encoding="utf-8")
-    found: dict[str, list[list[int]]] = {setting.label: [] for setting in SETTINGS}
+    lost_images: dict[str, list[list[int]]] = {setting.label: [] for setting in SETTINGS}
     _fieldkit(folder, "lab", "up")
     try:
         (folder / "lab.ssh").write_text(_fieldkit(folder, "lab", "ssh-config"), encoding="utf-8")
@@ -185,11 +186,11 @@ def measure(folder: Path, rounds: int) -> dict[str, list[list[int]]]:
         lab = ImageLab(folder)
         for number in range(rounds):
             for setting in SETTINGS:
-                found[setting.label].append(lab.lost(setting))
-                print(number, setting.label, found[setting.label][-1], file=sys.stderr, flush=True)
+                lost_images[setting.label].append(lab.lost(setting))
+                print(number, setting.label, lost_images[setting.label][-1], file=sys.stderr, flush=True)
     finally:
         _fieldkit(folder, "lab", "down")
-    return found
+    return lost_images
 
 
 def _fieldkit(folder: Path, *words: str) -> str:
@@ -198,34 +199,34 @@ def _fieldkit(folder: Path, *words: str) -> str:
     return subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
-def table(found: Mapping[str, Sequence[Sequence[int]]], conditions: str) -> Iterator[str]:
-    """Yield a table of every repeat: how many of the images were lost, in the order of the repeats."""
+def table(lost_images: Mapping[str, Sequence[Sequence[int]]], conditions: str) -> Iterator[str]:
+    """Yield a table with the number of lost images in each repeat, in the order of the repeats."""
     yield conditions
     yield ""
-    yield f"| pair and settings | images lost of {SAMPLES}, a number for each repeat | the first lost |"
+    yield f"| pair and settings | images lost of {SAMPLES}, a number for each repeat | first image lost |"
     yield "| --- | --- | --- |"
-    for label, repeats in found.items():
+    for label, repeats in lost_images.items():
         first = sum(0 in lost for lost in repeats)
         yield f"| {label} | {', '.join(str(len(lost)) for lost in repeats)} | {first} of {len(repeats)} |"
 
 
 def main() -> None:
-    """Measure; print the table, or put it into a page."""
+    """Measure; print the table, or write it into a page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=20, help="repeats of each setting")
-    parser.add_argument("--page", type=Path, help="put the table into this page")
+    parser.add_argument("--page", type=Path, help="write the table into this page")
     parser.add_argument("--json", type=Path, help="write every repeat there")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        found = measure(Path(folder), options.rounds)
+        lost_images = measure(Path(folder), options.rounds)
     control = Path("/proc/sys/net/ipv4/tcp_congestion_control").read_text(encoding="ascii").strip()
     conditions = (
         f"{time.strftime('%Y-%m-%d', time.gmtime())}: {options.rounds} repeats of each, in turn; TCP with {control}; "
         f"load average of the last 15 minutes {os.getloadavg()[2]:.1f}."
     )
     if options.json:
-        files.write(options.json, json.dumps(found).encode())
-    lines = list(table(found, conditions))
+        files.write(options.json, json.dumps(lost_images).encode())
+    lines = list(table(lost_images, conditions))
     if options.page is None:
         print("\n".join(lines))
         return

@@ -1,7 +1,8 @@
-"""A plain pair of Zenoh sessions as the yardstick of the agent's: `python zenoh_plain.py subscribe|publish JSON`.
+"""A plain pair of Zenoh sessions, the reference for the agent: `python zenoh_plain.py subscribe|publish JSON`.
 
-Nothing of fieldkit is imported, so that an error of its adapter is not repeated here. Each end prints a line of JSON
-for each sample: its number and times in nanoseconds since 1970 UTC. The subscriber ends with its standard input.
+It imports nothing of fieldkit, so that it does not repeat errors of fieldkit's adapter. Each end prints a line of
+JSON for each sample: its number and times in nanoseconds since 1970 UTC. The subscriber exits at the end of its
+standard input.
 """
 
 import json
@@ -17,44 +18,44 @@ SETTLES_S: Final = 0.5
 DRAINS_S: Final = 2.0
 
 
-def subscribe(session: Any, told: dict[str, Any]) -> None:  # noqa: ANN401 (untyped)
+def subscribe(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (untyped)
     """Print each sample until standard input ends."""
 
-    def take(sample: Any) -> None:  # noqa: ANN401 (untyped)
+    def print_sample(sample: Any) -> None:  # noqa: ANN401 (untyped)
         data = sample.payload.to_bytes()
         at_ns = time.time_ns()
         print(json.dumps([HEAD.unpack_from(data)[0], at_ns]), flush=True)
 
-    declared = session.declare_subscriber(told["key"], take)
+    declared = session.declare_subscriber(request["key"], print_sample)
     print("up", flush=True)
     sys.stdin.read()
     declared.undeclare()
 
 
-def publish(session: Any, told: dict[str, Any]) -> None:  # noqa: ANN401 (untyped)
-    """Publish samples at their times with congestion control DROP, as rmw_zenoh does unless all are kept."""
-    publisher = session.declare_publisher(told["key"], congestion_control=zenoh.CongestionControl.DROP)
+def publish(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (untyped)
+    """Publish samples at their times with congestion control DROP, as rmw_zenoh does except for KEEP_ALL."""
+    publisher = session.declare_publisher(request["key"], congestion_control=zenoh.CongestionControl.DROP)
     while not publisher.matching_status.matching:
         time.sleep(0.01)
     time.sleep(SETTLES_S)
-    begun_s = time.monotonic()
-    filling = bytes(told["bytes"] - HEAD.size)
-    for number in range(told["samples"]):
-        time.sleep(max(begun_s + number / told["rate"] - time.monotonic(), 0.0))
+    started_s = time.monotonic()
+    padding = bytes(request["bytes"] - HEAD.size)
+    for number in range(request["samples"]):
+        time.sleep(max(started_s + number / request["rate"] - time.monotonic(), 0.0))
         sent_ns = time.time_ns()
-        publisher.put(HEAD.pack(number, sent_ns) + filling)
+        publisher.put(HEAD.pack(number, sent_ns) + padding)
         print(json.dumps([number, sent_ns, time.time_ns()]), flush=True)
     time.sleep(DRAINS_S)
 
 
 def main() -> None:
     """Open a session and run one end."""
-    verb, told = sys.argv[1], json.loads(sys.argv[2])
+    verb, request = sys.argv[1], json.loads(sys.argv[2])
     config = zenoh.Config()
-    for path, value in told["config"].items():
+    for path, value in request["config"].items():
         config.insert_json5(path, json.dumps(value))
     session: Any = zenoh.open(config)
-    {"subscribe": subscribe, "publish": publish}[verb](session, told)
+    {"subscribe": subscribe, "publish": publish}[verb](session, request)
     session.close()
 
 

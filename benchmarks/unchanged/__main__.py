@@ -81,10 +81,10 @@ def _behaviour(base: Tree, head: Tree, kinds: Sequence[Class], *, labels_shown: 
         for number, item in enumerate(chosen):
             if item.kind is not kind:
                 continue
-            found = comparison.compare(item, number, base, head)
-            labels += found.labels
-            real += [f"{kind}: {item}\n  {text}".replace("\n", "\n  ") for text in found.real]
-            counts["different" if found.real else "labels" if found.labels else "same"] += 1
+            differences = comparison.compare(item, number, base, head)
+            labels += differences.labels
+            real += [f"{kind}: {item}\n  {text}".replace("\n", "\n  ") for text in differences.real]
+            counts["different" if differences.real else "labels" if differences.labels else "same"] += 1
             counts["succeeded"] += (base.results / str(number) / "exit_code").read_text(encoding="ascii") == "0\n"
         print(
             f"{kind + ':':40} {counts['same']:5} the same, {counts['labels']:4} with other labels,"

@@ -1,4 +1,4 @@
-"""Whether two recorded outputs are the same, differ in words alone, or differ.
+"""Compare two recorded outputs: they are equal, differ only in words, or differ.
 
 What programs read (commands of dry runs, tables, exports, hashes, exit codes) must be equal byte by byte. What people
 read (help, messages, tables on a terminal, reports) may differ in words, which are listed as labels; numbers and
@@ -25,7 +25,7 @@ _VARYING: Final = (
     (re.compile(r"(job|agent|fieldkit)-[0-9a-f]{12}\b"), r"\1-HASH"),
 )
 _FIXED: Final = re.compile(r"--[a-z][a-z-]+|\d+(?:\.\d+)?")
-"""What may not change in a text for people: options and numbers."""
+"""The parts of a text for people that must not change: options and numbers."""
 
 _WORDS_IN_EVENTS: Final = frozenset(
     ("text", "how", "note", "detail", "remedy", "reason", "summary", "question", "why")
@@ -39,10 +39,10 @@ _SHOWN_LINES: Final = 12
 
 @dataclass
 class Differences:
-    """What differs between two outputs.
+    """Differences between two outputs.
 
     Attributes:
-        labels: Pairs of words before and after, and how often.
+        labels: Pairs of words before and after, with their counts.
         real: Differences that are not labels, each with the lines that differ.
     """
 
@@ -64,18 +64,18 @@ def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
         base: The tree before, with recorded results.
         head: The tree after, with recorded results.
     """
-    found = Differences()
+    differences = Differences()
     before, after = (tree.results / str(number) for tree in (base, head))
     code = (before / "exit_code").read_text(encoding="ascii").strip()
     if item.succeeds and code != "0":
         error = (before / "stderr").read_text(encoding="utf-8", errors="replace").strip()
-        found.real.append(f"proves nothing: exit code {code} with the base\n{error}")
+        differences.real.append(f"no proof: exit code {code} with the base\n{error}")
     names = [{str(path.relative_to(top)) for path in top.rglob("*") if path.is_file()} for top in (before, after)]
     if item.kind is Class.TRIALS:
-        found.add(_trials(before, after))
-        return found
+        differences.add(_trials(before, after))
+        return differences
     if names[0] != names[1]:
-        found.real.append(
+        differences.real.append(
             f"files: {sorted(names[0] - names[1])} only before, {sorted(names[1] - names[0])} only after"
         )
     for name in sorted(names[0] & names[1]):
@@ -84,14 +84,14 @@ def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
         if contents[0] == contents[1] or (None not in texts and texts[0] == texts[1]):
             continue
         if texts[0] is None or texts[1] is None:
-            found.real.append(f"{name}: other bytes")
+            differences.real.append(f"{name}: other bytes")
         else:
-            found.add(_texts(name, texts[0], texts[1], exact=_exact(item, name)))
-    return found
+            differences.add(_texts(name, texts[0], texts[1], exact=_exact(item, name)))
+    return differences
 
 
 def _stable(content: bytes, tree: Tree) -> str | None:
-    """Return a text without what varies from run to run; None if it is no text."""
+    """Return a text without parts that vary between runs, or None if the content is not text."""
     try:
         text = content.decode()
     except UnicodeDecodeError:
@@ -112,17 +112,17 @@ def _exact(item: Item, name: str) -> bool:
 
 def _texts(name: str, before: str, after: str, *, exact: bool) -> Differences:
     if not exact and (pairs := _json_lines(before, after)) is not None:
-        found = Differences()
+        differences = Differences()
         for old, new in pairs:
-            found.add(_values(name, old, new))
-        return found
+            differences.add(_values(name, old, new))
+        return differences
     if exact or _FIXED.findall(before) != _FIXED.findall(after):
         return Differences(real=[f"{name}:\n{_diff(before, after)}"])
     return Differences(labels=Counter(labels(before, after)))
 
 
 def _json_lines(before: str, after: str) -> list[tuple[Any, Any]] | None:
-    """Return the JSON values of two texts in pairs: of each line, or the whole; None if either is something else."""
+    """Return pairs of the JSON values of two texts, per line or of the whole text, or None if one is not JSON."""
     values = [_json_values(text) for text in (before, after)]
     if values[0] is None or values[1] is None or len(values[0]) != len(values[1]):
         return None
@@ -144,20 +144,20 @@ def _values(where: str, old: Any, new: Any) -> Differences:  # noqa: ANN401 (any
     """Compare two JSON values: sentences may differ in words, everything else must be equal."""
     if old == new:
         return Differences()
-    found = Differences()
+    differences = Differences()
     if isinstance(old, dict) and isinstance(new, dict) and list(old) == list(new):
         for key in old:
             if key in _WORDS_IN_EVENTS and isinstance(old[key], str) and isinstance(new[key], str):
                 if old[key] != new[key]:
-                    found.add(_texts(f"{where}, {key}", old[key], new[key], exact=False))
+                    differences.add(_texts(f"{where}, {key}", old[key], new[key], exact=False))
             else:
-                found.add(_values(f"{where}, {key}", old[key], new[key]))
+                differences.add(_values(f"{where}, {key}", old[key], new[key]))
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        for one, other in zip(old, new, strict=True):
-            found.add(_values(where, one, other))
+        for old_item, new_item in zip(old, new, strict=True):
+            differences.add(_values(where, old_item, new_item))
     else:
-        found.real.append(f"{where}:\n- {_short(old)}\n+ {_short(new)}")
-    return found
+        differences.real.append(f"{where}:\n- {_short(old)}\n+ {_short(new)}")
+    return differences
 
 
 def _short(value: object) -> str:
@@ -167,12 +167,12 @@ def _short(value: object) -> str:
 
 def _trials(before: Path, after: Path) -> Differences:
     """Compare two runs of an emulated trial, whose numbers differ: events, their fields, files, and CSV headers."""
-    found = Differences()
+    differences = Differences()
     for name, shapes in {"exit code": _codes, "events": _event_shapes, "files": _file_shapes}.items():
         old, new = ("\n".join(sorted(shapes(top))) for top in (before, after))
         if old != new:
-            found.real.append(f"{name}:\n{_diff(old, new)}")
-    return found
+            differences.real.append(f"{name}:\n{_diff(old, new)}")
+    return differences
 
 
 def _codes(result: Path) -> Iterator[str]:
@@ -189,7 +189,7 @@ def _event_shapes(result: Path) -> Iterator[str]:
             else _MASKED_IN_TRIALS.sub("N", str(value))
             for key, value in event.items()
         }
-        # A time left is a float, an integer or unknown, as it happens.
+        # A remaining time can be a float, an integer or unknown.
         yield json.dumps(
             {key: "number" if shown[key] in {"int", "float", "NoneType"} else shown[key] for key in shown}
         )

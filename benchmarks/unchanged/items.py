@@ -1,4 +1,4 @@
-"""What is run with both commits, and the laboratory folder in which it is run."""
+"""Items that are run with both commits, and the laboratory folder for them."""
 
 import json
 import shutil
@@ -13,7 +13,7 @@ from benchmarks.unchanged import recorder
 from benchmarks.unchanged.trees import ROOT, Tree, python
 
 LAB: Final = Path(__file__).parent / "lab"
-"""Procedures and robot profiles of the proof, beside those that ship."""
+"""Procedures and robot profiles of the proof, in addition to those that ship."""
 
 STORED: Final = ROOT / "tests" / "data" / "fieldkit"
 BAGS: Final = ROOT / "tests" / "data" / "rosbag" / "1.15.15"
@@ -34,7 +34,7 @@ class Class(StrEnum):
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulation: names of scenario and policy, seed, and when it ends."""
+    """A simulation: names of scenario and policy, seed, and end time."""
 
     scenario: str
     policy: str
@@ -48,12 +48,12 @@ class Item:
 
     Attributes:
         kind: Its class.
-        arguments: What follows `fieldkit` on the command line.
+        arguments: The words after `fieldkit` on the command line.
         working_folder: Relative to the laboratory folder.
         outputs: Files and folders that it makes there; they are moved away and compared.
-        simulation: What is simulated; then there are no arguments.
-        succeeds: It has to succeed with the base, or it proves nothing.
-        counts_lines: After it the lines of imported modules are counted; it must be the first that runs.
+        simulation: The simulation; then there are no arguments.
+        succeeds: True if it must succeed with the base; otherwise it would be no proof.
+        counts_lines: True to count the lines of imported modules after it; it must run first.
     """
 
     kind: Class
@@ -98,7 +98,7 @@ def own(kind: str) -> list[str]:
     return sorted(path.stem for path in (LAB / kind).glob("*.yaml"))
 
 
-# Wrong files: the folder's name, the file that is changed, what is replaced in it, and by what.
+# Wrong files: name of the folder, changed file, replaced text, and new text.
 WRONG: Final = (
     ("key-typo", "fieldkit.yaml", "robots:", "robotz:"),
     ("key-missing", "fieldkit.yaml", "{profile: husky}", "{}"),
@@ -230,7 +230,7 @@ def prepare(tree: Tree) -> None:
             shutil.copy(ROOT / file, folder / file)
         text = (folder / file).read_text(encoding="utf-8")
         if old not in text:
-            raise ValueError(f"{file} has no {old!r} any more")
+            raise ValueError(f"{file} no longer contains {old!r}")
         (folder / file).write_text(text.replace(old, new, 1), encoding="utf-8")
 
 
@@ -243,7 +243,7 @@ def _site_folder(tree: Tree, name: str, text: str) -> None:
 
 
 def items(base: Tree, kinds: Sequence[Class]) -> list[Item]:
-    """Return the items of some classes: what the base ships decides which."""
+    """Return the items of some classes. The files that ship with the base determine them."""
     makers: dict[Class, Callable[[Tree], Iterable[Item]]] = {
         Class.TRIALS: _trial,  # first: it counts the lines of imported modules
         Class.TABLES: _tables,
@@ -336,7 +336,7 @@ def _help(tree: Tree) -> Iterator[Item]:
 
 
 def _output(tree: Tree, *words: str) -> str:
-    """Return what Python prints in a tree."""
+    """Return the output of Python in a tree."""
     return subprocess.run(
         (*python(), *words), env=tree.environment(), cwd=tree.lab, check=True, stdout=subprocess.PIPE, text=True
     ).stdout

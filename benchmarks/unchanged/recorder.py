@@ -1,10 +1,10 @@
-"""Runs commands of one exported tree and stores what they print and write.
+"""Run commands of one exported tree and store what they print and write.
 
 Runs as a program in an environment in which Python imports that tree: `python -P recorder.py ITEMS RESULTS`, where
 ITEMS is a JSON file of a list of items (`items.Item` as dictionaries) and RESULTS a folder, which is made. With
-`--commands` it prints the commands that the tree has. It imports
-nothing but the standard library and the tree, by the names that users know: the module `fieldkit`, and `build` and
-`load_scenario` of `sim_backends.cosim`.
+`--commands` it prints the commands that the tree has. It imports only the standard library and the public names of
+the
+tree: the module `fieldkit`, and `build` and `load_scenario` of `sim_backends.cosim`.
 
 All commands run in this process, one after the other: importing the libraries takes longer than most commands.
 """
@@ -37,7 +37,7 @@ def record(item: dict[str, Any], folder: Path) -> None:
         os.dup2(error.fileno(), 2)
         sys.stdout, sys.stderr = _stream(1), _stream(2)
         try:
-            code = _ran(item)
+            code = _run(item)
         finally:
             sys.stdout.flush()
             sys.stderr.flush()
@@ -59,16 +59,16 @@ def _stream(descriptor: int) -> io.TextIOWrapper:
     return io.TextIOWrapper(os.fdopen(descriptor, "wb", closefd=False), encoding="utf-8", write_through=True)
 
 
-def _ran(item: dict[str, Any]) -> int:
-    """Run an item; return the exit code of an item; 70 stands for an exception that no command handled."""
+def _run(item: dict[str, Any]) -> int:
+    """Run an item and return its exit code, or 70 for an exception that no command handled."""
     try:
         if item["simulation"]:
             print(_digest(**item["simulation"]))
             return 0
         sys.argv = ["fieldkit", *item["arguments"]]
         runpy.run_module("fieldkit", run_name="__main__")
-    except SystemExit as ended:
-        return ended.code if isinstance(ended.code, int) else 0 if ended.code is None else 1
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else 1
     except Exception:  # noqa: BLE001 (a crash of the tree is a result, and its text is compared)
         traceback.print_exc()
         return 70
@@ -77,7 +77,7 @@ def _ran(item: dict[str, Any]) -> int:
 
 def _digest(scenario: str, policy: str, seed: int, until_ns: int) -> str:
     """Return the hash over the events of a simulation."""
-    from sim_backends.cosim import build, load_scenario  # noqa: PLC0415 (of the tree, and only where it is needed)
+    from sim_backends.cosim import build, load_scenario  # noqa: PLC0415 (of the tree, and only if needed)
 
     return str(build(load_scenario(scenario), policy=policy, seed=seed).run(until_ns).digest)
 
@@ -104,15 +104,15 @@ def _help(group: Sequence[str]) -> str:
 
 def commands() -> list[list[str]]:
     """Return the words of every command and group of commands, found in the help of the group above."""
-    known: list[list[str]] = []
+    result: list[list[str]] = []
     waiting: list[list[str]] = [[]]
     while waiting:
         group = waiting.pop()
-        known.append(group)
+        result.append(group)
         text = _help(group)
         if re.search(r"^  COMMAND$", text, re.MULTILINE):
             waiting += [[*group, name] for name in re.findall(r"^    ([a-z][\w-]*)(?: |$)", text, re.MULTILINE)]
-    return known
+    return result
 
 
 if __name__ == "__main__":
@@ -120,7 +120,7 @@ if __name__ == "__main__":
         print(json.dumps(commands()))
         sys.exit()
     results = Path(sys.argv[2])
-    sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115 (until the end)
+    sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115 (open until exit)
     for number, each in enumerate(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))):
         record(each, results / str(number))
         if each["counts_lines"]:

@@ -43,7 +43,7 @@ def table(base: Tree, head: Tree) -> str:
 
 
 def imported(tree: Tree) -> dict[str, str]:
-    """Return how many own lines the emulated trial imported, by package and together."""
+    """Return the number of lines of fieldkit that the emulated trial imported, by package and in total."""
     path = tree.results / "imported_lines.json"
     lines = json.loads(path.read_text(encoding="ascii")) if path.exists() else {}
     shown = {f"lines of {package} in `trial los 30ft`": f"{lines.get(package, 'unknown')}" for package in PACKAGES}
@@ -86,14 +86,14 @@ def modules(tree: Path) -> list[Path]:
 
 
 def namesakes(tree: Path) -> dict[str, int]:
-    """Return file names that are used too often, and how often."""
+    """Return file names that are used too often, with their counts."""
     names = Counter(path.name for path in modules(tree) if path.name != "__init__.py")
     return {name: count for name, count in names.items() if count > MOST_NAMESAKES}
 
 
 def large_classes(tree: Path) -> dict[str, int]:
-    """Return the classes with too many public methods, and how many."""
-    found = {}
+    """Return the classes with too many public methods, with their counts."""
+    large = {}
     for path in modules(tree):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ClassDef):
@@ -103,8 +103,8 @@ def large_classes(tree: Path) -> dict[str, int]:
                     if isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef) and not part.name.startswith("_")
                 }
                 if len(methods) > MOST_METHODS:
-                    found[f"{path.relative_to(tree)}: {node.name}"] = len(methods)
-    return found
+                    large[f"{path.relative_to(tree)}: {node.name}"] = len(methods)
+    return large
 
 
 def bound_names(source: str) -> Iterator[str]:

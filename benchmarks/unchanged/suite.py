@@ -1,9 +1,9 @@
-"""Whether the tests of two commits are the same but for imports, names and labels.
+"""Compare the tests of two commits, except for imports, names and labels.
 
-Functions are compared by their shape: the syntax tree without names, docstrings, annotations and imports, where a
-string counts by its digits alone. A function is matched with one of the same shape anywhere in the other tests, so it
-may move; what is left is matched by its name. Inside an assertion the same name must stay the same name, so that
-`assert a == b` is not `assert a == a`. Limit: outside of assertions, a name in place of another one is not noticed.
+Functions are compared by their shape: the syntax tree without names, docstrings, annotations and imports, in which a
+string counts only by its digits. A function is matched with one of the same shape anywhere in the other tests, so it
+may move; the rest is matched by name. Inside of an assertion equal names must stay equal, so that `assert a == b` is
+not `assert a == a`. Limit: outside of assertions, a name in place of another one is not detected.
 """
 
 import ast
@@ -15,16 +15,16 @@ from typing import Final
 
 _SKIPPED: Final = frozenset(("ctx", "annotation", "returns", "type_comment", "type_params", "type_ignores"))
 _CHECKS: Final = frozenset(("raises", "warns", "fail", "approx"))
-"""Functions of pytest that check something, or say how exactly."""
+"""Functions of pytest that check something, or set a tolerance."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """A function or method, or the statements of a module outside of both.
+    """A function or method, or the other statements of a module.
 
     Attributes:
         file: Its file, relative to the folder of tests.
-        name: Its name, behind that of its class.
+        name: Its name, preceded by that of its class.
         shape: Its syntax tree without names.
         assertions: The shape of each assertion.
         sources: The source of each assertion and its line, by its shape.
@@ -40,7 +40,7 @@ class Unit:
 
     @property
     def is_test(self) -> bool:
-        """Whether pytest runs it."""
+        """True if pytest runs it."""
         return self.name.rpartition(".")[2].startswith("test")
 
     def __str__(self) -> str:
@@ -49,7 +49,7 @@ class Unit:
 
 @dataclass
 class Changes:
-    """What differs between the tests of two commits, beyond names.
+    """Differences between the tests of two commits, except for names.
 
     Attributes:
         same: Tests that are the same.
@@ -67,7 +67,7 @@ class Changes:
 
     @property
     def found(self) -> bool:
-        """Whether anything differs; an added test is no difference."""
+        """True if anything differs except for added tests."""
         return bool(self.removed or self.assertions or self.bodies)
 
     def summary(self) -> str:
@@ -89,12 +89,12 @@ def compare(before: Path, after: Path) -> Changes:
     """Compare two folders of tests.
 
     Raises:
-        SyntaxError: A file in them is no Python.
+        SyntaxError: A file is not valid Python.
     """
     olds, news = list(units(before)), list(units(after))
-    pairs, olds, news = _of_the_same_shape(olds, news)
+    pairs, olds, news = _match_by_shape(olds, news)
     changes = Changes(same=sum(old.is_test for old in pairs))
-    named, olds, news = _of_the_same_name(olds, news)
+    named, olds, news = _match_by_name(olds, news)
     for old, new in named:
         _add(changes, old, new)
     changes.removed = [str(old) for old in olds if old.is_test or old.assertions]
@@ -102,46 +102,46 @@ def compare(before: Path, after: Path) -> Changes:
     return changes
 
 
-def _of_the_same_shape(olds: Sequence[Unit], news: Sequence[Unit]) -> tuple[list[Unit], list[Unit], list[Unit]]:
-    """Return the old units that have a partner of the same shape, and the units of both that have none."""
-    # Those of the same name go first: a copy that is left over must be the one that was removed. A test has a test as
-    # its partner: pytest does not run it under a name that begins otherwise.
+def _match_by_shape(olds: Sequence[Unit], news: Sequence[Unit]) -> tuple[list[Unit], list[Unit], list[Unit]]:
+    """Return the old units that have a partner of the same shape, and the unmatched units of both."""
+    # Units of the same name are matched first, so that a remaining copy is the removed one. A test is matched
+    # only with a test, because pytest does not run functions with other names.
     partners: defaultdict[tuple[str, bool], list[Unit]] = defaultdict(list)
     for new in news:
         partners[new.shape, new.is_test].append(new)
     matched: list[Unit] = []
-    rest = olds
+    unmatched = olds
     for alike in (lambda a, b: str(a) == str(b), lambda a, b: a.name == b.name, lambda *_: True):
-        left = []
-        for old in rest:
+        still_unmatched = []
+        for old in unmatched:
             partner = next((new for new in partners[old.shape, old.is_test] if alike(old, new)), None)
             if partner is None:
-                left.append(old)
+                still_unmatched.append(old)
             else:
                 partners[old.shape, old.is_test].remove(partner)
                 matched.append(old)
-        rest = left
-    return matched, list(rest), [new for group in partners.values() for new in group]
+        unmatched = still_unmatched
+    return matched, list(unmatched), [new for group in partners.values() for new in group]
 
 
-def _of_the_same_name(
+def _match_by_name(
     olds: Sequence[Unit], news: Sequence[Unit]
 ) -> tuple[list[tuple[Unit, Unit]], list[Unit], list[Unit]]:
     """Return pairs of units of the same file and name, or of the same name alone, and the units of both without."""
     pairs = []
-    rest_news = list(news)
-    rest: list[Unit] = list(olds)
+    unmatched_news = list(news)
+    unmatched: list[Unit] = list(olds)
     for key in (str, lambda unit: unit.name if unit.is_test else None):
-        left = []
-        for old in rest:
-            partner = next((new for new in rest_news if key(old) is not None and key(old) == key(new)), None)
+        still_unmatched = []
+        for old in unmatched:
+            partner = next((new for new in unmatched_news if key(old) is not None and key(old) == key(new)), None)
             if partner is None:
-                left.append(old)
+                still_unmatched.append(old)
             else:
-                rest_news.remove(partner)
+                unmatched_news.remove(partner)
                 pairs.append((old, partner))
-        rest = left
-    return pairs, rest, rest_news
+        unmatched = still_unmatched
+    return pairs, unmatched, unmatched_news
 
 
 def _add(changes: Changes, old: Unit, new: Unit) -> None:
@@ -191,7 +191,7 @@ def _units_in(body: Sequence[ast.stmt], prefix: str, file: str, imports: set[str
 
 
 def _is_docstring(node: ast.stmt) -> bool:
-    """Return whether a statement is a string alone: a docstring, of a constant too."""
+    """Return True if a statement is only a string: a docstring, also of a constant."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
@@ -203,9 +203,11 @@ def _unit(nodes: Sequence[ast.stmt], name: str, file: str, imports: set[str]) ->
     for top in nodes:
         for node in ast.walk(top):
             if _is_assertion(node):
-                of_one = _Shaper(imports).shape(node)
-                assertions[of_one] += 1
-                sources[of_one] = f"line {getattr(node, 'lineno', '?')}: {' '.join(ast.unparse(node).split())[:200]}"
+                assertion_shape = _Shaper(imports).shape(node)
+                assertions[assertion_shape] += 1
+                sources[assertion_shape] = (
+                    f"line {getattr(node, 'lineno', '?')}: {' '.join(ast.unparse(node).split())[:200]}"
+                )
     return Unit(file, name, shape, assertions, sources, shaper.numbers)
 
 
@@ -226,16 +228,16 @@ class _Shaper:
     def __init__(self, imports: set[str]) -> None:
         self.numbers: Counter[str] = Counter()
         self._imports = imports
-        self._known: dict[str, int] | None = None
+        self._indices: dict[str, int] | None = None
 
     def shape(self, node: ast.AST) -> str:
         """Return the shape of a tree."""
-        if isinstance(node, ast.Assert) and self._known is None:
-            self._known = {}
+        if isinstance(node, ast.Assert) and self._indices is None:
+            self._indices = {}
             try:
                 return self._shape(node)
             finally:
-                self._known = None
+                self._indices = None
         return self._shape(node)
 
     def _shape(self, node: ast.AST) -> str:
@@ -279,7 +281,7 @@ class _Shaper:
         return repr(value)
 
     def _dotted(self, node: ast.Attribute) -> str:
-        """Return `module.name` where the module is imported, else an empty text."""
+        """Return `module.name` if the module is imported, or an empty text."""
         parts = [node.attr]
         inner: ast.expr = node.value
         while isinstance(inner, ast.Attribute):
@@ -290,6 +292,6 @@ class _Shaper:
         return ""
 
     def _name(self, name: str) -> str:
-        if self._known is None:
+        if self._indices is None:
             return "n"
-        return f"n{self._known.setdefault(name, len(self._known))}"
+        return f"n{self._indices.setdefault(name, len(self._indices))}"

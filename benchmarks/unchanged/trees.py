@@ -1,4 +1,4 @@
-"""Commits exported to folders of their own, each with the entry points that its own pyproject.toml declares."""
+"""Commits exported to separate folders, each with the entry points from its pyproject.toml."""
 
 import io
 import os
@@ -26,7 +26,7 @@ class Tree:
     """An exported commit.
 
     Attributes:
-        folder: Everything of this tree is inside; the path of the folder is removed from outputs before comparison.
+        folder: Folder of this tree; its path is removed from outputs before comparison.
         commit: The full hash.
     """
 
@@ -60,7 +60,7 @@ def export(commit: str, folder: Path) -> Tree:
 
     Args:
         commit: Anything that git resolves to a commit; `WORKING_TREE` for the tracked files as they are now.
-        folder: Is made.
+        folder: Folder to create.
 
     Raises:
         UnknownCommitError: git cannot resolve `commit`.
@@ -78,7 +78,7 @@ def export(commit: str, folder: Path) -> Tree:
 
 def _resolved(commit: str) -> str:
     if commit == WORKING_TREE:
-        # Makes a commit of the changed files without touching any of them; prints nothing if nothing is changed.
+        # Makes a commit of the changed files without changing the work tree; prints nothing without changes.
         snapshot = subprocess.run(("git", "stash", "create"), cwd=ROOT, check=True, capture_output=True, text=True)
         commit = snapshot.stdout.strip() or "HEAD"
     done = subprocess.run(
@@ -89,12 +89,12 @@ def _resolved(commit: str) -> str:
         text=True,
     )
     if done.returncode != 0:
-        raise UnknownCommitError(f"git resolves {commit!r} to no commit")
+        raise UnknownCommitError(f"git cannot resolve {commit!r} to a commit")
     return done.stdout.strip()
 
 
 def _declare_entry_points(tree: Tree) -> None:
-    """Write metadata of an installed package: without them Python would use those of the package in the venv."""
+    """Write metadata of an installed package; otherwise Python would use those of the package in the venv."""
     project = tomllib.loads((tree.code / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     groups = {"console_scripts": project.get("scripts", {})} | project.get("entry-points", {})
     lines = [

@@ -1,1 +1,1 @@
-"""Writes the reference pages, `docs/reference/*.md`, from the code: `python -m docs.generator`."""
+"""Write the reference pages, `docs/reference/*.md`, from the code: `python -m docs.generator`."""

@@ -38,7 +38,7 @@ GUIDES: Final = {
     "verify": "trial-folder.md",
     "cosim": "cosim-commands.md",
 }
-"""The page that explains a command."""
+"""The guide of each command."""
 
 
 def commands() -> str:

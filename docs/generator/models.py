@@ -16,7 +16,7 @@ HEAD = ("key", "default", "meaning")
 
 
 def describe(model: type) -> str:
-    """Return the description of a model, as its docstring has it."""
+    """Return the description in the docstring of a model."""
     return relative(description(model))
 
 
@@ -25,28 +25,28 @@ def keys_table(model: type[Strict], prefix: str = "", without: frozenset[str] = 
 
     Args:
         model: The model.
-        prefix: What all keys begin with.
-        without: Beginnings of keys that another table has.
+        prefix: Prefix of all keys.
+        without: Prefixes of keys in another table.
     """
     skipped = tuple(without)
     return table(HEAD, (row for row in rows(model, prefix) if not row[0].strip("`").startswith(skipped or "\0")))
 
 
 def rows(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield key, default and meaning of every key, nested ones behind their parent."""
+    """Yield key, default and meaning of every key, nested keys after their parent."""
     meanings = attributes(model)
     for name, field in model.model_fields.items():
         key = field.alias or name
         meaning = meanings.get(key) or meanings[name]
         yield f"`{prefix}{key}`", default(model, name), relative(meaning)
         if field.discriminator:
-            continue  # each kind has a table of its own
+            continue  # each kind has a separate table
         for mark, inner in _models_in(field.annotation):
             yield from rows(inner, f"{prefix}{key}{mark}.")
 
 
 def _models_in(annotation: object) -> Iterator[tuple[str, type[Strict]]]:
-    """Yield the models in an annotation, each with what is between its key and that of its field."""
+    """Yield the models in an annotation, each with the text between its key and that of its field."""
     if inspect.isclass(annotation) and issubclass(annotation, Strict):
         yield "", annotation
         return
@@ -59,7 +59,7 @@ def _models_in(annotation: object) -> Iterator[tuple[str, type[Strict]]]:
 
 
 def default(model: type[Strict], name: str) -> str:
-    """Return the default of a field as a file has it, `required` or `none`."""
+    """Return the default of a field in the notation of a file, `required` or `none`."""
     field = model.model_fields[name]
     if field.is_required():
         return "required"
@@ -81,7 +81,7 @@ def _yaml(value: object) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_yaml, value))}]"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{key}: {_yaml(one)}' for key, one in value.items())}}}"
+        return f"{{{', '.join(f'{key}: {_yaml(item)}' for key, item in value.items())}}}"
     return '""' if value == "" else str(value)
 
 

@@ -28,9 +28,7 @@ from sim_backends.cosim.scenario.traffic import Traffic
 from sim_backends.emulated.options import EmulatedOptions
 
 FOLDER: Final = Path(__file__).resolve().parents[1] / "reference"
-_MARKS: Final = (
-    "`[]` stands for each item of a list, `*` for each name of a mapping. Values: [quantities](../values.md)."
-)
+_MARKS: Final = "`[]` means each item of a list, `*` each name of a mapping. Values: [quantities](../values.md)."
 
 
 def pages() -> dict[str, str]:
@@ -63,7 +61,7 @@ def index() -> str:
         ("[Scenario file](scenario-file.md)", "`scenarios/NAME.yaml` of the co-simulation"),
         ("[World file](../world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
         ("[Values in files](../values.md)", "quantities with units, YAML, expectations"),
-        ("[Trial folder](../trial-folder.md)", "files that a trial leaves"),
+        ("[Trial folder](../trial-folder.md)", "files of a trial"),
         ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
         ("[JSON events](events.md)", "output of `--json`"),
         ("[Errors](../errors.md)", "messages and remedies"),
@@ -74,7 +72,7 @@ def index() -> str:
 def exit_codes() -> str:
     """Return the page of exit codes, from the families of errors."""
     families: list[type[errors.FieldkitError]] = [errors.FieldkitError]
-    for family in families:  # which grows meanwhile
+    for family in families:  # the list grows during the loop
         families += family.__subclasses__()
     meanings: dict[int, list[str]] = {}
     for family in families:
@@ -121,10 +119,10 @@ def procedure() -> str:
             HEAD,
             (
                 ("`each`", "required", "Lists of values, texts or numbers, by variable."),
-                ("`during`", "required", "Steps to write out for each combination of values."),
+                ("`during`", "required", "Steps to repeat for each combination of values."),
             ),
         ),
-        f"A file is written out to at most {loops.MOST:,} steps.",
+        f"A file has at most {loops.MOST:,} steps after expansion.",
     )
 
 
@@ -133,21 +131,21 @@ def _dedented(docstring: str | None) -> str:
 
 
 def steps() -> str:
-    """Return the page of all kinds of step that fieldkit has."""
-    own = {kind: model for kind, model in step_types().items() if model.__module__.startswith("fieldkit.")}
+    """Return the page of the kinds of step that are part of fieldkit."""
+    built_in = {kind: model for kind, model in step_types().items() if model.__module__.startswith("fieldkit.")}
     blocks = [
         (
-            "The keys of each kind of step, besides those of [every step](procedure.md#keys-of-every-step). "
+            "The keys of each kind of step, in addition to those of [every step](procedure.md#keys-of-every-step). "
             f"Packages can add kinds: [add a procedure](../add-a-procedure.md). {_MARKS}"
         ),
         table(
             ("step", "purpose"),
-            ((f"[`{kind}`](#{kind})", _first_sentence(model)) for kind, model in own.items()),
+            ((f"[`{kind}`](#{kind})", _first_sentence(model)) for kind, model in built_in.items()),
         ),
     ]
-    every = {row[0]: row for row in rows(Step)}
-    for kind, model in own.items():
-        keys = (row for row in rows(model) if row[0] not in every or row[1] != every[row[0]][1])
+    common = {row[0]: row for row in rows(Step)}
+    for kind, model in built_in.items():
+        keys = (row for row in rows(model) if row[0] not in common or row[1] != common[row[0]][1])
         blocks += [f"## {kind}", describe(model), table(HEAD, keys)]
     return page("Steps", *blocks)
 
@@ -177,13 +175,13 @@ def columns() -> str:
             "A missing value is empty, never 0. More: [trial folder](../trial-folder.md#columns)."
         ),
     ]
-    for name, own in files.items():
-        blocks += [f"## {name}", table(("column", "unit", "repeats give", "meaning"), _column_rows(own))]
+    for name, file_columns in files.items():
+        blocks += [f"## {name}", table(("column", "unit", "repeats give", "meaning"), _column_rows(file_columns))]
     return page("Columns", *blocks)
 
 
-def _column_rows(own: tuple[Column, ...]) -> Iterator[tuple[str, str, str, str]]:
-    for column in own:
+def _column_rows(columns_of_file: tuple[Column, ...]) -> Iterator[tuple[str, str, str, str]]:
+    for column in columns_of_file:
         figure = str(column.figure.kind) if column.figure else ""
         yield f"`{column.name}`", column.unit, figure, column.meaning.replace("<", "&lt;").replace("*", "\\*")
 

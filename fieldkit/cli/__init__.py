@@ -1,7 +1,7 @@
 """The command line: parse, call one library function, print, return an exit code.
 
-`commands` lists every command, and imports its module when it is named: help, typing errors and completion need no
-library but rich. `outside` adds the commands of other packages.
+`commands` lists every command and imports the module of a command only when the command is used, so help, usage
+errors and completion import no library except rich. `outside` adds the commands of other packages.
 """
 
 import argparse
@@ -24,24 +24,30 @@ INTERRUPTED: Final = 130
 EXIT_CODES: Final[Mapping[int, str]] = MappingProxyType(
     {
         0: "Done; for `trial`: every repeat ended valid.",
-        1: "A threshold was missed, an expectation was not shown to hold, or something was left open because the "
+        1: "A threshold was missed, an expectation was not shown to hold, or something was not done because the "
         "operator skipped it.",
-        INTERRUPTED: "Interrupted by Ctrl-C; everything that had ended is saved.",
+        INTERRUPTED: "Interrupted by Ctrl-C; all finished repeats are saved.",
     }
 )
-"""Exit codes that are not those of a family of errors."""
+"""Exit codes that do not belong to a family of errors."""
 
 _COLLECT_AFTER: Final = 50_000
-"""How many new objects the collector of cycles lets pass: imports make fewer, of which it would free none."""
+"""New objects between two runs of the cyclic garbage collector.
+
+Imports create fewer, and none of them would be freed.
+"""
 
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "1")
-"""numpy's OpenBLAS starts a thread per core, which spins for 30 ms, for products of larger matrices than any here."""
+"""By default OpenBLAS, which numpy uses, starts a thread per core that spins for 30 ms.
+
+It speeds up only larger matrices.
+"""
 
 _EPILOG: Final = """\
 begin with emulated robots:  fieldkit trial los 30ft --repeats 1 --record 1s
 begin with real ones:        fieldkit init
 
-exit codes: 0 valid, 1 threshold missed or something left open, 2 usage or
+exit codes: 0 valid, 1 threshold missed or something not done, 2 usage or
 configuration, 3 robot or link, 4 evidence not valid, 130 interrupted with the
 state saved"""
 
@@ -55,10 +61,10 @@ def parser() -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     top.add_argument("--version", action="version", version=f"fieldkit {__version__}")
-    found = top.add_commands(title="commands", metavar="COMMAND")
-    commands.add_all(found)
+    subparsers = top.add_commands(title="commands", metavar="COMMAND")
+    commands.add_all(subparsers)
     top.set_defaults(outside=None)
-    outside.add_all(found)
+    outside.add_all(subparsers)
     return top
 
 
@@ -67,52 +73,55 @@ def main(argv: Sequence[str] | None = None) -> int:
     _fill_streams()
     gc.set_threshold(_COLLECT_AFTER)
     os.environ.setdefault(*_ONE_THREAD)
-    if "_ARGCOMPLETE" in os.environ:  # a shell asks how its line may go on
-        from fieldkit.cli.commands import completion  # noqa: PLC0415 (only then)
+    if "_ARGCOMPLETE" in os.environ:  # a shell requests completions
+        from fieldkit.cli.commands import completion  # noqa: PLC0415 (needed only for completion)
 
         completion.answer(parser())
     top = parser()
-    with hints.completing(top) as known:
-        return _guarded(top, argv, known)
+    with hints.completing(top) as options:
+        return _run_guarded(top, argv, options)
 
 
 def _fill_streams() -> None:
-    """Open what the caller closed (`>&-`): a file of a trial would take its number, and a child print into it."""
+    """Open standard streams that the caller closed (`>&-`).
+
+    Otherwise a file of a trial would get the free file descriptor, and output of a child process would go into it.
+    """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
-            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 (until the end)
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 (open until exit)
 
 
-def _guarded(top: Parser, argv: Sequence[str] | None, known: hints.Given) -> int:
-    """Parse and run the command; whatever ends it early is told, and is an exit code."""
+def _run_guarded(top: Parser, argv: Sequence[str] | None, options: hints.CliOptions) -> int:
+    """Parse and run the command. Print any error that stops it, and return its exit code."""
     try:
         arguments = top.parse_args(argv)
-        known.take(arguments)
+        options.read(arguments)
         return _run(arguments)
     except FieldkitError as error:
         _show_error(str(error))
         return error.exit_code
     except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output went away: nothing is left to say, nor anyone to say it to
+        sys.stderr.close()  # the reader of our output has exited, so an error message cannot be delivered
         return 0
     except OSError as error:
-        # What a library function could foresee it has explained; a disk that fills up can meet any write.
-        first = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "mend it"
+        # Library functions wrap the errors that they expect. A full disk can make any write fail.
+        fix = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "correct this"
         where = error.filename or "its output"
-        _show_error(f"{where}: {error.strerror}\n  remedy: {first}, then type it again; what had ended is saved")
-        return ConfigurationError.exit_code
-    except MemoryError:
         _show_error(
-            "this machine has too little memory for it\n  remedy: end other programs, or do it on a larger one"
+            f"{where}: {error.strerror}\n  remedy: {fix}, then run the command again; finished repeats are saved"
         )
         return ConfigurationError.exit_code
+    except MemoryError:
+        _show_error("this machine has too little memory\n  remedy: close other programs, or use a larger machine")
+        return ConfigurationError.exit_code
     except KeyboardInterrupt:
-        _show_error("interrupted; what had ended is saved")
+        _show_error("interrupted; finished repeats are saved")
         return INTERRUPTED
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Run the command; without one, print the help."""
+    """Run the command, or print the help if no command is given."""
     if arguments.run is None:
         arguments.parser.print_help()
         return 0
@@ -122,6 +131,6 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _show_error(text: str) -> None:
-    from fieldkit.cli.display import show_error  # noqa: PLC0415 (rich, which most commands that go well need, too)
+    from fieldkit.cli.display import show_error  # noqa: PLC0415 (imports rich, which not every command needs)
 
     show_error(text)

@@ -24,39 +24,39 @@ from fieldkit.trial import sources
 from fieldkit.trial.sources import Sources
 
 _More = Sequence[Mapping[str, int]]
-"""Of each cell, how many repeats more each quantity wants; nothing if that was not asked."""
+"""For each cell, the number of additional repeats per quantity; empty unless `--width` is given."""
 
 _FOR_PROGRAMS: Final = MappingProxyType({"csv": tables.to_csv, "json": tables.to_json})
 _FOR_PAPERS: Final = MappingProxyType({"markdown": tables.to_markdown, "latex": tables.to_latex})
-# A paper has room for a delay and a loss; every protocol has one of the two losses.
+# A table in a paper has room for one delay and one loss. Each protocol has one of these two losses.
 _PAPER: Final = ("rtt_median_s", "ip_loss", "tcp_byte_loss")
 _VALUE: Final = MappingProxyType(
     {Kind.COUNTED: "share", Kind.FLAG: "share", Kind.MEAN: "mean", Kind.MEDIAN: "median"}
 )
 _WORDS: Final = "choose --format table, markdown, csv or json"
-_WIDTHS: Final = "give 2% for shares, 1ms for times, 100kbit/s for rates; or other columns by --quantity"
+_WIDTHS: Final = "give 2% for shares, 1ms for times, 100kbit/s for rates; or choose other columns with --quantity"
 _UNITS: Final = MappingProxyType({"share": "a share", "s": "a time", "bit/s": "a rate"})
 
 
 def show(arguments: argparse.Namespace) -> int:
     """Print the cells."""
     form = arguments.format
-    found = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
-    by = found.condition(arguments.by)
-    chosen, words = found.chosen(arguments.quantity)
+    data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
+    by = data.condition(arguments.by)
+    chosen, words = data.chosen(arguments.quantity)
     if words and form == "latex":
         raise ConfigurationError(
-            f"--quantity: {words[0].name} is words, which latex has no column for", remedy=_WORDS
+            f"--quantity: the values of {words[0].name} are words, for which latex has no column", remedy=_WORDS
         )
     if arguments.width and form in _FOR_PAPERS:
         raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
-    quantities = _by_default(form, found.quantities) if chosen is None else chosen
-    counted = list(found.words.values()) if words is None else words
+    quantities = _default_quantities(form, data.quantities) if chosen is None else chosen
+    counted = list(data.words.values()) if words is None else words
     widths = dict(_width(text, quantities) for text in arguments.width)
-    _demand_units(widths, quantities)
+    _require_units(widths, quantities)
     needed = {name for quantity in quantities for name in quantity.needed} | {quantity.name for quantity in counted}
-    mixed = {column.name for column in found.columns if plain_name(column.name) in MIXED_BY}
-    repeats = found.read({*by, *needed, *mixed, "started_utc_ns"})
+    mixed = {column.name for column in data.columns if plain_name(column.name) in MIXED_BY}
+    repeats = data.read({*by, *needed, *mixed, "started_utc_ns"})
     for mixture in mixtures(repeats, by):
         show_note(mixture.removesuffix("."))
     cells = aggregate(repeats, by, quantities=quantities, words=counted)
@@ -65,30 +65,30 @@ def show(arguments: argparse.Namespace) -> int:
         say(_FOR_PROGRAMS[form](by, cells, more), end="")
     elif form in _FOR_PAPERS:
         if form == "latex":
-            _demand_figures(cells, quantities)
+            _require_figures(cells, quantities)
         say(_FOR_PAPERS[form](by, cells, quantities), end="")
     else:
-        judgements = _judged(found, repeats, cells, quantities)
+        judgements = _judged(data, repeats, cells, quantities)
         expected = {judgement.expectation.quantity for judgement in judgements}
-        every = arguments.all or chosen is not None or bool(widths)
-        shown = lines.lines(cells, quantities) if every else lines.of_operator(cells, expected)
+        show_all = arguments.all or chosen is not None or bool(widths)
+        shown = lines.lines(cells, quantities) if show_all else lines.of_operator(cells, expected)
         _show(by, cells, shown, more)
         _show_expected(by, cells, judgements)
         _note_rest(cells, shown)
-    has = {name for cell in cells for name in (*cell.estimates, *cell.tallies)}
-    if missing := [name for name in arguments.quantity if name not in has]:
+    available = {name for cell in cells for name in (*cell.estimates, *cell.tallies)}
+    if missing := [name for name in arguments.quantity if name not in available]:
         show_note(f"no valid repeat has {' or '.join(missing)}")
     return 0
 
 
-def _by_default(form: str, known: Mapping[str, Quantity]) -> list[Quantity]:
-    """Return what is put together where nobody says: all that there is, and in a paper what it has room for."""
+def _default_quantities(form: str, available: Mapping[str, Quantity]) -> list[Quantity]:
+    """Return the quantities to aggregate without `--quantity`: all, or for latex those that fit into a paper."""
     if form != "latex":
-        return list(known.values())
-    return [one for name in _PAPER for one in known.values() if plain_name(one.name) == name]
+        return list(available.values())
+    return [quantity for name in _PAPER for quantity in available.values() if plain_name(quantity.name) == name]
 
 
-def _demand_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) -> None:
+def _require_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) -> None:
     if widths and not any(quantity.unit in widths for quantity in quantities):
         names = [quantity.name for quantity in quantities]
         raise ConfigurationError(
@@ -97,23 +97,23 @@ def _demand_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) -
         )
 
 
-def _demand_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
+def _require_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
     if not wording.shown(cells, quantities):
         names = " or ".join(quantity.name for quantity in quantities)
         raise EvidenceError(
-            f"no valid repeat has {names}: the table would be empty",
-            remedy="name others by --quantity; to see what there is: --format table",
+            f"no valid repeat has a value of {names}, so the table would be empty",
+            remedy="choose other columns with --quantity; to list the available ones: --format table",
         )
 
 
 def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
-    """Return the unit of the quantities that a wanted half-width is for, and the half-width in it."""
+    """Return the unit of the quantities that `--width` applies to, and the half-width in this unit."""
     units = dict.fromkeys(quantity.unit for quantity in quantities)
     symbol = text.strip().lstrip("0123456789. ")
-    own = [unit for unit in units if unit not in PER_UNIT]
-    unit = next((unit for unit in (*PER_UNIT, *own) if symbol in symbols(unit)), None)
+    other_units = [unit for unit in units if unit not in PER_UNIT]
+    unit = next((unit for unit in (*PER_UNIT, *other_units) if symbol in symbols(unit)), None)
     if unit is None:
-        parse_quantity(text, {symbol: 1.0 for unit in (*PER_UNIT, *own) for symbol in symbols(unit)}, "width")
+        parse_quantity(text, {symbol: 1.0 for unit in (*PER_UNIT, *other_units) for symbol in symbols(unit)}, "width")
         raise ConfigurationError(f"--width: {text!r} is not a width", remedy=_WIDTHS)
     width = parse_amount(text, unit, "width")
     if width <= 0:
@@ -122,95 +122,99 @@ def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
 
 
 def _note_rest(cells: Sequence[Cell], shown: Sequence[TableLine]) -> None:
-    """Print a note on the quantities that are not shown."""
+    """Print how many quantities are not shown."""
     names = {quantity.name for line in shown for quantity in line.quantities}
     if left_out := len({quantity.name for quantity in wording.measured(cells)} - names):
         prose(f"{summary.more(left_out)}: add --all")
 
 
 def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], more: _More) -> None:
-    """Print a table of the repeats, and one per line of `shown`."""
+    """Print a table of the repeats, and a table for each line of `shown`."""
     counts = [{"valid": str(cell.n_valid), "void": str(cell.n_void), "failed": str(cell.n_failed)} for cell in cells]
-    _show_one("repeats", by, cells, counts)
-    apart, _ = wording.told_by(by, cells)
+    _show_table("repeats", by, cells, counts)
+    differing, _ = wording.told_by(by, cells)
     for line in shown:
-        having = [cell for cell in cells if line.estimate(cell) or line.is_lacking(cell)]
-        scale = line.scale(having)
-        figures = [_figures(line, cell, scale) for cell in having]
-        if any(quantity.name in wanted for wanted in more for quantity in line.quantities):
+        measured_cells = [cell for cell in cells if line.estimate(cell) or line.is_lacking(cell)]
+        scale = line.scale(measured_cells)
+        figures = [_figures(line, cell, scale) for cell in measured_cells]
+        if any(quantity.name in additional for additional in more for quantity in line.quantities):
             figures = [
-                {**figure, "more": str(_wanted(line, cell, more[cells.index(cell)]))}
-                for figure, cell in zip(figures, having, strict=True)
+                {**figure, "more": str(_additional_repeats(line, cell, more[cells.index(cell)]))}
+                for figure, cell in zip(figures, measured_cells, strict=True)
             ]
-        if having:
-            _show_one(scale.head(line.label.removesuffix(", median")), apart, having, figures)
+        if measured_cells:
+            _show_table(scale.head(line.label.removesuffix(", median")), differing, measured_cells, figures)
     for name, label in wording.worded(cells).items():
-        having = [cell for cell in cells if name in cell.tallies]
+        measured_cells = [cell for cell in cells if name in cell.tallies]
         figures = [
-            {"n": _n(cell.tallies[name].n, cell), "repeats with each": wording.tally(cell, name)} for cell in having
+            {"n": _n(cell.tallies[name].n, cell), "repeats with each": wording.tally(cell, name)}
+            for cell in measured_cells
         ]
-        _show_one(label, apart, having, figures, words=1)
+        _show_table(label, differing, measured_cells, figures, words=1)
     for caution in wording.cautions(cells, {quantity.name for line in shown for quantity in line.quantities}):
         prose(caution)
 
 
 def _judged(
-    found: Sources, repeats: Repeats, cells: Sequence[Cell], quantities: Sequence[Quantity]
+    data: Sources, repeats: Repeats, cells: Sequence[Cell], quantities: Sequence[Quantity]
 ) -> Sequence[Judgement]:
-    """Return what cells say of what their trials expect of the figures that are shown."""
+    """Return the judgements of the trials' expectations about the quantities that are shown."""
     shown = {quantity.name for quantity in quantities}
-    if not (expected := found.expectations()):
+    if not (expected := data.expectations()):
         return ()
     rows = repeats.groups(tuple(cells[0].key))
 
-    def of(cell: Cell) -> Iterator[Expectation]:
+    def expectations_of(cell: Cell) -> Iterator[Expectation]:
         for source in dict.fromkeys(repeats.texts[SOURCE][rows[tuple(cell.key.values())]]):
-            yield from (one for one in expected.get(source, ()) if one.quantity in shown)
+            yield from (item for item in expected.get(source, ()) if item.quantity in shown)
 
-    return judge_own((cell, of(cell)) for cell in cells)
+    return judge_own((cell, expectations_of(cell)) for cell in cells)
 
 
 def _show_expected(by: Sequence[str], cells: Sequence[Cell], judgements: Sequence[Judgement]) -> None:
-    """Print whether expectations hold, a line for each condition; nothing where nothing was expected."""
-    apart, _ = wording.told_by(by, cells)
+    """Print for each condition if its expectations hold. Without expectations, print nothing."""
+    differing, _ = wording.told_by(by, cells)
     rows = []
     for judgement in judgements:
-        expected, _, *said = wording.judged(judgement)
+        expected, _, *judged = wording.judged(judgement)
         rows.append(
-            (expected, *(wording.key(judgement.cell, name) if judgement.cell else "" for name in apart), *said)
+            (expected, *(wording.key(judgement.cell, name) if judgement.cell else "" for name in differing), *judged)
         )
     if rows:
-        head = ("expected", *apart, "measured", "95 % interval", "")
+        head = ("expected", *differing, "measured", "95 % interval", "")
         table(head, rows, fold=(0, len(head) - 1))
 
 
-def _show_one(
+def _show_table(
     title: str, by: Sequence[str], cells: Sequence[Cell], figures: Sequence[Mapping[str, str]], *, words: int = 0
 ) -> None:
-    """Print a line per cell; what they have in common goes into the title. The last `words` figures are words."""
-    apart, common = wording.told_by(by, cells)
-    said = ", ".join([title, *dict.fromkeys(wording.key(cells[0], name) for name in common)])
-    head = [*apart, *figures[0]]
+    """Print a row per cell. Key columns that all cells share go into the title. The last `words` columns are text."""
+    differing, common = wording.told_by(by, cells)
+    full_title = ", ".join([title, *dict.fromkeys(wording.key(cells[0], name) for name in common)])
+    head = [*differing, *figures[0]]
     rows = [
-        [*(wording.key(cell, name) for name in apart), *one.values()]
-        for cell, one in zip(cells, figures, strict=True)
+        [*(wording.key(cell, name) for name in differing), *values.values()]
+        for cell, values in zip(cells, figures, strict=True)
     ]
-    table(head, rows, title=said, right=range(len(apart), len(head) - words))
+    table(head, rows, title=full_title, right=range(len(differing), len(head) - words))
 
 
-def _wanted(line: TableLine, cell: Cell, more: Mapping[str, int]) -> int | str:
-    """Return how many repeats more a cell wants, empty where that is not known."""
+def _additional_repeats(line: TableLine, cell: Cell, more: Mapping[str, int]) -> int | str:
+    """Return the number of additional repeats that a cell needs, or an empty string if it is unknown."""
     estimate = line.estimate(cell)
     return more.get(estimate.quantity.name, "") if estimate else ""
 
 
 def _n(n: int, cell: Cell) -> str:
-    """Return how many valid repeats have something: `5`, or `4 of 5`."""
+    """Return the number of valid repeats with a value: `5`, or `4 of 5`."""
     return lines.part_of(n, cell) or str(n)
 
 
 def _figures(line: TableLine, cell: Cell, scale: wording.Scale) -> dict[str, str]:
-    """Return the figures of a cell by head; of a cell that lacks them, empty ones and how many repeats it has."""
+    """Return the figures of a cell by column head.
+
+    A cell without values has empty figures and the number of its repeats.
+    """
     estimate, quantity = line.estimate(cell), line.quantities[0]
     kind = quantity.kind
     heads = ["n", *(("sent",) if kind is Kind.COUNTED else ()), _VALUE[kind], "95 % interval"]

@@ -1,4 +1,4 @@
-"""Show events, tables, findings and errors: as a live line, plain lines or JSON. The only user of rich."""
+"""Show events, tables, findings and errors as a live line, as plain lines or as JSON. The only user of rich."""
 
 import io
 import os
@@ -53,7 +53,7 @@ _STYLE: Final = {Status.VALID: "green", Status.VOID: "yellow", Status.FAILED: "r
 
 
 class _Output(Console):
-    """A stream whose reader may go away, which is for the command line to see, as of what is printed without rich."""
+    """A console that raises `BrokenPipeError` if the reader of its stream exits, as `print` does; rich would exit."""
 
     @override
     def on_broken_pipe(self) -> None:
@@ -71,17 +71,17 @@ def show_error(text: str) -> None:
 
 
 def show_note(text: str) -> None:
-    """Print on standard error what a reader should know of the output."""
+    """Print a note about the output on standard error."""
     _console(stderr=True).print(_harmless(Text.assemble(("note: ", "yellow"), completed(text))))
 
 
 def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-    """Return whether the terminal is as wide as a table; where the output goes elsewhere, lines have no end."""
+    """Return True if the terminal is wide enough for a table. Files and pipes have no limit."""
     return not sys.stdout.isatty() or _table_width(_widths([head, *rows])) <= _console().width
 
 
 def prose(text: str) -> None:
-    """Print a text of several words, folded between them where the output is a terminal."""
+    """Print a text. On a terminal, lines are folded between words."""
     text = harmless(text)
     print(textwrap.fill(text, _console().width) if sys.stdout.isatty() else text)
 
@@ -96,9 +96,9 @@ def table(
 ) -> None:
     """Print a table; columns whose index is in `right` are aligned to the right. A cell may have several lines.
 
-    Words are folded in the columns `fold` alone, in this order, by default in the last one unless that is aligned to
-    the right: a name or a figure broken in two is read as another. Where a terminal is too narrow even so, each row
-    is a block of lines instead, a cell per line.
+    Only the columns `fold` are folded, in this order and between words, because a broken name or number would be
+    misread. By default this is the last column unless it is aligned to the right. If a terminal is too narrow for the
+    folded table, each row is printed as a block with a line per cell.
     """
     console = _console()
     cells = [[harmless(cell) for cell in row] for row in (head, *rows)]
@@ -113,51 +113,51 @@ def table(
         return
     if title:
         console.print(Text(harmless(title), style="bold"))
-    lines = _drawn(cells, widths, right)
+    lines = _render_lines(cells, widths, right)
     rule = next(index for index, line in enumerate(lines) if line.startswith(_RULE))
     console.print(Text("\n".join(lines[:rule]), style="bold"))
     print("\n".join(lines[rule:]))
 
 
-def _drawn(cells: Sequence[Sequence[str]], widths: Sequence[int], right: Sequence[int]) -> list[str]:
-    """Return the lines of a table without styles, trailing spaces and blank lines; the first row is its head."""
+def _render_lines(cells: Sequence[Sequence[str]], widths: Sequence[int], right: Sequence[int]) -> list[str]:
+    """Return the lines of a table without styles, trailing spaces and blank lines. The first row is the head."""
     grid = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     head, *rows = cells
     for index, (name, width) in enumerate(zip(head, widths, strict=True)):
         grid.add_column(Text(name), justify="right" if index in right else "left", width=width, no_wrap=True)
     for row in rows:
-        grid.add_row(*(Text(_wrapped(cell, width)) for cell, width in zip(row, widths, strict=True)))
+        grid.add_row(*(Text(_fold_cell(cell, width)) for cell, width in zip(row, widths, strict=True)))
     drawn = io.StringIO()
     Console(file=drawn, width=_table_width(widths) + 1, color_system=None).print(grid)
     return [line.rstrip() for line in drawn.getvalue().splitlines() if line.strip()]
 
 
-def _wrapped(cell: str, width: int) -> str:
-    """Return a cell whose lines are folded between words where they are wider than `width`.
+def _fold_cell(cell: str, width: int) -> str:
+    """Return a cell with lines that are wider than `width` folded between words.
 
-    rich's own wrapping cuts lines that contain characters of two columns.
+    The wrapping of rich cuts lines that contain characters of two columns.
     """
     return "\n".join(
-        line if cell_len(line) <= width else "\n".join(_folded(line.split(), width)) for line in cell.split("\n")
+        line if cell_len(line) <= width else "\n".join(_fold_words(line.split(), width)) for line in cell.split("\n")
     )
 
 
 def _print_blocks(cells: Sequence[Sequence[str]], title: str, console: Console) -> None:
-    """Print rows as blocks: the first cell, then a line per other cell, folded between words, with its head."""
+    """Print each row as a block: the first cell, then a folded line with its head for each other cell."""
     head, *rows = cells
     indent = 2 + max(map(cell_len, head[1:]), default=0) + 2
     if title:
         console.print(Text(harmless(title), style="bold"))
     for first, *others in rows:
-        console.print(Text("\n".join(_folded(first.split() or [head[0]], console.width)), style="bold"))
+        console.print(Text("\n".join(_fold_words(first.split() or [head[0]], console.width)), style="bold"))
         for name, cell in zip(head[1:], others, strict=True):
             if words := cell.split():
-                begin = f"  {name}{' ' * (indent - 2 - cell_len(name))}"
-                print(begin + f"\n{' ' * indent}".join(_folded(words, console.width - indent)))
+                start = f"  {name}{' ' * (indent - 2 - cell_len(name))}"
+                print(start + f"\n{' ' * indent}".join(_fold_words(words, console.width - indent)))
 
 
-def _folded(words: Sequence[str], width: int) -> list[str]:
-    """Return lines of whole words; one that is longer than `width` has a line of its own, and is not broken."""
+def _fold_words(words: Sequence[str], width: int) -> list[str]:
+    """Return lines of whole words. A word that is longer than `width` gets its own line and is not broken."""
     lines = [""]
     for word in words:
         longer = f"{lines[-1]} {word}".lstrip()
@@ -182,41 +182,41 @@ _MARKS: Final = {Verdict.OK: ("ok", "green"), Verdict.WARN: ("warn", "yellow"), 
 
 
 def show_findings(findings: Sequence[Finding]) -> None:
-    """Print findings robot by robot, each that is not ok with what to type, and a count at the end."""
+    """Print findings robot by robot, with a remedy for each that is not ok, and the counts at the end."""
     console = _console()
     width = max(len(finding.check) for finding in findings)
     for robot in dict.fromkeys(finding.robot for finding in findings):
         console.print(Text(robot, style="bold"))
-        for one in (finding for finding in findings if finding.robot == robot):
-            word, style = _MARKS[one.status]
+        for finding in (item for item in findings if item.robot == robot):
+            word, style = _MARKS[finding.status]
             grid = Table.grid(padding=(0, 2, 0, 0))
             grid.add_column(width=6, justify="right")
             grid.add_column(width=width)
             grid.add_column(overflow="fold")
-            grid.add_row(Text(word, style=style), Text(one.check), _harmless(Text(one.detail)))
+            grid.add_row(Text(word, style=style), Text(finding.check), _harmless(Text(finding.detail)))
             with console.capture() as shown:
                 console.print(grid, soft_wrap=False)
             print("\n".join(line.rstrip() for line in shown.get().splitlines()))
-            if one.remedy:  # never broken, so that it can be copied
-                console.print(_harmless(Text.assemble("        ", (completed(one.remedy), "cyan"))))
+            if finding.remedy:  # not folded, so that it can be copied
+                console.print(_harmless(Text.assemble("        ", (completed(finding.remedy), "cyan"))))
     counts = {verdict: sum(finding.status is verdict for finding in findings) for verdict in Verdict}
-    names = {Verdict.OK: "ok", Verdict.WARN: "warned of", Verdict.FAIL: "failed"}
-    worst = max(findings, key=lambda one: list(Verdict).index(one.status)).status
-    said = ", ".join(f"{counts[verdict]} {name}" for verdict, name in names.items() if counts[verdict])
-    console.print(Text(said, style=_MARKS[worst][1]))
+    names = {Verdict.OK: "ok", Verdict.WARN: "warned", Verdict.FAIL: "failed"}
+    worst = max(findings, key=lambda item: list(Verdict).index(item.status)).status
+    counts_text = ", ".join(f"{counts[verdict]} {name}" for verdict, name in names.items() if counts[verdict])
+    console.print(Text(counts_text, style=_MARKS[worst][1]))
 
 
 @contextmanager
 def watching(*, as_json: bool) -> Iterator[Sink]:
-    """Show events while the body runs: as JSON lines, as a live line in a terminal, else as plain lines."""
+    """Show events while the body runs: as JSON lines, as a live line on a terminal, or as plain lines."""
     if as_json:
-        yield _audible(_print_json)
+        yield _serialize(_print_json)
     elif sys.stdout.isatty():
         line = _LiveLine()
         live = Live(line, console=_console(), refresh_per_second=8, transient=True)
 
         def sink(event: Event) -> None:
-            line.progress.take(event)
+            line.progress.update(event)
             if line.progress.is_needed:
                 live.start()
             else:
@@ -225,16 +225,16 @@ def watching(*, as_json: bool) -> Iterator[Sink]:
                 live.console.print(text)
 
         try:
-            yield _audible(sink)
+            yield _serialize(sink)
         finally:
             live.stop()
     else:
-        yield _audible(_print_plain)
+        yield _serialize(_print_plain)
 
 
 @contextmanager
 def working() -> Iterator[Sink]:
-    """Show on standard error how far a computation is while the body runs; nothing where that is no terminal."""
+    """Show the progress of a computation on standard error while the body runs, if that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -242,7 +242,7 @@ def working() -> Iterator[Sink]:
     live = Live(line, console=_console(stderr=True), refresh_per_second=8, transient=True)
 
     def sink(event: Event) -> None:
-        line.progress.take(event)
+        line.progress.update(event)
         live.start()
 
     try:
@@ -251,65 +251,65 @@ def working() -> Iterator[Sink]:
         live.stop()
 
 
-def _audible(sink: Sink) -> Sink:
-    """Tell one event at a time, whoever has one, and go on in silence once nobody reads.
+def _serialize(sink: Sink) -> Sink:
+    """Return a sink that shows one event at a time and discards events after a write error.
 
-    What is measured is worth more than what is told of it.
+    A measurement must not stop because its progress cannot be displayed.
     """
-    telling = threading.RLock()  # which a signal's handler may find held by what it interrupted
+    lock = threading.RLock()  # reentrant: a signal handler may interrupt the holder
 
-    def tell(event: Event) -> None:
+    def show(event: Event) -> None:
         try:
-            with telling:
+            with lock:
                 sink(event)
         except OSError:
-            with Path(os.devnull).open("wb") as silence:
-                os.dup2(silence.fileno(), sys.stdout.fileno())
+            with Path(os.devnull).open("wb") as null:
+                os.dup2(null.fileno(), sys.stdout.fileno())
 
-    return tell
+    return show
 
 
 def shown(event: Event, width: int | None = None) -> Text | None:
-    """Return an event as people see it, None for one that only the live line shows; errors as `words_of`."""
+    """Return the text of an event for people, or None if only the live line shows it. Raises as `words_of`."""
     said = words_of(event, width)
     return _harmless(Text.assemble(*((completed(text), style) for text, style in said))) if said else None
 
 
 def words_of(event: Event, width: int | None = None) -> Words:
-    """Return an event in words, none for one that only the live line shows.
+    """Return the styled texts of an event; empty if only the live line shows the event.
 
     Args:
-        event: What happened.
-        width: Columns of the terminal, below which the live line stands; None for a file.
+        event: The event.
+        width: Columns of a terminal with a live line, or None for a file.
     """
-    said: Words = ()
+    words: Words = ()
     match event:
         case Note(text):
-            said = ((text, ""),)
+            words = ((text, ""),)
         case Request(text, may_skip):
-            said = (f"\n>>> {text}\n", "bold"), (f"    {prompts.how(may_skip=may_skip)}", "")
+            words = (f"\n>>> {text}\n", "bold"), (f"    {prompts.how(may_skip=may_skip)}", "")
         case Asked(text, how):
-            said = (f"\n>>> {text}?\n", "bold"), (f"    {how}", "")
+            words = (f"\n>>> {text}?\n", "bold"), (f"    {how}", "")
         case Finding(status=Verdict.WARN):
             where = f"{event.robot}: {event.check}: "
-            said = ("warning: ", "yellow"), (f"{where}{event.detail}\n  remedy: {event.remedy}", "")
+            words = ("warning: ", "yellow"), (f"{where}{event.detail}\n  remedy: {event.remedy}", "")
         case PhaseStarted(name, repeat=""):
-            said = ((f"{name} ...", "dim"),)
+            words = ((f"{name} ...", "dim"),)
         case RepeatEnded():
-            said = _repeat(event, width)
+            words = _repeat(event, width)
         case TrialEnded(folder, valid, void, failed):
             counts = (
                 f"{valid} valid"
                 + (f", {void} void and redone" if void else "")
                 + (f", {failed} failed" if failed else "")
             )
-            said = ((f"{counts}: {folder}", "bold"),)
+            words = ((f"{counts}: {folder}", "bold"),)
         case TrialStopped(folder, done, total):
-            how = f"to go on: {typed('fieldkit', 'resume', folder)}"
-            said = ((f"stopped, {done} of {total} repeats are done; {how}", "bold"),)
+            command = f"to continue: {typed('fieldkit', 'resume', folder)}"
+            words = ((f"stopped, {done} of {total} repeats are done; {command}", "bold"),)
         case CampaignPlanned() | CampaignTrial() | CampaignWent() | CampaignEnded():
-            said = _campaign(event)
-    return said
+            words = _campaign(event)
+    return words
 
 
 def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEnded) -> Words:
@@ -321,43 +321,43 @@ def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEn
             return ((done, ""),)
         case CampaignPlanned():
             names = (f"\n{number:5d}  {name}" for number, name in enumerate(event.trials, start=event.done + 1))
-            room = f"{format_bytes(event.needed_bytes)} of disk ({format_bytes(event.free_bytes)} free)"
-            lasts = TimeEstimate(event.left_s, event.left_most_s)
-            dead = " if links are dead" if not lasts.is_certain else ""
-            cost = f"{event.walk_m:.0f} m to carry robots, about {lasts}{dead}; at most {room}"
+            disk = f"{format_bytes(event.needed_bytes)} of disk ({format_bytes(event.free_bytes)} free)"
+            duration = TimeEstimate(event.left_s, event.left_most_s)
+            dead_links = " if links are dead" if not duration.is_certain else ""
+            cost = f"{event.walk_m:.0f} m to walk with robots, about {duration}{dead_links}; at most {disk}"
             return ((f"{done}; {cost}{''.join(names)}", ""),)
         case CampaignWent():
-            lasts = TimeEstimate(event.left_s, event.left_most_s)
-            left = f", about {lasts} left" if event.done < event.total else ""
+            duration = TimeEstimate(event.left_s, event.left_most_s)
+            left = f", about {duration} left" if event.done < event.total else ""
             return ((f"{done}{left}", ""),)
         case CampaignEnded():
-            how = "" if event.done == event.total else "; to go on, give the same command again"
-            return ((f"{done}{how}: {event.folder}", "bold"),)
+            hint = "" if event.done == event.total else "; to continue, run the same command again"
+            return ((f"{done}{hint}: {event.folder}", "bold"),)
 
 
 def _repeat(event: RepeatEnded, width: int | None) -> Words:
-    """Return a repeat as one line; in a terminal, what it measured is folded below it where the line is longer."""
+    """Return a repeat as one line. On a terminal, a longer line is folded, with the measured figures below it."""
     head, status = f"{event.done:3d}/{event.total}  {event.repeat:7} ", f"{event.status:6} "
     measured = f"measured: {event.summary}" if event.reason and event.summary else event.summary
-    said = "; ".join(filter(None, (event.reason, measured)))
+    text = "; ".join(filter(None, (event.reason, measured)))
     left = f"  ({TimeEstimate(event.left_s, event.left_most_s)} left)" if event.left_s > 0 else ""
-    if width is not None:  # the live line says what is left
+    if width is not None:  # the live line shows the remaining time
         left, room = "", width - len(head) - len(status)
-        if cell_len(said) > room:
-            said = _below(said, width) if event.reason else _continued(said, width - room, width)
+        if cell_len(text) > room:
+            text = _fold_below(text, width) if event.reason else _fold_after(text, width - room, width)
     remedy = f"\n{' ' * _INDENT}remedy: {event.remedy}" if event.remedy else ""
     style = _STYLE[Status.FAILED] if event.summary.startswith(NOTHING_ARRIVED) else ""
-    return ((head, ""), (status, _STYLE[event.status]), (said, style), (left, "dim"), (remedy, ""))
+    return ((head, ""), (status, _STYLE[event.status]), (text, style), (left, "dim"), (remedy, ""))
 
 
-def _below(text: str, width: int) -> str:
-    """Return a text folded into indented lines below the one where it begins."""
+def _fold_below(text: str, width: int) -> str:
+    """Return a text folded into indented lines that start below the current line."""
     indent = f"\n{' ' * _INDENT}"
     return indent + indent.join(textwrap.wrap(text, max(width - _INDENT, _INDENT)))
 
 
-def _continued(text: str, begin: int, width: int) -> str:
-    """Return a text that begins in column `begin` and is folded into indented lines."""
+def _fold_after(text: str, begin: int, width: int) -> str:
+    """Return a text that starts in column `begin` and continues on indented lines."""
     lines = textwrap.wrap(
         text, max(width, begin + _INDENT), initial_indent=" " * begin, subsequent_indent=" " * _INDENT
     )

@@ -1,4 +1,4 @@
-"""Commands of a trial, shown without running them."""
+"""Show the commands of a trial without running them."""
 
 from collections.abc import Iterator
 
@@ -17,25 +17,25 @@ from fieldkit.trial.plan import Plan
 def print_commands(plan: Plan) -> None:
     """Print the commands of one repeat per protocol, in order, grouped by robot.
 
-    Jobs are shown as a person would type them; `job.sh` runs them detached.
+    Jobs are shown as a person would type them. In a trial `job.sh` starts them detached.
     """
     each = f"{format_count(plan.repeats, 'repeat')} per protocol"
     say(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {each}")
     for remark in _remarks(plan):
         say(f"# {remark}")
-    planned = list(_commands(plan))
+    commands = list(_commands(plan))
     for protocol in plan.protocols:
         for role, robot in plan.cast.items():
-            mine = [command for command in planned if (command.protocol, command.role) == (protocol, role)]
+            own_commands = [command for command in commands if (command.protocol, command.role) == (protocol, role)]
             say(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {_folder(plan, protocol)}")
-            if not mine:
-                say("nothing but the checks before repeat 1")
-            for command in mine:
+            if not own_commands:
+                say("only the checks before repeat 1")
+            for command in own_commands:
                 say(f"{command.number}. {command.name}: {command.command}")
 
 
-def tell_commands(plan: Plan, sink: Sink) -> None:
-    """Tell what `print_commands` prints as events, for a program."""
+def report_commands(plan: Plan, sink: Sink) -> None:
+    """Send the output of `print_commands` to `sink` as events, for programs."""
     for remark in _remarks(plan):
         sink(Note(remark))
     for command in _commands(plan):
@@ -43,10 +43,10 @@ def tell_commands(plan: Plan, sink: Sink) -> None:
 
 
 def _remarks(plan: Plan) -> Iterator[str]:
-    """Yield what is known before any robot is asked, beside the commands."""
+    """Yield the remarks that the plan alone implies, without a query to any robot."""
     for refusal in plan.refusals({}):
         name = plan.cast[refusal.role].name
-        yield f"will be refused, if {name} has what its profile names: {refusal.what}; {refusal.remedy}"
+        yield f"if {name} is as its profile says, this will be refused: {refusal.what}; {refusal.remedy}"
     for line in plan.dry_run_notes(plan.scene(RepeatId(plan.protocols[0], 1), "")):
         yield f"while steps run: {line}"
 
@@ -56,33 +56,33 @@ def _folder(plan: Plan, protocol: Protocol) -> str:
 
 
 def _commands(plan: Plan) -> Iterator[CommandPlanned]:
-    """Yield the commands of one repeat per protocol, robot by robot; a role that no step names has none."""
+    """Yield the commands of one repeat per protocol, robot by robot. A role that no step uses has no commands."""
     for protocol in plan.protocols:
         folder = _folder(plan, protocol)
         scene = plan.scene(RepeatId(protocol, 1), folder)
-        everybodys = list(plan.jobs(scene))
+        all_jobs = list(plan.jobs(scene))
         for role, robot in scene.cast.items():
             if role not in plan.procedure.roles():
                 continue
-            where = (scene.folder, role, robot.profile.radio.interface)
-            mine = [
-                (0, "begin", quote(evidence.begin_command(*where))),
-                *((0, "put", _copying(put, robot, folder)) for put in plan.puts() if put.role is role),
+            location = (scene.folder, role, robot.profile.radio.interface)
+            commands = [
+                (0, "begin", quote(evidence.begin_command(*location))),
+                *((0, "put", _copy_command(put, robot, folder)) for put in plan.puts() if put.role is role),
                 *(
                     (number, planned.job.name, in_shell(planned.job))
-                    for number, planned in enumerate(everybodys, start=1)
+                    for number, planned in enumerate(all_jobs, start=1)
                     if planned.role is role
                 ),
-                (len(everybodys) + 1, "pack", quote(fetching.pack_command(*where))),
+                (len(all_jobs) + 1, "pack", quote(fetching.pack_command(*location))),
             ]
-            for number, name, command in mine:
+            for number, name, command in commands:
                 yield CommandPlanned(protocol, robot.name, role, folder, number, name, command)
 
 
-def _copying(put: PutProgram, robot: Robot, folder: str) -> str:
-    """Return how a person would copy a program of the lab to a robot, once its folder there is made."""
-    words = ("scp", "-p", put.program.file, f"{robot.address}:{folder}/{put.at}")
-    return f"{quote(words)}  # SHA-256 {put.program.sha256}"
+def _copy_command(put: PutProgram, robot: Robot, folder: str) -> str:
+    """Return the command that copies a program of the lab into the folder of the repeat on a robot."""
+    argv = ("scp", "-p", put.program.file, f"{robot.address}:{folder}/{put.at}")
+    return f"{quote(argv)}  # SHA-256 {put.program.sha256}"
 
 
 def in_shell(job: Job) -> str:

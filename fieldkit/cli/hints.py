@@ -1,6 +1,6 @@
-"""Commands in remedies and hints, completed by what the operator gave, so that they can be typed as they are shown.
+"""Add the operator's options to the commands in remedies and hints, so that they can be typed as they are shown.
 
-Who words a remedy knows neither the site file's name nor the command line; here both are known.
+The code that writes a remedy has neither the name of the site file nor the command line. This module has both.
 """
 
 import argparse
@@ -14,69 +14,69 @@ from typing import Final
 from fieldkit.cli.parser import Parser
 
 _CARRIED: Final = ("site", "backend", "topology", "protocol", "repeats", "record")
-"""Options that say which robots, and what is tried on them, by the name under which argparse keeps them."""
+"""Options that select robots and what is measured on them, by their names in the namespace of argparse."""
 _CARRIED_FLAGS: Final = ("allow_motion",)
-"""Options without a value, without which a trial that was begun with them is not resumed."""
+"""Flags that a trial needs again when it is resumed."""
 
-# Words in small letters: a command of fieldkit, and one of `fieldkit lab`.
+# Words in lower case: a command of fieldkit, and perhaps its subcommand, such as `lab up`.
 _COMMAND: Final = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)(?P<rest>[^;\n`]*)")
 
 
-class Given:
-    """What the operator gave.
+class CliOptions:
+    """The options that the operator gave and that remedies repeat.
 
     Args:
-        parser: Of the whole command line.
+        parser: The parser of the whole command line.
     """
 
     def __init__(self, parser: Parser) -> None:
         self._parser = parser
         self._options: list[tuple[str, str]] = []
 
-    def take(self, arguments: argparse.Namespace) -> None:
-        """Take what was parsed."""
+    def read(self, arguments: argparse.Namespace) -> None:
+        """Store the options to repeat from parsed arguments."""
         for name in _CARRIED:
             value = getattr(arguments, name, None)
             values = value if isinstance(value, list) else [] if value is None else [value]
-            self._options += [(f"--{name}", str(one)) for one in values]
+            self._options += [(f"--{name}", str(item)) for item in values]
         for name in _CARRIED_FLAGS:
             if getattr(arguments, name, False):
                 self._options.append((f"--{name.replace('_', '-')}", ""))
 
-    def completed(self, found: re.Match[str]) -> str:
-        """Return a command with the options that it takes, and that were given."""
+    def completed(self, match: re.Match[str]) -> str:
+        """Return the matched command with those of the given options that it accepts."""
         parser, words = self._parser, list[str]()
-        for word in found["words"].split():
-            inner = parser.command(word)
-            if inner is None:
+        for word in match["words"].split():
+            subparser = parser.command(word)
+            if subparser is None:
                 break
-            parser, words = inner, [*words, word]
+            parser, words = subparser, [*words, word]
         missing = [
             shlex.join((option, value) if value else (option,))
             for option, value in self._options
-            if parser.takes(option, value) and f"{option} " not in f"{found[0]} "
+            if parser.takes(option, value) and f"{option} " not in f"{match[0]} "
         ]
         if not words or not missing:
-            return found[0]
+            return match[0]
         begin = f"fieldkit {' '.join(words)}"
-        return f"{begin} {' '.join(missing)}{found[0].removeprefix(begin)}"
+        return f"{begin} {' '.join(missing)}{match[0].removeprefix(begin)}"
 
 
-_known: ContextVar[Given | None] = ContextVar("known", default=None)
+_options: ContextVar[CliOptions | None] = ContextVar("options", default=None)
 
 
 @contextmanager
-def completing(parser: Parser) -> Iterator[Given]:
-    """Complete commands while the body runs, by what is given to the object that this yields."""
-    known = Given(parser)
-    token = _known.set(known)
+def completing(parser: Parser) -> Iterator[CliOptions]:
+    """Make `completed` use the options that the yielded object reads, while the body runs."""
+    options = CliOptions(parser)
+    token = _options.set(options)
     try:
-        yield known
+        yield options
     finally:
-        _known.reset(token)
+        _options.reset(token)
 
 
 def completed(text: str) -> str:
-    """Return a text with its commands of fieldkit as they have to be typed here."""
-    known = _known.get()
-    return text if known is None else _COMMAND.sub(known.completed, text)
+    """Return a text with the given options added to its fieldkit commands."""
+    options = _options.get()
+    return text if options is None else _COMMAND.sub(options.completed, text)

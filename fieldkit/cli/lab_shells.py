@@ -1,4 +1,4 @@
-"""Control connections to the robots of a directory's lab, from another process than the lab's."""
+"""Control connections to the robots of a directory's lab, for processes other than the lab."""
 
 import re
 import socket
@@ -14,17 +14,19 @@ from fieldkit.remote.ssh import SshShell
 
 @contextmanager
 def opened(folder: LabFolder) -> Iterator[dict[str, SshShell]]:
-    """Yield the connection of each robot by its name; each is made when it is first used. None where no lab is up.
+    """Yield the connection to each robot by its name, without any if no lab is up. They connect at first use.
 
     Raises:
-        ConfigurationError: The lab's folder is not whole.
+        ConfigurationError: The lab's folder is incomplete.
     """
     shells: dict[str, SshShell] = {}
     try:
         if folder.ssh_config.is_file():
             user = re.search(r"^    User (\S+)$", folder.ssh_config.read_text(encoding="utf-8"), re.MULTILINE)
             if user is None:
-                raise ConfigurationError("names no user", where=str(folder.ssh_config), remedy="fieldkit lab down")
+                raise ConfigurationError(
+                    "it has no line User", where=str(folder.ssh_config), remedy="fieldkit lab down"
+                )
             key = folder.key.read_text(encoding="utf-8")
             for line in folder.known_hosts.read_text(encoding="utf-8").splitlines():
                 name, _, host_key = line.partition(" ")
@@ -37,7 +39,7 @@ def opened(folder: LabFolder) -> Iterator[dict[str, SshShell]]:
 
 
 def _stream(folder: LabFolder, robot: str, timeout_s: float) -> socket.socket:
-    """Return a stream to a robot's SSH server, from the lab's process.
+    """Return a stream to a robot's SSH server, from the process of the lab.
 
     Raises:
         OSError: The lab does not answer, or has no such robot.
@@ -46,7 +48,7 @@ def _stream(folder: LabFolder, robot: str, timeout_s: float) -> socket.socket:
         lab.settimeout(min(timeout_s, TIMEOUT_S))
         lab.connect(str(folder.socket))
         lab.sendall(f"connect {robot}\n".encode())
-        said, descriptors, _, _ = socket.recv_fds(lab, 4096, 1)
+        answer, descriptors, _, _ = socket.recv_fds(lab, 4096, 1)
     if not descriptors:
-        raise OSError(said.decode(errors="replace"))
+        raise OSError(answer.decode(errors="replace"))
     return socket.socket(fileno=descriptors[0])

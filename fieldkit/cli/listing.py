@@ -8,11 +8,11 @@ from fieldkit.core.printing import say
 
 
 def list_or_show(kind: locations.Kind, summary: Callable[[str], str], name: str | None) -> int:
-    """List all of `kind`, or show the file of the one named."""
+    """List all files of `kind`, or show the file called `name`."""
     if name is None:
-        rows = [(one, str(path), summary(one)) for one, path in locations.names(kind).items()]
-        table(("name", "file", "summary"), rows)  # the last may be folded, which breaks a path
+        rows = [(item, str(path), summary(item)) for item, path in locations.names(kind).items()]
+        table(("name", "file", "summary"), rows)  # only the last column may be folded; a path must not be
     else:
-        summary(name)  # a file with an error is not shown as if it were good
+        summary(name)  # raises if the file has an error
         say(locations.find(kind, name).read_text(encoding="utf-8"), end="")
     return 0

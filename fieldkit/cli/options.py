@@ -1,4 +1,4 @@
-"""Turn the options that several commands share into what they mean: the request, the backend, who is asked."""
+"""Build the trial request, the backend and the operator from options that several commands share."""
 
 import argparse
 import sys
@@ -24,7 +24,7 @@ _STANDARD_INPUT: Final = "-"
 
 
 def request(arguments: argparse.Namespace, distance: Distance, *, seed: int = 1, notes: str = "") -> TrialRequest:
-    """Return what the operator asked for at one distance.
+    """Return the trial request at one distance.
 
     Raises:
         ConfigurationError: There is no such procedure, or the recording has no length.
@@ -46,7 +46,7 @@ def request(arguments: argparse.Namespace, distance: Distance, *, seed: int = 1,
 
 @contextmanager
 def operator(arguments: argparse.Namespace, sink: Sink) -> Iterator[Operator]:
-    """Yield who is asked: nobody, lines of a file or of a pipe, or the person at the terminal.
+    """Yield the operator: none with `--yes`, the answers of a file or a pipe, or the person at the terminal.
 
     Raises:
         ConfigurationError: The answers cannot be read.
@@ -58,11 +58,11 @@ def operator(arguments: argparse.Namespace, sink: Sink) -> Iterator[Operator]:
     elif arguments.answers == _STANDARD_INPUT:
         yield Script(sys.stdin, "standard input", sink)
     else:
-        with _opened(arguments.answers) as file:
+        with _open_answers(arguments.answers) as file:
             yield Script(file, arguments.answers, sink)
 
 
-def _opened(path: str) -> TextIO:
+def _open_answers(path: str) -> TextIO:
     try:
         return Path(path).open(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -81,8 +81,8 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
     if site is None and arguments.backend is None:
         sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
     name = backend_name(arguments, site)
-    found = load_backend(name, site, document)
-    found.allow_motion = getattr(arguments, "allow_motion", False)  # which only commands that run trials have
-    if hasattr(found, "allow_motion_after_fault"):  # an optional attribute of a backend with real robots
-        found.allow_motion_after_fault = getattr(arguments, "allow_motion_after_fault", False)
-    return name, found
+    chosen = load_backend(name, site, document)
+    chosen.allow_motion = getattr(arguments, "allow_motion", False)  # only commands that run trials have this option
+    if hasattr(chosen, "allow_motion_after_fault"):  # an optional attribute of a backend with real robots
+        chosen.allow_motion_after_fault = getattr(arguments, "allow_motion_after_fault", False)
+    return name, chosen

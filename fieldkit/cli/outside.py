@@ -1,7 +1,8 @@
-"""Commands of installed packages, found by their entry points; a package is imported when its command is used.
+"""Commands of installed packages, listed by their entry points. A package is imported when its command is used.
 
-`NAME = "package.module:function"` names a function that gets the command's `Parser` and declares what it takes, as
-`arguments` does for fieldkit's own. `run` of the parsed arguments, `package.module:function` too, runs the command.
+`NAME = "package.module:function"` names a function that gets the command's `Parser` and declares the arguments of the
+command, as `add` does in the modules of `fieldkit.cli.commands`. It must set the default `run` to
+`package.module:function`, the function that runs the command.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,10 +16,10 @@ from fieldkit.core.errors import ConfigurationError, FieldkitError
 
 
 def add_all(commands: Commands) -> None:
-    """Add a parser for each command; it learns what it takes when it is used first."""
+    """Add a parser for each command. Its arguments are declared at first use."""
     for name, targets in sorted(names().items()):
         if name in commands.choices:
-            continue  # fieldkit's own
+            continue  # a command of fieldkit
         packages = " and ".join(dict.fromkeys(target.partition(":")[0].partition(".")[0] for target in targets))
         parser: Parser = commands.add_parser(name, help=f"of {packages}, see fieldkit {name} --help")
         parser.set_defaults(outside=name)
@@ -26,8 +27,8 @@ def add_all(commands: Commands) -> None:
         parser.declare = partial(_declare, name, targets)
 
 
-def load(name: str, target: str) -> Any:  # noqa: ANN401 (whatever another package has there)
-    """Return what `package.module:function` of a command's package stands for.
+def load(name: str, target: str) -> Any:  # noqa: ANN401 (an object of any type)
+    """Return the object that `package.module:function` names.
 
     Raises:
         ConfigurationError: It cannot be imported.
@@ -36,18 +37,18 @@ def load(name: str, target: str) -> Any:  # noqa: ANN401 (whatever another packa
 
 
 def names() -> Mapping[str, Sequence[str]]:
-    """Return the commands that packages add, and what each stands for: several things where packages clash."""
-    found: dict[str, dict[str, None]] = {}
+    """Return the entry points of each command by its name. Several entry points mean that packages conflict."""
+    targets: dict[str, dict[str, None]] = {}
     for point in plugins.points(plugins.COMMANDS):
-        found.setdefault(point.name, {})[point.value] = None
-    return {name: tuple(targets) for name, targets in found.items()}
+        targets.setdefault(point.name, {})[point.value] = None
+    return {name: tuple(values) for name, values in targets.items()}
 
 
 def _declare(name: str, targets: Sequence[str], parser: Parser) -> None:
-    """Let the package of a command declare what it takes.
+    """Call the package of a command to declare its arguments.
 
     Raises:
-        ConfigurationError: It cannot be loaded, raises something, or another package adds a command of this name.
+        ConfigurationError: It cannot be loaded, raises an error, or another package adds a command of the same name.
     """
     if len(targets) > 1:
         raise ConfigurationError(
@@ -60,7 +61,7 @@ def _declare(name: str, targets: Sequence[str], parser: Parser) -> None:
         raise
     except Exception as error:
         raise ConfigurationError(
-            f"it cannot say what it takes: {type(error).__name__}: {error}",
+            f"its arguments cannot be declared: {type(error).__name__}: {error}",
             where=f"entry point {name} = {targets[0]}",
             remedy=plugins.REMEDY,
         ) from error

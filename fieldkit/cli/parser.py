@@ -1,4 +1,7 @@
-"""Parse command lines; a typing error is told as every other error is, with what was perhaps meant."""
+"""Parse command lines.
+
+A usage error is raised as every other error is, with a suggestion if there is a similar word.
+"""
 
 import argparse
 import difflib
@@ -16,16 +19,17 @@ _NEGATIVE: Final = re.compile(r"-\.?\d")
 
 
 class Parser(argparse.ArgumentParser):
-    """An `ArgumentParser` whose errors are `ConfigurationError`s; so are those of its subcommands.
+    """An `ArgumentParser` that raises usage errors as `ConfigurationError`, also for its subcommands.
 
     Attributes:
-        takes_lengths: Whether `-5m` is a length: argparse takes what begins with a dash for an option, unless it is a
-            number without a unit.
-        declare: Declares what it takes, called when it is used first; None where that is known from the start.
-        is_foreign: Whether a package declares it: no other command waits for the package, or breaks with it.
+        takes_lengths: True if `-5m` is a length. Otherwise argparse parses a word that begins with a dash as an
+            option, unless it is a number without a unit.
+        declare: Declares the arguments, called at first use. None if they are declared already.
+        is_foreign: True if another package declares the arguments. They are declared only when this command is used,
+            so that other commands neither load the package nor fail with it.
     """
 
-    def __init__(self, *words: Any, **options: Any) -> None:  # noqa: ANN401 (as they come)
+    def __init__(self, *words: Any, **options: Any) -> None:  # noqa: ANN401 (passed to argparse unchanged)
         super().__init__(*words, **options)
         self.takes_lengths = False
         self.declare: Callable[[Parser], None] | None = None
@@ -33,33 +37,34 @@ class Parser(argparse.ArgumentParser):
         self._commands: Commands = None
         self._words: Sequence[str] = ()
 
-    def add_commands(self, **options: Any) -> Commands:  # noqa: ANN401 (as they come)
-        """Return what `add_subparsers` returns; a subcommand that is not there is then told with the nearest.
+    def add_commands(self, **options: Any) -> Commands:  # noqa: ANN401 (passed to argparse unchanged)
+        """Return the object of `add_subparsers`; an error about an unknown subcommand names the nearest one.
 
-        Without one, `run` of the parsed arguments is None and `parser` is this one, whose help is wanted.
+        Without a subcommand, `run` of the parsed arguments is None, and `parser` is this parser, whose help is
+        printed.
         """
         self._commands = self.add_subparsers(**options)
         self.set_defaults(run=None, parser=self)
         return self._commands
 
     def complete(self) -> None:
-        """Let it know what it takes, if it does not yet.
+        """Declare the arguments unless this is done already.
 
         Raises:
-            FieldkitError: That cannot be had.
+            FieldkitError: A package cannot declare them.
         """
         declare, self.declare = self.declare, None
         if declare is not None:
             declare(self)
 
     def subcommands(self) -> Sequence[str]:
-        """Return the names of its subcommands."""
+        """Return the names of the subcommands."""
         return tuple(self._commands.choices) if self._commands else ()
 
     def command(self, name: str) -> "Parser | None":
-        """Return the parser of a subcommand, None where there is none of this name.
+        """Return the parser of a subcommand, or None if there is none of this name.
 
-        It knows what it takes, unless a package has yet to declare it.
+        Its arguments are declared, unless another package declares them.
         """
         parser: Parser | None = self._commands.choices.get(name) if self._commands else None
         if parser is not None and not parser.is_foreign:
@@ -67,12 +72,12 @@ class Parser(argparse.ArgumentParser):
         return parser
 
     def takes(self, option: str, value: str) -> bool:
-        """Return whether `option` may be given, with this value as its own and not as its default."""
+        """Return True if the parser has `option`, and `value` is not its default."""
         action = self._option_string_actions.get(option)
         return action is not None and str(action.default) != value
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> tuple[Any, list[str]]:  # type: ignore[override] # noqa: ANN401 (a namespace of any kind)
-        """See `ArgumentParser.parse_known_args`; argparse calls it for each subcommand, too.
+        """Parse as `ArgumentParser` does; argparse calls this for each subcommand, too.
 
         Raises:
             ConfigurationError: There is no such subcommand or option.
@@ -81,43 +86,44 @@ class Parser(argparse.ArgumentParser):
         words = list(sys.argv[1:] if args is None else args)
         self._words = words
         if self._commands is not None:
-            self._demand_command(words)
+            self._require_command(words)
         if self.takes_lengths:
-            # A word that begins with a space is no option; converters of lengths strip it.
+            # argparse does not parse a word with a leading space as an option. Converters of lengths
+            # remove the space.
             words = [f" {word}" if _NEGATIVE.match(word) else word for word in words]
         arguments, unknown = super().parse_known_args(words, namespace)
         if unknown:
             raise self._unknown(unknown[0])
         return arguments, unknown
 
-    def _demand_command(self, words: Sequence[str]) -> None:
-        """Refuse a subcommand that is not there: before it stand options alone, none of which has a value."""
+    def _require_command(self, words: Sequence[str]) -> None:
+        """Raise an error for an unknown subcommand. Only options without values can precede a subcommand."""
         for word in words:
             if word in {"-h", "--help", "--version"}:
                 return
             if not word.startswith("-"):
-                self._one_of("COMMAND", word, self._commands.choices)
+                self._require_choice("COMMAND", word, self._commands.choices)
                 return
             if word.startswith("--") and not any(option.startswith(word) for option in self._options()):
                 raise self._unknown(word)
 
     def _unknown(self, word: str) -> ConfigurationError:
-        """Return the error for a word that is not taken, with the option that is perhaps meant."""
+        """Return the error for an unknown word, with the most similar option."""
         name = word.partition("=")[0]
         for parser in filter(None, (self, *map(self.command, self.subcommands()))):
             if near := difflib.get_close_matches(name, parser._options(), n=1):  # noqa: SLF001 (of another Parser)
                 command = "" if parser is self else f"{parser.prog} "
                 return ConfigurationError(
-                    f"{self.prog} does not take {word!r}", remedy=f"did you mean {command + near[0]!r}?"
+                    f"{self.prog} has no option or argument {word!r}", remedy=f"did you mean {command + near[0]!r}?"
                 )
-        return ConfigurationError(f"{self.prog} does not take {word!r}", remedy=f"{self.prog} --help")
+        return ConfigurationError(f"{self.prog} has no option or argument {word!r}", remedy=f"{self.prog} --help")
 
     def _options(self) -> list[str]:
-        """Return the long options, as the help lists them: argparse has no public list."""
+        """Return the long options, read from the help because argparse has no public list."""
         return _OPTION.findall(self.format_help())
 
     def error(self, message: str) -> NoReturn:
-        """Raise what was typed wrong: an option that is not there before all that argparse misses because of it.
+        """Raise a usage error. An unknown option has priority over the errors that follow from it.
 
         Raises:
             ConfigurationError: Always.
@@ -128,21 +134,21 @@ class Parser(argparse.ArgumentParser):
                 raise self._unknown(word)
         raise ConfigurationError(message, remedy=f"{self.prog} --help")
 
-    def add_choice(self, name: str, choices: Iterable[str], **options: Any) -> None:  # noqa: ANN401 (as they come)
-        """Add an argument with a value of `choices`; another one is told with the nearest."""
-        known = tuple(choices)
-        self.add_argument(name, choices=known, type=self._choice(options.get("metavar", name), known), **options)
+    def add_choice(self, name: str, choices: Iterable[str], **options: Any) -> None:  # noqa: ANN401 (passed to argparse unchanged)
+        """Add an argument with one of `choices` as its value; an error about another value names the nearest one."""
+        values = tuple(choices)
+        self.add_argument(name, choices=values, type=self._choice(options.get("metavar", name), values), **options)
 
-    def _choice(self, name: str, known: Sequence[str]) -> Callable[[str], str]:
+    def _choice(self, name: str, choices: Sequence[str]) -> Callable[[str], str]:
         def converted(text: str) -> str:
-            self._one_of(name, text, known)
+            self._require_choice(name, text, choices)
             return text
 
         return converted
 
-    def _one_of(self, what: str, typed: str, known: Iterable[str]) -> None:
-        if typed not in known:
+    def _require_choice(self, argument: str, typed: str, choices: Iterable[str]) -> None:
+        if typed not in choices:
             raise ConfigurationError(
-                f"{what} cannot be {typed!r}; it is one of: {', '.join(known)}",
-                remedy=nearest(typed, known, f"{self.prog} --help"),
+                f"{argument} cannot be {typed!r}; it is one of: {', '.join(choices)}",
+                remedy=nearest(typed, choices, f"{self.prog} --help"),
             )

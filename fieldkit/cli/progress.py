@@ -1,4 +1,4 @@
-"""The line at the bottom of a terminal: how far trial, campaign or computation are, and what is being done."""
+"""The line at the bottom of a terminal: progress of trial, campaign or computation, and the current phase."""
 
 import time
 from typing import Final
@@ -24,7 +24,7 @@ Words = tuple[tuple[str, str], ...]
 """Texts with their styles, in order."""
 
 _BARS: Final = {100: 24, 60: 12, 0: 6}
-"""Width of the bar by the least width of the line, so that it does not jump with the words beside it."""
+"""Width of the bar by the least width of the line. Fixed widths keep the bar from moving when texts change."""
 _APART: Final = "  "
 _CUT: Final = "..."
 _FULL: Final = "\N{BOX DRAWINGS HEAVY HORIZONTAL}"
@@ -32,12 +32,12 @@ _EMPTY: Final = "\N{BOX DRAWINGS LIGHT HORIZONTAL}"
 
 
 def shortened(text: str, width: int) -> str:
-    """Return a text of at most `width` characters; one that is cut ends in `...`."""
+    """Return a text of at most `width` characters. A shortened text ends in `...`."""
     return text if len(text) <= width else f"{text[: max(width - len(_CUT), 0)]}{_CUT}"[:width]
 
 
 class ProgressBar:
-    """How far a trial or a computation is."""
+    """The progress of a trial or a computation."""
 
     def __init__(self) -> None:
         self._phase = PhaseStarted("")
@@ -49,14 +49,14 @@ class ProgressBar:
 
     @property
     def is_needed(self) -> bool:
-        """Whether there is something to show; a line that redraws itself would write over what an operator types."""
+        """True if there is something to show and no input is expected, which a redrawn line would overwrite."""
         return bool(self._phase.name) and not self._asking
 
-    def take(self, event: Event) -> None:
-        """Take up what happened."""
-        # Other threads may tell something while the operator is asked.
-        asked = isinstance(event, Request | Asked)
-        self._asking = asked or (self._asking and not isinstance(event, Answered | Entered))
+    def update(self, event: Event) -> None:
+        """Update the progress by an event."""
+        # Other threads may send events while the operator types.
+        is_question = isinstance(event, Request | Asked)
+        self._asking = is_question or (self._asking and not isinstance(event, Answered | Entered))
         match event:
             case PhaseStarted():
                 self._phase, self._phase_began_s = event, time.monotonic()
@@ -76,26 +76,29 @@ class ProgressBar:
                 self._phase, self._done, self._total, self._ends_s = PhaseStarted(""), 0, 0, None
 
     def words(self, width: int) -> Words:
-        """Return the line, at most `width` columns long: what is least needed goes first where room is short."""
+        """Return the line, at most `width` columns long.
+
+        If space is short, the least important texts are left out.
+        """
         now_s = time.monotonic()
         count = f"{self._done:g}/{self._total:g}{self._unit}" if self._total else ""
-        whole_s = 0.0 if self._ends_s is None else self._ends_s - now_s
-        whole = f"{format_duration(whole_s)} left" if whole_s > 0 else ""
+        total_left_s = 0.0 if self._ends_s is None else self._ends_s - now_s
+        total_left = f"{format_duration(total_left_s)} left" if total_left_s > 0 else ""
         spent_s = now_s - self._phase_began_s
         left_s = (self._phase.expected_s or 0.0) - spent_s
         phase = f"{self._phase.repeat} {self._phase.name}".strip()
-        lasts = f"{format_duration(left_s)} left" if left_s > 0 else f"for {format_duration(spent_s)}"
-        pieces = [(self._trial, "bold"), (count, ""), (whole, "dim"), (phase, "cyan"), (lasts, "dim")]
-        for least in (None, self._trial, whole, lasts, count):
-            pieces = [piece for piece in pieces if piece[0] and piece[0] is not least]
-            room = width - len(_APART.join(text for text, _ in pieces))
-            if room >= 0:
+        phase_time = f"{format_duration(left_s)} left" if left_s > 0 else f"for {format_duration(spent_s)}"
+        pieces = [(self._trial, "bold"), (count, ""), (total_left, "dim"), (phase, "cyan"), (phase_time, "dim")]
+        for left_out in (None, self._trial, total_left, phase_time, count):
+            pieces = [piece for piece in pieces if piece[0] and piece[0] is not left_out]
+            free = width - len(_APART.join(text for text, _ in pieces))
+            if free >= 0:
                 break
         bar = next(bar for least, bar in _BARS.items() if width >= least)
         words: list[tuple[str, str]] = []
         for text, style in pieces:
             words += [(_APART, "")] * bool(words)
-            if text is count and bar + len(_APART) <= room:
+            if text is count and bar + len(_APART) <= free:
                 full = int(bar * self._done / self._total)
                 words += [(_FULL * full, "green"), (_EMPTY * (bar - full), "dim"), (_APART, "")]
             words.append((shortened(text, width), style))

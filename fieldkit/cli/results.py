@@ -1,4 +1,4 @@
-"""Print the results of trials: a table per condition, what to type next, what failed, and the exit code."""
+"""Print the results of trials: a table per condition, next commands, failures. Return the exit code."""
 
 import argparse
 import re
@@ -24,40 +24,40 @@ _LENGTH: Final = re.compile(r"(?P<number>[0-9]+(?:\.[0-9]+)?)(?P<unit>[a-z]+)")
 
 
 def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) -> int:
-    """Print the table of each trial that was not left for later, and return the exit code of all.
+    """Print the table of each trial that was not skipped, and return the exit code for all trials.
 
     Args:
-        outcomes: What trials came to.
-        arguments: Of the command: `json`, which prints no table, `all` quantities in it, and `junit`, a file that
-            gets them too.
+        outcomes: The outcomes of trials, None for each skipped one.
+        arguments: The arguments of the command: `json` prints no table, `all` prints all quantities, and `junit` is a
+            file that gets the results, too.
     """
-    ended, quiet = [outcome for outcome in outcomes if outcome is not None], arguments.json
+    ended, is_json = [outcome for outcome in outcomes if outcome is not None], arguments.json
     left_out = 0
     for outcome in ended:
-        if not quiet:
+        if not is_json:
             expected = {judgement.expectation.quantity for judgement in outcome.judgements}
             left_out = max(left_out, summary.show(outcome.cells, every=arguments.all, expected=expected))
             expectation_table(outcome.judgements)
         if outcome.failed:
             reasons = outcome.folder / store.TRIAL_CSV
             failed = format_count(outcome.failed, "repeat")
-            again = typed("fieldkit", "resume", outcome.folder, "--failed")
-            remedy = f"correct what the reasons name, then redo them: {again}"
+            command = typed("fieldkit", "resume", outcome.folder, "--failed")
+            remedy = f"correct what the reasons name, then redo them: {command}"
             show_error(f"{failed} failed; reasons in {reasons}\n  remedy: {remedy}")
-    if not quiet:
+    if not is_json:
         _show_next(ended, left_out)
     skipped = len(outcomes) - len(ended)
     if skipped:
         show_error(f"{skipped} of {len(outcomes)} skipped\n  remedy: run the command again for what was skipped")
-    keep_junit(arguments, [outcome.folder for outcome in ended])
+    write_junit(arguments, [outcome.folder for outcome in ended])
     if any(outcome.failed for outcome in ended):
         return EvidenceError.exit_code
-    unmet = any(not one.holds for outcome in ended for one in outcome.judgements)
+    unmet = any(not judgement.holds for outcome in ended for judgement in outcome.judgements)
     return FieldkitError.exit_code if skipped or unmet else 0
 
 
-def keep_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
-    """Write trials as JUnit XML where `--junit` asks for it.
+def write_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
+    """Write trials as JUnit XML into the file of `--junit`, if given.
 
     Raises:
         ConfigurationError: The file cannot be written.
@@ -75,20 +75,20 @@ def keep_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
 
 
 def expectation_table(judgements: Sequence[Judgement]) -> None:
-    """Print what the figures say of expectations, a line each; nothing where nothing was expected."""
+    """Print a row for each expectation with its judgement. Without expectations, print nothing."""
     if judgements:
-        rows = [wording.judged(one) for one in judgements]
+        rows = [wording.judged(judgement) for judgement in judgements]
         table(("expected", "of", "measured", "[95 % interval]", ""), rows, fold=(0, 4))
 
 
 def _show_next(ended: Sequence[Outcome], left_out: int) -> None:
-    """Print the commands that a person most likely types next; nothing after trials without a valid repeat."""
+    """Print likely next commands, unless all trials are without a valid repeat."""
     if any(outcome.valid for outcome in ended):
-        for index, command in enumerate(_next(ended, left_out)):
-            say(f"{'      ' if index else 'next: '}{completed(command)}")  # never folded, so that it can be copied
+        for index, command in enumerate(_next_commands(ended, left_out)):
+            say(f"{'      ' if index else 'next: '}{completed(command)}")  # not folded, so that it can be copied
 
 
-def _next(ended: Sequence[Outcome], left_out: int) -> Iterator[str]:
+def _next_commands(ended: Sequence[Outcome], left_out: int) -> Iterator[str]:
     folders = [outcome.folder for outcome in ended]
     yield typed("fieldkit", "report", *folders)
     if left_out:
@@ -100,12 +100,12 @@ def _next(ended: Sequence[Outcome], left_out: int) -> Iterator[str]:
 
 
 def _lost_all(cell: Cell) -> bool:
-    """Return whether no ping of a cell was answered: no reason to go farther away."""
+    """Return True if no ping of a cell was answered. Then a longer distance is not suggested."""
     return any(plain_name(name) == "rtt_loss" and estimate.value >= 1 for name, estimate in cell.estimates.items())
 
 
 def _farther(distances: Sequence[str]) -> str:
-    """Return a distance beyond the last one: as far again as that is from the one before; empty for a word."""
+    """Return the last distance plus its difference to the one before, or an empty string if distances are words."""
     matches = [match for distance in distances[-2:] if (match := _LENGTH.fullmatch(distance))]
     if not matches:
         return ""

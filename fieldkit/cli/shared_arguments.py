@@ -1,4 +1,4 @@
-"""Arguments that several commands take. Nothing here imports what a command runs."""
+"""Arguments that several commands share. Nothing here imports what a command runs."""
 
 import argparse
 from pathlib import Path
@@ -13,7 +13,7 @@ from fieldkit.core.text import harmless
 TABLES: Final = ("table", "csv", "json", "markdown")
 PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
 CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,protocol"
-"""`analysis.quantities.DEFAULT_BY`, which a test compares."""
+"""Equal to `analysis.quantities.DEFAULT_BY`; a test compares them."""
 
 _MOST_DIGITS: Final = 15
 
@@ -21,7 +21,7 @@ _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 
 
 def add_site(parser: Parser) -> None:
-    """Add the options that say which robots."""
+    """Add the options that select robots."""
     names = ", ".join(point.name for point in plugins.points(plugins.BACKENDS))
     parser.add_argument(
         "--backend", metavar="NAME", help=f"one of: {names} (default: the site file's; without one, emulated)"
@@ -35,19 +35,19 @@ def add_site(parser: Parser) -> None:
 
 
 def add_operator(parser: Parser) -> None:
-    """Add the options that say who is asked."""
+    """Add the options for questions to the operator and for motion of robots."""
     answers = parser.add_mutually_exclusive_group()
-    answers.add_argument("--yes", action="store_true", help="do not ask: the robots stand where they should")
+    answers.add_argument("--yes", action="store_true", help="ask nothing: the robots are at their positions")
     answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: from standard input")
     parser.add_argument(
         "--allow-motion",
         action="store_true",
-        help="let fieldkit itself drive real robots where steps move them (safety: `fieldkit docs motion`)",
+        help="allow fieldkit to drive real robots in steps that move them (safety: `fieldkit docs motion`)",
     )
     parser.add_argument(
         "--allow-motion-after-fault",
         action="store_true",
-        help="after a fault stopped a robot, let robots move again from where they are, without asking anybody",
+        help="after a fault stopped a robot, let robots move again from their positions without a question",
     )
 
 
@@ -65,13 +65,13 @@ BAG_HELP: Final = "a .bag, .db3 or .mcap file, or the folder of a bag of ROS 2"
 
 
 def add_bag(parser: Parser) -> None:
-    """Add the bag that a command reads."""
+    """Add the argument for the bag that a command reads."""
     parser.add_argument("bag", type=Path, metavar="BAG", help=BAG_HELP)
 
 
 def add_json(parser: Parser) -> None:
-    """Add the option for programs that read along."""
-    parser.add_argument("--json", action="store_true", help="one event a line instead of the display")
+    """Add the option for output that programs read."""
+    parser.add_argument("--json", action="store_true", help="print events as JSON, one per line")
 
 
 def add_all(parser: Parser) -> None:
@@ -82,14 +82,14 @@ def add_all(parser: Parser) -> None:
 
 
 def add_out(parser: Parser, what: str) -> None:
-    """Add the option for where results go."""
+    """Add the option for the folder of results."""
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", default=Path("trials"), help=f"where {what} (default: trials/)"
     )
 
 
 def add_changes(parser: Parser) -> None:
-    """Add the options that change what the procedure says."""
+    """Add the options that override settings of the procedure."""
     parser.add_choice("--topology", map(str, Topology), help="default: the procedure's")
     parser.add_choice("--protocol", map(str, Protocol), action="append", help=_PROTOCOL_HELP)
     parser.add_argument("--repeats", type=repeats, metavar="N", help="per protocol (default: the procedure's)")
@@ -97,17 +97,17 @@ def add_changes(parser: Parser) -> None:
 
 
 def add_robots(parser: Parser) -> None:
-    """Add the options that say which robots a lab has."""
+    """Add the options that select the robots of a lab."""
     add_site(parser)
     parser.add_argument(
-        "--robots", type=int, metavar="N", help="robots robot-1 to robot-N instead of those in the site file"
+        "--robots", type=int, metavar="N", help="use robots robot-1 to robot-N instead of those in the site file"
     )
     profile = "turtlebot3_burger"
-    parser.add_argument("--profile", metavar="NAME", default=profile, help=f"what they are (default {profile})")
+    parser.add_argument("--profile", metavar="NAME", default=profile, help=f"their profile (default {profile})")
 
 
 def add_trial(parser: Parser, help_line: str = "folder of a trial") -> None:
-    """Add the folder of one trial."""
+    """Add the argument for the folder of one trial."""
     parser.add_argument("trial", type=Path, metavar="TRIAL", help=help_line)
 
 
@@ -136,7 +136,7 @@ def add_cells(parser: Parser, default: str = CONDITION) -> None:
 
 
 def add_show(parser: Parser, dest: str, what: str) -> None:
-    """Let a listing command take `show NAME`, which is None where all are listed."""
+    """Add `show NAME` to a listing command. `dest` is None if all are listed."""
     parser.usage = "%(prog)s [-h] [show NAME]"
     show = parser.add_commands(metavar="show NAME", prog=parser.prog).add_parser("show", help=f"show one {what}")
     show.add_argument(dest, metavar="NAME", help=f"name of the {what}")
@@ -144,14 +144,14 @@ def add_show(parser: Parser, dest: str, what: str) -> None:
 
 
 def file_to_write(text: str) -> Path:
-    """Return a file whose folder is there; argparse tells of one that is not, before anybody walks."""
+    """Return a path whose folder exists; argparse reports a missing folder before the trial starts."""
     if not Path(text).parent.is_dir():
         raise argparse.ArgumentTypeError(f"there is no folder {str(Path(text).parent)!r}")
     return Path(text)
 
 
 def natural(text: str) -> int:
-    """Return a whole number from 0 that a plan can hold; argparse tells what is none."""
+    """Return a whole number from 0 with at most 15 digits; argparse reports other texts."""
     if not text.isascii() or not text.isdigit():
         raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number from 0")
     if len(text) > _MOST_DIGITS:
@@ -160,12 +160,12 @@ def natural(text: str) -> int:
 
 
 def repeats(text: str) -> int:
-    """Return a number of repeats; argparse tells what is none."""
+    """Return a number of repeats from 1; argparse reports other texts."""
     if not 1 <= natural(text) <= MOST_REPEATS:
         raise argparse.ArgumentTypeError(f"must be at least 1, and at most {MOST_REPEATS}")
     return int(text)
 
 
 def free_text(text: str) -> str:
-    """Return what was typed as a file can hold it: bytes that are no UTF-8, and what moves a cursor, become `?`."""
+    """Return a text with `?` in place of bytes that are not UTF-8 and of control characters."""
     return harmless(text)

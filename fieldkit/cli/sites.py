@@ -1,4 +1,4 @@
-"""The site file that a command line chooses; imports little, for commands that must start quickly."""
+"""Find the site file for a command line. Imports little, for commands that must start quickly."""
 
 import argparse
 from pathlib import Path
@@ -12,7 +12,7 @@ DEFAULT_BACKEND: Final = "emulated"
 
 
 def lab_site(arguments: argparse.Namespace) -> tuple[Site, Document] | tuple[None, None]:
-    """Return the site file that the options choose, with its document; none where there is none.
+    """Return the site file that the options choose, with its document, or None for both without a site file.
 
     Raises:
         ConfigurationError: As `load_site`.

@@ -1,4 +1,4 @@
-"""The table of trials that an operator reads: quantities down, protocols across."""
+"""The table of trials for an operator: quantities in rows, protocols in columns."""
 
 from collections.abc import Collection, Sequence
 
@@ -9,19 +9,19 @@ from fieldkit.cli.display import fits, prose, table
 
 Row = tuple[str, ...]
 _Table = tuple[Row, list[Row]]
-"""Its head and its rows."""
+"""Head and rows of a table."""
 
 
 def show(cells: Sequence[Cell], *, every: bool = False, expected: Collection[str] = ()) -> int:
-    """Print a table per condition, each value with its 95 % interval, and return how many quantities are left out.
+    """Print a table per condition, each value with its 95 % interval, and return the number of omitted quantities.
 
-    Where the terminal is too narrow, each protocol has a table of its own; where that is too wide, intervals are
-    below their values, and labels are folded.
+    If the terminal is too narrow for that, each protocol has a separate table; if that is still too wide, intervals
+    are below their values and labels are folded.
 
     Args:
-        cells: What to show.
-        every: Whether to show all quantities, not only those of `lines.of_operator`.
-        expected: Names of quantities with an expectation, which are always shown.
+        cells: The cells to show.
+        every: True to show all quantities, not only those of `lines.of_operator`.
+        expected: Names of quantities with an expectation. They are always shown.
     """
     groups: dict[tuple[str | float | None, ...], list[Cell]] = {}
     for cell in cells:
@@ -31,8 +31,8 @@ def show(cells: Sequence[Cell], *, every: bool = False, expected: Collection[str
     for condition, group in groups.items():
         title = ", ".join(str(part) for part in condition)
         shown = lines.lines(group) if every else lines.with_radio_loss(lines.of_operator(group, expected), group)
-        names |= (here := {quantity.name for line in shown for quantity in line.quantities})
-        left_out |= {quantity.name for quantity in wording.measured(group)} - here
+        names |= (group_names := {quantity.name for line in shown for quantity in line.quantities})
+        left_out |= {quantity.name for quantity in wording.measured(group)} - group_names
         layouts: Sequence[tuple[list[_Table], Sequence[int]]] = (
             ([_summary(group, shown)], ()),
             ([_summary([cell], shown) for cell in group], ()),
@@ -59,5 +59,5 @@ def _summary(group: Sequence[Cell], shown: Sequence[TableLine], between: str = "
 
 
 def more(left_out: int) -> str:
-    """Return how many quantities a table leaves out, in words."""
+    """Return the number of omitted quantities in words."""
     return f"{left_out} more {'quantity' if left_out == 1 else 'quantities'}"

@@ -1,4 +1,4 @@
-"""Robots and procedures by name: YAML files of the lab's own folder first, then those that ship with fieldkit."""
+"""Robots and procedures by name: YAML files in the lab's folder first, then those that ship with fieldkit."""
 
 from typing import TypeVar
 
@@ -9,7 +9,7 @@ from fieldkit.core.errors import ConfigurationError
 
 
 class Named(Strict):
-    """Base of what a catalog file holds.
+    """Base of the models of catalog files.
 
     Attributes:
         name: The file's name without `.yaml`.
@@ -30,10 +30,10 @@ def load(kind: Kind, name: str, model: type[Item]) -> Item:
 
 
 def named(document: schema.Document, model: type[Item], name: str) -> Item:
-    """Return a document as a frozen `model` of that name.
+    """Return a document as a frozen `model` with this name.
 
     Raises:
-        ConfigurationError: As `schema.validate`, or its `name` is another than the file has.
+        ConfigurationError: As `schema.validate`, or the `name` in the file is not its file name.
     """
     loaded = schema.validate(document, model)
     if loaded.name != name:

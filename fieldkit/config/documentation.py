@@ -21,7 +21,7 @@ class Page:
 
     Attributes:
         path: Its file.
-        anchor: Section in it; empty for its beginning.
+        anchor: The section in it; empty for the start of the page.
     """
 
     path: Path
@@ -55,7 +55,7 @@ def topics() -> dict[str, Path]:
 
 
 def find(topic: str) -> Page:
-    """Return the page of a topic; of a command, its section of the page of all commands.
+    """Return the page of a topic; for a command, its section in the page of all commands.
 
     Raises:
         ConfigurationError: There is no such topic (the nearest is given), or no documentation.
@@ -73,6 +73,6 @@ def find(topic: str) -> Page:
 
 
 def _commands(reference: Path) -> set[str]:
-    """Return the names of the commands that a page has a section for, as its links to them have it."""
+    """Return the names of the commands that a page describes, read from the page's links to their sections."""
     text = reference.read_text(encoding="utf-8")
     return {part.partition('"')[0].partition(")")[0] for part in text.split("#fieldkit-")[1:]}

@@ -28,18 +28,18 @@ _MAX_BYTES: Final = 1 << 20
 _MAX_DEPTH: Final = 50
 _MAX_INT: Final = 2**63 - 1
 _MAX_DIGITS: Final = 100
-"""What a number may be written with: Python takes time that grows with the square of their count."""
+"""Most characters of a number. The time of Python's conversion grows with the square of the length."""
 _NO_TEXT: Final = re.compile("[\0\ud800-\udfff]")
-"""Characters that an escape in quotes can name, and no file name, argument or UTF-8 file can hold."""
+"""Characters that an escape sequence can produce, but that file names, arguments and UTF-8 files cannot contain."""
 
 Location = tuple[str | int, ...]
-"""Keys and indices that lead from the root of a document to a value."""
+"""Keys and indices from the root of a document to a value."""
 
 
 class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
     """Reads YAML 1.2: only true and false are booleans, `1:30` and `on` are text, 010 is 10.
 
-    It refuses aliases, tags, deep nesting and numbers that overflow, with their line.
+    Aliases, tags, deep nesting and numbers that overflow are errors, reported with their line.
     """
 
     def __init__(self, text: str) -> None:
@@ -52,26 +52,28 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
         self._depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Return a node, as PyYAML does, unless it is of what is left out."""
+        """Return a node, as PyYAML does; raise an error for unsupported YAML."""
         event = self.peek_event()  # type: ignore[no-untyped-call]
-        # Aliases hide what a file says, and nested ones grow without bound.
+        # Aliases make a file hard to read, and nested aliases can expand without bound.
         if isinstance(event, yaml.events.AliasEvent):
             raise _problem("aliases (*name) are not supported", event)
-        # A tag would have PyYAML convert what stands there, by rules of YAML 1.1.
+        # A tag would make PyYAML convert the value by the rules of YAML 1.1.
         if getattr(event, "tag", None) is not None:
-            raise _problem("tags (!name) are not supported; text that begins with ! goes in quotes", event)
-        # PyYAML calls itself at each level.
+            raise _problem("tags (!name) are not supported; put text that begins with ! in quotes", event)
+        # PyYAML recurses at each level.
         if self._depth >= _MAX_DEPTH:
             raise _problem(f"nested more than {_MAX_DEPTH} deep", event)
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
         if isinstance(node, yaml.ScalarNode) and _NO_TEXT.search(node.value):
-            raise _problem("this text has a character that no file can hold (\\0, or half of a pair)", event)
+            raise _problem(
+                "this text has a character that no file can hold (\\0, or half of a surrogate pair)", event
+            )
         return node
 
     def whole(self, node: yaml.ScalarNode) -> int:
-        """Return a whole number; zeros before it count nothing."""
+        """Return a whole number. Leading zeros have no effect."""
         if len(node.value) > _MAX_DIGITS or abs(number := int(node.value)) > _MAX_INT:
             raise _problem(f"this number is beyond {_MAX_INT}", node)
         return number
@@ -84,18 +86,19 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
 
 
 def _problem(text: str, place: yaml.Node | yaml.Event) -> yaml.MarkedYAMLError:
-    return yaml.MarkedYAMLError(problem=text, problem_mark=place.start_mark)  # type: ignore[arg-type] # a C mark has a line, too
+    return yaml.MarkedYAMLError(problem=text, problem_mark=place.start_mark)  # type: ignore[arg-type] # marks of the C parser have a line, too
 
 
-# PyYAML's types know its own loaders alone.
+# The type annotations of PyYAML accept only its own loaders.
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.whole)  # type: ignore[type-var]
 _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.real)  # type: ignore[type-var]
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that quotes what either version of YAML takes for a number: a hash may be `6372e70369712148`.
+    """SafeDumper that quotes text which YAML 1.1 or 1.2 would read as a number, such as the hash `6372e70369712148`.
 
-    It escapes line ends of YAML 1.1 beside the line feed, which it would write as they are and read as spaces.
+    It escapes the line ends of YAML 1.1 other than the line feed, because SafeDumper does not and they would be read
+    back as spaces.
     """
 
     def represent_text(self, text: str) -> yaml.Node:
@@ -123,19 +126,19 @@ for _tag, (_pattern, _first) in _CORE_SCHEMA.items():
         _class.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
 
 
-# PyYAML makes numbers and characters of a few escapes and directives, and does not look whether it can.
+# PyYAML converts some escapes and directives without checks, so invalid ones raise ValueError or OverflowError.
 _NOT_YAML: Final = (yaml.YAMLError, ValueError, OverflowError)
 
 
 @dataclass(frozen=True)
 class Document:
-    """A YAML document that remembers where each value stands.
+    """A YAML document with the line of each value.
 
     Attributes:
         data: Plain values: dict, list, str, int, float, bool, None.
         source: The file's name, for messages.
         lines: Line (from 1) per location, a tuple of keys and indices; the root is `()`.
-        place: Location of this document in the file, where it is a part of one.
+        place: Location of this document in the file; `()` if it is the whole file.
     """
 
     data: Any
@@ -144,19 +147,19 @@ class Document:
     place: Location = ()
 
     def where(self, location: Location) -> str:
-        """Return `file:line` of the innermost part of `location` that stands in the file."""
+        """Return `file:line` of the innermost part of `location` that exists in the file."""
         return f"{self.source}:{self.lines.get(self.known(location), 1)}"
 
     def known(self, location: Location) -> Location:
-        """Return a location without what does not stand in the file: a key that is missing, or the name of a kind."""
-        known: Location = ()
+        """Return a location without the parts that do not exist in the file: a missing key, or the name of a kind."""
+        existing: Location = ()
         for part in location:
-            known = (*known, part) if (*known, part) in self.lines else known
-        return known
+            existing = (*existing, part) if (*existing, part) in self.lines else existing
+        return existing
 
     @contextmanager
     def naming(self, *location: str | int) -> Iterator[None]:
-        """Say where in this document the name stands of which the body finds that there is nothing."""
+        """Add `file:line` of a location to errors that the body raises without a place."""
         try:
             yield
         except ConfigurationError as error:
@@ -164,7 +167,7 @@ class Document:
             raise
 
     def part(self, *location: str | int) -> "Document":
-        """Return the value at `location` as a document of its own, lines kept."""
+        """Return the value at `location` as a separate document with its lines."""
         data = self.data
         for key in location:
             data = data[key]
@@ -179,13 +182,15 @@ def read(path: Path) -> Document:
 
 
 def _text(path: Path) -> str:
-    """Return what a file holds; one that never ends, or never begins, is none."""
+    """Return the text of a regular file of at most 1 MiB; devices and pipes are refused because reads may block."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise ConfigurationError("this is no file", where=str(path), remedy="name a YAML file")
+            raise ConfigurationError("this is not a file", where=str(path), remedy="name a YAML file")
         if status.st_size > _MAX_BYTES:
-            raise ConfigurationError("the file is larger than 1 MiB", where=str(path), remedy="is it the right file?")
+            raise ConfigurationError(
+                "the file is larger than 1 MiB", where=str(path), remedy="check that it is the right file"
+            )
         with path.open("rb") as file:
             data = file.read(_MAX_BYTES + 1)
     except OSError as error:
@@ -200,21 +205,21 @@ def _text(path: Path) -> str:
         wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         line = 1 if wide else data.count(b"\n", 0, error.start) + 1
         remedy = "save it as UTF-8, not as UTF-16" if wide else "save it as UTF-8"
-        raise ConfigurationError("cannot be read: it is no UTF-8", where=f"{path}:{line}", remedy=remedy) from error
+        raise ConfigurationError("cannot be read: it is not UTF-8", where=f"{path}:{line}", remedy=remedy) from error
 
 
 def parse(text: str, *, source: str) -> Document:
     """Return the one YAML document in `text`.
 
     Raises:
-        ConfigurationError: Not YAML, an alias, a tag, a duplicate key, or a key that is no text.
+        ConfigurationError: Not YAML, an alias, a tag, a duplicate key, or a key that is not text.
     """
     loader = None
     try:
         loader = _Loader(text)
         return _document(loader, source)
     except _NOT_YAML as error:
-        raise _explained(error, text, source, loader.line + 1 if loader else 1) from error
+        raise _configuration_error(error, text, source, loader.line + 1 if loader else 1) from error
 
 
 def _document(loader: _Loader, source: str) -> Document:
@@ -227,26 +232,26 @@ def _document(loader: _Loader, source: str) -> Document:
 
 
 _REMEDIES: Final = {
-    "character '\\t'": "indent by spaces, not by tabs",
+    "character '\\t'": "indent with spaces, not with tabs",
     "cannot start any token": "put this text in quotes",
-    "expected <block end>": "indent this line as the others of its list or mapping are, by the same number of spaces",
+    "expected <block end>": "indent this line with as many spaces as the other lines of its list or mapping",
     "mapping values are not allowed": "put text that has a colon in quotes; indent the keys of one mapping alike",
 }
-"""What mends a line, by what PyYAML says of it."""
+"""Remedies by the message of PyYAML."""
 
 
-def _explained(error: Exception, text: str, source: str, line: int) -> ConfigurationError:
+def _configuration_error(error: Exception, text: str, source: str, line: int) -> ConfigurationError:
     if isinstance(error, yaml.reader.ReaderError):
-        said = f"a text file cannot hold the character {error.character:#04x}"
+        message = f"a text file cannot hold the character {error.character:#04x}"
         line = text.count("\n", 0, error.position) + 1
     elif isinstance(error, yaml.MarkedYAMLError):
-        said = str(error.problem or error.context)
+        message = str(error.problem or error.context)
         mark = error.problem_mark or error.context_mark
         line = line if mark is None else mark.line + 1
     else:
-        said = f"this names no character, and no version of YAML: {error}"
-    remedy = next((remedy for part, remedy in _REMEDIES.items() if part in said), "mend the line named above")
-    return ConfigurationError(f"not valid YAML: {said}", where=f"{source}:{line}", remedy=remedy)
+        message = f"an escape or a directive is not valid: {error}"
+    remedy = next((remedy for part, remedy in _REMEDIES.items() if part in message), "correct the line named above")
+    return ConfigurationError(f"not valid YAML: {message}", where=f"{source}:{line}", remedy=remedy)
 
 
 def _plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Location, int]) -> Any:  # noqa: ANN401
@@ -273,7 +278,7 @@ def _plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Locati
 
 
 def to_text(data: object) -> str:
-    """Return plain values as YAML that `parse` reads back as the same ones."""
+    """Return plain values as YAML that `parse` reads back as equal values."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
@@ -298,19 +303,19 @@ def with_value(text: str, location: tuple[str, ...], value: str) -> str:
         raise ValueError(str(error)) from error
     for parent in parents:
         node = _value(node, parent)
-    old = _value(node, key)
-    if old is not None:
-        begin, end = old.start_mark.index, old.end_mark.index
-        return f"{text[:begin]}{'' if begin < end else ' '}{value}{text[end:]}"
+    old_node = _value(node, key)
+    if old_node is not None:
+        start, end = old_node.start_mark.index, old_node.end_mark.index
+        return f"{text[:start]}{'' if start < end else ' '}{value}{text[end:]}"
     assert isinstance(node, yaml.MappingNode)
-    at = _end(node.value[-1][1])
+    insert_at = _end_index(node.value[-1][1])
     if node.flow_style:
-        return f"{text[:at]}, {key}: {value}{text[at:]}"
-    line_end = re.compile(r"\r?\n|\Z").search(text, at)
+        return f"{text[:insert_at]}, {key}: {value}{text[insert_at:]}"
+    line_end = re.compile(r"\r?\n|\Z").search(text, insert_at)
     assert line_end is not None
-    at = line_end.start()
+    insert_at = line_end.start()
     column = node.value[-1][0].start_mark.column
-    return f"{text[:at]}{line_end[0] or os.linesep}{' ' * column}{key}: {value}{text[at:]}"
+    return f"{text[:insert_at]}{line_end[0] or os.linesep}{' ' * column}{key}: {value}{text[insert_at:]}"
 
 
 def _value(mapping: yaml.Node | None, key: str) -> yaml.Node | None:
@@ -319,8 +324,8 @@ def _value(mapping: yaml.Node | None, key: str) -> yaml.Node | None:
     return next((value for name, value in mapping.value if name.value == key), None)
 
 
-def _end(node: yaml.Node) -> int:
-    """Return the index after a node. PyYAML's end of a block collection is the start of what follows it."""
+def _end_index(node: yaml.Node) -> int:
+    """Return the index after a node. For a block collection, the end mark of PyYAML is the start of the next node."""
     while isinstance(node, yaml.CollectionNode) and not node.flow_style:
         last = node.value[-1]
         node = last[1] if isinstance(node, yaml.MappingNode) else last

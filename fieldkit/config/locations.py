@@ -1,6 +1,6 @@
-"""Names of a lab's files: its site file, and the robots and procedures of its own beside those that ship.
+"""Names of a lab's files: its site file, and the robots and procedures of the lab and those that ship with fieldkit.
 
-It imports no reader of YAML, so that the command line can name and complete them at once.
+It imports no YAML reader, so that the command line can list and complete the names quickly.
 """
 
 from pathlib import Path
@@ -15,29 +15,30 @@ _PACKAGE: Final = Path(__file__).resolve().parents[1]
 
 
 def folders(kind: Kind) -> tuple[Path, ...]:
-    """Return the folders searched for `kind`, first match wins.
+    """Return the folders searched for `kind`; the first match is used.
 
-    The lab's own folder is the one in the current directory. In a source checkout the shipped files stand beside
-    the package; a wheel carries them inside it.
+    The lab's folder is in the current directory. In a source checkout the shipped files are next to the package, in a
+    wheel inside of it.
     """
     shipped = _PACKAGE / "data" / kind
     if not shipped.is_dir():
         shipped = _PACKAGE.parent / kind
-    own = Path(kind)
-    return (shipped,) if own.resolve() == shipped else (own, shipped)
+    lab_folder = Path(kind)
+    return (shipped,) if lab_folder.resolve() == shipped else (lab_folder, shipped)
 
 
 def names(kind: Kind) -> dict[str, Path]:
     """Return every name of `kind` with its file, sorted by name.
 
-    An empty file hides no other: a shell makes it before `fieldkit robots show NAME > robots/NAME.yaml` runs.
+    An empty file does not replace a shipped one, because the shell creates it before
+    `fieldkit robots show NAME > robots/NAME.yaml` runs.
     """
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for folder in folders(kind):
         for path in folder.glob("*.yaml"):
-            if path.stem not in found or _is_empty(found[path.stem]):
-                found[path.stem] = path
-    return dict(sorted(found.items()))
+            if path.stem not in paths or _is_empty(paths[path.stem]):
+                paths[path.stem] = path
+    return dict(sorted(paths.items()))
 
 
 def _is_empty(path: Path) -> bool:
@@ -45,7 +46,7 @@ def _is_empty(path: Path) -> bool:
 
 
 def own_copy(name: str) -> str:
-    """Return the command that makes a lab's own copy of a robot profile, to be edited."""
+    """Return the command that copies a robot profile into the lab, where it can be edited."""
     return f"mkdir -p robots; fieldkit robots show {name} > robots/{name}.yaml; then edit that copy"
 
 
@@ -55,11 +56,11 @@ def find(kind: Kind, name: str) -> Path:
     Raises:
         ConfigurationError: There is none; the message gives the nearest name.
     """
-    known = names(kind)
-    if name in known:
-        return known[name]
+    paths = names(kind)
+    if name in paths:
+        return paths[name]
     singular = kind.removesuffix("s")
     raise ConfigurationError(
         f"there is no {'robot profile' if kind == 'robots' else singular} {name!r}",
-        remedy=nearest(name, known, f"known: {', '.join(known)}; see fieldkit {kind}"),
+        remedy=nearest(name, paths, f"names: {', '.join(paths)}; see fieldkit {kind}"),
     )

@@ -1,12 +1,12 @@
-"""`for:` in lists of steps: what stands inside is written out once for each value, when a file is read.
+"""`for:` in lists of steps: its steps are repeated for each value, when a file is read.
 
     - for:
         each: {bytes: [502, 1400]}
         during:
           - ping: {name: "p{bytes}", from: sender, to: receiver, payload_bytes: "{bytes}"}
 
-Of several variables every combination is written out, the last one changing fastest. A text that is nothing but
-`{bytes}` becomes the value itself; `{{` and `}}` stand for braces.
+With several variables the steps are repeated for every combination, with the last variable changing fastest. A text
+that consists only of `{bytes}` becomes the value itself, with its type; `{{` and `}}` are literal braces.
 """
 
 import itertools
@@ -20,7 +20,7 @@ from fieldkit.config.documents import Document, Location
 from fieldkit.core.errors import ConfigurationError, nearest
 
 MOST: Final = 1000
-"""Steps that a file may be written out to."""
+"""Most steps of a file after its loops are expanded."""
 
 _LOOP: Final = "for"
 _KEYS: Final = ("each", "during")
@@ -29,35 +29,35 @@ _BRACES: Final = re.compile(r"\{\{|\}\}|\{(?P<name>[a-z][a-z0-9_]{0,30})\}")
 
 Scalar = str | int | float | bool
 Values = Mapping[str, Scalar]
-"""Value by variable."""
+"""Values by variable."""
 
 
 def written_out(document: Document, key: str) -> Document:
-    """Return a document with every `for:` written out; each value keeps the line that it came from.
+    """Return a document with every `for:` expanded; each value keeps its line.
 
     Args:
-        document: A mapping, of which nothing is known yet.
-        key: Of its list of steps.
+        document: A document that has not been validated.
+        key: The key of its list of steps.
 
     Raises:
-        ConfigurationError: A `for:` is not as it must be, names no such variable, or makes too many steps.
+        ConfigurationError: A `for:` is not valid, uses an unknown variable, or makes too many steps.
     """
     if not isinstance(document.data, dict) or not isinstance(document.data.get(key), list):
-        return document  # whoever validates it says what is wrong
-    writer = _Writer(document)
-    steps = writer.steps(document.data[key], (key,), (key,), {})
+        return document  # validation reports the error
+    expander = _Expander(document)
+    steps = expander.steps(document.data[key], (key,), (key,), {})
     others = {place: line for place, line in document.lines.items() if place[:1] != (key,) or place == (key,)}
-    return replace(document, data={**document.data, key: steps}, lines={**others, **writer.lines})
+    return replace(document, data={**document.data, key: steps}, lines={**others, **expander.lines})
 
 
-class _Writer:
-    """Writes out one document.
+class _Expander:
+    """Expands the loops of one document.
 
     Args:
         document: The document.
 
     Attributes:
-        lines: Line of each value that is written, by its new place.
+        lines: Line of each value of the result, by its new location.
     """
 
     def __init__(self, document: Document) -> None:
@@ -66,41 +66,45 @@ class _Writer:
         self._steps = 0
 
     def steps(self, items: list[Any], at: Location, to: Location, values: Values) -> list[Any]:
-        """Return a list of steps written out.
+        """Return a list of steps with its loops expanded.
 
         Args:
             items: The list.
-            at: Its place in the document.
-            to: Its new place.
-            values: Of the variables there.
+            at: Its location in the document.
+            to: Its location in the result.
+            values: Values of the variables that apply.
         """
-        made: list[Any] = []
-        self._note(at, to)
-        self._into(made, items, at, to, values)
-        return made
+        result: list[Any] = []
+        self._copy_line(at, to)
+        self._append(result, items, at, to, values)
+        return result
 
-    def _into(self, made: list[Any], items: list[Any], at: Location, to: Location, values: Values) -> None:
+    def _append(self, result: list[Any], items: list[Any], at: Location, to: Location, values: Values) -> None:
         for index, item in enumerate(items):
             here = (*at, index)
             if isinstance(item, dict) and _LOOP in item:
                 if len(item) > 1:
-                    raise self._problem("for: stands alone in its entry", here, "begin another entry with - for:")
-                self._repeated(made, item[_LOOP], (*here, _LOOP), to, values)
+                    raise self._problem(
+                        "for: must be the only key of its entry", here, "start another entry with - for:"
+                    )
+                self._append_loop(result, item[_LOOP], (*here, _LOOP), to, values)
                 continue
             self._steps += 1
             if self._steps > MOST:
                 raise self._problem(
-                    f"there are more than {MOST} steps, all for: written out", here, "give fewer values"
+                    f"there are more than {MOST} steps after for: is expanded", here, "give fewer values"
                 )
-            made.append(self._copy(item, here, (*to, len(made)), values))
+            result.append(self._copy(item, here, (*to, len(result)), values))
 
-    def _repeated(self, made: list[Any], loop: Any, at: Location, to: Location, values: Values) -> None:  # noqa: ANN401 (any YAML)
+    def _append_loop(self, result: list[Any], loop: Any, at: Location, to: Location, values: Values) -> None:  # noqa: ANN401 (any YAML)
         if not isinstance(loop, dict) or set(loop) != set(_KEYS):
             unknown = [key for key in loop if key not in _KEYS] if isinstance(loop, dict) else []
             what = f"unknown key {unknown[0]} in for:" if unknown else "for: needs each: and during:"
             raise self._problem(what, (*at, *unknown[:1]), "for: {each: {bytes: [502, 1400]}, during: [...]}")
         if not isinstance(loop["during"], list) or not loop["during"]:
-            raise self._problem("during: of for: is no list of steps", (*at, "during"), "write the steps to repeat")
+            raise self._problem(
+                "during: of for: is not a list of steps", (*at, "during"), "write the steps to repeat"
+            )
         variables = self._variables(loop["each"], (*at, "each"), values)
         if (times := math.prod(map(len, variables.values()))) > MOST:
             raise self._problem(
@@ -108,36 +112,38 @@ class _Writer:
             )
         for chosen in itertools.product(*variables.values()):
             inside = {**values, **dict(zip(variables, chosen, strict=True))}
-            self._into(made, loop["during"], (*at, "during"), to, inside)
+            self._append(result, loop["during"], (*at, "during"), to, inside)
 
     def _variables(self, each: Any, at: Location, outer: Values) -> dict[str, list[Scalar]]:  # noqa: ANN401 (any YAML)
         """Return the values of each variable of a loop."""
         if not isinstance(each, dict) or not each:
-            raise self._problem("each: of for: names no variable", at, "each: {bytes: [502, 1400]}")
-        found: dict[str, list[Scalar]] = {}
-        for name, listed in each.items():
+            raise self._problem("each: of for: has no variable", at, "each: {bytes: [502, 1400]}")
+        values_by_name: dict[str, list[Scalar]] = {}
+        for name, value_list in each.items():
             here = (*at, name)
             if not _VARIABLE.fullmatch(name):
-                raise self._problem(f"{name!r} cannot be a variable", here, "use small letters, digits and _")
+                raise self._problem(f"{name!r} is not a valid variable", here, "use lower-case letters, digits and _")
             if name in outer:
-                raise self._problem(f"{name} is a variable of a for: around this one", here, "give it another name")
-            if not isinstance(listed, list) or not listed:
-                raise self._problem(f"the values of {name} are no list", here, f"{name}: [1, 2]")
-            found[name] = [
-                self._copy(item, (*here, index), (*here, index), outer) for index, item in enumerate(listed)
+                raise self._problem(f"{name} is a variable of an enclosing for:", here, "give it another name")
+            if not isinstance(value_list, list) or not value_list:
+                raise self._problem(f"the values of {name} are not a list", here, f"{name}: [1, 2]")
+            values_by_name[name] = [
+                self._copy(item, (*here, index), (*here, index), outer) for index, item in enumerate(value_list)
             ]
-            for index, value in enumerate(found[name]):
+            for index, value in enumerate(values_by_name[name]):
                 if not isinstance(value, Scalar):
-                    raise self._problem(f"a value of {name} is no text or number", (*here, index), f"{name}: [1, 2]")
-        return found
+                    raise self._problem(
+                        f"a value of {name} is not a text or a number", (*here, index), f"{name}: [1, 2]"
+                    )
+        return values_by_name
 
     def _copy(self, value: Any, at: Location, to: Location, values: Values) -> Any:  # noqa: ANN401 (any YAML)
-        """Return a value with variables filled in, noting its lines."""
-        self._note(at, to)
+        """Return a value with variables substituted, and store its lines."""
+        self._copy_line(at, to)
         match value:
             case dict():
                 if unquoted := [key for key, item in value.items() if item is None and key in values]:
-                    what = f"without quotes YAML takes {{{unquoted[0]}}} for a mapping"
+                    what = f"without quotes YAML reads {{{unquoted[0]}}} as a mapping"
                     raise self._problem(what, at, f'put it in quotes: "{{{unquoted[0]}}}"')
                 return {
                     key: (self.steps if key == "during" and isinstance(item, list) else self._copy)(
@@ -148,28 +154,28 @@ class _Writer:
             case list():
                 return [self._copy(item, (*at, index), (*to, index), values) for index, item in enumerate(value)]
             case str() if values:
-                return self._filled(value, at, values)
+                return self._substituted(value, at, values)
         return value
 
-    def _note(self, at: Location, to: Location) -> None:
-        """Note the line of what is written to a place."""
+    def _copy_line(self, at: Location, to: Location) -> None:
+        """Store the line of a location for the new location."""
         if at in self._document.lines:
             self.lines[to] = self._document.lines[at]
 
-    def _filled(self, text: str, at: Location, values: Values) -> Scalar:
-        """Return a text with variables filled in; the value itself where it is nothing but one of them."""
+    def _substituted(self, text: str, at: Location, values: Values) -> Scalar:
+        """Return a text with variables substituted. A text that consists only of one variable becomes its value."""
 
         def value_of(match: re.Match[str]) -> Scalar:
             if (name := match["name"]) is None:
                 return match[0][0]
             if name not in values:
-                known = nearest(name, values, f"here are: {', '.join(values)}")
-                remedy = f"write {{{{{name}}}}} for the text {{{name}}}, or name a variable"
-                raise self._problem(f"there is no variable {name}; {known}", at, remedy)
+                suggestion = nearest(name, values, f"the variables are: {', '.join(values)}")
+                remedy = f"write {{{{{name}}}}} for the text {{{name}}}, or use a variable"
+                raise self._problem(f"there is no variable {name}; {suggestion}", at, remedy)
             return values[name]
 
-        if (whole := _BRACES.fullmatch(text)) is not None:
-            return value_of(whole)
+        if (only_variable := _BRACES.fullmatch(text)) is not None:
+            return value_of(only_variable)
         return _BRACES.sub(lambda match: _in_text(value_of(match)), text)
 
     def _problem(self, what: str, at: Location, remedy: str) -> ConfigurationError:
@@ -177,5 +183,5 @@ class _Writer:
 
 
 def _in_text(value: Scalar) -> str:
-    """Return a value as YAML writes it."""
+    """Return a value in the notation of YAML."""
     return str(value).lower() if isinstance(value, bool) else str(value)

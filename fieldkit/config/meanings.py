@@ -1,4 +1,4 @@
-"""Descriptions of models and records, read from their docstrings: the reference and editors show them.
+"""Descriptions of models and records, read from their docstrings for the reference and for editors.
 
 Links in them are Markdown, relative to the folder `docs/`.
 """
@@ -27,5 +27,5 @@ def attributes(model: type) -> dict[str, str]:
 
 
 def without_links(text: str) -> str:
-    """Return a text in which each Markdown link is replaced by its words."""
+    """Return a text with each Markdown link replaced by its link text."""
     return _LINK.sub(r"\1", text)

@@ -1,4 +1,4 @@
-"""What is wrong with a YAML file, as somebody can use it who knows YAML, but no classes."""
+"""Describe errors in YAML files for users who know YAML but not the classes."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -10,26 +10,26 @@ from fieldkit.core.errors import ConfigurationError, nearest
 from fieldkit.core.units import format_count
 
 SHAPES: Final[dict[str, str]] = {}
-"""What texts of a pattern are in words; whoever declares one says it, see `schema.shaped`."""
+"""Description of the texts that match a pattern, by pattern; see `schema.shaped`."""
 
 _WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
-_SHOWN: Final = 60
-_NOTHING: Final = ", and nothing stands here; keys that belong to this line are indented more than it is"
-_SAID: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
+_MOST_SHOWN: Final = 60
+_NOTHING: Final = ", and there are none; indent the keys that belong to this line more than this line"
+_MESSAGES: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
 
 
-def explain(found: Sequence[Any], document: Document) -> ConfigurationError:
+def explain(problems: Sequence[Any], document: Document) -> ConfigurationError:
     """Return the first problem in a document, with file, line and key path.
 
     Args:
-        found: All problems, pydantic's own `ErrorDetails`.
+        problems: All problems, as `ErrorDetails` of pydantic.
         document: The document.
     """
 
-    def line(problem: Any) -> int:  # noqa: ANN401 (as `found`)
+    def line(problem: Any) -> int:  # noqa: ANN401 (as in `explain`)
         return int(document.where(_location(problem)).rsplit(":", 1)[1])
 
-    problems = sorted(_told_once(found), key=line)
+    problems = sorted(_without_echoes(problems), key=line)
     first = problems[0]
     location = _location(first)
     place: Location = first["loc"]
@@ -37,15 +37,15 @@ def explain(found: Sequence[Any], document: Document) -> ConfigurationError:
     if missing:
         message = f"required key {missing!r} is missing"
     elif place and place[-1] == "[key]":
-        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {_worded(first)}"
+        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {_message(first)}"
     elif first.get("ctx", {}).get("outer"):
-        message = _too_far_in(first, document)
+        message = _misindented(first, document)
     else:
-        message = _worded(first)
+        message = _message(first)
     path = ".".join(str(part) for part in (*document.place, *document.known(place)))
-    remedy = f"add {missing}: to it" if missing else "mend this line"
-    # Of what may have several forms each says what is wrong, and the place is one.
-    others = len({(document.known(_location(one)), _missing_key(one)) for one in problems}) - 1
+    remedy = f"add {missing}: to it" if missing else "correct this line"
+    # A value with several valid forms has one problem per form at the same location.
+    others = len({(document.known(_location(problem)), _missing_key(problem)) for problem in problems}) - 1
     more = f" ({others} more after this one)" if others else ""
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",
@@ -54,32 +54,32 @@ def explain(found: Sequence[Any], document: Document) -> ConfigurationError:
     )
 
 
-def _too_far_in(problem: Any, document: Document) -> str:  # noqa: ANN401 (as in `explain`)
-    """Return that a key is of a mapping around the one in which it is, and how that mapping's keys are indented."""
+def _misindented(problem: Any, document: Document) -> str:  # noqa: ANN401 (as in `explain`)
+    """Return the message for a key of an enclosing mapping, with the indentation of that mapping's keys."""
     place, context = problem["loc"], problem["ctx"]
     key, outer = context["key"], context["outer"]
     depth = max((depth for depth, part in enumerate(place) if part in outer), default=0)
     names = [part for part in document.known(place[:depth]) if isinstance(part, str)]
-    of = f"of {names[-1]}" if names else "of the whole file"
-    return f"unknown key {key} here; it is a key {of}: indent it as {place[depth]}: is"
+    owner = f"of {names[-1]}" if names else "of the whole file"
+    return f"unknown key {key} here; it is a key {owner}: indent it like {place[depth]}:"
 
 
 def _missing_key(problem: Any) -> str:  # noqa: ANN401 (as in `explain`)
-    """Return the key that a mapping lacks; nothing where that is not the problem."""
+    """Return the key that a mapping lacks, or an empty string for another problem."""
     last = problem["loc"][-1] if problem["loc"] else None
     return last if problem["type"] == "missing" and isinstance(last, str) else ""
 
 
-def _told_once(found: Sequence[Any]) -> list[Any]:
-    """Return the problems without lists that are too short because what is wrong in them was not counted."""
+def _without_echoes(problems: Sequence[Any]) -> list[Any]:
+    """Return the problems without those of lists that are too short only because of an error in their items."""
 
-    def is_echo(one: Any) -> bool:  # noqa: ANN401 (as `found`)
-        depth = len(one["loc"])
-        return one["type"] == "too_short" and any(
-            other["loc"][:depth] == one["loc"] and len(other["loc"]) > depth for other in found
+    def is_echo(problem: Any) -> bool:  # noqa: ANN401 (as in `explain`)
+        depth = len(problem["loc"])
+        return problem["type"] == "too_short" and any(
+            other["loc"][:depth] == problem["loc"] and len(other["loc"]) > depth for other in problems
         )
 
-    return [one for one in found if not is_echo(one)]
+    return [problem for problem in problems if not is_echo(problem)]
 
 
 def _location(problem: Any) -> Location:  # noqa: ANN401 (as in `explain`)
@@ -89,43 +89,43 @@ def _location(problem: Any) -> Location:  # noqa: ANN401 (as in `explain`)
     return (*location, *context.get("at", ()), *(() if key is None else (key,)))
 
 
-def _worded(problem: Mapping[str, Any]) -> str:
-    message: str = _SAID.get(problem["type"], problem["msg"])
-    found, context = problem["input"], problem.get("ctx", {})
+def _message(problem: Mapping[str, Any]) -> str:
+    message: str = _MESSAGES.get(problem["type"], problem["msg"])
+    value, context = problem["input"], problem.get("ctx", {})
     match problem["type"]:
         case "model_type" | "dict_type":
-            message = f"keys with values are needed here{_NOTHING * (found is None)}"
+            message = f"keys with values are needed here{_NOTHING * (value is None)}"
         case "value_error":
             message = str(context["error"])
         case "union_tag_not_found":
             message = f"required key {context['discriminator']} is missing"
         case "union_tag_invalid":
-            known = re.findall(r"'([^']+)'", context["expected_tags"])
-            message = f"there is no kind {context['tag']!r}; {nearest(context['tag'], known, _kinds(known))}"
+            kinds = re.findall(r"'([^']+)'", context["expected_tags"])
+            message = f"there is no kind {context['tag']!r}; {nearest(context['tag'], kinds, _kinds(kinds))}"
         case "string_pattern_mismatch":
-            message = _misshapen(str(found), context["pattern"])
+            message = _pattern_message(str(value), context["pattern"])
         case "too_short":
             least, short = context["min_length"], context["actual_length"]
-            message = f"at least {format_count(least, 'item')} must stand here, not {short}"
-        case "string_type" if isinstance(found, bool | int | float):
+            message = f"at least {format_count(least, 'item')} are needed here, not {short}"
+        case "string_type" if isinstance(value, bool | int | float):
             message = f"{message}; put it in quotes"
-        case "bool_type" if isinstance(found, str):
+        case "bool_type" if isinstance(value, str):
             message = f"{message}; write true or false"
-        case "int_type" if isinstance(found, str):
-            message = f"{message}, in digits alone and without quotes"
+        case "int_type" if isinstance(value, str):
+            message = f"{message}, in digits only and without quotes"
     return message
 
 
-def _kinds(known: Sequence[str]) -> str:
-    return f"kinds: {', '.join(known)}"
+def _kinds(names: Sequence[str]) -> str:
+    return f"kinds: {', '.join(names)}"
 
 
-def _misshapen(text: str, pattern: str) -> str:
-    """Return why a text does not match a pattern."""
-    shown = repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+def _pattern_message(text: str, pattern: str) -> str:
+    """Return the message about a text that does not match a pattern."""
+    quoted = repr(text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}...")
     if words := _WORDS.fullmatch(pattern):
-        known = words[1].split("|")
-        return f"{shown} is none of these: {', '.join(known)}"
+        choices = words[1].split("|")
+        return f"{quoted} is not one of: {', '.join(choices)}"
     if pattern in SHAPES:
-        return f"{shown} is not {SHAPES[pattern]}"
-    return f"{shown} should match pattern {pattern!r}"
+        return f"{quoted} is not {SHAPES[pattern]}"
+    return f"{quoted} should match pattern {pattern!r}"

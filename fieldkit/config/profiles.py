@@ -20,7 +20,9 @@ from fieldkit.config.schema import (
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
-TopicName = Annotated[str, shaped(r"^(/[A-Za-z][A-Za-z0-9_]*)+$", "the name of a topic, as /scan or /camera/image")]
+TopicName = Annotated[
+    str, shaped(r"^(/[A-Za-z][A-Za-z0-9_]*)+$", "the name of a topic, such as /scan or /camera/image")
+]
 
 
 class PublishedTopic(Strict):
@@ -31,7 +33,7 @@ class PublishedTopic(Strict):
         type: ROS message type, `package/Name`.
         rate: Messages per second, `5Hz`.
         frame: `frame_id` of the header.
-        child_frame: For `nav_msgs/Odometry` and `tf2_msgs/TFMessage`, the robot's own frame, which moves in `frame`.
+        child_frame: For `nav_msgs/Odometry` and `tf2_msgs/TFMessage`, the frame of the robot, which moves in `frame`.
             Emulated robots use `base_link` if it is empty.
         points: For a laser scan, beams per turn; for a point cloud, points of 16 bytes.
         width: For an image, width in pixels of 3 bytes.
@@ -42,7 +44,7 @@ class PublishedTopic(Strict):
 
     name: TopicName
     type: Annotated[
-        str, shaped(r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$", "a type of messages, as sensor_msgs/LaserScan")
+        str, shaped(r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$", "a message type, such as sensor_msgs/LaserScan")
     ]
     rate: Hertz
     frame: str = ""
@@ -55,7 +57,7 @@ class PublishedTopic(Strict):
 
     @property
     def payload_bytes(self) -> int:
-        """How large the list in each message is, in bytes, as far as the profile says it."""
+        """Size of the list in each message in bytes, or 0 if the profile does not give it."""
         if self.type == "sensor_msgs/PointCloud2":
             return 16 * (self.points or 0)
         return round(self.size or 3 * (self.width or 0) * (self.height or 0))
@@ -65,36 +67,39 @@ def _known_placeholders(argv: tuple[str, ...]) -> tuple[str, ...]:
     for word in argv:
         for _, name, form, conversion in string.Formatter().parse(word):
             if name is not None and (name not in RECORD_PLACEHOLDERS or form or conversion):
-                valid = ", ".join(f"{{{known}}}" for known in sorted(RECORD_PLACEHOLDERS))
+                valid = ", ".join(f"{{{placeholder}}}" for placeholder in sorted(RECORD_PLACEHOLDERS))
                 raise schema.complaint(f"{word!r} has an unknown placeholder; valid: {valid}")
     if "{topics}" not in argv:
         raise schema.complaint("the word {topics} is missing; it becomes one word per topic")
     return argv
 
 
-def _whole_path(text: str) -> str:
+def _absolute_path(text: str) -> str:
     if not text.startswith("/") or posixpath.normpath(text) != text or "\0" in text:
-        raise schema.complaint(f"{text!r} is no whole path of a file; no shell sees it: /opt/ros/noetic/setup.bash")
+        raise schema.complaint(
+            f"{text!r} is not an absolute path without . and .., such as "
+            "/opt/ros/noetic/setup.bash; no shell expands it"
+        )
     return text
 
 
 class RecordCommand(Strict):
-    """How one ROS variant records topics.
+    """The record command of one ROS variant.
 
     Attributes:
         distribution: ROS distribution, for example `noetic`.
         setup: Shell files to source first: an SSH session without a terminal skips `.bashrc`.
         record: Argument list of the record command. `{duration_s}` and `{name}` are filled in; the word `{topics}`
             becomes one word per topic.
-        ends: `itself`: it ends after its duration. `sigint`: fieldkit ends it by SIGINT (`ros2 bag record` has no
+        ends: `itself`: it exits after its duration. `sigint`: fieldkit stops it by SIGINT (`ros2 bag record` has no
             duration).
-        writes: The file that holds the messages, with `{name}` filled in: `{name}.bag`, for ROS 2
+        writes: The file that contains the messages, with `{name}` filled in: `{name}.bag`, for ROS 2
             `{name}/{name}_0.db3` or `.mcap`.
         rmw: Middleware of ROS 2, `cyclonedds` (DDS) or `zenoh`, unless `RMW_IMPLEMENTATION` names one.
     """
 
     distribution: str
-    setup: tuple[Annotated[str, AfterValidator(_whole_path)], ...] = ()
+    setup: tuple[Annotated[str, AfterValidator(_absolute_path)], ...] = ()
     record: Annotated[tuple[str, ...], AfterValidator(_known_placeholders)]
     ends: Annotated[str, Field(pattern="^(itself|sigint)$")]
     writes: str
@@ -107,7 +112,7 @@ _Crossing = Annotated[
     str,
     shaped(
         r"^(/[A-Za-z]\w*)+:[a-z]\w*/(msg/)?[A-Z]\w*(:[a-z0-9_=,]+)?$",
-        "NAME:TYPE or NAME:TYPE:QOS, as /scan:sensor_msgs/LaserScan",
+        "NAME:TYPE or NAME:TYPE:QOS, such as /scan:sensor_msgs/LaserScan",
     ),
 ]
 
@@ -134,18 +139,18 @@ class RobotBridge(Strict):
     @schema.model_validator(mode="after")
     def _carries_something(self) -> "RobotBridge":
         if not self.topics and not self.back:
-            raise schema.complaint("it carries nothing; name topics", "topics")
+            raise schema.complaint("it carries no topics; add topics or back", "topics")
         if self.router is not None and self.to != "zenoh":
-            raise schema.complaint("a router is Zenoh's; write to: zenoh", "router")
+            raise schema.complaint("only Zenoh has a router; write to: zenoh", "router")
         return self
 
     def command(self, address: str, master: str, patience_s: int) -> tuple[str, ...]:
-        """Return the command that carries them.
+        """Return the command that carries the topics.
 
         Args:
-            address: Of the robot, where the others are.
-            master: Address of its ROS master; empty where its setup files say which.
-            patience_s: How long the master is awaited.
+            address: Address of the robot in the network of the other nodes.
+            master: Address of its ROS master; empty if its setup files set it.
+            patience_s: Time limit for the connection to the master.
         """
         options = ["--from", "ros1", "--to", self.to, "--address", address, "--domain", str(self.domain)]
         options += ["--patience", str(patience_s)]
@@ -156,15 +161,15 @@ class RobotBridge(Strict):
 
 
 MOST_DOMAIN: Final = 232
-"""Above it there are no ports for RTPS (docs.ros.org, "The ROS_DOMAIN_ID")."""
+"""Highest domain. Above it there are no ports for RTPS (docs.ros.org, "The ROS_DOMAIN_ID")."""
 
 
 class Ros(Strict):
     """The ROS side of a robot.
 
     Attributes:
-        variant: Which of `ros.variants` the robot runs: `ros1` or `ros2`.
-        variants: Record command per ROS generation, `ros1` or `ros2`.
+        variant: The entry of `ros.variants` that the robot runs: `ros1` or `ros2`.
+        variants: Record command per ROS version, `ros1` or `ros2`.
         environment: Variables set for the record command and for the bridge. `ROS_DOMAIN_ID` (0 to 232) and
             `RMW_IMPLEMENTATION` also determine how the robot [is driven](motion.md) and which middleware an emulated
             robot uses.
@@ -183,25 +188,25 @@ class Ros(Strict):
         if self.variant not in self.variants:
             raise schema.complaint(f"variant {self.variant!r} has no entry under variants")
         if self.bridge is not None and self.variant != "ros1":
-            raise schema.complaint("a robot with ROS 2 needs no bridge; leave it out", "bridge")
+            raise schema.complaint("a robot with ROS 2 needs no bridge; omit it", "bridge")
         return self
 
     @schema.model_validator(mode="after")
     def _is_in_a_domain(self) -> "Ros":
         text = self.environment.get("ROS_DOMAIN_ID") or "0"
         if not (text.isascii() and text.isdecimal() and int(text) <= MOST_DOMAIN):
-            why = f"{text!r} is no domain of ROS 2; take a whole number from 0 to {MOST_DOMAIN}"
-            raise schema.complaint(why, "environment", "ROS_DOMAIN_ID")
+            message = f"{text!r} is not a domain of ROS 2; use a whole number from 0 to {MOST_DOMAIN}"
+            raise schema.complaint(message, "environment", "ROS_DOMAIN_ID")
         return self
 
     @property
     def domain(self) -> int:
-        """The domain of ROS 2 that its programs are in, as its environment says it; 0 is ROS 2's own."""
+        """The ROS 2 domain of its programs, from `environment`; the default of ROS 2 is 0."""
         return int(self.environment.get("ROS_DOMAIN_ID") or 0)
 
     @property
     def middleware(self) -> str:
-        """What carries its ROS 2: `zenoh`, or `dds` by whichever RMW, as all of those speak RTPS."""
+        """Middleware of its ROS 2: `zenoh`, or `dds` for any other RMW, since all of these use RTPS."""
         named = self.environment.get("RMW_IMPLEMENTATION") or self.command.rmw
         return "zenoh" if named.removeprefix("rmw_").startswith("zenoh") else "dds"
 
@@ -212,12 +217,12 @@ class Ros(Strict):
 
 
 class Tools(Strict):
-    """Programs that the robot offers under these names, and how it grants the right to capture.
+    """Names of programs on the robot, and how captures get their privileges.
 
     Attributes:
         netcat: Its netcat: traditional, OpenBSD, ncat or busybox. The variant is
-            [detected](method-loss.md#tools-that-differ) before each trial; a dry run assumes it from the name, and
-            takes `nc` for the traditional one.
+            [detected](method-loss.md#tools-that-differ) before each trial; a dry run derives it from the name, with
+            `nc` as the traditional one.
         capture: Its tcpdump.
         ping: Its ping: iputils (old or new) or busybox.
         python: Its Python, 3.8 or later, for the step `topics`; searched after the setup files of ROS are sourced.
@@ -238,13 +243,13 @@ class Radio(Strict):
     Attributes:
         interface: Name of the network interface under test, `wlan0`.
         standard: For example `802.11n 2.4 GHz`, for information only.
-        access_point: Whether the robot runs its own access point, for information only.
+        access_point: True if the robot runs an access point, for information only.
         tx_power_dbm: Transmit power in dBm; used by the emulated radio.
-        sensitivity_dbm: Weakest signal that it receives, in dBm; used by the emulated radio, and by `check` to report
-            a weak signal.
+        sensitivity_dbm: Weakest signal that it can receive, in dBm; used by the emulated radio, and by `check` to
+            report a weak signal.
     """
 
-    interface: Annotated[str, shaped(r"^[a-z][a-z0-9._-]{0,14}$", "the name of a network interface, as wlan0")]
+    interface: Annotated[str, shaped(r"^[a-z][a-z0-9._-]{0,14}$", "the name of a network interface, such as wlan0")]
     standard: str
     access_point: schema.Bool = False
     tx_power_dbm: Number | Int
@@ -252,7 +257,7 @@ class Radio(Strict):
 
 
 LEAST_CHARGE: Final = 0.2
-"""Below which no drone begins a flight; 20 % is what makers of its batteries tell to leave in them."""
+"""No drone starts a flight below this charge. Battery makers recommend to keep 20 %."""
 
 _CONNECTION: Final = r"^((udpout|udpin|tcp):[0-9A-Za-z.-]+:[0-9]{1,5}|/dev/[0-9A-Za-z/_.-]+:[0-9]{3,7})$"
 
@@ -265,8 +270,8 @@ class Mavlink(Strict):
     """The MAVLink endpoint of an autopilot.
 
     Attributes:
-        port: UDP port at which it listens on the radio.
-        connection: How the robot's own computer reaches it, for the step `mavlink`: `udpout:HOST:PORT` (sends first),
+        port: UDP port on which it listens on the radio.
+        connection: Connection from the robot's computer, for the step `mavlink`: `udpout:HOST:PORT` (sends first),
             `udpin:HOST:PORT`, `tcp:HOST:PORT` or `/dev/ttyAMA0:921600`; without it, `port` on the robot itself.
         autopilot: Firmware of an emulated autopilot: `px4` or `ardupilot`. A real one reports its own.
         system: System id of an emulated autopilot after power-on, 1 to 250.
@@ -277,7 +282,8 @@ class Mavlink(Strict):
 
     port: Annotated[Int, Field(gt=0, lt=65536)]
     connection: (
-        Annotated[str, shaped(_CONNECTION, "a connection, as udpout:127.0.0.1:14550 or /dev/ttyAMA0:921600")] | None
+        Annotated[str, shaped(_CONNECTION, "a connection, such as udpout:127.0.0.1:14550 or /dev/ttyAMA0:921600")]
+        | None
     ) = None
     autopilot: Annotated[str, Field(pattern="^(px4|ardupilot)$", exclude_if=lambda name: name == "px4")] = "px4"
     system: Annotated[Int, Field(gt=0, le=250, exclude_if=lambda number: number == 1)] = 1
@@ -286,19 +292,19 @@ class Mavlink(Strict):
 
     @property
     def own(self) -> str:
-        """How the robot itself reaches it."""
+        """The connection from the robot's computer."""
         return self.connection or f"udpout:127.0.0.1:{self.port}"
 
 
 class Drive(Strict):
-    """How a ground robot is driven: by velocities on a topic, `geometry_msgs/Twist`.
+    """Settings for driving a ground robot by velocities on a topic, `geometry_msgs/Twist`.
 
     Attributes:
         topic: Topic of velocities (`geometry_msgs/Twist`) that its base subscribes to.
         odometry: Topic of its odometry (`nav_msgs/Odometry`).
         turn_rad_s: Maximum turn rate, in radians per second.
         acceleration_m_s2: Maximum acceleration, in m/s^2.
-        lease: The robot stops when it has heard nothing from the laptop for this time, 0.5 to 30 s.
+        lease: The robot stops if it has received nothing from the laptop for this time, 0.5 to 30 s.
     """
 
     topic: TopicName = "/cmd_vel"
@@ -309,14 +315,14 @@ class Drive(Strict):
 
 
 class Limits(Strict):
-    """What the robot can do.
+    """Limits of the robot.
 
     Attributes:
-        max_speed_m_s: Top speed in m/s; no step `move` may be faster.
+        max_speed_m_s: Maximum speed in m/s, also for steps `move`.
         max_height_m: Maximum height of a drone above its take-off point, in metres; without it no step flies the
             drone.
-        fence_m: Maximum horizontal distance from where the robot began, in metres; required by steps that fly or
-            drive it.
+        fence_m: Maximum horizontal distance from the robot's start, in metres; required by steps that fly or drive
+            it.
         battery_min: Approximate running time on one charge, in minutes, for information only.
     """
 
@@ -327,18 +333,18 @@ class Limits(Strict):
 
 
 class RobotProfile(catalog.Named):
-    """What a robot model is: one YAML file in `robots/`.
+    """A robot model: one YAML file in `robots/`.
 
     How to write one: [add a robot](add-a-robot.md). A key described as "for information only" has no effect in this
     version.
 
-    An emulated robot has its setup files wherever they are, except at the very top and in `/proc`, `/sys` and `/dev`;
+    An emulated robot has its setup files at their paths, except in the root folder, `/proc`, `/sys` and `/dev`;
     those in `/run` and `/tmp` are lost at a reboot. It publishes topics of any type at their rates and sizes. For
     `sensor_msgs/LaserScan` (needs `points`), `Imu`, `BatteryState`, `Range`, `NavSatFix`, `MagneticField`,
     `FluidPressure`, `Temperature`, `nav_msgs/Odometry`, `tf2_msgs/TFMessage` and `geometry_msgs/PoseStamped` the
-    values are those of such a sensor on a robot that [moves as it does](add-a-robot.md#what-an-emulated-robot-says).
-    In messages of other types, strings are empty, numbers 0 and quaternions the identity, and the first list of
-    numbers is noise of the size that the profile gives. Types with a `definition` need ROS 1.
+    values are those of such a sensor on [the moving robot](add-a-robot.md#what-an-emulated-robot-says). In messages
+    of other types, strings are empty, numbers are 0, quaternions are the identity, and the first list of numbers is
+    noise of the size in the profile. Types with a `definition` need ROS 1.
 
     Attributes:
         kind: `ugv` (ground), `uav` (air) or `usv` (water).
@@ -363,12 +369,12 @@ class RobotProfile(catalog.Named):
     @schema.model_validator(mode="after")
     def _has_a_fence(self) -> "RobotProfile":
         if self.drive is not None and self.limits.fence_m is None:
-            raise schema.complaint("a robot that is driven has a fence; write how far it may go: limits.fence_m")
+            raise schema.complaint("a robot with drive needs a fence; set limits.fence_m")
         return self
 
 
 def load_profile(name: str) -> RobotProfile:
-    """Return the profile `name`, the lab's own folder first.
+    """Return the profile `name`; the lab's folder is searched first.
 
     Raises:
         ConfigurationError: No such profile (the nearest name is given), or an error in its file.

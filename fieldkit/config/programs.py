@@ -1,7 +1,7 @@
-"""Programs of a lab that a procedure copies to robots: found beside the procedure, frozen by their SHA-256.
+"""Programs of a lab that a procedure copies to robots: files with their SHA-256.
 
 A procedure names a file. When the procedure is read, the file is searched first in the folder of the procedure file,
-then in the lab's folder (the current directory), and its hash is kept. `trial.yaml` holds the result.
+then in the lab's folder (the current directory). `trial.yaml` stores its path and its hash.
 """
 
 import hashlib
@@ -17,17 +17,20 @@ from fieldkit.core.errors import ConfigurationError, typed
 from fieldkit.core.units import format_bytes
 
 MOST_BYTES: Final = 8 << 20
-"""Largest program. It crosses the control connection before each attempt, and that may be a slow radio."""
+"""Largest size of a program.
+
+It is sent over the control connection before each attempt, perhaps over a slow radio.
+"""
 
 
 class LabProgram(Strict):
-    """A program of the lab, as it was when its procedure was read.
+    """A program of the lab, at the time when its procedure was read.
 
     Attributes:
-        file: Where it was found, written by fieldkit into `trial.yaml`.
+        file: Its path, written by fieldkit into `trial.yaml`.
         sha256: SHA-256 of its content, which is checked for each attempt.
         size_bytes: Its size in bytes.
-        executable: Whether the copy has the right to be executed.
+        executable: True if the copy is executable.
     """
 
     file: Annotated[str, Field(pattern=r"^[^\x00]+$")]
@@ -41,14 +44,14 @@ class LabProgram(Strict):
         return PurePosixPath(self.file).name
 
     def content(self) -> bytes:
-        """Return the content, which is as it was.
+        """Return the content after verifying its hash.
 
         Raises:
             ConfigurationError: The file is missing, cannot be read, or has changed.
         """
         remedy = f"restore it (SHA-256 {self.sha256}), or start a new trial"
         try:
-            content = files.read(_target(Path(self.file)), MOST_BYTES)
+            content = files.read(_resolve(Path(self.file)), MOST_BYTES)
         except OSError as error:
             raise ConfigurationError(
                 f"the program that the trial copies to robots cannot be read: {error.strerror}",
@@ -62,27 +65,27 @@ class LabProgram(Strict):
         return content
 
 
-def _found(value: object) -> object:
-    """Return what freezes the program that a procedure names; what is frozen stays as it is."""
+def _find(value: object) -> object:
+    """Return the record of the program with a given path; a record is returned unchanged."""
     if isinstance(value, dict | LabProgram):
         return value
     if not isinstance(value, str):
         raise schema.complaint("the path of a file is needed here, tools/probe.py for example")
-    _demand_name(value)
-    tried = list(dict.fromkeys((schema.folder(), Path())))
-    for folder in tried:
+    _require_valid_name(value)
+    searched = list(dict.fromkeys((schema.folder(), Path())))
+    for folder in searched:
         if os.path.lexists(path := folder / value):
-            return _frozen(value, path, folder)
-    where = " and ".join(f"{typed(folder.absolute())}" for folder in tried)
-    raise schema.complaint(f"there is no file {value!r}; searched in {where}")
+            return _record(value, path, folder)
+    folders = " and ".join(f"{typed(folder.absolute())}" for folder in searched)
+    raise schema.complaint(f"there is no file {value!r}; searched in {folders}")
 
 
-def _target(path: Path) -> Path:
-    """Return where a path leads, links followed; OSError where it leads nowhere."""
+def _resolve(path: Path) -> Path:
+    """Return a path with links resolved; raises OSError if it does not exist."""
     return Path(os.path.realpath(path, strict=True))
 
 
-def _demand_name(name: str) -> None:
+def _require_valid_name(name: str) -> None:
     path = PurePosixPath(name)
     if not path.name or path.is_absolute() or ".." in path.parts:
         raise schema.complaint(
@@ -92,29 +95,29 @@ def _demand_name(name: str) -> None:
         raise schema.complaint(f"{name!r} has a character in its name that cannot be printed")
 
 
-def _frozen(name: str, path: Path, folder: Path) -> dict[str, object]:
+def _record(name: str, path: Path, folder: Path) -> dict[str, object]:
     lab, folder = Path.cwd().resolve(), folder.resolve()
     inside = lab if folder.is_relative_to(lab) else folder
     try:
-        whole = _target(path)
-        status = whole.stat()
-        if not whole.is_relative_to(inside):
-            raise schema.complaint(f"{name!r} is a link that leads out of {inside}; copy the file there")
-        if whole.is_dir():
+        target = _resolve(path)
+        status = target.stat()
+        if not target.is_relative_to(inside):
+            raise schema.complaint(f"{name!r} is a link to a file outside of {inside}; copy the file there")
+        if target.is_dir():
             raise schema.complaint(f"{name!r} is a folder; name one file")
         if status.st_size > MOST_BYTES:
             sizes = f"{format_bytes(status.st_size)}, more than {format_bytes(MOST_BYTES)}"
             raise schema.complaint(f"{name!r} has {sizes}; install it on the robot")
-        content = files.read(whole, MOST_BYTES)
+        content = files.read(target, MOST_BYTES)
     except OSError as error:
         raise schema.complaint(f"{name!r} cannot be read: {error.strerror}") from None
     return {
-        "file": str(whole.relative_to(lab) if whole.is_relative_to(lab) else whole),
+        "file": str(target.relative_to(lab) if target.is_relative_to(lab) else target),
         "sha256": hashlib.sha256(content).hexdigest(),
         "size_bytes": len(content),
         "executable": bool(status.st_mode & stat.S_IXUSR),
     }
 
 
-NamedProgram = Annotated[LabProgram, BeforeValidator(_found)]
-"""A program as a procedure names it, `tools/probe.py`, or as `trial.yaml` freezes it."""
+NamedProgram = Annotated[LabProgram, BeforeValidator(_find)]
+"""A program: its path, `tools/probe.py`, in a procedure, or its record in `trial.yaml`."""

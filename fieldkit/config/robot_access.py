@@ -1,7 +1,7 @@
-"""SSH access to the robots of a site file, read without pydantic, whose import takes 80 ms: for `fieldkit stop`.
+"""SSH access to the robots of a site file, read for `fieldkit stop` without pydantic, whose import takes 80 ms.
 
-Only what reaches a robot is checked. An error elsewhere in the file, or in the entry of another robot, must not keep
-a robot from being stopped.
+Only the keys for the connection are checked. An error elsewhere in the file, or in the entry of another robot, must
+not prevent a robot from being stopped.
 """
 
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from fieldkit.config.documents import Document
 from fieldkit.core.errors import ConfigurationError
 
 _PASSWORDS: Final = (None, "ask", "keyring")
-_REMEDY: Final = "correct it; fieldkit check names every error of the file"
+_REMEDY: Final = "correct it; fieldkit check reports errors of the whole file"
 
 
 @dataclass(frozen=True)
 class RobotAccess:
-    """How a robot is reached by SSH; attributes are as in `fieldkit.config.site.SiteRobot`."""
+    """SSH access to a robot; attributes are as in `fieldkit.config.site.SiteRobot`."""
 
     host: str
     user: str
@@ -35,25 +35,27 @@ def read_access(document: Document) -> dict[str, RobotAccess | ConfigurationErro
     data = document.data
     robots = data.get("robots") if isinstance(data, dict) else None
     if not isinstance(robots, dict):
-        raise ConfigurationError("has no robots", where=document.where(("robots",)), remedy="add robots: to it")
+        raise ConfigurationError("it has no robots", where=document.where(("robots",)), remedy="add robots: to it")
     return {name: _access(document, name, entry) for name, entry in robots.items()}
 
 
 def backend_of(document: Document) -> str:
-    """Return the backend that a site file names, or the default."""
+    """Return the backend in a site file, or the default."""
     name = document.data.get("backend", "field") if isinstance(document.data, dict) else None
     return name if isinstance(name, str) else "field"
 
 
 def _access(document: Document, name: str, entry: Any) -> RobotAccess | ConfigurationError:  # noqa: ANN401 (any YAML)
     if not isinstance(entry, dict):
-        return ConfigurationError("is not a mapping", where=document.where(("robots", name)), remedy=_REMEDY)
+        return ConfigurationError(
+            "this entry is not a mapping", where=document.where(("robots", name)), remedy=_REMEDY
+        )
     values: dict[str, Any] = {"port": 22, "key": None, "password": None} | entry
     for key, is_valid, what in (
         ("host", _is_text(values.get("host")), "a text"),
         ("user", _is_text(values.get("user")), "a text"),
         ("host_key", _is_text(values.get("host_key")), f"a text: fieldkit enroll {name}"),
-        ("port", type(values["port"]) is int and 0 < values["port"] < 1 << 16, "a number of 1 to 65535"),
+        ("port", type(values["port"]) is int and 0 < values["port"] < 1 << 16, "a number from 1 to 65535"),
         ("key", values["key"] is None or _is_text(values["key"]), "the path of a file"),
         ("password", values["password"] in _PASSWORDS, "ask or keyring"),
     ):

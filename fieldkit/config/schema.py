@@ -1,7 +1,7 @@
-"""Strict YAML and JSON: load, validate, freeze; every complaint on YAML names file, line and the nearest key.
+"""Strict YAML and JSON: load, validate, freeze. Errors in YAML have file, line and the nearest valid key.
 
 The only module that imports pydantic. Profiles, procedures, site files and back-end options are subclasses of
-`Strict`, loaded by `load`; records that only programs write go through a `Codec`.
+`Strict`, loaded by `load`; records that only programs write are parsed by a `Codec`.
 """
 
 import json
@@ -80,33 +80,33 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 Quantity = TypeVar("Quantity")
 
-_AROUND: ContextVar[tuple[type["Strict"], ...]] = ContextVar("_AROUND", default=())
-"""The models of the mappings around the one that is validated now, the outermost first."""
+_ENCLOSING: ContextVar[tuple[type["Strict"], ...]] = ContextVar("_ENCLOSING", default=())
+"""Models of the mapping that is being validated and of its enclosing mappings, the outermost first."""
 _FOLDER: ContextVar[Path] = ContextVar("_FOLDER", default=Path())
 
 
 def complaint(text: str, *at: str | int) -> Exception:
-    """Return the exception that a validator raises; `text` reaches the user with file and line.
+    """Return the exception that a validator raises. The user gets `text` with file and line.
 
     Args:
         text: What is wrong.
-        at: Keys and indices that lead from the validated value to the part that is wrong, for the line.
+        at: Keys and indices from the validated value to the wrong part, for the line.
     """
     return PydanticCustomError("complaint", "{text}", {"text": text, "at": at})
 
 
 def shaped(pattern: str, words: str) -> Any:  # noqa: ANN401 (as pydantic's own `Field`)
-    """Return the `Field` of a text that has to match a pattern.
+    """Return the `Field` of a text that must match a pattern.
 
     Args:
         pattern: A regular expression for the whole text.
-        words: What such a text is, for who wrote another: `a name in small letters`.
+        words: Description of a valid text for error messages: `a name in lower-case letters`.
     """
     problems.SHAPES[pattern] = words
     return Field(pattern=pattern)
 
 
-def _written(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator:
+def _converter(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator:
     def convert(value: object) -> Quantity:
         if isinstance(value, bool) or not isinstance(value, str | int | float):
             raise complaint(f"a number with a unit is needed here; write for example 20{symbol}")
@@ -120,11 +120,11 @@ def _written(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator:
 
 def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object, object]:
     def show(value: float) -> str:
-        # Quantities are written out in digits, and read so: a float's own text has an exponent below 0.0001.
+        # Quantities are read without exponents, but str() of a float has an exponent below 0.0001.
         return f"{Decimal(f'{value / factor:.12g}'):f}{symbol}"
 
     shown = PlainSerializer(show, return_type=str)
-    return _written(parse, symbol), shown, WithJsonSchema({"type": "string", "examples": [f"20{symbol}"]})
+    return _converter(parse, symbol), shown, WithJsonSchema({"type": "string", "examples": [f"20{symbol}"]})
 
 
 def _unit(table: dict[str, float], what: str) -> Callable[[str], float]:
@@ -150,7 +150,7 @@ Length = Annotated[float, *_quantity(_unit(units.METRES_PER_UNIT, "length"), "m"
 Speed = Annotated[float, *_quantity(_unit(units.METRES_PER_S_PER_UNIT, "speed"), "m/s")]
 """Metres per second, written with a unit."""
 Span = Annotated[
-    Distance, _written(units.parse_distance, "ft"), PlainSerializer(lambda value: value.label, return_type=str)
+    Distance, _converter(units.parse_distance, "ft"), PlainSerializer(lambda value: value.label, return_type=str)
 ]
 """A distance that keeps the operator's label."""
 
@@ -161,21 +161,21 @@ class Strict(BaseModel):
     Numbers and booleans are declared as `Int`, `Number` and `Bool`, which convert nothing silently.
     """
 
-    # Most commands use few of the many models: each is built when it is first used.
+    # Most commands use few of the models, so each is built at first use.
     model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, defer_build=True)
 
     @classmethod
     def written_out(cls, document: Document) -> Document:
-        """Return a document of this model with whatever stands for more than itself written out; most have nothing.
+        """Return a document with constructs such as `for:` expanded; most models have none.
 
         Raises:
-            ConfigurationError: It stands for nothing.
+            ConfigurationError: A construct is not valid.
         """
         return document
 
     @classmethod
     def defaults(cls) -> Self:
-        """Return what an empty mapping gives, without building what validates others: for the default of a field."""
+        """Return the object of an empty mapping without building a validator, for the default of a field."""
         return cls.model_construct()
 
     @model_validator(mode="before")
@@ -186,19 +186,19 @@ class Strict(BaseModel):
         fields = _types(cls)
         for key in data:
             if key not in fields:
-                outer = [_types(model) for model in _AROUND.get()[:-1]]
-                hint, of = misplaced.hint(key, data, fields, outer)
-                raise _unknown(str(key), hint, outer[of] if of >= 0 else ())
+                outer = [_types(model) for model in _ENCLOSING.get()[:-1]]
+                hint, index = misplaced.hint(key, data, fields, outer)
+                raise _unknown(str(key), hint, outer[index] if index >= 0 else ())
         return data
 
     @model_validator(mode="wrap")
     @classmethod
-    def _knows_what_is_around(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        token = _AROUND.set((*_AROUND.get(), cls))
+    def _track_enclosing(cls, data: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        token = _ENCLOSING.set((*_ENCLOSING.get(), cls))
         try:
             return handler(data)
         finally:
-            _AROUND.reset(token)
+            _ENCLOSING.reset(token)
 
 
 def _types(model: type[Strict]) -> dict[str, Any]:
@@ -211,15 +211,15 @@ def _unknown(key: str, hint: str, outer: Iterable[str] = ()) -> Exception:
 
     Args:
         key: The key.
-        hint: What to do about it.
-        outer: All keys of the mapping around, where the key is one of these.
+        hint: How to correct it.
+        outer: All keys of the enclosing mapping in which the key is valid, if any.
     """
     context = {"key": key, "hint": hint, "outer": tuple(outer)}
     return PydanticCustomError("unknown_key", "unknown key {key}; {hint}", context)
 
 
 def is_empty(value: object) -> bool:
-    """Return whether a value says nothing and need not be written: for `exclude_if` of a default that is so."""
+    """Return True if a value is empty, for `exclude_if` of fields that are not written then."""
     return not value
 
 
@@ -233,33 +233,33 @@ def by_kind(
     take: Callable[[Item], tuple[str, Model]],
     what: str,
 ) -> CoreSchema:
-    """Return the schema of a mapping with one key, which says of what model its value is: `- ping: {...}`.
+    """Return the schema of a mapping with one key that selects the model of its value: `- ping: {...}`.
 
     Args:
-        kinds: The models by key; asked when something is validated, so that they may hold such mappings themselves.
-        make: Makes the object that stands for the mapping.
-        take: Gives key and value back.
-        what: One of them, for messages.
+        kinds: Returns the models by key. It is called during validation, so that models can contain such mappings.
+        make: Makes the object for a mapping.
+        take: Returns key and value of such an object.
+        what: Noun for messages.
     """
 
-    def validated(data: Any) -> Item:  # noqa: ANN401 (any YAML value, or what was validated before)
+    def validated(data: Any) -> Item:  # noqa: ANN401 (any YAML value, or an object that `make` returned)
         if not isinstance(data, Mapping):
-            return _made(data)
-        known = kinds()
-        if unknown := next((str(key) for key in data if key not in known), None):
-            around = next((str(key) for key in data if key in known and unknown in _types(known[key])), None)
-            valid = f"valid keys: {', '.join(known)}; a {what} of another kind comes with a package to be installed"
-            hint = f"it is a key of {around}: write it inside" if around else nearest(unknown, known, valid)
-            outer = [] if around else [types for model in _AROUND.get() if unknown in (types := _types(model))]
+            return _require_made(data)
+        models = kinds()
+        if unknown := next((str(key) for key in data if key not in models), None):
+            parent = next((str(key) for key in data if key in models and unknown in _types(models[key])), None)
+            valid = f"valid keys: {', '.join(models)}; other kinds of {what} need a package that is not installed"
+            hint = f"it is a key of {parent}: write it inside" if parent else nearest(unknown, models, valid)
+            outer = [] if parent else [types for model in _ENCLOSING.get() if unknown in (types := _types(model))]
             raise _unknown(unknown, hint, outer[-1] if outer else ())
         if len(data) != 1:
-            raise complaint(f"a {what} has one kind, one of: {', '.join(known)}")
+            raise complaint(f"a {what} has one kind, one of: {', '.join(models)}")
         ((kind, value),) = data.items()
-        # Under its key, so that an error says where it is.
-        located = SchemaValidator(core_schema.typed_dict_schema({kind: _field_of(known[kind])}))
+        # Validated under its key, so that the location of an error includes the key.
+        located = SchemaValidator(core_schema.typed_dict_schema({kind: _field_of(models[kind])}))
         return make(kind, located.validate_python({kind: value})[kind])
 
-    def _made(data: Any) -> Item:  # noqa: ANN401 (as above)
+    def _require_made(data: Any) -> Item:  # noqa: ANN401 (as above)
         try:
             take(data)
         except AttributeError:
@@ -309,12 +309,12 @@ def validate(document: Document, model: type[Model]) -> Model:
 
 
 def folder() -> Path:
-    """Return the folder of the file that is validated now; the current directory where none is."""
+    """Return the folder of the file that is being validated, or the current directory without one."""
     return _FOLDER.get()
 
 
 def dump(model: Strict) -> str:
-    """Return the YAML that `load` reads back as an equal model; what is None is left out."""
+    """Return the YAML that `load` reads back as an equal model; values that are None are omitted."""
     data = model.model_dump(mode="json", by_alias=True, exclude_none=True)
     return to_text(data)
 
@@ -323,9 +323,9 @@ Record = TypeVar("Record")
 
 
 class Codec(Generic[Record]):
-    """Records of one type to plain JSON values and back, for lines of a journal and messages between programs.
+    """Converts records of one type to JSON values and back, for lines of a journal and messages between programs.
 
-    A field of another name in the file is declared as `Annotated[str, Field(alias="other")]`.
+    A field with another name in the file is declared as `Annotated[str, Field(alias="other")]`.
 
     Args:
         record: The type, for example a frozen dataclass whose fields are annotated.
@@ -336,17 +336,19 @@ class Codec(Generic[Record]):
 
     @cached_property
     def _adapter(self) -> TypeAdapter[Record]:
-        return TypeAdapter(self._record)  # takes 10 ms, and few commands have a use for each
+        return TypeAdapter(self._record)  # takes 10 ms, and few commands use each adapter
 
     def parse(self, data: Any) -> Record:  # noqa: ANN401 (any JSON value)
-        """Return the record that a JSON value holds; a field that is missing has its default, none is converted.
+        """Return the record of a JSON value.
+
+        A missing field has its default; values are not converted to other types.
 
         Raises:
-            ValueError: It holds none.
+            ValueError: The value is not such a record.
         """
         try:
-            # Strictly, pydantic takes a list for a tuple and a word for an enumeration only out of JSON's own text.
-            # Half a surrogate pair, which Python's reader takes, is no text there and would be no entry.
+            # In strict mode pydantic accepts lists for tuples and words for enumerations only in JSON text.
+            # Its parser rejects half of a surrogate pair, which the parser of Python accepts, so it is replaced.
             text = json.dumps(data, ensure_ascii=False).encode(errors="replace")
             return self._adapter.validate_json(text, strict=True)
         except ValidationError as error:
@@ -355,5 +357,5 @@ class Codec(Generic[Record]):
             raise ValueError(f"{place}: {first['msg']}" if place else first["msg"]) from error
 
     def dump(self, record: Record) -> Any:  # noqa: ANN401 (any JSON value)
-        """Return the JSON value that `parse` makes an equal record of."""
+        """Return the JSON value from which `parse` makes an equal record."""
         return self._adapter.dump_python(record, mode="json", by_alias=True)

@@ -1,4 +1,4 @@
-"""Site files (`fieldkit.yaml`): the robots that a lab has, and the role that each plays, as frozen objects."""
+"""Site files (`fieldkit.yaml`): the robots of a lab and their roles, as frozen objects."""
 
 import ipaddress
 from pathlib import Path
@@ -12,12 +12,12 @@ from fieldkit.core.model import FIXED_ROLES, Control, Role, Topology
 
 def _no_plain_password(value: object) -> object:
     if value not in ("ask", "keyring"):
-        raise schema.complaint("a password never stands in a file; write `password: ask` or `password: keyring`")
+        raise schema.complaint("a password must not be in a file; write `password: ask` or `password: keyring`")
     return value
 
 
 def is_ipv4(text: str) -> bool:
-    """Return whether this is an IPv4 address as the tools on robots take and write it."""
+    """Return True if a text is an IPv4 address in the notation of the tools on robots."""
     try:
         return str(ipaddress.IPv4Address(text)) == text
     except ValueError:
@@ -26,18 +26,20 @@ def is_ipv4(text: str) -> bool:
 
 def _ipv4(text: str) -> str:
     if not is_ipv4(text):
-        raise schema.complaint(f"{text!r} is no IPv4 address, which the radio under test needs")
+        raise schema.complaint(f"{text!r} is not an IPv4 address; the radio under test needs one")
     return text
 
 
 RobotName = Annotated[
     str,
-    schema.shaped(r"^[a-z][a-z0-9-]{0,30}$", "a name: small letters, digits and -, a small letter first, 31 in all"),
+    schema.shaped(
+        r"^[a-z][a-z0-9-]{0,30}$", "a name of at most 31 lower-case letters, digits and -, with a letter first"
+    ),
 ]
 
 
 class SiteRobot(Strict):
-    """One robot that a lab has.
+    """One robot of a lab.
 
     Attributes:
         profile: Name of its profile.
@@ -45,7 +47,7 @@ class SiteRobot(Strict):
         port: SSH port.
         user: SSH user; required by the field backend.
         key: Path of the private key; without it, keys of the SSH agent are used.
-        password: Instead of a key: `ask` at the terminal once per run, or read it from the system's `keyring`. The
+        password: In place of a key: `ask` at the terminal once per run, or read it from the system's `keyring`. The
             password itself is never written into the file.
         host_key: Pinned host key, `ssh-ed25519 AAAA...`; required by the field backend. `fieldkit enroll` writes it.
         address: Its IPv4 address on the radio under test; without it, `host`.
@@ -61,14 +63,14 @@ class SiteRobot(Strict):
     address: Annotated[str, AfterValidator(_ipv4)] | None = None
 
     @schema.model_validator(mode="after")
-    def _one_way_in(self) -> "SiteRobot":
+    def _has_one_login_method(self) -> "SiteRobot":
         if self.key is not None and self.password is not None:
-            raise schema.complaint("it has a key and a password; leave one of them out")
+            raise schema.complaint("it has a key and a password; remove one of them")
         return self
 
 
 class Site(Strict):
-    """A lab: which robots exist, and which robot has which role. `fieldkit.yaml` in the current folder.
+    """A lab: its robots and their roles. `fieldkit.yaml` in the current folder.
 
     For real robots see [field](field.md). Without a site file the emulated backend uses two TurtleBots and a
     Duckiedrone.
@@ -81,17 +83,17 @@ class Site(Strict):
     models: [method](method-radio.md#the-emulated-radio).
 
     Attributes:
-        backend: Backend used when the command line names none.
-        control: `separate`: SSH has a network of its own. `radio`: SSH uses the radio under test, see [two ways of
+        backend: Backend used if the command line gives none.
+        control: `separate`: SSH has a separate network. `radio`: SSH uses the radio under test, see [two ways of
             control](field.md#two-ways-of-control).
         ros_master: Role of the robot that runs the ROS master of all robots with ROS 1, in topologies that have this
             role: [one ROS master](ros-master.md). Without it, each robot uses the master that its setup files name.
         patience: How long a command waits for a lost control connection before it fails. The first connection of a
             run is not retried.
         robots: The robots of the lab by name: lower-case letters, digits and hyphens.
-        roles: Which robot has which role, per topology. `master` needs `sender`, `receiver` and `relay`, `masterless`
-            the first two. Further roles are for procedures that have `places` for them; trials of other procedures do
-            not use their robots.
+        roles: Robot by role, per topology. `master` needs `sender`, `receiver` and `relay`, `masterless` the first
+            two. Further roles are for procedures that have `places` for them; trials of other procedures do not use
+            their robots.
         emulated: Options of the emulated backend; other backends ignore them.
     """
 
@@ -105,9 +107,9 @@ class Site(Strict):
 
     @schema.model_validator(mode="after")
     def _robots_are_different_machines(self) -> "Site":
-        found: dict[tuple[str, int], str] = {}
+        names: dict[tuple[str, int], str] = {}
         for name, robot in self.robots.items():
-            other = found.setdefault((robot.host or name, robot.port), name)
+            other = names.setdefault((robot.host or name, robot.port), name)
             if other != name:
                 raise schema.complaint(f"{name} and {other} are the same machine", "robots", name, "host")
         return self
@@ -117,25 +119,25 @@ class Site(Strict):
         for topology, cast in self.roles.items():
             for role, name in cast.items():
                 if name not in self.robots:
-                    known = ", ".join(self.robots)
+                    robots = ", ".join(self.robots)
                     raise schema.complaint(
-                        f"roles.{topology}.{role} names {name!r}; the robots are: {known}", "roles", topology, role
+                        f"roles.{topology}.{role} names {name!r}; the robots are: {robots}", "roles", topology, role
                     )
-                # A procedure may have any role of its own, but hardly one that is all but one that is not played.
-                left = [one for one in FIXED_ROLES if one not in cast]
-                if role not in FIXED_ROLES and (meant := nearest(role, left, "")):
-                    raise schema.complaint(f"roles.{topology}.{role}: {meant}", "roles", topology, role)
+                # A procedure may define other roles. A role that resembles an unassigned fixed role is a misspelling.
+                unassigned = [fixed for fixed in FIXED_ROLES if fixed not in cast]
+                if role not in FIXED_ROLES and (suggestion := nearest(role, unassigned, "")):
+                    raise schema.complaint(f"roles.{topology}.{role}: {suggestion}", "roles", topology, role)
             if len(set(cast.values())) < len(cast):
-                raise schema.complaint(f"roles.{topology}: one robot plays two roles", "roles", topology)
+                raise schema.complaint(f"roles.{topology}: one robot has two roles", "roles", topology)
         return self
 
     @schema.model_validator(mode="after")
-    def _somebody_plays_the_master(self) -> "Site":
-        # One of a procedure's own would take part in its trials alone.
-        played = [role for role in FIXED_ROLES if any(role in cast for cast in self.roles.values())]
-        if self.ros_master is not None and self.ros_master not in played:
+    def _ros_master_has_a_robot(self) -> "Site":
+        # A role of a procedure exists only in trials of that procedure, so it cannot be the master.
+        assigned = [role for role in FIXED_ROLES if any(role in cast for cast in self.roles.values())]
+        if self.ros_master is not None and self.ros_master not in assigned:
             raise schema.complaint(
-                f"ros_master is one of the roles that robots play: {', '.join(played)}", "ros_master"
+                f"ros_master must be one of the assigned roles: {', '.join(assigned)}", "ros_master"
             )
         return self
 

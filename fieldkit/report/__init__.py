@@ -1,1 +1,1 @@
-"""One page, and figures, of what repeats came to."""
+"""Reports: one page, and figures, with the results of trials."""

@@ -1,4 +1,4 @@
-"""The packets of each repeat in the order in which they were sent, those marked that were lost or sent again."""
+"""Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from fieldkit.report.conditions import panels
 from fieldkit.report.evidence import Evidence
 
 MOST_REPEATS: Final = 400
-"""Whose captures are read, over all cells; each cell shows at least its first."""
+"""Most repeats whose captures are read, over all cells. Each cell shows at least its first repeat."""
 MOST_LINES: Final = 20
-"""Of one cell."""
+"""Most lines of a cell."""
 MOST_COLUMNS: Final = 300
-"""Of a line; one of more packets puts several into a column, marked when any of them is."""
+"""Most columns of a line. A line with more packets combines several in a column, marked if any of them is."""
 
 _WHAT: Final = {Protocol.UDP: "IP packets lost", Protocol.TCP: "segments sent again"}
 
@@ -29,12 +29,12 @@ class Raster:
     """A line per repeat, a column per packet.
 
     Attributes:
-        place: What tells its condition from the others of its group.
+        place: The condition, as far as it differs from the others of its group.
         lines: Number of lines.
-        columns: Columns of the longest.
-        lengths: Columns of each line.
-        runs: Marked columns as (line, first column, how many).
-        words: What it shows, for those who cannot see it.
+        columns: Number of columns of the longest line.
+        lengths: Number of columns of each line.
+        runs: Runs of marked columns as (line, first column, number of columns).
+        words: Description for screen readers.
     """
 
     place: str
@@ -50,9 +50,9 @@ class RasterGroup:
     """Rasters of one protocol and topology.
 
     Attributes:
-        title: Which.
-        what: What is marked, and how many packets a column is.
-        rasters: One per condition whose captures are at hand.
+        title: Transfer, protocol and topology.
+        what: The meaning of a mark, and the number of packets per column.
+        rasters: One per condition whose captures are available.
     """
 
     title: str
@@ -61,35 +61,37 @@ class RasterGroup:
 
 
 def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
-    """Yield the rasters of all cells whose captures are at hand."""
-    told = wording.differing(cells) - {"topology"}
+    """Yield the rasters of all cells whose captures are available."""
+    differing = wording.differing(cells) - {"topology"}
     share = min(MOST_LINES, max(1, MOST_REPEATS // max(1, len(cells))))
     for title, cells_of in panels(cells).items():
-        drawn = {wording.place(cell, told=told): _marked(cell, evidence, share) for cell in cells_of}
+        drawn = {
+            wording.place(cell, differing=differing): _marked_packets(cell, evidence, share) for cell in cells_of
+        }
         for transfer in dict.fromkeys(name for lines in drawn.values() for name in lines):
             marked = {place: lines.get(transfer, []) for place, lines in drawn.items()}
             width = -(-max(len(line) for lines in marked.values() for line in lines) // MOST_COLUMNS)
             what = _WHAT[transfer[1]]
             yield RasterGroup(
                 title=", ".join(filter(None, (transfer[0], title))),
-                what=what if width == 1 else f"{what}; a column is {width} of them, marked when any was",
+                what=what if width == 1 else f"{what}; a column is {width} packets, marked if any of them is",
                 rasters=[_raster(place, lines, width, what) for place, lines in marked.items() if lines],
             )
 
 
-def _marked(cell: Cell, evidence: Evidence, share: int) -> dict[tuple[str, Protocol], list[Mask]]:
-    """Return which packets of each of the first valid repeats are marked, by name and protocol of the transfer."""
-    found: dict[tuple[str, Protocol], list[Mask]] = {}
+def _marked_packets(cell: Cell, evidence: Evidence, share: int) -> dict[tuple[str, Protocol], list[Mask]]:
+    """Return the mask of marked packets of each of the first valid repeats, by name and protocol of the transfer."""
+    masks: dict[tuple[str, Protocol], list[Mask]] = {}
     for row in evidence.rows(cell).tolist():
         attempt, plan = evidence.attempt(row), evidence.plan(row)
         if attempt is None or plan is None or evidence.repeats.texts["status"][row] != Status.VALID:
             continue
         for transfer in plan.transfers(Protocol(evidence.repeats.texts["protocol"][row])):
             if (packets := fates.read(attempt, transfer)) is not None:
-                found.setdefault((transfer.name, transfer.protocol), []).append(packets.marked)
-        if max(map(len, found.values()), default=0) == share:
+                masks.setdefault((transfer.name, transfer.protocol), []).append(packets.marked)
+        if max(map(len, masks.values()), default=0) == share:
             break
-    return found
+    return masks
 
 
 def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
@@ -107,6 +109,6 @@ def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
 
 
 def _runs(marked: Mask) -> list[tuple[int, int]]:
-    """Return where each run of marked columns begins, and how long it is."""
+    """Return the first column and the length of each run of marked columns."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], marked, [False])).astype(np.int8)))
     return [(int(start), int(stop - start)) for start, stop in edges.reshape(-1, 2)]

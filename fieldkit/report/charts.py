@@ -1,4 +1,4 @@
-"""Charts as plain data: `figures` draws them, for the page and for papers."""
+"""Charts as plain data. `figures` draws them for the page and for papers."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fieldkit.report.theme import Colour, Style
 
 Join = Literal["line", "steps", "none"]
-"""How points are joined: `steps` as a distribution function, which keeps its value up to the next point."""
+"""Type of line between points. With `steps` a value holds until the next point, as in a distribution function."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,17 +19,17 @@ class Series:
 
     Attributes:
         label: For the legend; series of one label have one style.
-        style: How it looks.
+        style: Colour, marker and line.
         x: Positions.
         y: Values.
-        low: Lower ends of their intervals, None where there is none; empty when no point has one.
+        low: Lower ends of their intervals, None for a point without one; empty if no point has one.
         high: Upper ends.
-        join: How the points are joined.
-        behind: What the points stand for, as (x, y): drawn faintly behind them.
-        breaks: Points, by index, after which the line is interrupted.
-        notes: A short text beside each point, empty for none; empty when no point has one.
-        bounds: Whether each value is only a lower bound; empty when none is.
-        behind_bounds: Like `behind`, for what is only a lower bound.
+        join: Type of line between the points.
+        behind: Single values behind the points, as (x, y), drawn faintly.
+        breaks: Indices of points after which the line is interrupted.
+        notes: A short text next to each point, empty for none; an empty sequence if no point has one.
+        bounds: True for each value that is only a lower bound; empty if none is.
+        behind_bounds: Like `behind`, for values that are only lower bounds.
     """
 
     label: str
@@ -48,13 +48,13 @@ class Series:
 
 @dataclass(frozen=True)
 class EdgeMark:
-    """A cross at the edge of a panel where a condition has no value.
+    """A cross at the edge of a panel for a condition without a value.
 
     Attributes:
-        at: Its place along the axis of conditions: x, or the lane of a panel with lanes.
-        text: Why there is no value.
-        colour: Of the series that lacks it.
-        is_high: Whether it is at the upper end of the axis of values.
+        at: Its position on the axis of conditions: x, or the lane of a panel with lanes.
+        text: The reason for the missing value.
+        colour: Colour of the series without the value.
+        is_high: True if it is at the upper end of the axis of values.
     """
 
     at: float
@@ -69,9 +69,9 @@ class Span:
 
     Attributes:
         lane: Number of the lane, from 0.
-        start: Where it begins.
-        stop: Where it ends.
-        colour: Of the bar.
+        start: Its start.
+        stop: Its end.
+        colour: Colour of the bar.
     """
 
     lane: int
@@ -85,22 +85,22 @@ class Panel:
     """One set of axes.
 
     Attributes:
-        title: Above it.
-        x_label: What x is, with its unit.
-        y_label: What y is, with its unit.
-        series: What is drawn.
-        words: What it shows, for those who cannot see it.
-        x_ticks: Position and text of each tick; empty leaves them to the drawing.
-        top: Upper end of the y axis, None to leave it to the drawing.
-        bottom: Lower end of the y axis, likewise.
-        right: Right end of the x axis, likewise.
-        left: Left end of the x axis, where `right` is given.
-        log: Whether the y axis is logarithmic; then `bottom` is above 0.
-        x_log: Whether the x axis is logarithmic; then `left` is above 0.
+        title: Title above the axes.
+        x_label: Quantity of the x axis, with its unit.
+        y_label: Quantity of the y axis, with its unit.
+        series: The series.
+        words: Description for screen readers.
+        x_ticks: Position and text of each tick; empty for automatic ticks.
+        top: Upper end of the y axis, None for an automatic one.
+        bottom: Lower end of the y axis, None for an automatic one.
+        right: Right end of the x axis, None for automatic ends.
+        left: Left end of the x axis, used if `right` is given.
+        log: True for a logarithmic y axis; then `bottom` is above 0.
+        x_log: True for a logarithmic x axis; then `left` is above 0.
         edges: Conditions without a value.
-        is_strip: Whether it is wide and low, with the same margins as others, to be stacked on a shared x axis.
+        is_strip: True for a wide, low panel with fixed margins, to be stacked on a shared x axis.
         spans: Bars in lanes.
-        lanes: Names of the lanes, the lowest first; none when y is a number. With lanes, values of series and their
+        lanes: Names of the lanes, the lowest first; empty if y is a number. With lanes, values of series and their
             intervals are along x.
     """
 
@@ -128,11 +128,11 @@ class Chart:
 
     Attributes:
         name: For file names and links.
-        title: What it is.
-        caption: How to read it, and what was left out.
+        title: Its title.
+        caption: Explanation, and what was left out.
         panels: At least one.
-        is_dense: Whether panels are many and plain enough to stand small.
-        is_stacked: Whether panels stand below each other.
+        is_dense: True if panels are simple enough to be drawn small.
+        is_stacked: True if panels are below each other.
     """
 
     name: str
@@ -143,13 +143,13 @@ class Chart:
     is_stacked: bool = False
 
     def of_size(self, size: str) -> "Chart":
-        """Return the chart, said to be of packets of this size; none is said where `size` is empty."""
+        """Return the chart with a packet size in its name and title, or unchanged if `size` is empty."""
         if not size:
             return self
         return replace(self, name=f"{self.name}-{size.replace(' ', '-')}", title=f"{self.title}, {size}")
 
     @property
     def legend(self) -> dict[str, Style]:
-        """The style of each label that has points, in the order of drawing; empty when one label needs no legend."""
-        found = {series.label: series.style for panel in self.panels for series in panel.series if len(series.x)}
-        return found if len(found) > 1 else {}
+        """The style of each label that has points, in the order of drawing; empty for a single label."""
+        styles = {series.label: series.style for panel in self.panels for series in panel.series if len(series.x)}
+        return styles if len(styles) > 1 else {}

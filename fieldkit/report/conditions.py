@@ -1,4 +1,4 @@
-"""Panels of conditions, and the colour, shape and line that each series keeps throughout a report."""
+"""Panels of conditions, and the colour, marker and line of each series in all figures of a report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,17 +9,17 @@ from fieldkit.core.model import Scenario
 from fieldkit.report import wording
 from fieldkit.report.theme import CYCLE, LINES, Style
 
-_SCENARIOS = [str(one) for one in Scenario]
+_SCENARIOS = [str(scenario) for scenario in Scenario]
 
 
 @dataclass(frozen=True)
 class Identity:
-    """How a series is called and drawn.
+    """Label and style of a series.
 
     Attributes:
-        label: `LOS`; with the procedure where several have the scenario, and the backend where there are several.
-        style: Its look.
-        rank: Its place among the others: by scenario, in each the field first.
+        label: `LOS`, with the procedure if several have this scenario, and the backend if there are several.
+        style: Its style.
+        rank: Sort key: by scenario, within it the field backend first.
     """
 
     label: str
@@ -31,15 +31,15 @@ class Identities:
     """The identity of the series that each cell belongs to: procedure and scenario by colour, backend by line.
 
     Args:
-        cells: All that stand in the report, so that each has the same looks in every figure.
+        cells: All cells of the report, so that each has the same style in every figure.
     """
 
     def __init__(self, cells: Sequence[Cell]) -> None:
         kinds = sorted({_kind(cell) for cell in cells}, key=_by_scenario)
         backends = sorted({wording.text(cell, "backend") for cell in cells}, key=lambda name: (name != "field", name))
-        # The first of line of sight and the first without it keep their looks, also where the other is missing.
-        kept, others = {str(one): rank for rank, one in enumerate(Scenario)}, count(len(Scenario))
-        self._kinds = {kind: kept.pop(kind[0]) if kind[0] in kept else next(others) for kind in kinds}
+        # The first series with line of sight and the first without have fixed styles, even if the other is missing.
+        fixed, others = {str(scenario): rank for rank, scenario in enumerate(Scenario)}, count(len(Scenario))
+        self._kinds = {kind: fixed.pop(kind[0]) if kind[0] in fixed else next(others) for kind in kinds}
         self._backends = {name: index for index, name in enumerate(backends)}
         self._ambiguous = len({scenario for scenario, _ in kinds}) < len(kinds)
 
@@ -57,13 +57,13 @@ class Identities:
 
 
 def panels(cells: Sequence[Cell]) -> Mapping[str, Sequence[Cell]]:
-    """Return cells by the title of the panel in which they stand, one per protocol and topology: `UDP, master`."""
-    found: dict[tuple[str, str], list[Cell]] = {}
+    """Return cells by the title of their panel, one per protocol and topology: `UDP, master`."""
+    groups: dict[tuple[str, str], list[Cell]] = {}
     for cell in cells:
-        found.setdefault((wording.text(cell, "protocol"), wording.text(cell, "topology")), []).append(cell)
+        groups.setdefault((wording.text(cell, "protocol"), wording.text(cell, "topology")), []).append(cell)
     return {
         ", ".join(filter(None, (protocol.upper(), topology))) or "all": group
-        for (protocol, topology), group in sorted(found.items())
+        for (protocol, topology), group in sorted(groups.items())
     }
 
 
@@ -72,7 +72,7 @@ def _kind(cell: Cell) -> tuple[str, str]:
 
 
 def _by_scenario(kind: tuple[str, str]) -> tuple[bool, int, str, str]:
-    """Return what kinds are sorted by: first the plain ones, of which the scenario is the procedure's name."""
+    """Return the sort key of a kind: first kinds whose procedure is named after the scenario."""
     scenario, procedure = kind
-    known = _SCENARIOS.index(scenario) if scenario in _SCENARIOS else len(_SCENARIOS)
-    return scenario != procedure, known, scenario, procedure
+    index = _SCENARIOS.index(scenario) if scenario in _SCENARIOS else len(_SCENARIOS)
+    return scenario != procedure, index, scenario, procedure

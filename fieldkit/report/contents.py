@@ -1,4 +1,4 @@
-"""All that stands in a report, put together from a table of repeats and the evidence beside it."""
+"""Contents of a report, made from a table of repeats and the evidence that belongs to it."""
 
 import shlex
 from collections import Counter
@@ -35,7 +35,7 @@ from fieldkit.report.evidence import Evidence, at_hand
 from fieldkit.report.headlines import Headline, headlines
 from fieldkit.report.ranking import Ranking
 
-_QUOTED: Final = frozenset(
+_ALWAYS_VISIBLE: Final = frozenset(
     (
         *distance.LOSS,
         "file_loss",
@@ -44,30 +44,30 @@ _QUOTED: Final = frozenset(
         *(of_fault(kind, what) for kind in FaultKind for what in ("recovered", "recovery_s")),
     )
 )
-"""What stands in the tables at once; the rest is folded away."""
+"""Quantities that are always visible in tables. The others are collapsed."""
 
 
 _FIRST: Final = "expected and own figures"
-"""Quantities of which a trial expects something, and those that a lab declares itself."""
+"""Quantities with an expectation, and quantities that a lab declares."""
 _SECTIONS: Final = (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
 _MOST_FURTHER: Final = 12
-"""Charts of quantities that are not fieldkit's own."""
+"""Most charts of quantities that are not defined by fieldkit."""
 _MOST_IN_TABLE: Final = 8
-"""Of these in a table at once."""
+"""Most visible columns of quantities that are not defined by fieldkit."""
 
 
 @dataclass(frozen=True)
 class CellTable:
-    """Cells of one protocol with the quantities that any of them has, of one step where that has a name.
+    """Cells of one protocol with the quantities that any of them has; for named steps, those of one step.
 
     Attributes:
         title: The protocol, and the step.
-        quantities: Columns: what is quoted.
-        more: Further ones.
-        lines: Cells, each with what tells it from the others.
-        notes: What stands below the name of a quantity.
-        words: Labels of columns of words, by name.
-        missing: Why a cell of the table has no figure, by the number of its line and the name of its quantity.
+        quantities: Quantities of the visible columns.
+        more: Quantities of collapsed columns.
+        lines: Cells, each with its condition as far as it differs from the others.
+        notes: Text below the name of a quantity.
+        words: Labels of text columns, by name of the column.
+        missing: Reason for a missing figure, by the number of the line and the name of the quantity.
     """
 
     title: str
@@ -87,7 +87,7 @@ class ChartSection:
         name: For links.
         title: The heading.
         charts: At least one.
-        note: What is left out, and how to have it.
+        note: What is left out, and how to draw it.
     """
 
     name: str
@@ -98,22 +98,22 @@ class ChartSection:
 
 @dataclass(frozen=True)
 class Contents:
-    """What stands in a report.
+    """The contents of a report.
 
     Attributes:
         title: Its title.
-        paragraph: What was run, in words.
-        headlines: The figures that matter most.
-        warnings: What to know before quoting one.
-        verdicts: Whether each expectation holds, condition by condition.
-        against_distance: The figures that matter most.
+        paragraph: Description of the trials.
+        headlines: The most important figures.
+        warnings: Limitations that a reader must know before quoting a figure.
+        verdicts: Judgements by expectation, one per condition.
+        against_distance: Charts against distance.
         tables: Cells, a table per protocol.
-        sections: Further figures.
+        sections: Further charts.
         strips: Attempts in order of time.
-        bursts: The packets of repeats whose captures are at hand.
-        trials: Where all that comes from.
-        evidence: What is at hand.
-        command: What makes this report again.
+        bursts: The packets of repeats whose captures are available.
+        trials: Provenance of each trial.
+        evidence: The table and the available evidence.
+        command: The command that makes this report again.
     """
 
     title: str
@@ -137,7 +137,7 @@ class Contents:
 
     @property
     def versions(self) -> dict[str, int]:
-        """How many trials ran with each set of versions, where that is known."""
+        """Number of trials for each known set of versions."""
         return Counter(trial.versions for trial in self.trials if trial.versions)
 
 
@@ -154,31 +154,31 @@ def put_together(
 
     Args:
         repeats: Attempts, with the column `source`.
-        title: Its title; empty to make one.
-        repeat: Whose time line is drawn, as `repeat_to_draw`.
-        command: The words that the operator typed, but for `--rebuild`.
-        quantities: Names of what is drawn besides what is drawn in any case.
+        title: Its title; empty for a generated one.
+        repeat: Repeat for the time line, as `repeat_to_draw`.
+        command: The words of the operator's command, without `--rebuild`.
+        quantities: Names of quantities to draw in addition to the default ones.
         unmeasured: Planned conditions without any attempt, in words.
     """
     evidence = at_hand(repeats)
     is_whole = evidence.plans.keys() == set(repeats.texts["source"].tolist())
-    cells = sorted(aggregate(repeats), key=_order)
+    cells = sorted(aggregate(repeats), key=_sort_key)
     identities = Identities(cells)
     row = repeat_to_draw(cells, evidence, repeat)
     ranking = Ranking(evidence)
     first = list(dict.fromkeys(plain_name(quantity.name) for quantity in ranking.first(measured_in(cells))))
     against_distance = [
         ChartSection(
-            what.replace(" ", "-"),
-            f"{what.capitalize()} against distance",
+            heading.replace(" ", "-"),
+            f"{heading.capitalize()} against distance",
             [*distance.charts(cells, identities, evidence, names)],
         )
-        for what, names in (
+        for heading, names in (
             (_FIRST, first),
-            *((what, [name for name in names if name not in first]) for what, names in _SECTIONS),
+            *((kind, [name for name in names if name not in first]) for kind, names in _SECTIONS),
         )
     ]
-    against_distance.append(_further(cells, identities, evidence, quantities, first))
+    against_distance.append(_further_charts(cells, identities, evidence, quantities, first))
     sections = (
         ChartSection("quantities", "Quantities at one distance", list(dots.charts(cells, identities, evidence))),
         ChartSection("distributions", "Distributions", list(distribution.charts(cells, identities, evidence))),
@@ -201,34 +201,38 @@ def put_together(
     )
 
 
-def _further(
+def _further_charts(
     cells: Sequence[Cell],
     identities: Identities,
     evidence: Evidence,
     wanted: Sequence[str],
     first: Sequence[str],
 ) -> ChartSection:
-    """Return curves of what is not fieldkit's own, as many as can be looked at, and of what is wanted besides.
+    """Return charts of quantities that fieldkit does not define, up to a limit, and of requested quantities.
 
     Args:
         cells: Conditions.
-        identities: Looks of their series.
-        evidence: The table and what is at hand beside it.
+        identities: Labels and styles of their series.
+        evidence: The table and the available evidence.
         wanted: Names of quantities that are drawn in any case.
         first: Plain names of those that are drawn already.
     """
     drawn = {*distance.LOSS, *distance.DELAY, *distance.RATE, *first}
-    others: dict[str, str] = {}  # by plain name the first of that
-    for one in measured_in(cells):
-        if not one.is_own and plain_name(one.name) not in drawn and distance.has_curve(cells, one, evidence):
-            others.setdefault(plain_name(one.name), one.name)
+    others: dict[str, str] = {}  # the first name with each plain name
+    for quantity in measured_in(cells):
+        if (
+            not quantity.is_own
+            and plain_name(quantity.name) not in drawn
+            and distance.has_curve(cells, quantity, evidence)
+        ):
+            others.setdefault(plain_name(quantity.name), quantity.name)
     chosen = dict.fromkeys((*map(plain_name, wanted), *list(others)[:_MOST_FURTHER]))
-    left = [name for plain, name in others.items() if plain not in chosen]
+    undrawn = [name for plain, name in others.items() if plain not in chosen]
     return ChartSection(
         "further",
         "Further figures against distance",
         [*distance.charts(cells, identities, evidence, [name for name in chosen if name not in drawn])],
-        f"Not drawn: {', '.join(left)}. To draw one: --quantity {left[0]}." if left else "",
+        f"Not drawn: {', '.join(undrawn)}. To draw one: --quantity {undrawn[0]}." if undrawn else "",
     )
 
 
@@ -237,29 +241,31 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> in
 
     Args:
         cells: Conditions.
-        evidence: The table and what is at hand beside it.
-        wanted: Folder of an attempt, `udp-07`, with `TRIAL/` before it where several trials have one; empty for the
-            one with the median loss, among valid repeats that lost anything under the condition that loses most.
+        evidence: The table and the available evidence.
+        wanted: Folder of an attempt, `udp-07`, preceded by `TRIAL/` if several trials have it. If empty, use the
+            repeat with the median loss among the valid repeats with losses of the condition with the highest loss.
 
     Returns:
-        None when nothing was wanted and no evidence is at hand.
+        The row, or None if `wanted` is empty and no evidence is available.
 
     Raises:
-        ConfigurationError: There is no such attempt, or several, or its evidence is not at hand.
+        ConfigurationError: There is no such attempt, or several, or its evidence is not available.
     """
     if wanted:
         row = evidence.repeats.row(wanted)
         if evidence.attempt(row) is None:
             raise ConfigurationError(
-                f"the evidence of {wanted} is not at hand", remedy="name a repeat of a trial whose folder is"
+                f"the evidence of {wanted} is not available", remedy="name a repeat of a trial whose folder exists"
             )
         return row
     measured = measured_in(cells)
-    names = [(one.name, 0.0) for name in LOSSES for one in alike(measured, name)]
-    names += [(one.name, -np.inf) for name in ("transfer_s", "rtt_median_s") for one in alike(measured, name)]
+    names = [(quantity.name, 0.0) for name in LOSSES for quantity in alike(measured, name)]
+    names += [
+        (quantity.name, -np.inf) for name in ("transfer_s", "rtt_median_s") for quantity in alike(measured, name)
+    ]
     for name, least in names:
-        having = [cell for cell in cells if name in cell.estimates]
-        for cell in sorted(having, key=lambda one: one.estimates[name].value, reverse=True):
+        measured_cells = [cell for cell in cells if name in cell.estimates]
+        for cell in sorted(measured_cells, key=lambda cell: cell.estimates[name].value, reverse=True):
             values, rows = evidence.repeats.numbers[name], evidence.valid(cell, name)
             shown = [row for row in rows[values[rows] > least].tolist() if evidence.attempt(row)]
             if shown:
@@ -267,7 +273,7 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> in
     return None
 
 
-def _order(cell: Cell) -> tuple[str | float, ...]:
+def _sort_key(cell: Cell) -> tuple[str | float, ...]:
     names = ("protocol", "topology", "scenario", "procedure")
     return *(wording.text(cell, name) for name in names), wording.metres(cell), wording.text(cell, "backend")
 
@@ -276,17 +282,17 @@ def _tables(cells: Sequence[Cell], evidence: Evidence) -> list[CellTable]:
     groups: dict[str, list[Cell]] = {}
     for cell in cells:
         groups.setdefault(wording.text(cell, "protocol").upper(), []).append(cell)
-    told = wording.differing(cells)
+    differing = wording.differing(cells)
     ranking = Ranking(evidence)
     return [
-        replace(table, missing=_reasons(table, evidence))
+        replace(table, missing=_missing_reasons(table, evidence))
         for title, group in groups.items()
-        for table in _tables_of(title, group, told, evidence, ranking)
+        for table in _tables_of_protocol(title, group, differing, evidence, ranking)
     ]
 
 
-def _reasons(table: CellTable, evidence: Evidence) -> dict[tuple[int, str], str]:
-    """Return why conditions of a table have no figure."""
+def _missing_reasons(table: CellTable, evidence: Evidence) -> dict[tuple[int, str], str]:
+    """Return the reasons for missing figures, by line and name of the quantity."""
     cells = [cell for _, cell in table.lines]
     numbers = {id(cell): number for number, cell in enumerate(cells)}
     return {
@@ -297,37 +303,39 @@ def _reasons(table: CellTable, evidence: Evidence) -> dict[tuple[int, str], str]
     }
 
 
-def _tables_of(
-    title: str, cells: Sequence[Cell], told: Collection[str], evidence: Evidence, ranking: Ranking
+def _tables_of_protocol(
+    title: str, cells: Sequence[Cell], differing: Collection[str], evidence: Evidence, ranking: Ranking
 ) -> Iterator[CellTable]:
-    """Yield the tables of one protocol: expected quantities and the lab's own, fieldkit's, those of steps, words."""
-    lines = [(wording.place(cell, told=told), cell) for cell in cells]
+    """Yield the tables of one protocol: expected and lab-declared quantities, built-in ones, steps, words."""
+    lines = [(wording.place(cell, differing=differing), cell) for cell in cells]
     words = worded(cells)
     first = ranking.first(measured_in(cells))
-    if own_words := {name: said for name, said in words.items() if ranking.is_own(name)}:
-        words = {name: said for name, said in words.items() if name not in own_words}
-    if first or own_words:
-        yield CellTable(f"{title}, {_FIRST}", first, (), lines, _sizes(first, cells, evidence), own_words)
-    known = [quantity for quantity in measured_in(cells) if quantity not in first]
-    for step in dict.fromkeys(("", *(one.step for one in known))):
-        own = [one for one in known if one.step == step and one.is_own]
-        other = [one for one in known if one.step == step and not one.is_own]
-        # Where nothing is quoted the others are all that there is.
-        quoted = [one for one in own if plain_name(one.name) in _QUOTED] or own[:_MOST_IN_TABLE]
-        more = [one for one in own if one not in quoted]
-        if own or (not step and not known and not first):
+    if lab_words := {name: label for name, label in words.items() if ranking.is_own(name)}:
+        words = {name: label for name, label in words.items() if name not in lab_words}
+    if first or lab_words:
+        yield CellTable(f"{title}, {_FIRST}", first, (), lines, _ping_sizes(first, cells, evidence), lab_words)
+    remaining = [quantity for quantity in measured_in(cells) if quantity not in first]
+    for step in dict.fromkeys(("", *(quantity.step for quantity in remaining))):
+        builtin = [quantity for quantity in remaining if quantity.step == step and quantity.is_own]
+        others = [quantity for quantity in remaining if quantity.step == step and not quantity.is_own]
+        # Without quantities to be always visible, the first ones are.
+        visible = [quantity for quantity in builtin if plain_name(quantity.name) in _ALWAYS_VISIBLE] or builtin[
+            :_MOST_IN_TABLE
+        ]
+        more = [quantity for quantity in builtin if quantity not in visible]
+        if builtin or (not step and not remaining and not first):
             yield CellTable(
-                ", ".join(filter(None, (title, step))), quoted, more, lines, _sizes(quoted, cells, evidence)
+                ", ".join(filter(None, (title, step))), visible, more, lines, _ping_sizes(visible, cells, evidence)
             )
-        if other:
-            said = ", ".join(filter(None, (title, step, "further figures")))
-            yield CellTable(said, other[:_MOST_IN_TABLE], other[_MOST_IN_TABLE:], lines, {})
+        if others:
+            title_text = ", ".join(filter(None, (title, step, "further figures")))
+            yield CellTable(title_text, others[:_MOST_IN_TABLE], others[_MOST_IN_TABLE:], lines, {})
     if words:
         yield CellTable(f"{title}, words", (), (), lines, {}, words)
 
 
-def _sizes(quantities: Sequence[Quantity], cells: Sequence[Cell], evidence: Evidence) -> dict[str, str]:
-    """Return how large the requests were of pings whose round-trip time is among some quantities, by its name."""
+def _ping_sizes(quantities: Sequence[Quantity], cells: Sequence[Cell], evidence: Evidence) -> dict[str, str]:
+    """Return the ping payload sizes below the names of round-trip times."""
     return {
         quantity.name: ", ".join(evidence.payloads(cells, quantity.step))
         for quantity in quantities

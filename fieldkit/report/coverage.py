@@ -1,4 +1,4 @@
-"""How many repeats under a condition have a figure, and why the others have none."""
+"""Number of repeats with a value of a quantity under each condition, and reasons for missing values."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ _LOSSES: Final = {
     "topic": ("topic_loss",),
     "iperf3": ("iperf3_loss", "iperf3_captured_loss"),
 }
-"""By the first part of a column's name, the losses of what it is measured on."""
+"""Losses that belong to a quantity, by the first part of its column's name."""
 _OF_TRANSFERS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "file_loss")
-_EVERY_LOSS: Final = frozenset((*_OF_TRANSFERS, *(name for names in _LOSSES.values() for name in names)))
+_ALL_LOSSES: Final = frozenset((*_OF_TRANSFERS, *(name for names in _LOSSES.values() for name in names)))
 
 NOTHING_ARRIVED: Final = "nothing arrived"
 NO_VALUE: Final = "no value"
@@ -33,14 +33,14 @@ NO_VALID_REPEAT: Final = "no valid repeat"
 
 @dataclass(frozen=True)
 class RepeatCounts:
-    """What became of the repeats under one condition.
+    """Numbers of repeats under one condition by outcome.
 
     Attributes:
-        planned: How many there were to be, by the plans at hand; without a plan those that were begun.
-        valid: Those with a valid attempt.
-        void: Those whose last attempt is void.
-        failed: Those whose last attempt failed.
-        silent: Valid ones in which nothing arrived.
+        planned: Planned repeats by the available plans; without a plan, the started ones.
+        valid: Repeats with a valid attempt.
+        void: Repeats whose last attempt is void.
+        failed: Repeats whose last attempt failed.
+        silent: Valid repeats in which nothing arrived.
     """
 
     planned: int
@@ -62,8 +62,8 @@ class Absence:
     Attributes:
         cell: The condition.
         reason: `nothing arrived`, `no value`, or `no valid repeat`.
-        count: How many repeats have no value for this reason; attempts if none is valid.
-        of: Of how many.
+        count: Number of repeats without a value for this reason; of attempts if none is valid.
+        of: Number of all repeats or attempts.
     """
 
     cell: Cell
@@ -73,16 +73,16 @@ class Absence:
 
     @property
     def is_total(self) -> bool:
-        """Whether the condition has no value at all."""
+        """True if the condition has no value at all."""
         return self.count == self.of
 
     @property
     def share(self) -> str:
-        """How many repeats of how many, `3 of 5`; how the attempts ended if none is valid, `2 failed`."""
+        """Number of affected repeats, `3 of 5`; if none is valid, the outcomes of attempts, `2 failed`."""
         if self.cell.n_valid:
             return f"{self.count} of {self.of}"
-        ways = (("void", self.cell.n_void), ("failed", self.cell.n_failed))
-        return ", ".join(f"{count} {status}" for status, count in ways if count)
+        outcomes = (("void", self.cell.n_void), ("failed", self.cell.n_failed))
+        return ", ".join(f"{count} {status}" for status, count in outcomes if count)
 
     @property
     def text(self) -> str:
@@ -91,67 +91,71 @@ class Absence:
 
 
 def repeat_counts(cell: Cell, evidence: Evidence, silent: Rows) -> RepeatCounts:
-    """Return what became of the repeats under one condition; `silent` as `everything_lost`."""
+    """Return the numbers of repeats under one condition by outcome; `silent` as returned by `everything_lost`."""
     texts, rows = evidence.repeats.texts, evidence.rows(cell)
     last: dict[tuple[str, str, float], str] = {}
-    for row in rows.tolist():  # in the order of time
+    for row in rows.tolist():  # in order of time
         key = texts["source"][row], texts["trial"][row], float(evidence.repeats.numbers["repeat"][row])
         if last.get(key) != Status.VALID:
             last[key] = texts["status"][row]
-    ended = list(last.values())
+    statuses = list(last.values())
     planned = 0
     for source in {source for source, *_ in last}:
         plan = evidence.plans.get(source)
-        begun = sum(key[0] == source for key in last)
-        planned += max(begun, plan.repeats) if plan else begun
-    valid, void, failed = (ended.count(status) for status in ENDED)
+        started = sum(key[0] == source for key in last)
+        planned += max(started, plan.repeats) if plan else started
+    valid, void, failed = (statuses.count(status) for status in ENDED)
     is_silent = silent[rows] & (texts["status"][rows] == Status.VALID)
     return RepeatCounts(planned, valid, void, failed, int(is_silent.sum()))
 
 
 def everything_lost(repeats: Repeats) -> Rows:
-    """Return for each row whether every loss that it has is total; shape (n,)."""
-    names = [name for name in repeats.numbers if plain_name(name) in _EVERY_LOSS]
+    """Return a mask of the rows in which every known loss is total; shape (n,)."""
+    names = [name for name in repeats.numbers if plain_name(name) in _ALL_LOSSES]
     return _all_lost([repeats.numbers[name] for name in names], len(repeats))
 
 
 def nothing_arrived(repeats: Repeats, quantity: Quantity, rows: NDArray[np.int64]) -> Rows:
-    """Return for each of some rows whether nothing arrived of what a quantity is measured on; shape of `rows`.
+    """Return a mask of the given rows in which nothing arrived; shape of `rows`.
 
-    A row that has no loss of that is judged by all its losses.
+    A row without a loss that belongs to the quantity is judged by all its losses.
     """
     kind = plain_name(quantity.name).partition("_")[0]
-    own = {prefixed(quantity.step, loss) for loss in _LOSSES.get(kind, _OF_TRANSFERS)}
-    losses = {name: column[rows] for name, column in repeats.numbers.items() if plain_name(name) in _EVERY_LOSS}
-    mine = [column for name, column in losses.items() if name in own]
-    is_known = np.any([np.isfinite(column) for column in mine], axis=0) if mine else np.zeros(len(rows), np.bool_)
-    is_lost = np.any([column >= 1 for column in mine], axis=0) if mine else is_known
+    related = {prefixed(quantity.step, loss) for loss in _LOSSES.get(kind, _OF_TRANSFERS)}
+    losses = {name: column[rows] for name, column in repeats.numbers.items() if plain_name(name) in _ALL_LOSSES}
+    related_columns = [column for name, column in losses.items() if name in related]
+    is_known = (
+        np.any([np.isfinite(column) for column in related_columns], axis=0)
+        if related_columns
+        else np.zeros(len(rows), np.bool_)
+    )
+    is_lost = np.any([column >= 1 for column in related_columns], axis=0) if related_columns else is_known
     lost: Rows = np.where(is_known, is_lost, _all_lost(list(losses.values()), len(rows)))
     return lost
 
 
 def _all_lost(columns: Sequence[NDArray[np.float64]], count: int) -> Rows:
-    """Return for each row whether it has a loss, and none that is partial."""
+    """Return a mask of the rows that have a loss and no partial one."""
     if not columns:
         return np.zeros(count, dtype=np.bool_)
     is_known = np.any([np.isfinite(column) for column in columns], axis=0)
-    is_partial = np.any([column < 1 for column in columns], axis=0)  # false for a missing one
+    is_partial = np.any([column < 1 for column in columns], axis=0)  # False for a missing loss
     lost: Rows = is_known & ~is_partial
     return lost
 
 
 def absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> Iterator[Absence]:
-    """Yield what is missing of a quantity under conditions in which it should have been measured.
+    """Yield the missing values of a quantity under conditions in which it should have been measured.
 
     Args:
-        cells: Conditions; of each protocol and topology those count that have the quantity under some condition.
-        quantity: Which.
-        evidence: The table and the plans at hand.
+        cells: Conditions; only protocols and topologies count in which some condition has the quantity.
+        quantity: The quantity.
+        evidence: The table and the available plans.
     """
-    having = {_group(cell) for cell in cells if quantity.name in cell.estimates}
+    measured_groups = {_group(cell) for cell in cells if quantity.name in cell.estimates}
     for cell in cells:
-        if _group(cell) in having and _is_measured(cell, quantity, cells, evidence):
-            yield from _absent(cell, quantity, evidence)
+        if _group(cell) in measured_groups and _is_measured(cell, quantity, cells, evidence):
+            yield from _absences_of(cell, quantity, evidence)
 
 
 def _group(cell: Cell) -> tuple[str, str]:
@@ -159,19 +163,19 @@ def _group(cell: Cell) -> tuple[str, str]:
 
 
 def _is_measured(cell: Cell, quantity: Quantity, cells: Iterable[Cell], evidence: Evidence) -> bool:
-    """Return whether the repeats of a cell measure a quantity, by their plan, else by what is known of others."""
+    """Return True if the repeats of a cell measure a quantity, by their plan or else by similar cells."""
     if quantity.name in cell.estimates:
         return True
     if (declared := evidence.declared(cell)) is not None:
         return quantity.name in declared
     same = ("procedure", "scenario", "topology", "backend", "protocol")
-    alike = (one for one in cells if all(one.key[name] == cell.key[name] for name in same))
-    if not cell.n_valid or any(quantity.name in one.estimates for one in alike):
+    similar = (other for other in cells if all(other.key[name] == cell.key[name] for name in same))
+    if not cell.n_valid or any(quantity.name in other.estimates for other in similar):
         return True
     return bool(nothing_arrived(evidence.repeats, quantity, evidence.rows(cell)).any())
 
 
-def _absent(cell: Cell, quantity: Quantity, evidence: Evidence) -> Iterator[Absence]:
+def _absences_of(cell: Cell, quantity: Quantity, evidence: Evidence) -> Iterator[Absence]:
     if not cell.n_valid:
         attempts = cell.n_void + cell.n_failed
         yield Absence(cell, NO_VALID_REPEAT, attempts, attempts)

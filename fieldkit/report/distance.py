@@ -1,4 +1,4 @@
-"""Charts against distance: a chart per quantity; protocols, topologies and steps that have a name in panels."""
+"""Charts against distance: one per quantity, with panels for protocols, topologies and named steps."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ DELAY: Final = ("rtt_median_s", "one_way_median_s", "delay_s", "transfer_s", "to
 RATE: Final = ("goodput_bit_s", "throughput_bit_s", "iperf3_throughput_bit_s")
 
 _DODGE: Final = 0.026
-"""Between series at the same distance, as a share of the axis, so that no interval hides another."""
+"""Offset between series at the same distance, as a share of the axis, so that intervals do not overlap."""
 _ASIDE: Final = 0.009
-"""Of single repeats, from the interval of their estimate, likewise."""
+"""Offset of single repeats from the interval of their estimate, as a share of the axis."""
 _FEWEST_JOINED: Final = 4
-"""Distances from which on their points are joined: a line through fewer suggests a course that nobody measured."""
+"""Fewest distances whose points are joined. A line through fewer suggests a curve that was not measured."""
 _MOST_WIDE: Final = 2
-"""Panels of a chart of several steps that stand large."""
+"""Most panels of a chart of several steps that are drawn large."""
 _MARGIN: Final = 0.06
-"""At either end of the axis, likewise."""
+"""Margin at each end of the axis, as a share of the axis."""
 _TICKS_APART: Final = 0.16
-"""Of the axis, so that no label of a distance runs into another."""
+"""Least distance between labels, as a share of the axis."""
 
 
 def charts(
@@ -39,47 +39,49 @@ def charts(
 ) -> Iterator[Chart]:
     """Yield a chart for each of the quantities `names` that was measured at several distances.
 
-    Those of steps that have a name share one, a panel for each step. Round trips of requests of different sizes have
-    charts of their own, unless the names of their steps tell them apart: beside each other they would be compared.
+    Named steps share a chart with a panel for each step. Round-trip times of different payload sizes have separate
+    charts unless they belong to named steps, because they must not be compared.
     """
     drawing = _CurveDrawing(cells, identities, evidence, Ranking(evidence))
     for name in names:
-        found = alike(evidence.quantities.values(), name)
-        of_steps = {one: measured for one in found if one.step and (measured := _placed(cells, one))}
-        for quantity in found:
-            for size, same in ({} if quantity.step else by_size(cells, quantity, evidence)).items():
-                if placed := _placed(same, quantity):
-                    yield from (chart.of_size(size) for chart in drawing.chart({quantity: placed}))
-        yield from drawing.chart(of_steps)
+        matches = alike(evidence.quantities.values(), name)
+        cells_by_step = {
+            quantity: measured for quantity in matches if quantity.step and (measured := _placed(cells, quantity))
+        }
+        for quantity in matches:
+            for size, same_size in ({} if quantity.step else by_size(cells, quantity, evidence)).items():
+                if placed_cells := _placed(same_size, quantity):
+                    yield from (chart.of_size(size) for chart in drawing.chart({quantity: placed_cells}))
+        yield from drawing.chart(cells_by_step)
 
 
 def is_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> bool:
-    """Return whether any panel has a quantity, or should have it, at more than one distance."""
-    lacking = (absence.cell for absence in absences(cells, quantity, evidence) if absence.is_total)
+    """Return True if any panel has a quantity, or should have it, at more than one distance."""
+    cells_without = (absence.cell for absence in absences(cells, quantity, evidence) if absence.is_total)
     metres: dict[tuple[str, str], set[float]] = {}
-    for cell in (*_placed(cells, quantity), *lacking):
+    for cell in (*_placed(cells, quantity), *cells_without):
         metres.setdefault(_group(cell), set()).add(wording.metres(cell))
     return any(len(places) > 1 for places in metres.values())
 
 
 def has_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> bool:
-    """Return whether a quantity of these cells has a curve, pings of all sizes taken together."""
-    return is_curve(around(cells, quantity, _placed(cells, quantity)), quantity, evidence)
+    """Return True if a quantity of these cells has a curve, with pings of all sizes combined."""
+    return is_curve(with_missing(cells, quantity, _placed(cells, quantity)), quantity, evidence)
 
 
 def by_size(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> Mapping[str, Sequence[Cell]]:
-    """Return the cells that have a quantity by the size of their pings, if it is their round-trip time; else all."""
-    having = [cell for cell in cells if quantity.name in cell.estimates]
+    """Return the cells that have a quantity, for a round-trip time by the payload size of the pings, else by ""."""
+    measured_cells = [cell for cell in cells if quantity.name in cell.estimates]
     if plain_name(quantity.name) != "rtt_median_s":
-        return {"": having} if having else {}
-    return evidence.by_payload(having, quantity.step)
+        return {"": measured_cells} if measured_cells else {}
+    return evidence.by_payload(measured_cells, quantity.step)
 
 
-def around(cells: Sequence[Cell], quantity: Quantity, group: Sequence[Cell]) -> list[Cell]:
-    """Return the cells of a group, and those of its protocols and topologies that do not have the quantity."""
-    alike_ = {_group(cell) for cell in group}
+def with_missing(cells: Sequence[Cell], quantity: Quantity, group: Sequence[Cell]) -> list[Cell]:
+    """Return the cells of a group, and the cells of the same protocols and topologies without the quantity."""
+    groups = {_group(cell) for cell in group}
     return [
-        cell for cell in cells if cell in group or (_group(cell) in alike_ and quantity.name not in cell.estimates)
+        cell for cell in cells if cell in group or (_group(cell) in groups and quantity.name not in cell.estimates)
     ]
 
 
@@ -90,10 +92,10 @@ def _placed(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
 
 @dataclass(frozen=True)
 class _CurvePlace:
-    """A condition in a panel: an estimate, or why there is none."""
+    """A condition in a panel: an estimate, or the reason for its absence."""
 
     cell: Cell
-    found: Point | Absence
+    content: Point | Absence
     is_high: bool = True
 
     @property
@@ -111,31 +113,35 @@ class _CurveDrawing:
     ranking: Ranking
 
     def chart(self, measured: Mapping[Quantity, Sequence[Cell]]) -> Iterator[Chart]:
-        """Yield the chart of a quantity, or of the same one of several steps, if several distances have it."""
-        if not any(is_curve(around(self.cells, one, cells), one, self.evidence) for one, cells in measured.items()):
+        """Yield the chart of a quantity, or of the same quantity of several steps, if it has several distances."""
+        if not any(
+            is_curve(with_missing(self.cells, each, cells), each, self.evidence) for each, cells in measured.items()
+        ):
             return
         quantity, several = next(iter(measured)), len(measured) > 1
-        values = [cell.estimates[one.name].value for one, cells in measured.items() for cell in cells]
-        written = scale_of(quantity, values)
+        values = [cell.estimates[each.name].value for each, cells in measured.items() for cell in cells]
+        scale = scale_of(quantity, values)
         groups = {
-            _titled(title, one if several else None, group, self.evidence): self._places(one, group, written.factor)
-            for one, cells in measured.items()
+            _panel_title(title, each if several else None, group, self.evidence): self._places(
+                each, group, scale.factor
+            )
+            for each, cells in measured.items()
             for title, group in panels(cells).items()
         }
         label = quantity.label if quantity.step and not several else _capital(quantity.plain_label)
-        unit = "% of repeats" if quantity.kind is Kind.FLAG else written.unit
+        unit = "% of repeats" if quantity.kind is Kind.FLAG else scale.unit
         y_label = f"{label} [{unit}]" if unit else label
-        every = [place.found for places in groups.values() for place in places if isinstance(place.found, Point)]
+        points = [place.content for places in groups.values() for place in places if isinstance(place.content, Point)]
         of_protocols = {
-            protocol: ends([point for point in every if point.protocol == protocol], written.unit)
-            for protocol in {point.protocol for point in every}
+            protocol: ends([each for each in points if each.protocol == protocol], scale.unit)
+            for protocol in {each.protocol for each in points}
         }
-        lacking = [place for places in groups.values() for place in places if isinstance(place.found, Absence)]
+        missing = [place for places in groups.values() for place in places if isinstance(place.content, Absence)]
         name = plain_name(quantity.name).removesuffix("_s").removesuffix("_bit").replace("_", "-")
         yield Chart(
             name=f"{name}-of-steps" if quantity.step else name,
             title=f"{label} against distance{', by step' if several else ''}",
-            caption=_caption(quantity, every, of_protocols, is_lacking=bool(lacking)),
+            caption=_caption(quantity, points, of_protocols, is_lacking=bool(missing)),
             panels=[
                 self._panel(title, places, y_label, of_protocols[wording.text(places[0].cell, "protocol")])
                 for title, places in groups.items()
@@ -144,46 +150,46 @@ class _CurveDrawing:
         )
 
     def _places(self, quantity: Quantity, group: Sequence[Cell], factor: float) -> list[_CurvePlace]:
-        """Return the conditions of a panel in the order of distance, those without a value too."""
+        """Return the conditions of a panel in order of distance, also those without a value."""
         is_up = self.ranking.more_is_worse(quantity) is not False
-        found = [_CurvePlace(cell, point(cell, quantity, factor, self.evidence)) for cell in group]
-        found += [
+        places = [_CurvePlace(cell, point(cell, quantity, factor, self.evidence)) for cell in group]
+        places += [
             _CurvePlace(absence.cell, absence, is_high=is_up)
-            for absence in absences(around(self.cells, quantity, group), quantity, self.evidence)
+            for absence in absences(with_missing(self.cells, quantity, group), quantity, self.evidence)
             if absence.is_total and absence.cell.key["distance_m"] is not None
         ]
-        return sorted(found, key=lambda place: place.metres)
+        return sorted(places, key=lambda place: place.metres)
 
     def _panel(self, title: str, places: Sequence[_CurvePlace], y_label: str, limits: tuple[float, float]) -> Panel:
-        found: dict[str, tuple[Identity, list[_CurvePlace]]] = {}
+        places_by_label: dict[str, tuple[Identity, list[_CurvePlace]]] = {}
         for place in places:
             identity = self.identities.of(place.cell)
-            found.setdefault(identity.label, (identity, []))[1].append(place)
+            places_by_label.setdefault(identity.label, (identity, []))[1].append(place)
         metres = [place.metres for place in places]
         span = (max(metres) - min(metres)) or 1.0
-        middle = (len(found) - 1) / 2
-        room = (_MARGIN + middle * _DODGE) * span if len(set(metres)) > 1 else span / 2
-        ranked = sorted(found.values(), key=lambda pair: pair[0].rank)
+        middle = (len(places_by_label) - 1) / 2
+        margin = (_MARGIN + middle * _DODGE) * span if len(set(metres)) > 1 else span / 2
+        ranked = sorted(places_by_label.values(), key=lambda pair: pair[0].rank)
         shifts = [(rank - middle) * _DODGE * span for rank in range(len(ranked))]
         return Panel(
             title=title,
             x_label="distance",
             y_label=y_label,
             series=[
-                _series(identity, mine, shift, _ASIDE * span, limits)
-                for shift, (identity, mine) in zip(shifts, ranked, strict=True)
+                _series(identity, own_places, shift, _ASIDE * span, limits)
+                for shift, (identity, own_places) in zip(shifts, ranked, strict=True)
             ],
-            words=_words(title, y_label, found.values()),
+            words=_words(title, y_label, places_by_label.values()),
             x_ticks=_ticks(places, span),
             bottom=limits[0],
             top=limits[1],
-            left=min(metres) - room,
-            right=max(metres) + room,
+            left=min(metres) - margin,
+            right=max(metres) + margin,
             edges=[
-                EdgeMark(place.metres + shift, place.found.text, identity.style.colour, place.is_high)
-                for shift, (identity, mine) in zip(shifts, ranked, strict=True)
-                for place in mine
-                if isinstance(place.found, Absence)
+                EdgeMark(place.metres + shift, place.content.text, identity.style.colour, place.is_high)
+                for shift, (identity, own_places) in zip(shifts, ranked, strict=True)
+                for place in own_places
+                if isinstance(place.content, Absence)
             ],
         )
 
@@ -193,12 +199,12 @@ def _group(cell: Cell) -> tuple[str, str]:
 
 
 def _capital(label: str) -> str:
-    """Return a label as it begins a line; a program is called as it is."""
+    """Return a label with a capital letter, except for names of programs."""
     return label if label.startswith("iperf3") else label[:1].upper() + label[1:]
 
 
-def _titled(title: str, quantity: Quantity | None, cells: Sequence[Cell], evidence: Evidence) -> str:
-    """Return the title of a panel: with the name of the step among several, and what a ping of this name sent."""
+def _panel_title(title: str, quantity: Quantity | None, cells: Sequence[Cell], evidence: Evidence) -> str:
+    """Return the title of a panel: with the step's name if there are several, and the payload size of its ping."""
     if quantity is None:
         return title
     sizes = evidence.payloads(cells, quantity.step) if plain_name(quantity.name) == "rtt_median_s" else []
@@ -243,7 +249,7 @@ def _caption(
 def _series(
     identity: Identity, places: Sequence[_CurvePlace], shift: float, aside: float, limits: tuple[float, float]
 ) -> Series:
-    points = [place.found for place in places if isinstance(place.found, Point)]
+    points = [place.content for place in places if isinstance(place.content, Point)]
     is_line = len({point.metres for point in points}) >= _FEWEST_JOINED
     return Series(
         label=identity.label,
@@ -262,14 +268,14 @@ def _series(
 
 
 def _breaks(places: Sequence[_CurvePlace], limits: tuple[float, float]) -> frozenset[int]:
-    """Return the points after which no line is drawn: an interval there says too little, or values are missing."""
+    """Return the points after which no line is drawn: a wide interval there, or missing values."""
     breaks, index = set(), -1
     for place in places:
-        if isinstance(place.found, Absence):
+        if isinstance(place.content, Absence):
             breaks.add(index)
             continue
         index += 1
-        if place.found.is_vague(limits):
+        if place.content.is_vague(limits):
             breaks |= {index - 1, index}
     return frozenset(breaks)
 
@@ -284,14 +290,14 @@ def _ticks(places: Sequence[_CurvePlace], span: float) -> list[tuple[float, str]
 
 
 def _words(title: str, y_label: str, series: Iterable[tuple[Identity, list[_CurvePlace]]]) -> str:
-    """Return a panel as a sentence per series."""
-    said = [
+    """Return the description of a panel, one sentence per series."""
+    sentences = [
         f"{identity.label or 'all'}: "
         + ", ".join(
-            f"{f'{each.found.value:.2f}' if isinstance(each.found, Point) else each.found.text} "
+            f"{f'{each.content.value:.2f}' if isinstance(each.content, Point) else each.content.text} "
             f"at {wording.distance(each.cell)}"
             for each in places
         )
         for identity, places in series
     ]
-    return f"{y_label} against distance, {title}. " + "; ".join(said) + "."
+    return f"{y_label} against distance, {title}. " + "; ".join(sentences) + "."

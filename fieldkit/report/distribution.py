@@ -1,4 +1,4 @@
-"""Distribution functions: of each round trip where ping's own lines are at hand, else of the repeats."""
+"""Distribution functions of all round trips if the outputs of ping are available, else of the repeats."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,106 +17,112 @@ from fieldkit.report.evidence import Evidence
 from fieldkit.report.points import needs_log
 
 MOST_DISTANCES: Final = 3
-"""In panels: the nearest, the middle and the farthest."""
+"""Most distances with a panel: the nearest, the middle and the farthest."""
 _ROOM: Final = 1.03
 _LOG_ROOM: Final = 1.1
-"""Factor beyond the extreme times of an axis."""
+"""Factor between the ends of an axis and the extreme times."""
 _LOG: Final = ", on a logarithmic axis"
 MOST_STEPS: Final = 120
-"""Of a line; a longer one is drawn through as many of its quantiles."""
+"""Most steps of a line. A longer line is drawn through this number of its quantiles."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """What one cell gives to a distribution: times in seconds, sorted."""
+    """The times of one cell in seconds, sorted."""
 
     cell: Cell
     times_s: NDArray[np.float64]
 
 
 def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Chart]:
-    """Yield the distributions of round-trip time and transfer time that the table and ping's output give."""
-    for one in alike(evidence.quantities.values(), "rtt_median_s"):
-        yield from _round_trips(one, cells, identities, evidence)
-    for one in alike(evidence.quantities.values(), "transfer_s"):
-        name, title = _named("transfer-distribution", one), _said("Transfer time", one)
-        yield from _chart(name, title, "repeats", _column(one.name, cells, evidence), identities)
+    """Yield the distributions of round-trip time and transfer time from the table and the outputs of ping."""
+    for quantity in alike(evidence.quantities.values(), "rtt_median_s"):
+        yield from _round_trips(quantity, cells, identities, evidence)
+    for quantity in alike(evidence.quantities.values(), "transfer_s"):
+        name, title = _chart_name("transfer-distribution", quantity), _chart_title("Transfer time", quantity)
+        yield from _chart(name, title, "repeats", _repeat_samples(quantity.name, cells, evidence), identities)
 
 
 def _round_trips(
     quantity: Quantity, cells: Sequence[Cell], identities: Identities, evidence: Evidence
 ) -> Iterator[Chart]:
-    """Yield the distributions of one ping's round-trip times, those of each size of requests by themselves."""
-    replies = _replies(quantity, cells, evidence)
-    title, of = ("Round-trip time", "replies") if replies else ("Median round-trip time", "repeats")
-    samples = replies or _column(quantity.name, cells, evidence)
+    """Yield the distributions of one ping's round-trip times, separately for each payload size."""
+    replies = _reply_samples(quantity, cells, evidence)
+    title, unit_name = ("Round-trip time", "replies") if replies else ("Median round-trip time", "repeats")
+    samples = replies or _repeat_samples(quantity.name, cells, evidence)
     for size in evidence.by_payload(cells, quantity.step):
-        mine = [one for one in samples if evidence.payload(one.cell, quantity.step) == size]
-        for chart in _chart(_named("rtt-distribution", quantity), _said(title, quantity), of, mine, identities):
+        same_size = [sample for sample in samples if evidence.payload(sample.cell, quantity.step) == size]
+        for chart in _chart(
+            _chart_name("rtt-distribution", quantity), _chart_title(title, quantity), unit_name, same_size, identities
+        ):
             yield chart.of_size(size)
 
 
-def _named(chart: str, quantity: Quantity) -> str:
-    """Return the name of a chart of one step, which files and links are called by."""
+def _chart_name(chart: str, quantity: Quantity) -> str:
+    """Return the name of a chart of one step, for files and links."""
     return "-".join(filter(None, (chart, quantity.step.replace("_", "-").replace(".", "-"))))
 
 
-def _said(title: str, quantity: Quantity) -> str:
+def _chart_title(title: str, quantity: Quantity) -> str:
     return f"{title} of {quantity.step}" if quantity.step else title
 
 
-def _replies(quantity: Quantity, cells: Sequence[Cell], evidence: Evidence) -> list[_Sample] | None:
-    """Return every round trip of each cell; None where ping's output is missing for a repeat that has a median."""
+def _reply_samples(quantity: Quantity, cells: Sequence[Cell], evidence: Evidence) -> list[_Sample] | None:
+    """Return all round-trip times of each cell, or None if a repeat with a median has no output of ping."""
     samples = []
     for cell in cells:
-        said = [evidence.pings(row, quantity.step) for row in evidence.valid(cell, quantity.name).tolist()]
-        if None in said:
+        outputs = [evidence.pings(row, quantity.step) for row in evidence.valid(cell, quantity.name).tolist()]
+        if None in outputs:
             return None
-        samples.append(_Sample(cell, np.sort([rtt_s for one in said if one for rtt_s in one.rtt_s])))
+        samples.append(_Sample(cell, np.sort([rtt_s for output in outputs if output for rtt_s in output.rtt_s])))
     return samples
 
 
-def _column(name: str, cells: Sequence[Cell], evidence: Evidence) -> list[_Sample]:
+def _repeat_samples(name: str, cells: Sequence[Cell], evidence: Evidence) -> list[_Sample]:
     numbers = evidence.repeats.numbers[name]
     return [_Sample(cell, np.sort(numbers[evidence.valid(cell, name)])) for cell in cells]
 
 
-def _chart(name: str, title: str, of: str, samples: Sequence[_Sample], identities: Identities) -> Iterator[Chart]:
-    known = [one for one in samples if len(one.times_s)]
-    if not known:
+def _chart(
+    name: str, title: str, unit_name: str, samples: Sequence[_Sample], identities: Identities
+) -> Iterator[Chart]:
+    nonempty = [sample for sample in samples if len(sample.times_s)]
+    if not nonempty:
         return
-    # In one unit, in which also the shortest can be read.
-    scale = time_scale(min(one.times_s[-1] for one in known))
-    found = []
-    for condition, group in panels([one.cell for one in known]).items():
+    # One unit for all lines, chosen for the shortest one.
+    scale = time_scale(min(sample.times_s[-1] for sample in nonempty))
+    chart_panels = []
+    for condition, group in panels([sample.cell for sample in nonempty]).items():
         alike_s = np.concatenate(
-            [one.times_s for one in known if one.cell.key["protocol"] == group[0].key["protocol"]]
+            [sample.times_s for sample in nonempty if sample.cell.key["protocol"] == group[0].key["protocol"]]
         )
         is_log = needs_log(alike_s)
         for place in _places(group):
-            there = [one for one in known if one.cell in group and wording.distance(one.cell) == place]
-            there.sort(key=lambda one: identities.of(one.cell).rank)
-            series = [_series(identities, one, scale.factor) for one in there]
-            found.append(
+            place_samples = [
+                sample for sample in nonempty if sample.cell in group and wording.distance(sample.cell) == place
+            ]
+            place_samples.sort(key=lambda sample: identities.of(sample.cell).rank)
+            series = [_series(identities, sample, scale.factor) for sample in place_samples]
+            chart_panels.append(
                 Panel(
                     title=f"{condition}, {place}",
                     x_label=f"{title} [{scale.unit}]",
-                    y_label=f"share of {of}",
+                    y_label=f"share of {unit_name}",
                     series=series,
-                    words=_words(f"{title}, {condition}, {place}", there, identities, scale),
+                    words=_words(f"{title}, {condition}, {place}", place_samples, identities, scale),
                     top=1.0,
                     left=scale.factor * float(alike_s.min()) / _LOG_ROOM if is_log else 0.0,
                     right=scale.factor * float(alike_s.max()) * (_LOG_ROOM if is_log else _ROOM),
                     x_log=is_log,
                 )
             )
-    caption = _caption(known, of, is_log=any(panel.x_log for panel in found))
-    yield Chart(name, f"{title}: distribution", caption, found, is_dense=True)
+    caption = _caption(nonempty, unit_name, is_log=any(panel.x_log for panel in chart_panels))
+    yield Chart(name, f"{title}: distribution", caption, chart_panels, is_dense=True)
 
 
 def _places(cells: Sequence[Cell]) -> list[str]:
-    """Return the distances that get a panel, in words: at most `MOST_DISTANCES`."""
-    places = [said for _, said in sorted({(wording.metres(cell), wording.distance(cell)) for cell in cells})]
+    """Return labels of the distances that get a panel, at most `MOST_DISTANCES`."""
+    places = [label for _, label in sorted({(wording.metres(cell), wording.distance(cell)) for cell in cells})]
     if len(places) <= MOST_DISTANCES:
         return places
     return [places[0], places[(len(places) - 1) // 2], places[-1]]
@@ -129,7 +135,7 @@ def _series(identities: Identities, sample: _Sample, factor: float) -> Series:
 
 
 def _steps(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners of the distribution function: shares up to each time, from 0 to 1."""
+    """Return the corners of the distribution function: times, and the shares up to each time, from 0 to 1."""
     if len(times) > MOST_STEPS:
         shares = np.linspace(0, 1, MOST_STEPS + 1)
         return np.quantile(times, shares, method="inverted_cdf"), shares
@@ -137,20 +143,22 @@ def _steps(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 def _words(title: str, samples: Sequence[_Sample], identities: Identities, scale: Scale) -> str:
-    said = []
-    for one in samples:
-        half, most = (f"{scale.number(time_s)} {scale.unit}" for time_s in np.quantile(one.times_s, (0.5, 0.95)))
-        said.append(f"{identities.of(one.cell).label or 'all'}: median {half}, 95 % up to {most}")
-    return f"{title}. " + "; ".join(said) + "."
+    sentences = []
+    for sample in samples:
+        median, p95 = (f"{scale.number(time_s)} {scale.unit}" for time_s in np.quantile(sample.times_s, (0.5, 0.95)))
+        sentences.append(f"{identities.of(sample.cell).label or 'all'}: median {median}, 95 % up to {p95}")
+    return f"{title}. " + "; ".join(sentences) + "."
 
 
-def _caption(samples: Sequence[_Sample], of: str, *, is_log: bool) -> str:
-    counts = sorted(len(one.times_s) for one in samples)
+def _caption(samples: Sequence[_Sample], unit_name: str, *, is_log: bool) -> str:
+    counts = sorted(len(sample.times_s) for sample in samples)
     many = str(counts[0]) if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
-    said = f"Share of {of} that took at most this time{_LOG if is_log else ''}; {many} {of} per line"
-    places = {wording.distance(one.cell) for one in samples}
+    text = f"Share of {unit_name} that took at most this time{_LOG if is_log else ''}; {many} {unit_name} per line"
+    places = {wording.distance(sample.cell) for sample in samples}
     if len(places) > MOST_DISTANCES:
-        said += f"; of {len(places)} distances the nearest, a middle one and the farthest"
+        text += f"; of {len(places)} distances the nearest, a middle one and the farthest"
     if counts[-1] > MOST_STEPS:
-        said += f"; lines of more than {MOST_STEPS} go through as many quantiles"
-    return f"{said}. Requests without a reply are in no line: see ping loss." if of == "replies" else f"{said}."
+        text += f"; lines of more than {MOST_STEPS} go through as many quantiles"
+    return (
+        f"{text}. Requests without a reply are in no line: see ping loss." if unit_name == "replies" else f"{text}."
+    )

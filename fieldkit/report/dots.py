@@ -20,9 +20,9 @@ from fieldkit.report.ranking import Ranking
 _DODGE: Final = 0.7
 """Share of a lane over which the conditions of one quantity are spread."""
 _ASIDE: Final = 0.12
-"""Of single repeats, below their estimate, as a share of the room of a condition."""
+"""Offset of single repeats below their estimate, as a share of the height of a condition."""
 _LOG_ROOM: Final = 1.25
-"""Factor beyond the smallest and the largest value of a logarithmic axis."""
+"""Factor between the ends of a logarithmic axis and the extreme values."""
 _LABELS: Final = {
     "share": "share",
     "s": "time",
@@ -43,35 +43,37 @@ class _Lane:
     """One quantity in one panel.
 
     Attributes:
-        label: Its name, and the size of a ping's requests.
-        quantity: Which.
+        label: Its name, and the payload size of a ping.
+        quantity: The quantity.
         cells: The conditions that have it.
-        around: These, and those that lack it.
+        with_missing: These conditions, and those without a value.
     """
 
     label: str
     quantity: Quantity
     cells: Sequence[Cell]
-    around: Sequence[Cell]
+    with_missing: Sequence[Cell]
 
 
 def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Chart]:
-    """Yield the dot plot of all quantities that no curve shows; none if there are none."""
+    """Yield the dot plot of all quantities that no curve shows, if there are any."""
     ranking = Ranking(evidence)
     quantities = measured(cells)
     first = ranking.first(quantities)
     ordered = [*first, *(quantity for quantity in quantities if quantity not in first)]
     groups: dict[tuple[str, str, str], list[_Lane]] = {}
     for quantity in ordered:
-        for size, same in distance.by_size(cells, quantity, evidence).items():
-            around = distance.around(cells, quantity, same)
-            if distance.is_curve(around, quantity, evidence):
+        for size, same_size in distance.by_size(cells, quantity, evidence).items():
+            all_cells = distance.with_missing(cells, quantity, same_size)
+            if distance.is_curve(all_cells, quantity, evidence):
                 continue
-            for title, group in panels(same).items():
+            for title, group in panels(same_size).items():
                 label = ", ".join(filter(None, (quantity.label, size)))
-                beside = distance.around(cells, quantity, group)
+                panel_cells = distance.with_missing(cells, quantity, group)
                 place = wording.distance(group[0])
-                groups.setdefault((title, place, quantity.unit), []).append(_Lane(label, quantity, group, beside))
+                groups.setdefault((title, place, quantity.unit), []).append(
+                    _Lane(label, quantity, group, panel_cells)
+                )
     if groups:
         drawing = _DotDrawing(identities, evidence, ranking)
         units = list(dict.fromkeys(unit for *_, unit in groups))
@@ -96,7 +98,7 @@ class _DotDrawing:
         """Return the panel of the quantities of one unit."""
         values = [cell.estimates[lane.quantity.name].value for lane in lanes for cell in lane.cells]
         scale = scale_of(lanes[0].quantity, values)
-        conditions = list({id(cell): cell for lane in lanes for cell in lane.around}.values())
+        conditions = list({id(cell): cell for lane in lanes for cell in lane.with_missing}.values())
         conditions.sort(key=lambda cell: self.identities.of(cell).rank)
         step = _DODGE / len(conditions)
         offsets = {id(cell): _DODGE / 2 - (index + 0.5) * step for index, cell in enumerate(conditions)}
@@ -105,24 +107,27 @@ class _DotDrawing:
         for height, lane in enumerate(reversed(lanes)):
             for cell in lane.cells:
                 identity = self.identities.of(cell)
-                found = point(cell, lane.quantity, scale.factor, self.evidence)
-                placed.setdefault(identity.label, (identity, []))[1].append((height + offsets[id(cell)], found))
+                estimate = point(cell, lane.quantity, scale.factor, self.evidence)
+                placed.setdefault(identity.label, (identity, []))[1].append((height + offsets[id(cell)], estimate))
             is_high = self.ranking.more_is_worse(lane.quantity) is not False
             edges += [
                 EdgeMark(
-                    height + offsets[id(lack.cell)], lack.text, self.identities.of(lack.cell).style.colour, is_high
+                    height + offsets[id(absence.cell)],
+                    absence.text,
+                    self.identities.of(absence.cell).style.colour,
+                    is_high,
                 )
-                for lack in absences(lane.around, lane.quantity, self.evidence)
-                if lack.is_total
+                for absence in absences(lane.with_missing, lane.quantity, self.evidence)
+                if absence.is_total
             ]
-        points = [found for _, mine in placed.values() for _, found in mine]
+        points = [estimate for _, placed_points in placed.values() for _, estimate in placed_points]
         ranked = sorted(placed.values(), key=lambda pair: pair[0].rank)
-        return _limited(
+        return _with_limits(
             Panel(
                 title=title,
                 x_label=_axis(unit, scale, lanes),
                 y_label="",
-                series=[_series(identity, mine, _ASIDE * step) for identity, mine in ranked],
+                series=[_series(identity, placed_points, _ASIDE * step) for identity, placed_points in ranked],
                 words=_words(title, lanes, scale),
                 lanes=[lane.label for lane in reversed(lanes)],
                 edges=edges,
@@ -139,8 +144,8 @@ def _axis(unit: str, scale: Scale, lanes: Sequence[_Lane]) -> str:
     return f"{label} [{scale.unit}]" if scale.unit else label
 
 
-def _limited(panel: Panel, points: Sequence[Point], unit: str) -> Panel:
-    """Return a panel with the ends of its axis of values, which is logarithmic where that is needed."""
+def _with_limits(panel: Panel, points: Sequence[Point], unit: str) -> Panel:
+    """Return a panel with the ends of its axis of values, which is logarithmic if values need it."""
     values = list(chain.from_iterable((each.value, *each.repeats) for each in points))
     if needs_log(values):
         return replace(panel, x_log=True, left=min(values) / _LOG_ROOM, right=max(values) * _LOG_ROOM)
@@ -168,18 +173,20 @@ def _series(identity: Identity, placed: Sequence[tuple[float, Point]], aside: fl
 def _caption(drawn: Sequence[Panel]) -> str:
     parts = [
         _HOW,
-        "The axis is logarithmic where values differ more than 30 times." if any(one.x_log for one in drawn) else "",
-        "Hollow, with an arrow: a lower bound, because something had not ended."
-        if any(series.behind_bounds for one in drawn for series in one.series)
+        "The axis is logarithmic where values differ more than 30 times."
+        if any(panel.x_log for panel in drawn)
         else "",
-        "A cross marks a condition without a value." if any(one.edges for one in drawn) else "",
+        "Hollow, with an arrow: a lower bound, because something had not ended."
+        if any(series.behind_bounds for panel in drawn for series in panel.series)
+        else "",
+        "A cross marks a condition without a value." if any(panel.edges for panel in drawn) else "",
     ]
     return " ".join(filter(None, parts))
 
 
 def _words(title: str, lanes: Sequence[_Lane], scale: Scale) -> str:
-    said = [
+    sentences = [
         f"{lane.label}: {', '.join(scale.amount(cell.estimates[lane.quantity.name].value) for cell in lane.cells)}"
         for lane in lanes
     ]
-    return f"{title}. {'; '.join(said)}."
+    return f"{title}. {'; '.join(sentences)}."

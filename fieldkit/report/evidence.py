@@ -1,4 +1,4 @@
-"""The folders behind the rows of a table, where they are at hand: plan, raw files, what is linked."""
+"""The trial folders of the rows of a table, if available: plan, raw files, links."""
 
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
@@ -23,13 +23,13 @@ from fieldkit.trial.plan import PLAN_FILE, Plan
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What is at hand beside a table of repeats.
+    """A table of repeats with the available evidence.
 
     Attributes:
         repeats: The table.
-        plans: Plan by the `source` of its rows; only sources that are folders of trials have one.
-        unread: A sentence per plan that could not be read, and per trial whose evidence is not as it was kept.
-        changed: The folders of attempts whose evidence is not; it is taken as not at hand.
+        plans: Plans by the `source` of rows; only sources that are folders of trials have one.
+        unread: A sentence per plan that could not be read, and per trial whose evidence differs from its manifest.
+        changed: Folders of attempts whose evidence differs from the manifest. It counts as not available.
     """
 
     repeats: Repeats
@@ -39,8 +39,8 @@ class Evidence:
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
-        """What figures can be made of, by name and in order."""
-        return {one.name: one for one in self.repeats.quantities}
+        """Quantities of the table by name, in order."""
+        return {quantity.name: quantity for quantity in self.repeats.quantities}
 
     @cached_property
     def _rows(self) -> Mapping[Key, NDArray[np.int64]]:
@@ -53,7 +53,7 @@ class Evidence:
         return self._rows[tuple(cell.key[name] for name in DEFAULT_BY)]
 
     def declared(self, cell: Cell) -> Set[str] | None:
-        """Return the columns that the steps of a cell's trials measure, None if no plan of them is at hand."""
+        """Return the columns that the steps of a cell's trials measure, or None if no plan of them is available."""
         key = tuple(cell.key[name] for name in DEFAULT_BY)
         if key not in self._declared:
             sources = dict.fromkeys(self.repeats.texts["source"][self.rows(cell)].tolist())
@@ -75,7 +75,7 @@ class Evidence:
         return chosen
 
     def observed(self, cell: Cell, quantity: Quantity) -> tuple[Numbers, NDArray[np.bool_]]:
-        """Return the values of a cell's valid repeats in order of time, and which of them are only lower bounds."""
+        """Return the values of a cell's valid repeats in order of time, and a mask of the mere lower bounds."""
         rows = self.rows(cell)
         rows = rows[self.repeats.texts["status"][rows] == Status.VALID]
         values, is_bound = (column[rows] for column in self.repeats.observed(quantity))
@@ -83,18 +83,18 @@ class Evidence:
         return values[is_known], is_bound[is_known]
 
     def by_payload(self, cells: Sequence[Cell], step: str = "") -> Mapping[str, list[Cell]]:
-        """Return cells by the size of their echo requests in words: those of different sizes are not compared."""
-        found: dict[str, list[Cell]] = {}
+        """Return cells by the payload size of their pings in words, since different sizes must not be compared."""
+        cells_by_size: dict[str, list[Cell]] = {}
         for cell in cells:
-            found.setdefault(self.payload(cell, step), []).append(cell)
-        return found
+            cells_by_size.setdefault(self.payload(cell, step), []).append(cell)
+        return cells_by_size
 
     def payloads(self, cells: Iterable[Cell], step: str = "") -> list[str]:
-        """Return how large the echo requests of cells were, in words: `502 bytes`; of a step that has a name."""
+        """Return the payload sizes of the pings of cells, `502 bytes`, optionally of a named step."""
         return [size for size in dict.fromkeys(self.payload(cell, step) for cell in cells) if size]
 
     def payload(self, cell: Cell, step: str = "") -> str:
-        """Return how large a cell's echo requests were, in words: `502 bytes`; empty where nobody says."""
+        """Return the payload size of a cell's pings, `502 bytes`, or an empty string if it is unknown."""
         name = f"{step}.rtt_payload_bytes".removeprefix(".")
         if name not in self.repeats.numbers:
             return ""
@@ -102,11 +102,11 @@ class Evidence:
         return f"{' or '.join(f'{size:.0f}' for size in sizes)} bytes" if len(sizes) else ""
 
     def plan(self, row: int) -> Plan | None:
-        """Return the plan of a row's trial, None where it is not at hand."""
+        """Return the plan of a row's trial, or None if it is not available."""
         return self.plans.get(self.repeats.texts["source"][row])
 
     def attempt(self, row: int) -> AttemptEvidence | None:
-        """Return a row's raw evidence, None where it is not at hand."""
+        """Return a row's raw evidence, or None if it is not available."""
         plan, texts, name = self.plan(row), self.repeats.texts, self.repeats.folder(row)
         if plan is None or name is None or plan.trial != texts["trial"][row]:
             return None
@@ -114,23 +114,25 @@ class Evidence:
         return AttemptEvidence(folder) if folder.is_dir() and folder not in self.changed else None
 
     def pings(self, row: int, step: str = "") -> ping.Ping | None:
-        """Return what ping said in a row's attempt, in a step that has a name; None where that is not at hand."""
+        """Return the output of ping in a row's attempt, optionally of a named step, or None if unavailable."""
         evidence, plan = self.attempt(row), self.plan(row)
-        pinging = next((one for one in plan.pingings() if one.name == step), None) if plan else None
+        pinging = next((each for each in plan.pingings() if each.name == step), None) if plan else None
         return evidence.read_or_none(ping.read, pinging.file) if evidence and pinging else None
 
 
 def at_hand(repeats: Repeats) -> Evidence:
-    """Return what the sources of `repeats` hold beside their tables."""
+    """Return a table of repeats with the evidence in its sources."""
     plans, unread, changed = {}, [], set[Path]()
     for source in dict.fromkeys(repeats.texts["source"].tolist()):
         if not (Path(source) / PLAN_FILE).is_file():
             continue
         try:
             plans[source] = store.read_plan(Path(source))
-            if found := manifest.differences(Path(source)):
-                unread.append(f"{source}: not as it was kept, evidence of which is left out: {manifest.few(found)}")
-                changed |= {Path(source, *Path(name).parts[:2]) for name in found}
+            if differences := manifest.differences(Path(source)):
+                unread.append(
+                    f"{source}: evidence that differs from the manifest is left out: {manifest.few(differences)}"
+                )
+                changed |= {Path(source, *Path(name).parts[:2]) for name in differences}
         except FieldkitError as error:
             unread.append(error.located)
     return Evidence(repeats, MappingProxyType(plans), tuple(unread), frozenset(changed))

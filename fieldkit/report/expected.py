@@ -1,4 +1,4 @@
-"""What was expected of the trials of a report, and whether it holds."""
+"""Judgements of the expectations of trials, for reports."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from fieldkit.report.evidence import Evidence
 
 @dataclass(frozen=True)
 class JudgementRow:
-    """What the repeats under one condition say of an expectation, in words.
+    """The judgement of an expectation under one condition, as texts.
 
     Attributes:
-        place: The condition; empty where there is none.
-        value: What was measured.
+        place: The condition; empty without one.
+        value: The measured value.
         interval: Its 95 % interval, empty without one.
-        ruling: Whether the expectation holds.
-        why: Why it does not hold, beside the numbers; empty where they say it.
+        ruling: The ruling on the expectation.
+        why: Reason for a failure other than the numbers, or empty.
     """
 
     place: str
@@ -31,24 +31,24 @@ class JudgementRow:
 
 
 def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence[JudgementRow]]:
-    """Return what cells say of what their own trials expect, by expectation as it was written.
+    """Return the judgements of the trials' expectations, by the text of the expectation.
 
-    Nothing is known of what is expected of a table without its trial.
+    The expectations of a table without its trial are unknown.
     """
-    told = wording.differing(cells)
-    found: dict[str, list[JudgementRow]] = {}
-    for said in judge_own((cell, _of(cell, evidence)) for cell in cells):
-        found.setdefault(said.expectation.text, []).append(_verdict(said, told))
-    return found
+    differing = wording.differing(cells)
+    rows: dict[str, list[JudgementRow]] = {}
+    for judgement in judge_own((cell, _expectations_of(cell, evidence)) for cell in cells):
+        rows.setdefault(judgement.expectation.text, []).append(_verdict(judgement, differing))
+    return rows
 
 
-def _verdict(said: Judgement, told: Collection[str]) -> JudgementRow:
-    place = wording.condition(said.cell, told=told) if said.cell else ""
-    _, _, value, interval, _ = judged(said)
-    return JudgementRow(place, wording.unbroken(value), wording.unbroken(interval), said.ruling, said.why)
+def _verdict(judgement: Judgement, differing: Collection[str]) -> JudgementRow:
+    place = wording.condition(judgement.cell, differing=differing) if judgement.cell else ""
+    _, _, value, interval, _ = judged(judgement)
+    return JudgementRow(place, wording.unbroken(value), wording.unbroken(interval), judgement.ruling, judgement.why)
 
 
-def _of(cell: Cell, evidence: Evidence) -> Iterator[Expectation]:
-    """Yield what the trials of a cell expect."""
+def _expectations_of(cell: Cell, evidence: Evidence) -> Iterator[Expectation]:
+    """Yield the expectations of a cell's trials."""
     plans = {id(plan): plan for row in evidence.rows(cell).tolist() if (plan := evidence.plan(row))}
-    return (one for plan in plans.values() for one in plan.procedure.expectations)
+    return (expectation for plan in plans.values() for expectation in plan.procedure.expectations)

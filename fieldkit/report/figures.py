@@ -1,4 +1,4 @@
-"""Figures of matplotlib, for the page and for papers: the same bytes whenever and wherever."""
+"""Figures of matplotlib for the page and for papers. Equal inputs give equal bytes on every machine."""
 
 import io
 import math
@@ -24,12 +24,12 @@ from fieldkit.report.theme import FORMATS, LIGHT, METADATA, SETTINGS, Colour, Fo
 _MARKER: Final = 5.0
 _PANEL_INCHES: Final = (4.4, 2.75)
 _STRIP_INCHES: Final = (5.8, 1.25)
-"""Of a strip without lanes."""
+"""Size of a strip without lanes."""
 _STRIP_MARGINS_INCHES: Final = (1.45, 0.15, 0.42, 0.28)
-"""Left, right, below and above the axes of a strip: the same for all, so that their x axes stand below each other."""
+"""Left, right, lower and upper margin of a strip, the same for all so that their x axes are aligned."""
 _LANE_INCHES: Final = 0.3
-_AROUND_LANES_INCHES: Final = 1.05
-# What IEEE asks for: one column of 3.5 in or both, 7.16 in, and 8 pt for what stands in figures.
+_LANE_MARGINS_INCHES: Final = 1.05
+# IEEE requires a width of one column, 3.5 in, or of both, 7.16 in, and a font of 8 pt in figures.
 _COLUMN_INCHES: Final = 3.5
 _BOTH_COLUMNS_INCHES: Final = 7.16
 _PAPER_PANEL_INCHES: Final = 2.3
@@ -37,20 +37,20 @@ _PAPER_PANEL_INCHES: Final = 2.3
 _MATERIALS: Final[dict[str, Colour]] = {"foliage": "green", "wood": "orange", "brick": "red", "ground": "orange"}
 """Colours of obstacles that are not grey."""
 _SNR_DB: Final = (0.0, 60.0)
-"""From where next to nothing arrives to more than any mode needs: equal colours in all figures."""
+"""Range of the colour scale: from almost no reception to more than any mode needs. It is equal in all figures."""
 _BACKED: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.5}
 _EDGE: Final = 0.15
-"""Share of the world next to its edge, where labels turn inwards."""
+"""Share of the world next to its edges in which labels are aligned inwards."""
 
-_FEW_LINKS: Final = 15
-"""So many links can have their SNR beside them: those of six robots."""
-_LONG_LINK: Final = 0.1
-"""Share of the drawing's width from which on a link has room for it."""
+_MOST_LABELLED: Final = 15
+"""Most links that are labelled with their SNR: those of six robots."""
+_LEAST_LABELLED: Final = 0.1
+"""Least length of a labelled link, as a share of the drawing's width."""
 
 
 def panel_svg(panel: Panel) -> str:
-    """Return one panel as an SVG document for the page: no background, text as text, colours of the light theme."""
-    with _drawing(9.0):
+    """Return one panel as an SVG document for the page: transparent, with text as text, in light colours."""
+    with _settings(9.0):
         width, height = _inches(panel)
         figure = Figure(figsize=(width, height), layout=None if panel.is_strip else "constrained")
         drawing.draw(figure.add_subplot(), panel)
@@ -59,12 +59,12 @@ def panel_svg(panel: Panel) -> str:
             figure.subplots_adjust(
                 left=left / width, right=1 - right / width, bottom=below / height, top=1 - above / height
             )
-        return _saved(figure, "svg", transparent=True).decode()
+        return _to_bytes(figure, "svg", transparent=True).decode()
 
 
 def _inches(panel: Panel) -> tuple[float, float]:
     """Return width and height of a panel of the page."""
-    lanes = _AROUND_LANES_INCHES + _LANE_INCHES * len(panel.lanes)
+    lanes = _LANE_MARGINS_INCHES + _LANE_INCHES * len(panel.lanes)
     if panel.is_strip:
         return _STRIP_INCHES[0], lanes if panel.lanes else _STRIP_INCHES[1]
     return _PANEL_INCHES[0], lanes if panel.lanes else _PANEL_INCHES[1]
@@ -76,22 +76,22 @@ def paper(chart: Chart, form: Format) -> bytes:
     rows = -(-len(chart.panels) // columns)
     width = _COLUMN_INCHES if len(chart.panels) == 1 else _BOTH_COLUMNS_INCHES
     height = _STRIP_INCHES[1] if chart.is_stacked else _PAPER_PANEL_INCHES
-    with _drawing(8.0):
+    with _settings(8.0):
         figure = Figure(figsize=(width, height * rows + 0.3), layout="constrained")
         for number, panel in enumerate(chart.panels, start=1):
             drawing.draw(figure.add_subplot(rows, columns, number), panel)
         if chart.legend:
             handles = [drawing.handle(label, style) for label, style in chart.legend.items()]
             figure.legend(handles=handles, loc="outside upper center", ncols=min(4, len(handles)))
-        return _saved(figure, form, transparent=False)
+        return _to_bytes(figure, form, transparent=False)
 
 
 def save(charts: Iterable[Chart], folder: Path) -> Iterator[Path]:
-    """Write charts as `paper` draws them, each in every format, yielding the files.
+    """Write charts as `paper` draws them in every format, and yield the paths.
 
     Args:
-        charts: What to draw.
-        folder: Where to; it is there.
+        charts: The charts.
+        folder: An existing folder.
 
     Raises:
         OSError: A file cannot be written.
@@ -104,8 +104,8 @@ def save(charts: Iterable[Chart], folder: Path) -> Iterator[Path]:
 
 
 def overview(lab: Overview, form: Format) -> bytes:
-    """Return a lab from above: what stands in it, the robots, and their links coloured by SNR; broken ones dotted."""
-    with _drawing(8.0):
+    """Return a plan view of a lab: obstacles, robots, and links coloured by SNR (dotted: no reception)."""
+    with _settings(8.0):
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _BOTH_COLUMNS_INCHES * 0.75), layout="constrained")
         axes = figure.add_subplot()
         axes.set_title(harmless(f"{lab.world}, {len(lab.robots)} robots"), wrap=True)
@@ -123,7 +123,7 @@ def overview(lab: Overview, form: Format) -> bytes:
         east_m, north_m = zip(*lab.robots.values(), strict=True)
         axes.plot(east_m, north_m, "o", color=LIGHT["ink"], markersize=_MARKER, zorder=4, clip_on=False)
         for name, place_m in lab.robots.items():
-            # Away from the links, which are in the middle, but not out of the world.
+            # Labels are away from the links, which are in the middle, but inside of the world.
             share = place_m[1] / lab.area_m[1]
             above = share < _EDGE or (place_m[1] >= fmean(north_m) and share <= 1 - _EDGE)
             axes.annotate(
@@ -136,11 +136,11 @@ def overview(lab: Overview, form: Format) -> bytes:
                 va="bottom" if above else "top",
                 zorder=5,
             )
-        return _saved(figure, form, transparent=False)
+        return _to_bytes(figure, form, transparent=False)
 
 
 def _side(east_m: float, width_m: float) -> Literal["left", "center", "right"]:
-    """Return how a label is aligned at a place, so that it does not leave the world."""
+    """Return the alignment of a label, so that it stays inside of the world."""
     share = east_m / width_m
     return "left" if share < _EDGE else "right" if share > 1 - _EDGE else "center"
 
@@ -152,14 +152,14 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
         array=[link.snr_db for link in lab.links],
         cmap="viridis",
         linestyles=["solid" if link.linked else "dotted" for link in lab.links],
-        linewidths=1.2 if len(lines) <= _FEW_LINKS else 0.4,
+        linewidths=1.2 if len(lines) <= _MOST_LABELLED else 0.4,
         zorder=2,
     )
     drawn.set_clim(*_SNR_DB)
     axes.add_collection(drawn)
     figure.colorbar(drawn, ax=axes, label="SNR (dB)", shrink=0.7)
     for (place_m, other_m), link in zip(lines, lab.links, strict=True):
-        if len(lines) <= _FEW_LINKS and math.dist(place_m, other_m) > _LONG_LINK * max(lab.area_m):
+        if len(lines) <= _MOST_LABELLED and math.dist(place_m, other_m) > _LEAST_LABELLED * max(lab.area_m):
             middle_m = (place_m[0] + other_m[0]) / 2, (place_m[1] + other_m[1]) / 2
             axes.annotate(
                 harmless(", ".join((f"{link.snr_db:.0f} dB", *link.through))),
@@ -173,17 +173,17 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
 
 
 @contextmanager
-def _drawing(points: float) -> Iterator[None]:
+def _settings(points: float) -> Iterator[None]:
     with mpl.rc_context(), warnings.catch_warnings():
-        # What a user's matplotlibrc says must not change a byte.
+        # A user's matplotlibrc must not change the output.
         mpl.rcdefaults()
         mpl.rcParams.update(SETTINGS | {"font.size": points, "axes.titlesize": points, "axes.labelsize": points})
-        # A letter that DejaVu lacks is still text in SVG, and a box elsewhere.
+        # A character that DejaVu lacks is still text in SVG, and a box elsewhere.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         yield
 
 
-def _saved(figure: Figure, form: Format, *, transparent: bool) -> bytes:
+def _to_bytes(figure: Figure, form: Format, *, transparent: bool) -> bytes:
     out = io.BytesIO()
     figure.savefig(out, format=form, metadata=METADATA[form], transparent=transparent)
     return out.getvalue()

@@ -17,33 +17,33 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
 
 MOST_SAMPLES: Final = 1500
-"""Of each kind in a panel; of more, every k-th is drawn."""
+"""Most samples of each kind in a panel; of more samples, every k-th is drawn."""
 _TIME: Final = "time [s]"
 _ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 _RECEIVED: Final = Style("green", "^", "none")
 _LOST: Final = Style("lost", "x", "none")
 
 
-def panels(evidence: AttemptEvidence, plan: Plan, known: Moments, zero_ns: int) -> Iterator[Panel]:
+def panels(evidence: AttemptEvidence, plan: Plan, times: Moments, zero_ns: int) -> Iterator[Panel]:
     """Yield a panel for each test of iperf3 and each topic whose evidence has times.
 
     Args:
-        evidence: Of the attempt.
-        plan: Of its trial.
-        known: Times of the attempt.
-        zero_ns: Beginning of the time axis, in nanoseconds since 1970 UTC.
+        evidence: Evidence of the attempt.
+        plan: Plan of its trial.
+        times: Times of the attempt.
+        zero_ns: Start of the time axis, in nanoseconds since 1970 UTC.
     """
     for placed in plan.procedure.walk():
         if placed.kind == "iperf3":
-            yield from _iperf3(placed, evidence, known, zero_ns)
+            yield from _iperf3(placed, evidence, times, zero_ns)
         elif placed.kind == "topics":
-            yield from _topic(placed, evidence, known, zero_ns)
+            yield from _topic(placed, evidence, times, zero_ns)
 
 
-def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, known: Moments, zero_ns: int) -> Iterator[Panel]:
-    """Yield the payload per second that each end counted; its seconds begin with the client."""
+def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield the payload rate that each end counted per second. The first second starts with the client."""
     step = placed.step
-    client = next((span for (_, job), span in known.jobs.items() if job == step.own_name("iperf3-client")), None)
+    client = next((span for (_, job), span in times.jobs.items() if job == step.own_name("iperf3-client")), None)
     if client is None:
         return
     start_s = (client[0] - zero_ns) / 1e9
@@ -65,40 +65,42 @@ def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, known: Moments, zero_
         )
 
 
-def _topic(placed: PlacedStep, evidence: AttemptEvidence, known: Moments, zero_ns: int) -> Iterator[Panel]:
-    """Yield the delay of each sample that came, and the lost ones, against the time at which they were sent."""
+def _topic(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield the delays of received samples, and the lost samples, by the time of sending."""
     step = placed.step
     logs = {
         role: evidence.read_or_none(topic_log.read, step.own_name(f"{role}-topic.bin"))
         for verb in ("publish", "subscribe")
-        for role, job in known.jobs
+        for role, job in times.jobs
         if job == step.own_name(verb)
     }
-    whole = [log for log in logs.values() if log]
-    if len(whole) != 2:
+    complete = [log for log in logs.values() if log]
+    if len(complete) != 2:
         return
     publisher, _ = logs
-    sent, received = (log.samples for log in whole)
+    sent, received = (log.samples for log in complete)
     if not len(sent.sequence):
         return
     is_lost = ~np.isin(sent.sequence, received.sequence)
-    lost_s = (sent.at_ns[is_lost] - known.ahead_ns[publisher] - zero_ns) / 1e9
-    took_ms = (received.at_ns - received.sent_ns) / 1e6  # by two clocks: only differences mean something
-    late_ms = took_ms - took_ms.min(initial=math.inf) if len(took_ms) else took_ms
-    received_s = (received.sent_ns - known.ahead_ns[publisher] - zero_ns) / 1e9
+    lost_s = (sent.at_ns[is_lost] - times.ahead_ns[publisher] - zero_ns) / 1e9
+    took_ms = (
+        received.at_ns - received.sent_ns
+    ) / 1e6  # measured with two clocks, so only differences are meaningful
+    excess_ms = took_ms - took_ms.min(initial=math.inf) if len(took_ms) else took_ms
+    received_s = (received.sent_ns - times.ahead_ns[publisher] - zero_ns) / 1e9
     kinds = (
-        ("sample received", _RECEIVED, received_s, late_ms),
+        ("sample received", _RECEIVED, received_s, excess_ms),
         ("sample lost", _LOST, lost_s, np.zeros(len(lost_s))),
     )
     series = []
     for label, style, at_s, heights in kinds:
-        some = slice(None, None, max(1, -(-len(at_s) // MOST_SAMPLES)))
-        series.append(Series(label, style, at_s[some], heights[some]))
+        every_kth = slice(None, None, max(1, -(-len(at_s) // MOST_SAMPLES)))
+        series.append(Series(label, style, at_s[every_kth], heights[every_kth]))
     yield Panel(
         title=f"delay of {step.name or 'the topic'} beyond its fastest sample",
         x_label=_TIME,
         y_label="[ms]",
         series=series,
         words=f"{len(sent.sequence)} samples sent, {int(is_lost.sum())} lost, {len(received.sequence)} received",
-        top=None if len(late_ms) else 1.0,
+        top=None if len(excess_ms) else 1.0,
     )

@@ -1,4 +1,4 @@
-"""The page of a report: one HTML file with its figures inside, which opens without a network.
+"""The page of a report: one HTML file that contains its figures and opens without a network.
 
 The only module that imports jinja2.
 """
@@ -24,9 +24,9 @@ _TEMPLATE: Final = "report.html"
 _SVG: Final = "http://www.w3.org/2000/svg"
 _XLINK: Final = "http://www.w3.org/1999/xlink"
 _HREF: Final = f"{{{_XLINK}}}href"
-# The style is the same in all, and the page's own.
+# The style is the same in all figures, and the page defines it.
 _DROPPED: Final = frozenset((f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"))
-# A hundredth of a point is nothing that anybody sees, and half of the page.
+# More than two decimals of a point are invisible, but make up half of the page's size.
 _GEOMETRY: Final = frozenset(("d", "x", "y", "width", "height", "transform"))
 _DECIMALS: Final = re.compile(r"(\.\d{2})\d+")
 _LOCAL_URL: Final = re.compile(r"url\(#")
@@ -39,14 +39,14 @@ def render(contents: Contents, out: Path) -> str:
     """Return the page as HTML.
 
     Args:
-        contents: What stands in it.
-        out: Where it will be written: links to evidence begin there.
+        contents: Its contents.
+        out: Path of the page; links to evidence are relative to its folder.
     """
     environment = Environment(
         loader=PackageLoader("fieldkit.report"),
         autoescape=True,
         undefined=StrictUndefined,
-        finalize=_finalized,
+        finalize=_without_control_characters,
         trim_blocks=True,
         lstrip_blocks=True,
     )
@@ -67,18 +67,18 @@ def render(contents: Contents, out: Path) -> str:
 
 
 def _link(target: Path, *, base: Path) -> str:
-    """Return the link from a page in the folder `base` to evidence; it works where both are copied together."""
+    """Return the link from a page in the folder `base` to evidence. It remains valid if both are copied together."""
     relative = os.path.relpath(target, base)
     return quote(relative + "/" if target.is_dir() else relative)
 
 
-def _finalized(value: Any) -> Any:  # noqa: ANN401 (whatever stands in the template)
-    """Return what stands in the page for a value: nothing from evidence keeps control characters."""
+def _without_control_characters(value: Any) -> Any:  # noqa: ANN401 (any value in the template)
+    """Return a value for the page, with control characters of texts replaced."""
     return harmless(value) if type(value) is str else value
 
 
 class _Panels:
-    """Draws panels, each with ids of its own."""
+    """Draws panels, each with unique ids."""
 
     def __init__(self) -> None:
         self._drawn = 0
@@ -91,14 +91,14 @@ class _Panels:
 def inlined(document: str, prefix: str, words: str) -> str:
     """Return an SVG document as an element of a page.
 
-    Its colours become the page's, its width is free, its ids begin with `prefix`, for those of a page are unique.
+    Its colours become variables of the page, its width is flexible, and its ids start with `prefix` to be unique.
 
     Args:
-        document: As `figures.panel_svg` returns it.
-        prefix: Different for each document of a page.
-        words: What it shows, for those who cannot see it.
+        document: An SVG document, as `figures.panel_svg` returns it.
+        prefix: A prefix that is different for each document of a page.
+        words: Description for screen readers.
     """
-    root = ET.fromstring(document)  # noqa: S314 (matplotlib's, not a stranger's)
+    root = ET.fromstring(document)  # noqa: S314 (made by matplotlib, so it is trusted)
     for parent in list(root.iter()):
         for child in list(parent):
             if child.tag in _DROPPED:

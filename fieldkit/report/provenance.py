@@ -15,24 +15,24 @@ from fieldkit.report.evidence import Evidence
 
 @dataclass(frozen=True)
 class Provenance:
-    """What the rows of one trial come from.
+    """The provenance of one trial.
 
     Attributes:
         name: Its name.
-        source: Its folder, or the table that its rows were read from.
-        is_at_hand: Whether its raw evidence is.
-        began: When its first attempt began, in words.
-        robots: Who sent to whom, and by whom.
-        attempts: How they ended.
+        source: Its folder, or the table with its rows.
+        has_evidence: True if its raw evidence is available.
+        began: Start of its first attempt, as text.
+        robots: Sender, receiver and relay.
+        attempts: Numbers of attempts by status.
         seed: Its seed.
-        hashes: Of code, procedure and profiles; empty where missing.
-        versions: Of the programs that made it, in words; empty when its folder is not at hand.
-        notes: The operator's.
+        hashes: Hashes of code, procedure and profiles; empty if missing.
+        versions: Versions of its programs; empty if its folder is not available.
+        notes: The operator's notes.
     """
 
     name: str
     source: Path
-    is_at_hand: bool
+    has_evidence: bool
     began: str
     robots: str
     attempts: str
@@ -51,8 +51,8 @@ def trials(evidence: Evidence) -> Iterator[Provenance]:
     rows: dict[tuple[str, str], list[int]] = {}
     for row, key in enumerate(zip(texts["trial"].tolist(), texts["source"].tolist(), strict=True)):
         rows.setdefault(key, []).append(row)
-    for (name, source), mine in rows.items():
-        yield _trial(name, Path(source), mine, evidence)
+    for (name, source), row_numbers in rows.items():
+        yield _trial(name, Path(source), row_numbers, evidence)
 
 
 def _trial(name: str, source: Path, rows: list[int], evidence: Evidence) -> Provenance:
@@ -63,12 +63,12 @@ def _trial(name: str, source: Path, rows: list[int], evidence: Evidence) -> Prov
     return Provenance(
         name=name,
         source=source,
-        is_at_hand=plan is not None,
+        has_evidence=plan is not None,
         began=summary.utc(float(np.nanmin(started))) if np.isfinite(started).any() else "",
         robots=f"{texts['sender'][first]} to {texts['receiver'][first]}" + (f" by {relay}" if relay else ""),
         attempts=ended(Counter(texts["status"][rows])),
         seed="" if np.isnan(numbers["seed"][first]) else f"{numbers['seed'][first]:.0f}",
         hashes=[texts[name][first] for name in _HASHES],
-        versions=", ".join(f"{what} {number}" for what, number in plan.versions.items()) if plan else "",
+        versions=", ".join(f"{program} {number}" for program, number in plan.versions.items()) if plan else "",
         notes=plan.notes if plan else "",
     )

@@ -1,4 +1,4 @@
-"""Which quantities come first, and which end of a quantity is the worse one."""
+"""The order of quantities, and whether larger or smaller values are worse."""
 
 from collections.abc import Iterable, Iterator
 from typing import Final
@@ -10,16 +10,16 @@ from fieldkit.report.evidence import Evidence
 from fieldkit.trial.plan import Plan
 
 _LAB_KINDS: Final = frozenset(("ask", "run"))
-"""Kinds of step whose columns a lab declares itself."""
+"""Kinds of step whose columns a lab declares."""
 _MORE_IS_BETTER: Final = frozenset(("bit/s", "dBm", "dB"))
 _LOSSES: Final = frozenset((*LOSSES, "topic_loss", "iperf3_loss", "iperf3_captured_loss"))
 
 
 class Ranking:
-    """The order of quantities: those that a trial has an expectation of, the lab's own, then the others.
+    """The order of quantities: those with an expectation, those that a lab declares, then the others.
 
     Args:
-        evidence: The plans at hand; without them no expectation and no column of a lab is known.
+        evidence: The available plans, which contain the expectations and the columns of a lab.
     """
 
     def __init__(self, evidence: Evidence) -> None:
@@ -28,22 +28,22 @@ class Ranking:
         self._expected: dict[str, Expectation] = {}
         for expectation in expectations:
             self._expected.setdefault(expectation.quantity, expectation)
-        self._own = dict.fromkeys(name for plan in plans for name in _lab_columns(plan))
+        self._lab_columns = dict.fromkeys(name for plan in plans for name in _lab_columns(plan))
 
     def first(self, quantities: Iterable[Quantity]) -> list[Quantity]:
-        """Return the expected quantities, then the lab's own, without the others."""
+        """Return the expected quantities, then those that a lab declares, without the others."""
         by_name = {quantity.name: quantity for quantity in quantities}
-        return [by_name[name] for name in dict.fromkeys((*self._expected, *self._own)) if name in by_name]
+        return [by_name[name] for name in dict.fromkeys((*self._expected, *self._lab_columns)) if name in by_name]
 
     def is_own(self, name: str) -> bool:
-        """Return whether a lab declares a column itself."""
-        return name in self._own
+        """Return True if a lab declares this column."""
+        return name in self._lab_columns
 
     def more_is_worse(self, quantity: Quantity) -> bool | None:
-        """Return whether larger values are worse: as expected, else by unit; None if neither says."""
+        """Return True if larger values are worse, by the expectation or else by unit; None if both are unknown."""
         if (expectation := self._expected.get(quantity.name)) is not None:
             return expectation.is_below
-        if quantity.name in self._own or quantity.kind is Kind.FLAG:
+        if quantity.name in self._lab_columns or quantity.kind is Kind.FLAG:
             return None
         if quantity.unit in _MORE_IS_BETTER:
             return False

@@ -1,4 +1,4 @@
-"""Strip charts: one mark per attempt at a repeat, in order of time, as high as its loss."""
+"""Strip charts: one mark per attempt, in order of time, with the loss as its height."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from fieldkit.report.evidence import Evidence
 from fieldkit.report.theme import Colour
 
 MOST_MARKS: Final = 2000
-"""On a page, shared by its strips; of more, valid ones are left out evenly, never a void or failed one."""
+"""Most marks on a page, shared by its strips. Of more attempts, valid ones are omitted evenly, others never."""
 FEWEST_MARKS: Final = 20
-"""Of valid ones in a strip, however many strips and void ones there are."""
+"""Fewest marks of valid attempts in a strip."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ class Mark:
 
     Attributes:
         row: Its row in the table.
-        status: How it ended.
-        height: Its loss as a share of the highest among strips of the same protocol; None unless valid and known.
-        title: What it is, for a pointer or a screen reader.
+        status: Its status.
+        height: Its loss as a share of the highest one in strips of the same protocol; None unless valid and known.
+        title: Description for a tooltip or a screen reader.
     """
 
     row: int
@@ -43,10 +43,10 @@ class Strip:
     """The attempts of one cell.
 
     Attributes:
-        cell: Whose.
-        place: What tells it from the others of its group.
-        colour: Of its series.
-        marks: In order of time.
+        cell: The cell.
+        place: Its condition, as far as it differs from the others of its group.
+        colour: Colour of its series.
+        marks: Marks in order of time.
         left_out: Valid attempts without a mark.
     """
 
@@ -63,7 +63,7 @@ class StripGroup:
 
     Attributes:
         title: Protocol and topology.
-        scale: What a mark of full height is.
+        scale: The meaning of a mark of full height.
         strips: A strip per cell.
     """
 
@@ -74,21 +74,21 @@ class StripGroup:
 
 def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[StripGroup]:
     """Yield the strips of all cells, those of a protocol and a topology together."""
-    told = wording.differing(cells) - {"topology"}
-    most = max(FEWEST_MARKS, MOST_MARKS // max(1, len(cells)))
+    differing = wording.differing(cells) - {"topology"}
+    most_marks = max(FEWEST_MARKS, MOST_MARKS // max(1, len(cells)))
     for title, group in panels(cells).items():
         heights = _heights(group, [cell for cell in cells if cell.key["protocol"] == group[0].key["protocol"]])
         strips = []
         for cell in group:
-            mine = evidence.rows(cell)
-            kept = _thinned(mine, evidence, most)
+            rows = evidence.rows(cell)
+            kept = _thinned(rows, evidence, most_marks)
             strips.append(
                 Strip(
                     cell=cell,
-                    place=wording.place(cell, told=told),
+                    place=wording.place(cell, differing=differing),
                     colour=identities.of(cell).style.colour,
                     marks=[_mark(row, heights, evidence) for row in kept.tolist()],
-                    left_out=len(mine) - len(kept),
+                    left_out=len(rows) - len(kept),
                 )
             )
         yield StripGroup(title, str(heights), strips)
@@ -96,7 +96,7 @@ def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
 
 @dataclass(frozen=True)
 class _Heights:
-    """What the height of marks is: the first loss that there is, if any, and the share of it at full height."""
+    """The scale of the marks' heights: the first measured loss, if any, and its value at full height."""
 
     loss: Quantity | None
     full: float
@@ -113,9 +113,9 @@ class _Heights:
 
 
 def _heights(group: Sequence[Cell], cells: Sequence[Cell]) -> _Heights:
-    """Return the heights of a group of cells, the same wherever those of its protocol show the same loss."""
-    measured = dict.fromkeys(one.quantity for cell in group for one in cell.estimates.values())
-    loss = next((one for name in LOSSES for one in alike(measured, name)), None)
+    """Return the scale of a group of cells, which is equal for all groups of a protocol that show the same loss."""
+    measured = dict.fromkeys(estimate.quantity for cell in group for estimate in cell.estimates.values())
+    loss = next((quantity for name in LOSSES for quantity in alike(measured, name)), None)
     if loss is None:
         return _Heights(None, 0.0)
     return _Heights(loss, max(cell.estimates[loss.name].maximum for cell in cells if loss.name in cell.estimates))

@@ -1,4 +1,4 @@
-"""Beginning of a report: what was run, where and when, and what to know before quoting a number."""
+"""The first part of a report: a description of the trials, and warnings for readers who quote figures."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -20,11 +20,11 @@ from fieldkit.report.evidence import Evidence
 
 @dataclass(frozen=True)
 class Caution:
-    """What a reader must know before quoting a number.
+    """A warning for a reader who quotes a number.
 
     Attributes:
-        text: In a sentence.
-        reasons: Why, each with how often it was given; a page folds them away.
+        text: A sentence.
+        reasons: Reasons, each with its count; a page shows them collapsed.
     """
 
     text: str
@@ -32,12 +32,12 @@ class Caution:
 
 
 def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
-    """Return what was run, where, when and how often, in words."""
+    """Return a sentence about the trials: procedures, times, distances and numbers of attempts."""
     repeats = evidence.repeats
     trials = format_count(len(set(repeats.texts["trial"].tolist())), "trial")
     return (
         f"{trials} of {wording.listed(_values(cells, 'procedure'))}{_when(repeats)}: {_distances(cells)}; "
-        f"{wording.listed([one.upper() for one in _values(cells, 'protocol')])}; "
+        f"{wording.listed([name.upper() for name in _values(cells, 'protocol')])}; "
         f"{_topologies(cells)}{wording.listed(_values(cells, 'backend'))} robots. "
         f"{format_count(len(repeats), 'attempt')}: {ended(Counter(repeats.texts['status']))}. "
         "All figures are of the valid ones."
@@ -45,16 +45,16 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
 
 
 def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
-    """Yield what a reader must know before quoting a number."""
+    """Yield the warnings for a reader who quotes numbers."""
     repeats = evidence.repeats
     for status in (Status.VOID, Status.FAILED):
         if (rows := repeats.texts["status"] == status).any():
             reasons = _counted(repeats.texts["reason"][rows].tolist())
             yield Caution(f"{format_count(int(rows.sum()), 'attempt')} {status}.", reasons)
-    if none := [cell for cell in cells if not cell.n_valid]:
-        told = wording.differing(cells)
-        places = [wording.condition(cell, told=told) for cell in none]
-        yield Caution(f"Nothing valid in {format_count(len(none), 'condition')}.", places)
+    if invalid_cells := [cell for cell in cells if not cell.n_valid]:
+        differing = wording.differing(cells)
+        places = [wording.condition(cell, differing=differing) for cell in invalid_cells]
+        yield Caution(f"No valid repeat in {format_count(len(invalid_cells), 'condition')}.", places)
     for caution in cautions(cells):
         yield Caution(f"{caution}.".replace(" %", "\N{NO-BREAK SPACE}%"))
     if single := sum(cell.n_valid == 1 for cell in cells):
@@ -68,9 +68,10 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
             f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}.", reasons
         )
     yield from map(Caution, mixtures(repeats))
-    if (versions_found := len(np.unique(repeats.numbers["schema_version"]))) > 1:
+    if (version_count := len(np.unique(repeats.numbers["schema_version"]))) > 1:
         yield Caution(
-            f"{versions_found} versions of the tables: without rebuilding, what an older one lacks is missing."
+            f"{version_count} versions of the tables: columns that an older version lacks are missing unless tables "
+            "are rebuilt."
         )
     yield from map(Caution, evidence.unread)
 
@@ -104,16 +105,16 @@ def _when(repeats: Repeats) -> str:
 
 
 def utc(at_ns: float) -> str:
-    """Return a moment, in nanoseconds since 1970 UTC, as date and time to the minute."""
+    """Return a time, given in nanoseconds since 1970 UTC, as date and time to the minute."""
     return datetime.fromtimestamp(at_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M")
 
 
 def _counted(reasons: Sequence[str]) -> list[str]:
-    """Return the reasons, the most frequent first, each with how often it was given."""
+    """Return the reasons with their counts, the most frequent first."""
     counted = Counter(reason or "no reason given" for reason in reasons)
     return [f"{reason} ({count})" for reason, count in sorted(counted.items(), key=lambda pair: (-pair[1], pair[0]))]
 
 
 def title(cells: Sequence[Cell]) -> str:
-    """Return a title for a report that was given none."""
+    """Return the default title of a report."""
     return f"Loss and delay: {wording.listed(_values(cells, 'procedure'))}"

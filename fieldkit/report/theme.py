@@ -1,7 +1,7 @@
-"""The colours and shapes of every figure and of the page, light and dark.
+"""Colours, markers and lines of all figures and of the page, in a light and a dark theme.
 
-Series take the colours of Okabe and Ito (2008, Color Universal Design), which stay apart for colour-blind people; a
-shape goes with each, so that none is told by its colour alone. On a dark page the two darkest are lightened.
+Series use the colours of Okabe and Ito (2008, Color Universal Design), which colour-blind people can distinguish.
+Each colour has a marker, so that no series is identified by colour alone. In the dark theme colours are lighter.
 """
 
 import re
@@ -74,50 +74,50 @@ SETTINGS: Final[dict[Any, Any]] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "fieldkit",
     "text.color": LIGHT["ink"],
-    # Names from evidence are no formulas.
+    # Names from evidence must not be parsed as formulas.
     "text.parse_math": False,
     "xtick.color": LIGHT["muted"],
     "xtick.labelcolor": LIGHT["ink"],
     "ytick.color": LIGHT["muted"],
     "ytick.labelcolor": LIGHT["ink"],
 }
-"""Settings of matplotlib, without the size of letters."""
+"""Settings of matplotlib, without font sizes."""
 
-# Neither date nor version: equal figures are equal files.
+# Neither date nor version, so that equal figures are equal files.
 METADATA: Final[dict[Format, dict[str, None]]] = {
     "svg": dict.fromkeys(("Date", "Creator", "Format", "Type")),
     "pdf": dict.fromkeys(("CreationDate", "Creator", "Producer")),
     "png": {"Software": None},
 }
-"""Of files of each format."""
+"""Metadata of files, by format."""
 
 
 def format_of(path: Path, option: str) -> Format:
-    """Return the format of a figure by the ending of its file's name.
+    """Return the format of a figure by the suffix of its file name.
 
     Args:
         path: The file.
-        option: By which it was named, for the message.
+        option: The option of the path, for the message.
 
     Raises:
-        ConfigurationError: It is none of `FORMATS`.
+        ConfigurationError: The suffix is not one of `FORMATS`.
     """
     for form in FORMATS:
         if path.suffix == f".{form}":
             return form
     raise ConfigurationError(
-        f"{option}: what {path.name!r} should be is not clear", remedy=f"end it in .{', .'.join(FORMATS)}"
+        f"{option}: {path.name!r} has no known format", remedy=f"use the suffix .{', .'.join(FORMATS)}"
     )
 
 
 @dataclass(frozen=True)
 class Style:
-    """How a series looks.
+    """Colour, marker and line of a series.
 
     Attributes:
-        colour: Of its line and markers.
-        marker: Shape of its markers; empty for none.
-        line: How its line is drawn; markers of a broken one are hollow.
+        colour: Colour of line and markers.
+        marker: Shape of the markers; empty for none.
+        line: Type of line; the markers of a broken line are hollow.
     """
 
     colour: Colour
@@ -126,7 +126,7 @@ class Style:
 
     @property
     def is_hollow(self) -> bool:
-        """Whether the page shows through its markers."""
+        """True if the markers are not filled."""
         return self.line not in {"solid", "none"}
 
 
@@ -138,22 +138,22 @@ CYCLE: Final[tuple[tuple[Colour, Marker], ...]] = (
     ("orange", "v"),
     ("sky", "P"),
 )
-"""Of procedures, in order: line of sight is the first, without it the second."""
+"""Colours and markers of procedures, in order: first with line of sight, second without."""
 
 LINES: Final[tuple[Line, ...]] = ("solid", "dashed", "dotted", "dashdot")
-"""Of backends, in order: the field is the first."""
+"""Lines of backends, in order: the field backend is the first."""
 
 _NAME_OF: Final = {value: name for name, value in LIGHT.items()}
 _HEX: Final = re.compile("|".join(_NAME_OF))
 
 
 def themed(css: str) -> str:
-    """Return CSS in which each colour of the light theme became the page's variable, for light and dark."""
-    return _HEX.sub(lambda found: f"var(--{_NAME_OF[found[0]]})", css)
+    """Return CSS with each colour of the light theme replaced by the page's variable."""
+    return _HEX.sub(lambda match: f"var(--{_NAME_OF[match[0]]})", css)
 
 
 def variables(colours: Mapping[Colour, str]) -> str:
-    """Return the CSS that gives the page's variables these colours."""
+    """Return the CSS that sets the page's variables to these colours."""
     return "".join(f"--{name}:{value};" for name, value in colours.items())
 
 

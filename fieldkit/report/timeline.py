@@ -1,4 +1,4 @@
-"""The time line of one repeat on one axis: bars of steps, faults and moves, then flows, pings, radios, distance."""
+"""The time line of one repeat: bars of steps, faults and moves, then flows, pings, radios and distance."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ from fieldkit.report.moments import Moments
 from fieldkit.report.theme import Style
 
 MOST_PACKETS: Final = 1500
-"""Of each kind in a panel; of more, every k-th is drawn."""
+"""Most packets of each kind in a panel; of more packets, every k-th is drawn."""
 
 _MARKED: Final = {Protocol.UDP: "lost", Protocol.TCP: "sent again"}
 _SENT: Final = Style("blue", "o", "none")
@@ -29,57 +29,60 @@ _MARK: Final = Style("lost", "x", "none")
 _ROUND_TRIP: Final = Style("pink", "D", "none")
 _DISTANCE: Final = Style("orange", line="solid")
 _LINKS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
-"""Of the one that sends, and of the other."""
+"""Styles of the sending robot and of the other."""
 _LEAST_BAR: Final = 0.004
-"""Of the axis: what is shorter would not be seen."""
+"""Least length of a bar, as a share of the axis; a shorter one would be invisible."""
 _TIME: Final = "time [s]"
 _ROOM: Final = 0.01
-"""Of the axis, at its right end."""
+"""Margin at the right end of the axis, as a share of the axis."""
 
 
-def charts(row: int, found: Evidence) -> Iterator[Chart]:
-    """Yield the time line of the attempt in a row whose evidence is at hand, and its packets one by one.
+def charts(row: int, data: Evidence) -> Iterator[Chart]:
+    """Yield the time line of the attempt in a row with available evidence, and a chart of its packets.
 
-    There is none if nothing of the evidence has times.
+    Yield nothing if no evidence has times.
     """
-    evidence, plan = found.attempt(row), found.plan(row)
+    evidence, plan = data.attempt(row), data.plan(row)
     if evidence is None or plan is None:
         return
-    known = moments.read(evidence, plan, found.repeats, row)
-    if not known.happenings:
+    times = moments.read(evidence, plan, data.repeats, row)
+    if not times.activities:
         return
-    zero_ns = known.happenings[0].start_ns
-    pings = [panel for name, role, said in known.pings for panel in _round_trips(name, role, said, known, zero_ns)]
-    ends_s = [(each.stop_ns - zero_ns) / 1e9 for each in known.happenings]
-    ends_s += [float(np.max(series.x)) for panel in pings for series in panel.series if len(series.x)]
-    strips = [
-        _bars(known, zero_ns),
-        *flows.panels(evidence, plan, known, zero_ns),
-        *pings,
-        *_links(known, zero_ns),
-        *_distance(known, zero_ns),
+    zero_ns = times.activities[0].start_ns
+    pings = [
+        panel for name, role, output in times.pings for panel in _round_trips(name, role, output, times, zero_ns)
     ]
-    reason = found.repeats.texts["reason"][row]
-    ended = ": ".join(filter(None, (found.repeats.texts["status"][row], reason)))
+    stops_s = [(each.stop_ns - zero_ns) / 1e9 for each in times.activities]
+    stops_s += [float(np.max(series.x)) for panel in pings for series in panel.series if len(series.x)]
+    strips = [
+        _bars(times, zero_ns),
+        *flows.panels(evidence, plan, times, zero_ns),
+        *pings,
+        *_links(times, zero_ns),
+        *_distance(times, zero_ns),
+    ]
+    reason = data.repeats.texts["reason"][row]
+    outcome = ": ".join(filter(None, (data.repeats.texts["status"][row], reason)))
     name = evidence.folder.name
     yield Chart(
         name="timeline",
         title=f"Time line of {name}",
-        caption=f"Trial {plan.trial}, {ended}. {known.clocks}",
-        panels=_stacked(strips, max(ends_s)),
+        caption=f"Trial {plan.trial}, {outcome}. {times.clocks}",
+        panels=_stacked(strips, max(stops_s)),
         is_stacked=True,
     )
-    if known.transfers:
+    if times.transfers:
         yield Chart(
             name="packets",
             title=f"Packets of {name}",
-            caption="Where in the payload each packet begins, at both ends: a part of the time line, drawn larger.",
-            panels=[_packets(transfer, one, zero_ns) for transfer, one in known.transfers],
+            caption="Offset of each packet in the payload over time, at both ends: an enlarged part of the time "
+            "line.",
+            panels=[_packets(transfer, fates, zero_ns) for transfer, fates in times.transfers],
         )
 
 
 def _stacked(strips: Sequence[Panel], end_s: float) -> list[Panel]:
-    """Return panels with one time axis, which the lowest names; what lies outside of it is left out."""
+    """Return panels with a shared time axis, labelled in the lowest panel; points outside of it are removed."""
     last, right_s = len(strips) - 1, (1 + _ROOM) * end_s or 1.0
     return [
         replace(
@@ -97,21 +100,21 @@ def _stacked(strips: Sequence[Panel], end_s: float) -> list[Panel]:
 def _within(series: Series, right_s: float) -> Series:
     """Return the points of a series from 0 to the end of the time axis."""
     x, y = (np.asarray(values, dtype=np.float64) for values in (series.x, series.y))
-    if series.join == "steps":  # a value holds until the next one, and from before the beginning
+    if series.join == "steps":  # a value holds until the next one, so an early value applies from the start
         x = np.clip(x, 0.0, right_s)
         return replace(series, x=x, y=y)
     is_shown = (x >= 0) & (x <= right_s)
     return replace(series, x=x[is_shown], y=y[is_shown])
 
 
-def _bars(known: Moments, zero_ns: int) -> Panel:
-    """Return a lane for each thing that went on, the first on top; things of one name share it."""
-    names = list(dict.fromkeys(each.name for each in known.happenings))
+def _bars(times: Moments, zero_ns: int) -> Panel:
+    """Return a panel with a lane per activity name, the first at the top."""
+    names = list(dict.fromkeys(each.name for each in times.activities))
     last = len(names) - 1
-    spans = [(each, (each.start_ns - zero_ns) / 1e9, (each.stop_ns - zero_ns) / 1e9) for each in known.happenings]
+    spans = [(each, (each.start_ns - zero_ns) / 1e9, (each.stop_ns - zero_ns) / 1e9) for each in times.activities]
     least_s = _LEAST_BAR * max(stop for *_, stop in spans)
     return Panel(
-        title="what went on",
+        title="activities",
         x_label=_TIME,
         y_label="",
         series=[],
@@ -124,41 +127,46 @@ def _bars(known: Moments, zero_ns: int) -> Panel:
     )
 
 
-def _packets(transfer: Transfer, one: Fates, zero_ns: int) -> Panel:
-    """Return where in the payload each packet begins, against time, at both ends."""
-    begins_ns = int(one.sent_ns.min())
-    what = _MARKED[transfer.protocol]
+def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
+    """Return the offset of each packet in the payload over time, at both ends."""
+    first_sent_ns = int(fates.sent_ns.min())
+    marked_text = _MARKED[transfer.protocol]
     kinds = (
-        ("sent", _SENT, one.sent_ns[~one.marked], one.sent_bytes[~one.marked]),
-        ("received", _RECEIVED, one.received_ns, one.received_bytes),
-        (what, _MARK, one.sent_ns[one.marked], one.sent_bytes[one.marked]),
+        ("sent", _SENT, fates.sent_ns[~fates.marked], fates.sent_bytes[~fates.marked]),
+        ("received", _RECEIVED, fates.received_ns, fates.received_bytes),
+        (marked_text, _MARK, fates.sent_ns[fates.marked], fates.sent_bytes[fates.marked]),
     )
     series = []
     for label, style, at_ns, at_bytes in kinds:
-        some = slice(None, None, max(1, -(-len(at_ns) // MOST_PACKETS)))
-        series.append(Series(label, style, (at_ns[some] - begins_ns) / 1e6, at_bytes[some] / 1e3))
+        every_kth = slice(None, None, max(1, -(-len(at_ns) // MOST_PACKETS)))
+        series.append(Series(label, style, (at_ns[every_kth] - first_sent_ns) / 1e6, at_bytes[every_kth] / 1e3))
     return Panel(
         title=f"packets of {transfer.name or 'the transfer'}",
-        x_label=f"time [ms] after {(begins_ns - zero_ns) / 1e9:.3f} s",
-        y_label="place in the payload [kB]",
+        x_label=f"time [ms] after {(first_sent_ns - zero_ns) / 1e9:.3f} s",
+        y_label="offset in the payload [kB]",
         series=series,
-        words=f"{len(one.sent_ns)} packets sent, {one.marked.sum()} of them {what}, {len(one.received_ns)} received",
+        words=f"{len(fates.sent_ns)} packets sent, {fates.marked.sum()} of them {marked_text}, "
+        f"{len(fates.received_ns)} received",
     )
 
 
-def _round_trips(name: str, role: Role, said: ping.Ping, known: Moments, zero_ns: int) -> Iterator[Panel]:
-    """Yield the time that each round trip took, and the requests without a reply, against time."""
-    ahead_ns = known.ahead_ns[role]
+def _round_trips(name: str, role: Role, output: ping.Ping, times: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield the round-trip times, and the requests without a reply, by the time of sending."""
+    ahead_ns = times.ahead_ns[role]
     answered = [
         (reply.seq, reply.at_utc_ns - ahead_ns - zero_ns, reply.rtt_s)
-        for reply in said.answers
+        for reply in output.answers
         if reply.at_utc_ns is not None and reply.rtt_s is not None
     ]
-    lost = np.array(said.gaps)
+    lost = np.array(output.gaps)
     seq, at_ns, rtt_s = np.array(answered).T if answered else np.empty((3, 0))
     series = [Series("round trip", _ROUND_TRIP, at_ns / 1e9, 1e3 * rtt_s)]
     if len(lost):
-        lost_s = left_at(lost, seq, at_ns / 1e9) if answered else _by_job(lost, name, role, known, zero_ns)
+        lost_s = (
+            estimate_send_times(lost, seq, at_ns / 1e9)
+            if answered
+            else _spread_over_job(lost, name, role, times, zero_ns)
+        )
         if lost_s is None:
             return
         series.append(Series("no reply", _MARK, np.maximum(lost_s, 0.0), np.zeros(len(lost))))
@@ -175,43 +183,45 @@ def _round_trips(name: str, role: Role, said: ping.Ping, known: Moments, zero_ns
     )
 
 
-def _by_job(
-    number: NDArray[np.int64], name: str, role: Role, known: Moments, zero_ns: int
+def _spread_over_job(
+    number: NDArray[np.int64], name: str, role: Role, times: Moments, zero_ns: int
 ) -> NDArray[np.float64] | None:
-    """Return about when requests left if none was answered: evenly while the job ran; None if that is not known."""
-    if (span := known.jobs.get((role, prefixed(name, "ping")))) is None:
+    """Return approximate send times of requests without any reply, spread evenly over the job; None if unknown."""
+    if (span := times.jobs.get((role, prefixed(name, "ping")))) is None:
         return None
     start_s, stop_s = ((at_ns - zero_ns) / 1e9 for at_ns in span)
     at_s: NDArray[np.float64] = start_s + (stop_s - start_s) * (number - number.min()) / len(number)
     return at_s
 
 
-def left_at(number: NDArray[np.int64], known: NDArray[np.float64], at_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return about when requests left that were never answered, which nobody says: by number among the others.
+def estimate_send_times(
+    number: NDArray[np.int64], known: NDArray[np.float64], at_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return approximate send times of requests without a reply, interpolated by sequence number.
 
     Args:
-        number: Of those requests.
-        known: Of the others, rising.
-        at_s: When the replies to those came.
+        number: Sequence numbers of those requests.
+        known: Sequence numbers of answered requests, rising.
+        at_s: Times of the replies to these.
     """
-    step_s = (at_s[-1] - at_s[0]) / (known[-1] - known[0]) if len(known) > 1 else 1.0  # ping's own default
-    among: NDArray[np.float64] = np.interp(number, known, at_s)
-    beyond: NDArray[np.float64] = np.minimum(number - known[0], 0) + np.maximum(number - known[-1], 0)
-    return among + step_s * beyond
+    step_s = (at_s[-1] - at_s[0]) / (known[-1] - known[0]) if len(known) > 1 else 1.0  # default interval of ping
+    interpolated: NDArray[np.float64] = np.interp(number, known, at_s)
+    steps_outside: NDArray[np.float64] = np.minimum(number - known[0], 0) + np.maximum(number - known[-1], 0)
+    return interpolated + step_s * steps_outside
 
 
-def _links(known: Moments, zero_ns: int) -> Iterator[Panel]:
-    """Yield what both radios said of their links, against time: the signal, and the rate that they sent at."""
-    signals = {role: [(at_ns, one.signal_dbm) for at_ns, one in link_] for role, link_ in known.links.items()}
+def _links(times: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield the signal and the PHY rate of both radios over time."""
+    signals = {role: [(at_ns, sample.signal_dbm) for at_ns, sample in link_] for role, link_ in times.links.items()}
     rates = {
-        role: [(at_ns, one.tx_rate_bit_s and one.tx_rate_bit_s / 1e6) for at_ns, one in link_]
-        for role, link_ in known.links.items()
+        role: [(at_ns, sample.tx_rate_bit_s and sample.tx_rate_bit_s / 1e6) for at_ns, sample in link_]
+        for role, link_ in times.links.items()
     }
-    yield from _of_radios("signal", "[dBm]", signals, zero_ns, bottom=None)
-    yield from _of_radios("PHY rate", "[Mbit/s]", rates, zero_ns, bottom=0.0)
+    yield from _radio_panel("signal", "[dBm]", signals, zero_ns, bottom=None)
+    yield from _radio_panel("PHY rate", "[Mbit/s]", rates, zero_ns, bottom=0.0)
 
 
-def _of_radios(
+def _radio_panel(
     what: str,
     y_label: str,
     values: Mapping[Role, Sequence[tuple[int, float | None]]],
@@ -219,7 +229,7 @@ def _of_radios(
     *,
     bottom: float | None,
 ) -> Iterator[Panel]:
-    """Yield what each radio said of one thing, against time, if any did; the one that sends comes first."""
+    """Yield a quantity of each radio over time, the sending radio first, if any radio has values."""
     series, words = [], []
     for (role, samples), style in zip(values.items(), _LINKS, strict=True):
         points = [((at_ns - zero_ns) / 1e9, value) for at_ns, value in samples if value is not None]
@@ -238,9 +248,9 @@ def _of_radios(
         )
 
 
-def _distance(known: Moments, zero_ns: int) -> Iterator[Panel]:
-    """Yield how far sender and receiver were apart, against time, if that changed."""
-    changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in known.distances_m]
+def _distance(times: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield the distance between sender and receiver over time, if it changed."""
+    changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in times.distances_m]
     known_m = [metres for _, metres in changes if metres is not None]
     if len(set(known_m)) < 2:
         return

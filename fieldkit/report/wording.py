@@ -1,4 +1,4 @@
-"""Numbers, conditions and quantities in words, the same in the summary, in tables and below figures."""
+"""Numbers, conditions and quantities as text, the same in the summary, in tables and below figures."""
 
 from collections.abc import Collection, Sequence
 
@@ -7,84 +7,84 @@ from fieldkit.analysis.wording import Scale, amount, incomplete, scale_of
 from fieldkit.analysis.wording import interval as interval_of
 
 
-def value(found: Estimate) -> str:
-    """Return the figure to quote, unbroken: `3.21 %`."""
-    return unbroken(amount(_scale(found), found))
+def value(result: Estimate) -> str:
+    """Return the value of an estimate with non-breaking spaces: `3.21 %`."""
+    return unbroken(amount(_scale(result), result))
 
 
-def interval(found: Estimate) -> str:
-    """Return its interval, unbroken, and of how many repeats it is if not of all: `[1.10, 6.70] (7 of 10)`."""
-    of = incomplete(found)
-    return unbroken(" ".join(filter(None, (interval_of(_scale(found), found), f"({of})" if of else ""))))
+def interval(result: Estimate) -> str:
+    """Return the interval of an estimate, and the count of its repeats if not all: `[1.10, 6.70] (7 of 10)`."""
+    part = incomplete(result)
+    return unbroken(" ".join(filter(None, (interval_of(_scale(result), result), f"({part})" if part else ""))))
 
 
-def estimate(found: Estimate) -> str:
-    """Return the figure to quote with its interval: `3.21 % [1.10, 6.70]`."""
-    return f"{value(found)} {interval(found)}".strip()
+def estimate(result: Estimate) -> str:
+    """Return the value of an estimate with its interval: `3.21 % [1.10, 6.70]`."""
+    return f"{value(result)} {interval(result)}".strip()
 
 
-def unbroken(said: str) -> str:
-    """Return words between which no line is broken."""
-    return said.replace(" ", "\N{NO-BREAK SPACE}")
+def unbroken(words: str) -> str:
+    """Return a text with non-breaking spaces."""
+    return words.replace(" ", "\N{NO-BREAK SPACE}")
 
 
-def _scale(found: Estimate) -> Scale:
-    return scale_of(found.quantity, [found.value])
+def _scale(result: Estimate) -> Scale:
+    return scale_of(result.quantity, [result.value])
 
 
 def text(cell: Cell, name: str) -> str:
-    """Return a text of a cell's key, empty where missing."""
+    """Return a text of a cell's key, or an empty string if it is missing."""
     return str(cell.key[name] or "")
 
 
 def metres(cell: Cell) -> float:
-    """Return a cell's distance in metres, 0 where it is missing."""
-    found = cell.key["distance_m"]
-    return found if isinstance(found, float) else 0.0
+    """Return a cell's distance in metres, or 0 if it is missing."""
+    value_m = cell.key["distance_m"]
+    return value_m if isinstance(value_m, float) else 0.0
 
 
 def distance(cell: Cell) -> str:
-    """Return a cell's distance as its operator wrote it, `30ft`; in metres if only these are known."""
+    """Return a cell's distance as the operator wrote it, `30ft`, or in metres if only these are known."""
     if label := text(cell, "distance"):
         return label
     return "distance unknown" if cell.key["distance_m"] is None else unbroken(f"{metres(cell):.2f} m")
 
 
 def scenario(cell: Cell) -> str:
-    """Return a cell's scenario, `LOS` or `NLOS`; the procedure where there is none."""
+    """Return a cell's scenario, `LOS` or `NLOS`, or the procedure without one."""
     return text(cell, "scenario").upper() or text(cell, "procedure") or "no scenario"
 
 
 def procedure(cell: Cell) -> str:
-    """Return what a cell's procedure is called, empty where its scenario says so already."""
+    """Return the name of a cell's procedure, or an empty string if it equals the scenario."""
     name, scene = text(cell, "procedure"), text(cell, "scenario")
     return name if scene and name != scene else ""
 
 
-def place(cell: Cell, *, told: Collection[str]) -> str:
-    """Return what distinguishes a cell from others: `LOS, master, 30ft, field`.
+def place(cell: Cell, *, differing: Collection[str]) -> str:
+    """Return the condition of a cell, as far as it differs from others: `LOS, master, 30ft, field`.
 
     Args:
-        cell: Which.
-        told: Columns of its key that differ among those others; what does not is left out, but for the distance.
+        cell: The cell.
+        differing: Columns of its key that differ between the cells; the others are omitted, except for the distance.
     """
     parts = {
         "scenario": scenario(cell),
-        "procedure": procedure(cell) if "scenario" in told else text(cell, "procedure"),
+        "procedure": procedure(cell) if "scenario" in differing else text(cell, "procedure"),
         "topology": text(cell, "topology"),
         "distance_m": distance(cell),
         "backend": text(cell, "backend"),
     }
-    return ", ".join(said for name, said in parts.items() if said and (name in told or name == "distance_m"))
+    return ", ".join(part for name, part in parts.items() if part and (name in differing or name == "distance_m"))
 
 
-def condition(cell: Cell, *, told: Collection[str]) -> str:
-    """Return the same with the protocol before it: `UDP, 30ft`."""
-    return ", ".join(filter(None, (text(cell, "protocol").upper(), place(cell, told=told))))
+def condition(cell: Cell, *, differing: Collection[str]) -> str:
+    """Return the condition of a cell with its protocol: `UDP, 30ft`."""
+    return ", ".join(filter(None, (text(cell, "protocol").upper(), place(cell, differing=differing))))
 
 
 def differing(cells: Sequence[Cell]) -> frozenset[str]:
-    """Return the columns of their keys that tell these cells apart; the scenario tells for its procedure."""
+    """Return the columns that distinguish cells; the procedure is omitted if the scenario determines it."""
     names = {name for name in cells[0].key if len({cell.key[name] for cell in cells}) > 1} if cells else set()
     kinds = {(cell.key["scenario"], cell.key["procedure"]) for cell in cells}
     if len(kinds) == len({scenario for scenario, _ in kinds}):

@@ -111,7 +111,7 @@ def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: 
     assert main(["bag", "info", str(bag)]) == 0
     assert "/t1" in capsys.readouterr().out
     assert main(["bag", "check", str(bag)]) == 0
-    assert capsys.readouterr().out == f"{bag}: whole, 31 messages\n"
+    assert capsys.readouterr().out == f"{bag}: intact, 31 messages\n"
 
 
 @pytest.mark.parametrize("form", BagFormat)
@@ -288,7 +288,7 @@ def test_a_file_of_mcap_is_a_bag_by_itself(
     assert not (alone.parent / METADATA).exists()
     for path in (alone, alone.parent):
         assert main(["bag", "check", str(path)]) == 0
-        assert "whole, 300 messages" in capsys.readouterr().out
+        assert "intact, 300 messages" in capsys.readouterr().out
     assert main(["bag", "convert", str(alone.parent), str(tmp_path / "new.bag")]) == 0
     assert read(tmp_path / "new.bag") == messages
     capsys.readouterr()

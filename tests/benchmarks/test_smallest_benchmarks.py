@@ -1,4 +1,4 @@
-"""Benchmarks do not rot: each runs at its smallest size, see `tests/helpers/smallest.py`."""
+"""Every benchmark runs at its smallest size, see `tests/helpers/smallest.py`."""
 
 from pathlib import Path
 
@@ -8,18 +8,18 @@ from tests.helpers.paths import ROOT
 from tests.helpers.smallest import CASES, run_module, run_smallest
 
 NOT_RUN = {
-    "firmware_flights": "flies a simulated firmware, which CI lacks; test_firmware_flights.py runs its rows",
-    "gallery": "draws the pictures of a page; tests/e2e/test_gallery.py runs it",
-    "wifi_vm": "makes a virtual machine of Debian packages, and boots it for 8 minutes or more",
+    "firmware_flights": "needs simulated firmware, not available in CI; test_firmware_flights.py tests its rows",
+    "gallery": "run by tests/e2e/test_gallery.py",
+    "wifi_vm": "builds a virtual machine of Debian packages, which takes 8 minutes or more to boot",
 }
-"""Benchmarks that need more than CI has, and what else is tested of them; their help is printed all the same."""
+"""Benchmarks that need more than CI has, with their tests; only their help is printed here."""
 
 PARTS = {"bash_peer", "footprint", "lifetimes", "middleware_cells", "middleware_page", "namespaces", "own_time"} | {
     "pandas_peer",
     "slow_links",
     "zenoh_plain",
 }
-"""Modules that others import or start."""
+"""Modules that other benchmarks import or start."""
 
 
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if not case.emulated])
@@ -34,7 +34,7 @@ def test_a_benchmark_that_does_not_run_here_prints_its_help(name: str) -> None:
     assert "usage:" in done.stdout
 
 
-def test_every_module_runs_or_is_a_part_of_others() -> None:
+def test_every_module_runs_or_is_used_by_others() -> None:
     modules = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
     assert set(CASES) | set(NOT_RUN) | PARTS == modules
     texts = [

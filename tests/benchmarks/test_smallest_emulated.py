@@ -1,4 +1,4 @@
-"""Benchmarks on namespaces and emulated robots do not rot: each runs at its smallest size."""
+"""Every benchmark on namespaces or emulated robots runs at its smallest size."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ ON_ROBOTS = ("emane", "field_shape", "mesh", "mesh_losses", "middleware", "stop"
 ON_LOOPBACK = ("bridge",)
 
 
-# Tests of a class run one after the other in one process: there are two, to share the work.
+# pytest-xdist runs the tests of a class in one process; two classes distribute the work.
 class TestOnNamespaces:
     @pytest.mark.parametrize("name", ON_NAMESPACES + ON_LOOPBACK)
     def test_a_benchmark_runs_at_its_smallest_size(self, name: str, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The comparison of two recorded outputs: words for people may differ, everything else may not."""
+"""Comparison of two recorded outputs: only natural-language text may differ."""
 
 import json
 from collections import Counter
@@ -16,7 +16,7 @@ ABORT = Item(Class.COMMAND_LINES, ("abort",), succeeds=False)
 
 
 def trees(tmp_path: Path, *outputs: Files) -> list[Tree]:
-    made = []
+    recorded_trees = []
     for name, files in zip(("base", "head"), outputs, strict=True):
         tree = Tree(tmp_path / name, "0" * 40)
         folder = tree.results / "0"
@@ -27,11 +27,11 @@ def trees(tmp_path: Path, *outputs: Files) -> list[Tree]:
             path.write_bytes(
                 content if isinstance(content, bytes) else content.replace("LAB", str(tree.lab)).encode()
             )
-        made.append(tree)
-    return made
+        recorded_trees.append(tree)
+    return recorded_trees
 
 
-def compared(tmp_path: Path, item: Item, before: Files, after: Files) -> Differences:
+def compare_outputs(tmp_path: Path, item: Item, before: Files, after: Files) -> Differences:
     return comparison.compare(item, 0, *trees(tmp_path, before, after))
 
 
@@ -53,7 +53,7 @@ def command(name: str, text: str) -> str:
 def test_folders_stamps_and_hashes_of_programs_may_differ(
     tmp_path: Path, item: Item, before: Files, after: Files
 ) -> None:
-    assert compared(tmp_path, item, before, after) == Differences()
+    assert compare_outputs(tmp_path, item, before, after) == Differences()
 
 
 @pytest.mark.parametrize(
@@ -77,10 +77,10 @@ def test_folders_stamps_and_hashes_of_programs_may_differ(
         (ABORT, "stdout", '{"text": "2 told"}', '{"text": "2 shown"}', ("told", "shown")),
     ],
 )
-def test_other_words_are_labels(  # noqa: PLR0917
+def test_changed_words_are_labels(  # noqa: PLR0917
     tmp_path: Path, item: Item, file: str, before: str, after: str, label: tuple[str, str]
 ) -> None:
-    assert compared(tmp_path, item, {file: before}, {file: after}) == Differences(labels=Counter([label]))
+    assert compare_outputs(tmp_path, item, {file: before}, {file: after}) == Differences(labels=Counter([label]))
 
 
 SIMULATION = Item(Class.SIMULATIONS, simulation=Simulation("baylands", "scheduled", 1, 9))
@@ -104,15 +104,15 @@ SIMULATION = Item(Class.SIMULATIONS, simulation=Simulation("baylands", "schedule
     ],
 )
 def test_everything_else_is_a_difference(tmp_path: Path, item: Item, before: Files, after: Files) -> None:
-    found = compared(tmp_path, item, before, after)
-    assert found.real
-    assert not found.labels
+    differences = compare_outputs(tmp_path, item, before, after)
+    assert differences.real
+    assert not differences.labels
 
 
-def test_what_fails_with_the_base_proves_nothing(tmp_path: Path) -> None:
+def test_failure_at_the_base_commit_is_no_proof(tmp_path: Path) -> None:
     failed: Files = {"exit_code": "3\n", "stderr": "error: no namespaces"}
-    (found,) = compared(tmp_path, Item(Class.TRIALS), failed, failed).real
-    assert found.startswith("proves nothing: exit code 3")
+    (difference,) = compare_outputs(tmp_path, Item(Class.TRIALS), failed, failed).real
+    assert difference.startswith("no proof: exit code 3")
 
 
 def test_emulated_trials_may_differ_in_numbers_but_not_in_fields_files_and_columns(tmp_path: Path) -> None:
@@ -123,6 +123,6 @@ def test_emulated_trials_may_differ_in_numbers_but_not_in_fields_files_and_colum
         return {"stdout": json.dumps(event), f"trials/20261122T010946.1Z/{repeat}/trial.csv": f"{header}\n{left_s}\n"}
 
     item = Item(Class.TRIALS)
-    assert compared(tmp_path / "same", item, trial(), trial(left_s=None, repeat="udp-02")) == Differences()
+    assert compare_outputs(tmp_path / "same", item, trial(), trial(left_s=None, repeat="udp-02")) == Differences()
     for number, other in enumerate((trial(field="left"), trial(header="a,c"), trial(repeat="tcp-01"))):
-        assert compared(tmp_path / str(number), item, trial(), other).real
+        assert compare_outputs(tmp_path / str(number), item, trial(), other).real

@@ -1,4 +1,4 @@
-"""The proof of unchanged behaviour sees each kind of change in a clone that was changed, and covers what ships."""
+"""The check of unchanged behaviour detects changes in a modified clone, and covers all that ships."""
 
 import os
 import subprocess
@@ -32,7 +32,7 @@ def prove(clone: Path, *words: str) -> "subprocess.CompletedProcess[str]":
 
 @pytest.fixture
 def clone(tmp_path: Path) -> Path:
-    """A repository of its own with the files of this one as they are now, and one commit."""
+    """A repository with the current files of this one and one commit."""
     names = git(ROOT, "ls-files", "-z", "--cached", "--others", "--exclude-standard").split("\0")
     folder = tmp_path / "clone"
     folder.mkdir()
@@ -70,7 +70,7 @@ def test_a_label_passes_and_a_number_does_not(clone: Path) -> None:
 def test_an_unknown_commit_is_a_wrong_command_line(clone: Path) -> None:
     done = prove(clone, "no-such-commit")
     assert (done.returncode, done.stdout) == (2, "")
-    assert "resolves 'no-such-commit' to no commit" in done.stderr
+    assert "cannot resolve 'no-such-commit' to a commit" in done.stderr
 
 
 def test_every_kind_of_step_is_in_a_dry_run() -> None:
@@ -79,15 +79,15 @@ def test_every_kind_of_step_is_in_a_dry_run() -> None:
     assert kinds.own() <= used
 
 
-def steps(listed: list[dict[str, dict[str, object]]]) -> set[str]:
-    """Return the kinds of steps in a list, and in the steps inside of them."""
-    found: set[str] = set()
-    for step in listed:
+def steps(listing: list[dict[str, dict[str, object]]]) -> set[str]:
+    """Return the kinds of steps in a list, including nested ones."""
+    kinds_found: set[str] = set()
+    for step in listing:
         for kind, keys in step.items():
             inside = keys.get("during", [])
             assert isinstance(inside, list)
-            found |= {kind} | steps(inside)
-    return found
+            kinds_found |= {kind} | steps(inside)
+    return kinds_found
 
 
 def test_structure_is_counted(tmp_path: Path) -> None:

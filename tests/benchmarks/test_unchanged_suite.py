@@ -1,4 +1,4 @@
-"""The comparison of two commits' tests: names, imports, labels and places may change, checks may not."""
+"""Comparison of the tests of two commits: names, imports, labels and files may change, checks may not."""
 
 from pathlib import Path
 
@@ -66,7 +66,7 @@ def changes(tmp_path: Path, after: str, name: str = "test_a.py", before: str = B
 
 
 @pytest.mark.parametrize("name", ["test_a.py", "motion/test_b.py"])
-def test_names_imports_labels_and_places_may_change(tmp_path: Path, name: str) -> None:
+def test_names_imports_labels_and_files_may_change(tmp_path: Path, name: str) -> None:
     found = changes(tmp_path, RENAMED, name)
     assert (found.found, found.same, list(found.lines())) == (False, 2, [])
 
@@ -99,8 +99,8 @@ def test_a_changed_check_is_listed(tmp_path: Path, old: str, new: str, shown: st
     assert any(line.startswith(shown) for line in found.lines()), list(found.lines())
 
 
-def test_a_copy_that_is_removed_is_the_one_that_is_listed(tmp_path: Path) -> None:
+def test_removed_copy_is_the_one_that_is_listed(tmp_path: Path) -> None:
     copy = "def test_copy() -> None:\n    one, other = 1, 2\n    assert one < other\n"
-    found = changes(tmp_path, BEFORE, before=f"{BEFORE}\n\n{copy}")
-    assert list(found.lines()) == ["removed: test_a.py::test_copy"]
+    result = changes(tmp_path, BEFORE, before=f"{BEFORE}\n\n{copy}")
+    assert list(result.lines()) == ["removed: test_a.py::test_copy"]
     assert changes(tmp_path / "added", f"{BEFORE}\n\n{copy}").added == 1

@@ -1,4 +1,4 @@
-"""Tables and events as they are printed."""
+"""Tables and events as the command line prints them."""
 
 import argparse
 import json
@@ -20,7 +20,7 @@ from tests.helpers.paths import ROOT
 from tests.helpers.stored_trials import TRIALS
 
 
-def test_a_table_wider_than_the_screen_breaks_no_name_and_no_figure(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_wider_than_the_screen_does_not_wrap_names_and_values(capsys: pytest.CaptureFixture[str]) -> None:
     table([f"quantity {n}" for n in range(20)], [["masterless", *["[0.00, 56.15]"] * 19]], right=range(1, 20))
     head, _, row = capsys.readouterr().out.splitlines()
     assert len(row) > 200
@@ -47,7 +47,7 @@ def test_a_summary_wider_than_the_terminal_has_a_table_per_protocol(
 def test_a_summary_of_a_trial_fits_a_narrow_terminal(
     tmp_path: Path, columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """No figure is broken: in the narrowest, an interval stands below its value."""
+    """No value is broken; in the narrowest terminal, an interval is below its value."""
     trial = shutil.copytree(TRIALS / "20261122T013134.573068Z_los_30ft_master", tmp_path / "los")
     main(["rebuild", str(trial)])
     wide = capsys.readouterr().out
@@ -60,7 +60,7 @@ def test_a_summary_of_a_trial_fits_a_narrow_terminal(
     assert sorted(figure.findall(wide)) == sorted(figure.findall(narrow))
 
 
-def test_words_at_the_end_of_a_line_are_folded_between_words(capsys: pytest.CaptureFixture[str]) -> None:
+def test_long_text_wraps_between_words(capsys: pytest.CaptureFixture[str]) -> None:
     verdict = "no difference seen; " * 20
     table(("quantity", "A", "verdict"), [("RTT, median", "1.05 ms", verdict)], right=(1,))
     _, _, *lines = capsys.readouterr().out.splitlines()
@@ -75,32 +75,32 @@ def test_a_title_longer_than_its_table_stays_one_line(capsys: pytest.CaptureFixt
     assert capsys.readouterr().out.splitlines()[0] == "repeats, nlos, masterless, emulated, 30ft"
 
 
-def test_why_a_repeat_is_not_valid_comes_before_what_it_measured() -> None:
+def test_reason_of_a_void_repeat_precedes_its_measurements() -> None:
     ended = RepeatEnded("udp-07", 1, Status.VOID, "no message", "RTT 1.3 ms", done=0, total=2, left_s=0.0)
     assert "".join(text for text, _ in words_of(ended)) == "  0/2  udp-07  void   no message; measured: RTT 1.3 ms"
 
 
-def test_what_to_do_about_a_step_that_failed_stands_below_its_repeat() -> None:
+def test_remedy_for_a_failed_step_is_below_its_repeat() -> None:
     ended = RepeatEnded("udp-07", 1, Status.VOID, "too late", "", done=0, total=2, left_s=0, remedy="a larger idle")
     _, below = "".join(text for text, _ in words_of(ended)).splitlines()
     assert below.split() == ["remedy:", "a", "larger", "idle"]
 
 
-def test_a_campaign_that_is_done_tells_of_no_time_and_no_disk() -> None:
+def test_finished_campaign_shows_no_time_and_no_disk_space() -> None:
     went = CampaignWent("los 10ft master", done=2, total=2, left_s=0.0)
     planned = CampaignPlanned("small", (), 2, 2, walk_m=0.0, left_s=0.0, needed_bytes=0, free_bytes=1 << 30)
     for event in (went, planned):
         assert "".join(text for text, _ in words_of(event)) == "campaign: 2 of 2 trials are done"
 
 
-def test_a_path_in_a_list_of_robots_is_never_folded(capsys: pytest.CaptureFixture[str]) -> None:
+def test_paths_in_the_list_of_robots_are_not_wrapped(capsys: pytest.CaptureFixture[str]) -> None:
     robots.run(argparse.Namespace(profile=None))
     head, _, *rows = capsys.readouterr().out.splitlines()
     assert head.split() == ["name", "file", "summary"]
     assert any(str(ROOT / "robots" / "duckiedrone.yaml") in row for row in rows)
 
 
-def test_a_table_has_a_head_a_rule_and_aligned_columns(capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_has_a_header_a_rule_and_aligned_columns(capsys: pytest.CaptureFixture[str]) -> None:
     rows = [("RTT", "1.05 ms\n[1.00, 1.10]", "same"), ("漢", "", ""), ("", "", "")]
     table(("quantity", "A", "verdict"), rows, title="los", right=(1,))
     assert capsys.readouterr().out.splitlines() == [
@@ -113,7 +113,7 @@ def test_a_table_has_a_head_a_rule_and_aligned_columns(capsys: pytest.CaptureFix
     ]
 
 
-TELL = """
+REPORT_EVENTS = """
 from threading import Thread
 from fieldkit.cli.display import watching
 from fieldkit.core.events import PhaseStarted
@@ -126,7 +126,9 @@ with watching(as_json=True) as sink:
 """
 
 
-def test_events_of_steps_that_run_at_the_same_time_are_a_line_each() -> None:
+def test_events_of_concurrent_steps_are_one_line_each() -> None:
     unbuffered = os.environ | {"PYTHONUNBUFFERED": "1"}
-    done = subprocess.run((sys.executable, "-c", TELL), capture_output=True, text=True, check=True, env=unbuffered)
+    done = subprocess.run(
+        (sys.executable, "-c", REPORT_EVENTS), capture_output=True, text=True, check=True, env=unbuffered
+    )
     assert [json.loads(line)["name"] for line in done.stdout.split("\n")[:-1]] == ["ping"] * 800

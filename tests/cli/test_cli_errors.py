@@ -1,4 +1,4 @@
-"""What a person can type wrong, and what they are told: one message, a remedy, the right exit code."""
+"""Invalid command lines: one error message, a remedy and the right exit code for each."""
 
 import re
 import subprocess
@@ -29,7 +29,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         ("trial los 30", "distance '30' has no unit"),
         ("trial los 30feet", "unknown unit 'feet'"),
@@ -47,23 +47,23 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("rebuild .", "there is no trial.yaml"),
     ],
 )
-def test_a_wrong_word_is_exit_2_with_a_remedy(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_word_is_exit_2_with_a_remedy(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words.split()) == 2
     shown = capsys.readouterr()
-    assert said in shown.err
+    assert message in shown.err
     assert "remedy:" in shown.err
     assert "Traceback" not in shown.err
 
 
-@pytest.mark.parametrize(("content", "said"), [(None, "No such file"), (b"float64 \xff", "it is no UTF-8")])
+@pytest.mark.parametrize(("content", "message"), [(None, "No such file"), (b"float64 \xff", "it is not UTF-8")])
 def test_a_definition_that_cannot_be_read_is_exit_2(
-    lab: Path, content: bytes | None, said: str, capsys: pytest.CaptureFixture[str]
+    lab: Path, content: bytes | None, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if content is not None:
         (lab / "Radio.msg").write_bytes(content)
     words = ("--from", "ros1", "--to", "dds", "/radio:lab_msgs/Radio", "--type", "lab_msgs/Radio=Radio.msg")
     assert main(["bridge", *words]) == 2
-    assert capsys.readouterr().err.startswith(f"error: Radio.msg: cannot be read: {said}")
+    assert capsys.readouterr().err.startswith(f"error: Radio.msg: cannot be read: {message}")
 
 
 @pytest.mark.parametrize(
@@ -84,22 +84,22 @@ def test_a_wrong_option_is_exit_2_with_a_remedy(words: str, capsys: pytest.Captu
     assert re.fullmatch(r"error: .+\n  remedy: .+\n", capsys.readouterr().err)
 
 
-def test_a_mistyped_command_names_the_one_that_is_meant(capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistyped_command_suggests_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["trail", "los", "30ft"]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("error: COMMAND cannot be 'trail'; it is one of: init, enroll, ")
-    assert said.endswith("\n  remedy: did you mean 'trial'?\n")
+    message = capsys.readouterr().err
+    assert message.startswith("error: COMMAND cannot be 'trail'; it is one of: init, enroll, ")
+    assert message.endswith("\n  remedy: did you mean 'trial'?\n")
     assert main(["trial", "los"]) == 2
     assert capsys.readouterr().err.endswith("\n  remedy: fieldkit trial --help\n")
 
 
-def test_an_output_that_is_full_says_what_to_do() -> None:
+def test_full_output_device_has_a_remedy() -> None:
     with Path("/dev/full").open("w", encoding="ascii") as full:
         run = subprocess.run(
             (sys.executable, "-m", "fieldkit", "columns"), stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
-    said = "remedy: free some space, then type it again; what had ended is saved"
-    assert (run.returncode, run.stderr) == (2, f"error: its output: No space left on device\n  {said}\n")
+    message = "remedy: free some space, then run the command again; finished repeats are saved"
+    assert (run.returncode, run.stderr) == (2, f"error: its output: No space left on device\n  {message}\n")
 
 
 def test_verify_of_no_trial_is_exit_4(capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,7 +107,7 @@ def test_verify_of_no_trial_is_exit_4(capsys: pytest.CaptureFixture[str]) -> Non
     assert "no readable manifest" in capsys.readouterr().err
 
 
-def test_a_master_topology_without_a_relay_is_named(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_master_topology_without_a_relay_is_an_error(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (lab / "fieldkit.yaml").write_text(f"backend: emulated\n{SITE}", encoding="utf-8")
     assert main(["trial", "los", "30ft", "--dry-run"]) == 2
     assert "nobody plays relay in topology master" in capsys.readouterr().err
@@ -125,18 +125,18 @@ def test_a_topology_without_roles_names_the_line_of_the_roles(
     assert shown.endswith("remedy: add roles.masterless\n")
 
 
-def test_asking_without_a_terminal_says_what_to_add() -> None:
-    with pytest.raises(ConfigurationError, match="somebody must put a and b 5m apart") as caught:
+def test_a_question_without_a_terminal_suggests_an_option() -> None:
+    with pytest.raises(ConfigurationError, match="a person must put a and b 5m apart") as caught:
         Terminal(lambda event: None).ask("put a and b 5m apart")
     assert "--yes" in caught.value.remedy
 
 
-def test_the_version_is_told() -> None:
+def test_version_option_prints_the_version() -> None:
     run = fieldkit(Path.cwd(), "--version")
     assert (run.code, run.out) == (0, f"fieldkit {__version__}\n")
 
 
-def test_a_site_file_that_is_wrong_names_its_line(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_error_in_a_site_file_has_its_line(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     site = f"backend: emulated\n{SITE}emulated: {{radio: {{los: 10%}}}}\n"
     (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
     assert main(["trial", "los", "30ft", "--dry-run"]) == 2
@@ -145,6 +145,6 @@ def test_a_site_file_that_is_wrong_names_its_line(lab: Path, capsys: pytest.Capt
     assert "in emulated.radio: unknown key los; did you mean 'loss'?" in shown
 
 
-def test_a_junit_file_without_its_folder_is_refused_before_anything_runs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_junit_file_in_a_missing_folder_is_rejected_before_the_trial(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["trial", "los", "5m", "--junit", "no-such-folder/results.xml"]) == 2
     assert "there is no folder 'no-such-folder'" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Commands in hints and remedies: each can be typed as it is shown, with what the operator gave."""
+"""Commands in hints and remedies are valid, and include the options that the operator gave."""
 
 import ast
 import json
@@ -19,34 +19,34 @@ COMMAND = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)(?P<rest>[^;,\n`]*
 GIVEN = ("--site", "my lab.yaml", "--backend", "field")
 
 
-def named() -> Iterator[tuple[str, str, bool]]:
-    """Yield every text of the code that is no docstring, `x` for what is filled in, and whether it is to be typed."""
+def messages() -> Iterator[tuple[str, str, bool]]:
+    """Yield the file, each text in the code except docstrings (`x` for values), and whether it is a command."""
     for path in sorted((*ROOT.glob("fieldkit/**/*.py"), *ROOT.glob("sim_backends/**/*.py"))):
         where = str(path.relative_to(ROOT))
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        apart = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        excluded = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
         for node in ast.walk(tree):
             if isinstance(node, ast.JoinedStr):
-                apart |= {id(part) for part in node.values}
+                excluded |= {id(part) for part in node.values}
                 parts = (part.value if isinstance(part, ast.Constant) else "x" for part in node.values)
                 yield where, "".join(map(str, parts)), False
             elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "typed":
-                yield where, typed(*(getattr(one, "value", "x") for one in node.args)), True
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in apart:
+                yield where, typed(*(getattr(word, "value", "x") for word in node.args)), True
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in excluded:
                 yield where, node.value, False
 
 
-def test_every_command_that_is_named_is_one_and_takes_its_options() -> None:
+def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
     top, seen = parser(), 0
-    for path, text, to_type in named():
-        for found in COMMAND.finditer(text):
+    for path, text, to_type in messages():
+        for match in COMMAND.finditer(text):
             inner = top
-            for word in found["words"].split():
+            for word in match["words"].split():
                 inner = inner.command(word) or inner
                 inner.complete()
             assert inner is not top or not to_type, f"{path}: {text}"
             seen += inner is not top
-            options = [] if inner is top else re.findall(r" (--[a-z-]+)", found["rest"])
+            options = [] if inner is top else re.findall(r" (--[a-z-]+)", match["rest"])
             assert all(inner.takes(option, "x") for option in options), f"{path}: {text}"
     assert seen > 30
 
@@ -77,10 +77,10 @@ def test_every_command_that_is_named_is_one_and_takes_its_options() -> None:
         ("lab up", "fieldkit lab down", "fieldkit lab down"),
     ],
 )
-def test_a_hint_carries_what_was_given(typed_before: str, hint: str, whole: str) -> None:
+def test_hints_include_the_options_given(typed_before: str, hint: str, whole: str) -> None:
     top = parser()
-    with hints.completing(top) as known:
-        known.take(top.parse_args((*typed_before.split(), *GIVEN)))
+    with hints.completing(top) as options:
+        options.read(top.parse_args((*typed_before.split(), *GIVEN)))
         completed = hints.completed(hint)
     assert completed == whole.format(given=shlex.join(GIVEN))
     if completed.split()[0] == "fieldkit" and not any(mark in completed for mark in (" lists", ",", ";")):
@@ -88,11 +88,11 @@ def test_a_hint_carries_what_was_given(typed_before: str, hint: str, whole: str)
         assert getattr(again, "site", None) is None or str(again.site) == "my lab.yaml"
 
 
-def test_every_way_in_which_something_is_shown_completes_it(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture[str]) -> None:
     finding = Finding("a", "lock", Verdict.FAIL, "held", "wait, or end it: fieldkit abort")
     top = parser()
-    with hints.completing(top) as known:
-        known.take(top.parse_args(("check", "--site", "x.yaml")))
+    with hints.completing(top) as options:
+        options.read(top.parse_args(("check", "--site", "x.yaml")))
         show_error("held\n  remedy: fieldkit abort")
         show_findings([finding])
         for as_json in (False, True):
@@ -102,13 +102,13 @@ def test_every_way_in_which_something_is_shown_completes_it(capsys: pytest.Captu
     shown = capsys.readouterr()
     assert shown.err.endswith("remedy: fieldkit abort --site x.yaml\n")
     assert "end it: fieldkit abort --site x.yaml\n" in shown.out
-    assert "to go on: fieldkit resume --site x.yaml 'my trials/a'\n" in shown.out
+    assert "to continue: fieldkit resume --site x.yaml 'my trials/a'\n" in shown.out
     assert json.loads(shown.out.splitlines()[-1])["remedy"] == "wait, or end it: fieldkit abort --site x.yaml"
 
 
-def test_without_options_a_hint_is_as_it_was_worded() -> None:
+def test_without_options_hints_are_unchanged() -> None:
     ((text, _),) = words_of(TrialStopped("trials/a", 1, 2))
-    assert hints.completed(text).endswith("to go on: fieldkit resume trials/a")
+    assert hints.completed(text).endswith("to continue: fieldkit resume trials/a")
 
 
 @pytest.mark.parametrize(("words", "begin"), [([], "usage: fieldkit [-h]"), (["lab"], "usage: fieldkit lab [-h]")])

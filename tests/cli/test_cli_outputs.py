@@ -1,4 +1,4 @@
-"""Where commands write: into no pipe, device or folder, and into streams that are closed."""
+"""Output files and streams: pipes, devices and folders are rejected, and closed streams are no error."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ from tests.helpers.tables import ROW, write
 
 
 @pytest.mark.parametrize("words", [["report"], ["export", "--format", "csv"]], ids=" ".join)
-def test_what_is_no_file_is_neither_read_nor_replaced(
+def test_output_that_is_not_a_regular_file_is_rejected(
     tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     table, out = write(tmp_path, [ROW]), tmp_path / "out"
@@ -23,7 +23,7 @@ def test_what_is_no_file_is_neither_read_nor_replaced(
 
 
 @pytest.mark.parametrize("closed", ["1>&-", "0>&- 1>&- 2>&-"])
-def test_a_stream_that_the_caller_closed_is_no_traceback(tmp_path: Path, closed: str) -> None:
+def test_closed_streams_cause_no_traceback(tmp_path: Path, closed: str) -> None:
     words = (sys.executable, "-m", "fieldkit", "aggregate", str(write(tmp_path, [ROW])))
     run = subprocess.run(("sh", "-c", f'exec "$@" {closed}', "sh", *words), stderr=subprocess.PIPE, check=False)
     assert (run.returncode, run.stderr) == (0, b"")

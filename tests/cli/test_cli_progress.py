@@ -1,4 +1,4 @@
-"""The line at the bottom of a terminal: it fits, and says what matters most where there is little room."""
+"""The progress line of a terminal: it fits the width and keeps the most important values if space is short."""
 
 import time
 
@@ -20,7 +20,7 @@ from fieldkit.core.events import (
 from fieldkit.core.model import Status
 
 VALID = RepeatEnded("udp-07", 1, Status.VALID, "", "IP loss 3.2 %, file loss 18 %, RTT 1.3 ms", 7, 40, 200.0)
-BEGUN = (
+STARTED = (
     CampaignTrial("los 5m master", 3, 6),
     TrialStarted("trials/a", 0, 40),
     VALID,
@@ -31,7 +31,7 @@ BEGUN = (
 def line(width: int, *events: Event) -> str:
     progress = ProgressBar()
     for event in events:
-        progress.take(event)
+        progress.update(event)
     return "".join(text for text, _ in progress.words(width))
 
 
@@ -52,35 +52,35 @@ def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
         (5, "ud..."),
     ],
 )
-def test_the_line_fits_and_keeps_what_is_done_now(width: int, shown: str) -> None:
-    assert line(width, *BEGUN) == shown
+def test_line_fits_and_keeps_the_current_phase(width: int, shown: str) -> None:
+    assert line(width, *STARTED) == shown
 
 
 def test_the_line_is_never_wider_than_the_terminal() -> None:
     for width in range(1, 130):
-        assert len(line(width, *BEGUN)) <= width
-        assert len(line(width, *BEGUN[1:])) <= width
+        assert len(line(width, *STARTED)) <= width
+        assert len(line(width, *STARTED[1:])) <= width
 
 
-def test_before_a_repeat_ended_nothing_is_estimated() -> None:
-    assert line(80, *BEGUN[1:2], PhaseStarted("preflight")) == f"{'─' * 12}  0/40  preflight  for 0.0 s"
+def test_no_estimate_before_the_first_repeat_ends() -> None:
+    assert line(80, *STARTED[1:2], PhaseStarted("preflight")) == f"{'─' * 12}  0/40  preflight  for 0.0 s"
 
 
-def test_nothing_is_drawn_over_a_question_nor_after_the_end() -> None:
+def test_no_line_during_a_question_and_after_the_end() -> None:
     progress = ProgressBar()
     assert not progress.is_needed
-    progress.take(BEGUN[-1])
+    progress.update(STARTED[-1])
     assert progress.is_needed
-    progress.take(Request("move a", may_skip=False))
-    progress.take(PhaseStarted("told by another thread"))
+    progress.update(Request("move a", may_skip=False))
+    progress.update(PhaseStarted("told by another thread"))
     assert not progress.is_needed
-    progress.take(Answered(skip=False, note=""))
+    progress.update(Answered(skip=False, note=""))
     assert progress.is_needed
-    progress.take(TrialEnded("trials/a", 1, 0, 0))
+    progress.update(TrialEnded("trials/a", 1, 0, 0))
     assert not progress.is_needed
 
 
-def test_a_valid_repeat_is_whole_and_is_folded_where_a_terminal_is_narrow() -> None:
+def test_line_of_a_valid_repeat_is_complete_and_wraps_in_narrow_terminals() -> None:
     def repeat(width: int | None) -> str:
         return "".join(text for text, _ in words_of(VALID, width))
 
@@ -89,7 +89,7 @@ def test_a_valid_repeat_is_whole_and_is_folded_where_a_terminal_is_narrow() -> N
     assert repeat(40) == "  7/40  udp-07  valid  IP loss 3.2 %,\n        file loss 18 %, RTT 1.3 ms"
 
 
-def test_why_a_repeat_is_void_is_folded_below_it_and_never_cut() -> None:
+def test_reason_of_a_void_repeat_wraps_below_it_and_is_not_cut() -> None:
     reason = "turtlebot-1: the link is lost; the sender's capture dropped 12 packets, its interface none"
     void = RepeatEnded("udp-07", 1, Status.VOID, reason, "RTT 1.3 ms", 6, 40, 200.0)
     first, *below = "".join(text for text, _ in words_of(void, 60)).splitlines()
@@ -98,7 +98,7 @@ def test_why_a_repeat_is_void_is_folded_below_it_and_never_cut() -> None:
     assert " ".join(text.strip() for text in below) == f"{reason}; measured: RTT 1.3 ms"
 
 
-def test_a_computation_tells_how_much_of_it_is_done_and_how_long_the_rest_takes() -> None:
+def test_progress_of_a_computation_with_its_remaining_time() -> None:
     half = Progress("simulate", 15.0, 30.0, "s", 42.0)
     assert line(80, half) == f"{'━' * 6}{'─' * 6}  15/30 s  42 s left  simulate  for 0.0 s"
     assert line(80, Progress("simulate", 0, 20, "runs")) == f"{'─' * 12}  0/20 runs  simulate  for 0.0 s"

@@ -1,4 +1,4 @@
-"""What the results of a trial end with: the commands that a person types next."""
+"""The commands that the result of a trial suggests next."""
 
 import argparse
 import shlex
@@ -13,14 +13,14 @@ from tests.helpers.tables import RepeatRow, replace
 
 
 def commands(capsys: pytest.CaptureFixture[str], *rows: RepeatRow, every: bool = False) -> list[str]:
-    """Return the commands that are named as the next ones after trials of one row each."""
+    """Return the commands suggested after trials of one row each."""
     outcomes = [Outcome(Path(f"trials/{number}"), cells_of([row]), 1, 0) for number, row in enumerate(rows)]
     assert results.report(outcomes, argparse.Namespace(json=False, all=every, junit=None)) == 0
     text = capsys.readouterr().out
     return [line.strip() for line in text[text.index("next: ") :].removeprefix("next: ").splitlines()]
 
 
-def test_the_next_commands_can_be_typed_as_they_are(
+def test_suggested_commands_are_valid(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -41,13 +41,13 @@ def test_the_next_commands_can_be_typed_as_they_are(
         (["30ft", "30ft"], None),
     ],
 )
-def test_another_distance_goes_on_as_those_before(
+def test_suggested_distance_continues_the_series(
     capsys: pytest.CaptureFixture[str], distances: list[str], farther: str | None
 ) -> None:
-    said = commands(capsys, *(replace(PINGED, distance=distance) for distance in distances), every=True)
-    assert said[1:] == ([f"fieldkit trial los {farther}  # another distance"] if farther else [])
+    suggested = commands(capsys, *(replace(PINGED, distance=distance) for distance in distances), every=True)
+    assert suggested[1:] == ([f"fieldkit trial los {farther}  # another distance"] if farther else [])
 
 
-def test_nobody_is_sent_farther_away_where_no_ping_was_answered(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_larger_distance_is_suggested_if_no_ping_was_answered(capsys: pytest.CaptureFixture[str]) -> None:
     dead = replace(PINGED, rtt_received=0, rtt_loss=1.0, rtt_median_s=None)
     assert commands(capsys, dead, every=True) == ["fieldkit report trials/0"]

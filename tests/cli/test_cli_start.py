@@ -1,4 +1,4 @@
-"""What a command imports: words that need no library load none, and texts that stand in for one say what it says."""
+"""Imports of each command: no unneeded library; texts that stand in for a library's values equal them."""
 
 import os
 import pkgutil
@@ -24,7 +24,7 @@ LIBRARIES = {
     *("cryptography", "jinja2", "keyring", "matplotlib", "mcap", "numpy", "pandas", "paramiko", "pyarrow"),
     *("pydantic", "rich", "rosbags", "ruamel", "scipy", "sim_backends", "yaml"),
 }
-ROOMS = {"analysis", "campaign", "export", "lab", "measure", "remote", "report", "steps", "trial"}
+PACKAGES = {"analysis", "campaign", "export", "lab", "measure", "remote", "report", "steps", "trial"}
 LIMIT_S = 60.0
 
 
@@ -32,9 +32,9 @@ def modules(package: ModuleType) -> set[str]:
     return {module.name for module in pkgutil.iter_modules(package.__path__)}
 
 
-def imported(lab: Path, words: str, asked: Mapping[str, str] | None = None) -> set[str]:
-    """Return the libraries, and the rooms of fieldkit, that a command imports."""
-    environment = os.environ | {"PYTHONPROFILEIMPORTTIME": "1", "PYTHONPATH": str(ROOT)} | dict(asked or {})
+def imported(lab: Path, words: str, variables: Mapping[str, str] | None = None) -> set[str]:
+    """Return the libraries and the packages of fieldkit that a command imports."""
+    environment = os.environ | {"PYTHONPROFILEIMPORTTIME": "1", "PYTHONPATH": str(ROOT)} | dict(variables or {})
     done = subprocess.run(
         (sys.executable, "-m", "fieldkit", *words.split()),
         cwd=lab,
@@ -48,8 +48,8 @@ def imported(lab: Path, words: str, asked: Mapping[str, str] | None = None) -> s
     lines = (line for line in done.stderr.splitlines() if line.startswith("import time:"))
     names = {line.rpartition("|")[2].strip() for line in lines}
     assert "fieldkit.cli.commands" in names, done.stderr
-    rooms = {room for room in ROOMS if f"fieldkit.{room}" in names}
-    return rooms | {name.partition(".")[0] for name in names} & LIBRARIES
+    packages = {package for package in PACKAGES if f"fieldkit.{package}" in names}
+    return packages | {name.partition(".")[0] for name in names} & LIBRARIES
 
 
 @pytest.mark.parametrize("words", ["--version", "--help"])
@@ -57,10 +57,10 @@ def test_the_list_of_commands_imports_no_library(tmp_path: Path, words: str) -> 
     assert imported(tmp_path, words) == set()
 
 
-# An operator waits for `stop`, so it imports at its top.
+# `stop` is urgent, so its module imports at the top.
 @pytest.mark.parametrize("name", [name for name in commands.COMMANDS if name != "stop"])
 def test_help_imports_no_slow_library(tmp_path: Path, name: str) -> None:
-    """Of `rosbags` the names of types, which take 10 ms."""
+    """Importing the type names of `rosbags` takes 10 ms."""
     assert imported(tmp_path, f"{name} --help") & LIBRARIES <= {"rich", "rosbags"}
 
 
@@ -68,11 +68,11 @@ def test_help_imports_no_slow_library(tmp_path: Path, name: str) -> None:
     "line", ["fieldkit tr", "fieldkit trial ", "fieldkit trial los 30ft --to", "fieldkit resume "]
 )
 def test_completion_imports_no_library_but_rich(tmp_path: Path, line: str) -> None:
-    asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
-    assert imported(tmp_path, "", asked | {"_ARGCOMPLETE_STDOUT_FILENAME": os.devnull}) & LIBRARIES <= {"rich"}
+    variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
+    assert imported(tmp_path, "", variables | {"_ARGCOMPLETE_STDOUT_FILENAME": os.devnull}) & LIBRARIES <= {"rich"}
 
 
-def test_a_mistyped_word_imports_what_shows_errors_alone(tmp_path: Path) -> None:
+def test_mistyped_command_imports_only_rich(tmp_path: Path) -> None:
     assert imported(tmp_path, "trail los 30ft") == {"rich"}
 
 
@@ -89,19 +89,19 @@ def test_a_mistyped_word_imports_what_shows_errors_alone(tmp_path: Path) -> None
         ("completion bash", LIBRARIES),
     ],
 )
-def test_a_command_imports_no_library_that_it_does_not_need(tmp_path: Path, words: str, unneeded: set[str]) -> None:
+def test_command_imports_no_unneeded_library(tmp_path: Path, words: str, unneeded: set[str]) -> None:
     assert not imported(tmp_path, words) & unneeded
 
 
-def test_stop_imports_only_what_reaches_robots(tmp_path: Path) -> None:
+def test_stop_imports_only_what_connects_to_robots(tmp_path: Path) -> None:
     access = "profile: box, host: 127.0.0.1, port: 1, user: u, host_key: ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIA=="
     (tmp_path / "fieldkit.yaml").write_text(f"robots: {{a: {{{access}}}}}\nroles: {{}}\n", encoding="utf-8")
     needed = {"cryptography", "paramiko", "yaml"}
     assert imported(tmp_path, "stop --all") == needed | {"lab", "remote"}
 
 
-def test_a_command_that_calculates_has_one_thread(tmp_path: Path) -> None:
-    """Of numpy's OpenBLAS there would be one more per core, which spins while it has nothing to do."""
+def test_commands_start_no_openblas_threads(tmp_path: Path) -> None:
+    """By default numpy's OpenBLAS starts one thread per core, which spins while idle."""
     script = "import os; from fieldkit.cli import main; main(['columns']); print(*os.listdir('/proc/self/task'))"
     done = subprocess.run(
         (sys.executable, "-c", script),
@@ -115,7 +115,7 @@ def test_a_command_that_calculates_has_one_thread(tmp_path: Path) -> None:
     assert len(done.stdout.splitlines()[-1].split()) == 1
 
 
-def test_the_help_names_the_columns_by_which_repeats_are_told_apart() -> None:
+def test_help_lists_the_default_grouping_columns() -> None:
     assert tuple(shared_arguments.CONDITION.split(",")) == DEFAULT_BY
     assert tuple(compare.PAIRED_BY.split(",")) == PAIRED_BY
 
@@ -124,38 +124,46 @@ def test_the_help_names_the_installed_backends() -> None:
     assert "one of: emulated, field (default:" in " ".join(fieldkit(Path.cwd(), "abort", "--help").out.split())
 
 
-def test_every_command_has_a_module_of_its_name_with_a_function_that_runs_it() -> None:
+def test_every_command_has_its_module_and_run_function() -> None:
     top = parser()
     for name in commands.COMMANDS:
-        own = top.command(name)
-        assert own is not None
-        for inner in map(own.command, own.subcommands()) if own.subcommands() else (own,):
-            assert inner is not None
-            run = inner.get_default("run") or own.get_default("run")  # `show` of a listing runs as its listing
-            assert isfunction(run), inner.prog
+        command = top.command(name)
+        assert command is not None
+        for leaf in map(command.command, command.subcommands()) if command.subcommands() else (command,):
+            assert leaf is not None
+            run = leaf.get_default("run") or command.get_default("run")  # `show` of a listing runs as its listing
+            assert isfunction(run), leaf.prog
             assert run.__module__ == f"fieldkit.cli.commands.{name}"
     assert modules(commands) == set(commands.COMMANDS)
 
 
 @pytest.mark.parametrize(
-    ("words", "said", "remedy"),
+    ("words", "message", "remedy"),
     [
-        ("--toplogy", "fieldkit does not take '--toplogy'", "did you mean 'fieldkit check --topology'?"),
-        ("--versoin", "fieldkit does not take '--versoin'", "did you mean '--version'?"),
-        ("trial los 30ft --toplogy master", "fieldkit trial does not take '--toplogy'", "did you mean '--topology'?"),
+        ("--toplogy", "fieldkit has no option or argument '--toplogy'", "did you mean 'fieldkit check --topology'?"),
+        ("--versoin", "fieldkit has no option or argument '--versoin'", "did you mean '--version'?"),
+        (
+            "trial los 30ft --toplogy master",
+            "fieldkit trial has no option or argument '--toplogy'",
+            "did you mean '--topology'?",
+        ),
         ("trial los 30ft --topology mastr", "--topology cannot be 'mastr'", "did you mean 'master'?"),
-        ("aggregate x --zzz=1", "fieldkit aggregate does not take '--zzz=1'", "fieldkit aggregate --help"),
-        ("rebuild x y", "fieldkit rebuild does not take 'y'", "fieldkit rebuild --help"),
+        (
+            "aggregate x --zzz=1",
+            "fieldkit aggregate has no option or argument '--zzz=1'",
+            "fieldkit aggregate --help",
+        ),
+        ("rebuild x y", "fieldkit rebuild has no option or argument 'y'", "fieldkit rebuild --help"),
         ("lab mvoe", "COMMAND cannot be 'mvoe'", "did you mean 'move'?"),
         ("lab move a --by -5m", "--by takes EAST NORTH [UP], not '-5m'", "fieldkit lab move ROBOT --to 20m 10m"),
     ],
 )
-def test_a_mistyped_word_names_the_one_that_is_meant(
-    words: str, said: str, remedy: str, capsys: pytest.CaptureFixture[str]
+def test_mistyped_word_suggests_the_right_one(
+    words: str, message: str, remedy: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(words.split()) == 2
     shown = capsys.readouterr().err
-    assert shown.startswith(f"error: {said}")
+    assert shown.startswith(f"error: {message}")
     assert f"\n  remedy: {remedy}" in shown
 
 

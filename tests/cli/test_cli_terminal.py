@@ -1,4 +1,4 @@
-"""The person at a terminal: asked on a line that nothing redraws, asked again, and free to leave."""
+"""Questions at a terminal: not redrawn, repeated after an invalid answer, and ended by Ctrl-C."""
 
 import codecs
 import os
@@ -26,7 +26,7 @@ from fieldkit.cli import INTERRUPTED
 from fieldkit.cli.display import watching
 from fieldkit.cli.terminal import Terminal
 from fieldkit.core.events import Event, Note, PhaseStarted, Request
-def told(event: Event) -> None:
+def forward(event: Event) -> None:
     sink(event)
     if isinstance(event, Request):
         Thread(target=sink, args=[Note("link lost")]).start()
@@ -34,7 +34,7 @@ try:
     with watching(as_json=False) as sink:
         sink(PhaseStarted("connect"))
         sink(PhaseStarted("work", repeat="tcp-01"))
-        answer = Terminal(told).ask("move a", may_skip=True)
+        answer = Terminal(forward).ask("move a", may_skip=True)
         sink(PhaseStarted("go on"))
 except KeyboardInterrupt:
     sys.exit(INTERRUPTED)
@@ -42,12 +42,12 @@ print(answer)
 """
 
 
-class Person:
-    """Reads and types at the other end of a terminal."""
+class Operator:
+    """The operator's side of a pseudo-terminal."""
 
     def __init__(self, terminal: int) -> None:
         self._terminal = terminal
-        self._decode = codecs.getincrementaldecoder("utf-8")().decode  # a character may come in two pieces
+        self._decode = codecs.getincrementaldecoder("utf-8")().decode  # a character may be split between two reads
         self.read = ""
 
     def wait_for(self, *texts: str) -> None:
@@ -55,10 +55,10 @@ class Person:
         start = len(self.read)
         while not all(text in self.read[start:] for text in texts):
             assert time.monotonic() < ends, self.read
-            self.sees(WITHIN_S)
+            self.read_new(WITHIN_S)
 
-    def sees(self, within_s: float) -> str:
-        """Return what appears next, empty if nothing does in time."""
+    def read_new(self, within_s: float) -> str:
+        """Return the next output, empty after a timeout."""
         if not select.select([self._terminal], [], [], within_s)[0]:
             return ""
         new = self._decode(os.read(self._terminal, 4096))
@@ -70,77 +70,77 @@ class Person:
 
 
 @contextmanager
-def asked(*words: str, lab: Path | None = None) -> Iterator[tuple[Person, "subprocess.Popen[bytes]"]]:
-    """Run `ASK`, or python with `words` in the folder `lab`, at a terminal."""
-    ours, theirs = pty.openpty()
+def run_at_terminal(*words: str, lab: Path | None = None) -> Iterator[tuple[Operator, "subprocess.Popen[bytes]"]]:
+    """Run `ASK`, or python with `words` in the folder `lab`, at a pseudo-terminal."""
+    near, far = pty.openpty()
     process = subprocess.Popen(
         (sys.executable, *(words or ("-c", ASK))),
         cwd=lab,
-        stdin=theirs,
-        stdout=theirs,
-        stderr=theirs,
+        stdin=far,
+        stdout=far,
+        stderr=far,
         start_new_session=True,
     )
-    os.close(theirs)
+    os.close(far)
     try:
-        yield Person(ours), process
+        yield Operator(near), process
     finally:
         process.kill()
         process.wait(WITHIN_S)
-        os.close(ours)
+        os.close(near)
 
 
-def test_nothing_is_drawn_while_a_question_stands() -> None:
-    with asked() as (person, _):
-        person.wait_for("\n> ", "link lost\r\n")
-        assert "work" in person.read
-        assert "move a" in person.read
-        assert "s to leave it for later" in person.read
-        # The live line is drawn eight times a second.
-        assert person.sees(0.6) == ""
+def test_nothing_is_drawn_during_a_question() -> None:
+    with run_at_terminal() as (operator, _):
+        operator.wait_for("\n> ", "link lost\r\n")
+        assert "work" in operator.read
+        assert "move a" in operator.read
+        assert "s to leave it for later" in operator.read
+        # The progress line is drawn 8 times per second.
+        assert operator.read_new(0.6) == ""
 
 
-def test_a_meaningless_answer_is_asked_again_and_a_note_is_kept() -> None:
-    with asked() as (person, process):
-        person.wait_for("\n> ")
-        person.type("what?\n")
-        person.wait_for("\n> ")
-        person.type("n wet grass\n")
-        person.wait_for("Answer(skip=False, note='wet grass')")
-        assert "go on" in person.read
+def test_question_repeats_after_an_invalid_answer_and_keeps_a_note() -> None:
+    with run_at_terminal() as (operator, process):
+        operator.wait_for("\n> ")
+        operator.type("what?\n")
+        operator.wait_for("\n> ")
+        operator.type("n wet grass\n")
+        operator.wait_for("Answer(skip=False, note='wet grass')")
+        assert "go on" in operator.read
         assert process.wait(WITHIN_S) == 0
 
 
 def test_a_terminal_that_closes_is_an_error() -> None:
-    with asked() as (person, process):
-        person.wait_for("\n> ")
-        person.type("\x04")
-        person.wait_for("the terminal was closed at a question")
+    with run_at_terminal() as (operator, process):
+        operator.wait_for("\n> ")
+        operator.type("\x04")
+        operator.wait_for("the terminal was closed during a question")
         assert process.wait(WITHIN_S) == 1
 
 
-def test_an_abort_that_is_refused_ends_nothing(tmp_path: Path) -> None:
+def test_abort_that_is_not_confirmed_terminates_nothing(tmp_path: Path) -> None:
     key = " ".join(make_key(tmp_path / "key").split()[:2])
     robot = f"{{profile: duckiedrone, host: localhost, port: {free_port()}, user: nobody, host_key: {key}}}"
     site = f"backend: field\nrobots:\n  a: {robot}\nroles: {{}}\n"
     (tmp_path / SITE_FILE).write_text(site, encoding="utf-8")
-    with asked("-m", "fieldkit", "abort", lab=tmp_path) as (person, process):
-        person.wait_for("end every job of fieldkit on a? yes or no", "\n> ")
-        person.type("no\n")
-        person.wait_for("nothing was ended")
+    with run_at_terminal("-m", "fieldkit", "abort", lab=tmp_path) as (operator, process):
+        operator.wait_for("terminate every job of fieldkit on a? yes or no", "\n> ")
+        operator.type("no\n")
+        operator.wait_for("nothing was terminated")
         assert process.wait(WITHIN_S) == 1
 
 
 def reads_standard_input(process: "subprocess.Popen[bytes]") -> bool:
-    """Return whether it sleeps in a system call whose first argument is descriptor 0."""
+    """Return whether the process waits in a system call whose first argument is descriptor 0."""
     return Path(f"/proc/{process.pid}/syscall").read_text(encoding="ascii").split()[1:2] == ["0x0"]
 
 
 def test_ctrl_c_ends_a_question() -> None:
-    with asked() as (person, process):
-        person.wait_for("\n> ")
-        # Python loses a signal that comes between its last look and the system call that waits. A second one may
-        # come when Python has ended its own handler, and then kills.
+    with run_at_terminal() as (operator, process):
+        operator.wait_for("\n> ")
+        # Python misses a signal that arrives between its last check and the blocking system call. A second signal
+        # may arrive after Python has removed its handler, and then kills the process.
         wait_until(lambda: reads_standard_input(process), Deadline.after(WITHIN_S))
         process.send_signal(signal.SIGINT)
         assert process.wait(WITHIN_S) == INTERRUPTED

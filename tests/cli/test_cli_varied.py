@@ -1,4 +1,4 @@
-"""Trials whose procedures differ, and whose steps measure what fieldkit never heard of, as people look at them."""
+"""Command output for trials of different procedures, with columns that fieldkit does not declare itself."""
 
 import csv
 import io
@@ -18,7 +18,7 @@ DISTANCES = {"10ft": 3.048, "30ft": 9.144}
 
 @pytest.fixture
 def trials(tmp_path: Path) -> Path:
-    """Per distance a trial with two transfers, two pings and a vendor's meter, and one with the meter alone."""
+    """For each distance, a trial with two transfers, two pings and a vendor's meter, and one with only the meter."""
     for index, (distance, metres) in enumerate(DISTANCES.items()):
         for name, columns in (("all", (*varied.NAMED, *varied.VENDOR)), ("meter", varied.VENDOR)):
             plan = varied.plan(f"{name}-{distance}", distance=distance, metres=metres, columns=columns)
@@ -26,7 +26,7 @@ def trials(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+def output_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     assert main([*words]) == 0, capsys.readouterr().err
     return capsys.readouterr().out
 
@@ -35,49 +35,52 @@ def records(text: str) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text)))
 
 
-def test_any_declared_figure_is_put_together_with_its_unit_and_interval(
+def test_aggregate_includes_all_declared_quantities_with_unit_and_interval(
     trials: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lines = records(said(capsys, "aggregate", str(trials), "--by", "distance", "--format", "csv"))
-    found = {(line["distance"], line["quantity"]): line for line in lines}
-    level, locked, loss = (found["30ft", name] for name in ("probe.level", "probe.locked", "up.ip_loss"))
+    lines = records(output_of(capsys, "aggregate", str(trials), "--by", "distance", "--format", "csv"))
+    by_quantity = {(line["distance"], line["quantity"]): line for line in lines}
+    level, locked, loss = (by_quantity["30ft", name] for name in ("probe.level", "probe.locked", "up.ip_loss"))
     assert (level["unit"], level["estimate"], level["n"]) == ("dBm", "median", "32")
     assert -60 < float(level["low"]) < float(level["value"]) < float(level["high"]) < -40
     assert (locked["unit"], locked["estimate"]) == ("share", "flag")
-    assert (loss["unit"], loss["n"], loss["trials"]) == ("share", "16", str(16 * 40)), "of the trials that have it"
-    assert not [name for _, name in found if name in {"probe.firmware", "wind"}]
+    assert (loss["unit"], loss["n"], loss["trials"]) == ("share", "16", str(16 * 40)), (
+        "of the trials that have the column"
+    )
+    assert not [name for _, name in by_quantity if name in {"probe.firmware", "wind"}]
 
 
-def test_a_text_that_the_operator_gave_tells_conditions_apart(
-    trials: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = said(capsys, "aggregate", str(trials), "--by", "wind", "--quantity", "probe.level", "--format", "csv")
+def test_conditions_can_be_grouped_by_an_operators_answer(trials: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = output_of(capsys, "aggregate", str(trials), "--by", "wind", "--quantity", "probe.level", "--format", "csv")
     assert {line["wind"] for line in records(text)} == {"calm", "gusts"}
     for table in trials.glob("*/trial.yaml"):
         table.unlink()
-    assert said(capsys, "aggregate", str(trials), "--by", "wind", "--quantity", "up.transfer_s", "--format", "csv")
+    assert output_of(
+        capsys, "aggregate", str(trials), "--by", "wind", "--quantity", "up.transfer_s", "--format", "csv"
+    )
 
 
-def test_tables_for_people_have_units_and_no_more_digits_than_there_are(
-    trials: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_tables_have_units_and_rounded_values(trials: Path, capsys: pytest.CaptureFixture[str]) -> None:
     chosen = [word for name in ("probe.level", "probe.resets", "up.ip_loss") for word in ("--quantity", name)]
     words = ("aggregate", str(trials), "--by", "distance", *chosen)
-    table = said(capsys, *words)
+    table = output_of(capsys, *words)
     assert re.search(r"^probe: level \(dBm\)\n.*\n.*\n *10ft +32 +-4\d\.\d\d +\[-", table, re.MULTILINE)
     assert re.search(r"^probe: resets\n", table, re.MULTILINE)
-    assert "| distance | repeats | probe: level, median (dBm) | probe: resets | up: IP packet loss (%) |" in said(
-        capsys, *words, "--format", "markdown"
+    assert (
+        "| distance | repeats | probe: level, median (dBm) | probe: resets | up: IP packet loss (%) |"
+        in output_of(capsys, *words, "--format", "markdown")
     )
-    assert r"probe: level, median (dBm)" in said(capsys, *words, "--format", "latex")
-    whole = json.loads(said(capsys, *words, "--format", "json"))
+    assert r"probe: level, median (dBm)" in output_of(capsys, *words, "--format", "latex")
+    whole = json.loads(output_of(capsys, *words, "--format", "json"))
     assert whole["cells"][0]["estimates"]["probe.level"]["unit"] == "dBm"
 
 
-def test_a_width_in_any_unit_says_how_many_more_repeats(trials: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_width_in_any_unit_gives_the_number_of_repeats_needed(
+    trials: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ("aggregate", str(trials), "--by", "protocol", "--format", "csv", "--quantity", "probe.level")
     for width in ("0.5dBm", "0.5 dB"):
-        (tcp, udp) = records(said(capsys, *words, "--width", width))
+        (tcp, udp) = records(output_of(capsys, *words, "--width", width))
         for line in (tcp, udp):
             wide = float(line["high"]) - float(line["low"])
             assert (int(line["more_wanted"]) > 0) is (wide > 1)
@@ -90,7 +93,7 @@ def test_two_runs_are_compared_in_any_unit(tmp_path: Path, capsys: pytest.Captur
         plan = varied.plan(name, distance="30ft", metres=9.144, columns=varied.VENDOR)
         varied.write(tmp_path, plan, varied.measured(plan, repeats=20, seed=3, level_dbm=level_dbm))
     words = ("compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force")
-    text = said(capsys, *words, "--format", "csv")
+    text = output_of(capsys, *words, "--format", "csv")
     level = next(line for line in records(text) if line["quantity"] == "probe.level")
     assert level["unit"] == "dBm"
     assert float(level["difference"]) == pytest.approx(-6)
@@ -103,7 +106,7 @@ def test_two_runs_are_compared_in_any_unit(tmp_path: Path, capsys: pytest.Captur
     assert "'20m' is not a threshold\n  remedy: write for example 15dBm" in capsys.readouterr().err
 
 
-def test_runs_that_mean_different_things_by_a_name_are_not_compared(
+def test_runs_with_different_definitions_of_a_column_are_not_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = Column("probe.level", "mW", "In another unit.", figure=Figure("level", Kind.MEDIAN))
@@ -118,25 +121,27 @@ def test_exports_have_types_units_and_meanings_of_all_columns(
     trials: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(trials)
-    said(capsys, "export", ".", "--format", "parquet", "-o", "all.parquet")
+    output_of(capsys, "export", ".", "--format", "parquet", "-o", "all.parquet")
     table = pyarrow.parquet.read_table(trials / "all.parquet")
     for column in (*varied.NAMED, *varied.VENDOR):
         kept = table.schema.field(column.name).metadata
         assert (kept[b"unit"].decode(), kept[b"meaning"].decode()) == (column.unit, column.meaning)
     assert table.column("probe.level").null_count == 0
     assert table.column("up.transfer_s").null_count == table.num_rows // 2
-    said(capsys, "export", ".", "--format", "csv", "-o", "all.csv")
-    again = said(capsys, "aggregate", "all.csv", "--by", "distance", "--format", "csv", "--quantity", "up.ip_loss")
-    assert again == said(
+    output_of(capsys, "export", ".", "--format", "csv", "-o", "all.csv")
+    again = output_of(
+        capsys, "aggregate", "all.csv", "--by", "distance", "--format", "csv", "--quantity", "up.ip_loss"
+    )
+    assert again == output_of(
         capsys, "aggregate", ".", "--by", "distance", "--format", "csv", "--quantity", "up.ip_loss"
-    ), "by the name behind that of the step, without a plan"
+    ), "by the column name after the step name, without a plan"
 
 
-def test_a_report_draws_every_step_beside_the_others(
+def test_report_draws_all_steps_together(
     trials: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(trials)
-    said(capsys, "report", ".", "-o", "page.html", "--quantity", "up.jitter_s")
+    output_of(capsys, "report", ".", "-o", "page.html", "--quantity", "up.jitter_s")
     page = (trials / "page.html").read_text(encoding="utf-8")
     for title in (
         "IP packet loss against distance, by step",
@@ -148,12 +153,12 @@ def test_a_report_draws_every_step_beside_the_others(
         assert f"<caption>{caption}</caption>" in page
     assert '<figure id="ip-loss-of-steps"' in page
     assert "p8192, UDP, master, 8192 bytes" in page
-    assert "--quantity up.jitter_s" in page, "the command that makes the page again"
+    assert "--quantity up.jitter_s" in page, "the command that reproduces the page"
     assert main(["report", ".", "-o", "page.html", "--quantity", "up.jiter_s"]) == 2
     assert "did you mean 'up.jitter_s'" in capsys.readouterr().err
 
 
-def test_a_report_of_very_many_figures_says_which_it_does_not_draw(
+def test_report_lists_the_quantities_that_it_does_not_draw(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -161,14 +166,14 @@ def test_a_report_of_very_many_figures_says_which_it_does_not_draw(
     for distance, metres in DISTANCES.items():
         plan = varied.plan(distance, distance=distance, metres=metres, columns=many)
         varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
-    said(capsys, "report", ".", "-o", "page.html")
+    output_of(capsys, "report", ".", "-o", "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "a: m11 against distance" in page
     assert "a: m12 against distance" not in page
     assert "Not drawn: a.m12, a.m13, a.m14. To draw one: --quantity a.m12." in page
 
 
-def test_figures_of_one_distance_leave_room_for_the_curves_of_others(
+def test_quantities_of_one_distance_do_not_displace_curves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -177,7 +182,7 @@ def test_figures_of_one_distance_leave_room_for_the_curves_of_others(
     for (distance, metres), columns in zip(DISTANCES.items(), ((*many, last), (last,)), strict=True):
         plan = varied.plan(distance, distance=distance, metres=metres, columns=columns)
         varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
-    said(capsys, "report", ".", "-o", "page.html")
+    output_of(capsys, "report", ".", "-o", "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "b: level against distance" in page
     assert "a: m0 against distance" not in page
@@ -190,30 +195,30 @@ HOSTILE = ("<script>alert(1)</script>", r"\input{/etc/passwd}", "[x](javascript:
 
 
 @pytest.mark.parametrize("text", HOSTILE)
-def test_words_of_a_stranger_s_plan_are_words_everywhere(
+def test_texts_of_a_plan_are_escaped_in_all_formats(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     column = Column("a", text[:20], text, figure=Figure(text, Kind.MEDIAN))
     plan = varied.plan("one", distance="30ft", metres=9.144, columns=[column])
     varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
-    said(capsys, "report", ".", "-o", "page.html")
+    output_of(capsys, "report", ".", "-o", "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<script" not in page
     assert "javascript:alert)</a>" not in page
     words = ("aggregate", ".", "--quantity", "a")
-    latex = said(capsys, *words, "--format", "latex")
+    latex = output_of(capsys, *words, "--format", "latex")
     assert r"\input{" not in latex
     assert not re.search(r"(?<!\\)[$#_~^]", re.sub(r"\\textasci\w+\{\}", "", latex.split(r"\toprule")[1]))
     (row,) = {
         line.count("|") - line.count(r"\|")
-        for line in said(capsys, *words, "--format", "markdown").splitlines()[2:-1]
+        for line in output_of(capsys, *words, "--format", "markdown").splitlines()[2:-1]
         if line
     }
     assert row > 0
 
 
-def test_the_columns_of_a_procedure_are_those_that_its_steps_fill(
+def test_columns_of_a_procedure_are_those_of_its_steps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -224,12 +229,12 @@ def test_the_columns_of_a_procedure_are_those_that_its_steps_fill(
         "  - ask: {column: wind, question: How strong is the wind, unit: m/s}\n",
         encoding="utf-8",
     )
-    listed = said(capsys, "columns", "two")
+    listed = output_of(capsys, "columns", "two")
     assert re.search(r"^ small\.rtt_median_s +s +median +Median round-trip time\.$", listed, re.MULTILINE)
     assert re.search(r"^ wind +m/s +median +What the operator answered", listed, re.MULTILINE)
     assert "rtt_loss" in listed
     assert "ip_loss" not in listed.replace("small.", "")
-    assert said(capsys, "columns", "procedures/two.yaml") == listed
+    assert output_of(capsys, "columns", "procedures/two.yaml") == listed
     assert main(["columns", "procedures/too.yaml"]) == 2
     assert "procedures/too.yaml: " in capsys.readouterr().err
     assert main(["columns", "too"]) == 2
@@ -237,5 +242,5 @@ def test_the_columns_of_a_procedure_are_those_that_its_steps_fill(
     assert main(["columns", "two", "ip_loss"]) == 2
     assert main(["columns", "show"]) == 2
     assert "fieldkit columns lists them" in capsys.readouterr().err
-    assert "Median round-trip time." in said(capsys, "columns", "show", "rtt_median_s")
-    assert "Median round-trip time." in said(capsys, "columns", "show", "small.rtt_median_s")
+    assert "Median round-trip time." in output_of(capsys, "columns", "show", "rtt_median_s")
+    assert "Median round-trip time." in output_of(capsys, "columns", "show", "small.rtt_median_s")

@@ -1,4 +1,4 @@
-"""What is printed into terminals of any width: nothing is cut off without a mark, no word is broken."""
+"""Output for terminals of any width: cuts are marked, and words are not broken."""
 
 import io
 import re
@@ -52,9 +52,7 @@ PARTS = st.lists(st.from_regex(r"[a-zA-Z]{1,15} (loss|RTT) [0-9]{1,4}\.[0-9] (%|
 
 
 @given(PARTS, st.integers(40, 200), st.sampled_from(ENDED), st.text("ab ", max_size=60))
-def test_the_line_of_a_repeat_is_whole_at_any_width(
-    parts: list[str], width: int, status: Status, reason: str
-) -> None:
+def test_line_of_a_repeat_is_complete_at_any_width(parts: list[str], width: int, status: Status, reason: str) -> None:
     ended = RepeatEnded("udp-07", 1, status, reason.strip(), ", ".join(parts), 7, 40, 0.0)
     text = "".join(part for part, _ in words_of(ended, width))
     assert all(len(line) <= width for line in text.splitlines())
@@ -68,10 +66,10 @@ def test_a_repeat_in_which_nothing_arrived_is_red() -> None:
 
 
 @given(WORD, WORD, st.integers(4, 120))
-def test_the_live_line_marks_what_it_cuts(trial: str, phase: str, width: int) -> None:
+def test_progress_line_marks_cuts(trial: str, phase: str, width: int) -> None:
     progress = ProgressBar()
     for event in (CampaignTrial(trial, 1, 2), TrialStarted("a", 0, 40), PhaseStarted(phase, repeat="udp-07")):
-        progress.take(event)
+        progress.update(event)
     text = "".join(part for part, _ in progress.words(width))
     assert len(text) <= width
     assert f"udp-07 {phase}" in text or text.endswith("...") or "..." in text

@@ -1,4 +1,4 @@
-"""Remedies are typed as they are shown: their commands and options parse, and what they name is there."""
+"""Remedies are valid commands: commands and options parse, and named files exist."""
 
 import ast
 import re
@@ -15,19 +15,19 @@ from fieldkit.cli.parser import Parser
 from fieldkit.pytest.options import as_pytest_option
 from tests.helpers.paths import ROOT
 
-# As in `cli.hints`: words in small letters are commands; what follows are their arguments.
+# As in `cli.hints`: lower-case words are commands, the rest are their arguments.
 COMMAND = re.compile(r"\bfieldkit((?: [a-z][a-z-]*)+)([^;,\n`()]*)")
 OPTION = re.compile(r"--[a-z][a-z-]+")
 
 
 def remedies() -> list[tuple[str, str]]:
-    """Return each remedy in the source with its place; what is filled in when it is shown stands as `X`."""
-    found = []
+    """Return each remedy in the source with its location; values are shown as `X`."""
+    located = []
     for path in sorted([*(ROOT / "fieldkit").rglob("*.py"), *(ROOT / "sim_backends").rglob("*.py")]):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.keyword) and node.arg == "remedy":
-                found += [(f"{path.relative_to(ROOT)}:{node.value.lineno}", text) for text in texts(node.value)]
-    return found
+                located += [(f"{path.relative_to(ROOT)}:{node.value.lineno}", text) for text in texts(node.value)]
+    return located
 
 
 def texts(node: ast.expr) -> list[str]:
@@ -58,15 +58,15 @@ def parser_of(words: str, parsed: Parser) -> tuple[Parser, list[str]]:
     return parser, rest
 
 
-def test_commands_in_remedies_are_there_and_take_their_options() -> None:
+def test_commands_in_remedies_exist_and_accept_their_options() -> None:
     parser = cli.parser()
     wrong = []
     for place, text in REMEDIES:
         for match in COMMAND.finditer(text):
-            known, _ = parser_of(match[1], parser)
-            if known is parser and match[1].split()[0] not in {"is", "runs", "itself", "reads"}:
+            command, _ = parser_of(match[1], parser)
+            if command is parser and match[1].split()[0] not in {"is", "runs", "itself", "reads"}:
                 wrong.append((place, match[0], "no such command"))
-            taken = set(re.findall(r"--[a-z][a-z-]+", known.format_help()))
+            taken = set(re.findall(r"--[a-z][a-z-]+", command.format_help()))
             wrong += [(place, match[0], option) for option in OPTION.findall(match[2]) if option not in taken]
     assert wrong == []
 
@@ -81,28 +81,28 @@ def test_commands_in_remedies_are_there_and_take_their_options() -> None:
         ("--fieldkit-yes", "--fieldkit-yes"),
     ],
 )
-def test_options_in_messages_of_pytest_are_pytest_s(shown: str, typed: str) -> None:
+def test_options_in_pytest_messages_have_the_pytest_prefix(shown: str, typed: str) -> None:
     assert as_pytest_option(shown) == typed
 
 
 @pytest.mark.parametrize("words", ["trial los -5m", "trial los 5m -3ft", "check --record -2s"])
-def test_a_negative_length_is_told_as_what_it_is(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_negative_quantity_is_reported_as_below_zero(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words.split()) == 2
     assert "is below zero\n  remedy: write for example" in capsys.readouterr().err
 
 
-def test_a_copy_of_a_shipped_profile_is_made_as_it_is_documented(tmp_path: Path) -> None:
-    """The shell makes the empty file before fieldkit looks for the profile."""
+def test_documented_command_copies_a_shipped_profile(tmp_path: Path) -> None:
+    """The shell creates the empty file before fieldkit searches for the profile."""
     command = f"mkdir -p robots; {shlex.quote(sys.executable)} -m fieldkit robots show husky > robots/husky.yaml"
     subprocess.run(command, shell=True, cwd=tmp_path, check=True)
     made = (tmp_path / "robots" / "husky.yaml").read_text(encoding="utf-8")
     assert made == (ROOT / "robots" / "husky.yaml").read_text(encoding="utf-8")
 
 
-def test_a_line_that_is_indented_otherwise_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_indentation_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     site = tmp_path / "lab.yaml"
     site.write_text("robots:\n  a: {profile: husky}\n   b: {profile: husky}\n", encoding="utf-8")
     assert main(["check", "--site", str(site)]) == 2
-    told = capsys.readouterr().err
-    assert "lab.yaml:3" in told
-    assert "indent this line" in told
+    message = capsys.readouterr().err
+    assert "lab.yaml:3" in message
+    assert "indent this line" in message

@@ -1,4 +1,4 @@
-"""Records as JSON values: what was written is read back, and nothing is converted on the way."""
+"""Records as JSON values: parsed values equal the written ones, and no type is converted."""
 
 import json
 from dataclasses import dataclass
@@ -48,11 +48,11 @@ records = st.builds(
 
 
 @given(records)
-def test_what_was_written_is_read_back(record: Record) -> None:
+def test_dumped_records_parse_to_equal_records(record: Record) -> None:
     assert CODEC.parse(json.loads(json.dumps(CODEC.dump(record)))) == record
 
 
-def test_a_field_has_the_name_that_it_has_in_the_file() -> None:
+def test_fields_are_dumped_with_their_alias() -> None:
     assert CODEC.dump(Record(1, Colour.RED)) == {**WHOLE, "parts": [], "by_name": None, "excused": False}
 
 
@@ -69,7 +69,7 @@ def test_a_field_has_the_name_that_it_has_in_the_file() -> None:
         (None, "Input should be an object"),
     ],
 )
-def test_what_is_no_record_is_refused_with_its_place(data: object, message: str) -> None:
+def test_invalid_record_is_rejected_with_the_field_path(data: object, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         CODEC.parse(data)
     assert type(caught.value) is ValueError

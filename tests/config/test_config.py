@@ -44,7 +44,7 @@ def test_every_shipped_procedure_loads(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("  interface: wlan0", "  interfce: wlan0", "unknown key interfce; did you mean 'interface'?"),
         ("kind: ugv", "kid: ugv", "unknown key kid; did you mean 'kind'?"),
@@ -54,19 +54,19 @@ def test_every_shipped_procedure_loads(name: str) -> None:
         ("points: 360", "points: many", "valid integer"),
         ("points: 360", "points: 0", "greater than 0"),
         ("{duration_s}", "{duraton_s}", "unknown placeholder"),
-        ("  variant: ros1", "  variant: ros3", "'ros3' is none of these: ros1, ros2"),
+        ("  variant: ros1", "  variant: ros3", "'ros3' is not one of: ros1, ros2"),
         ("kind: ugv", "kind: ugv\nkind: uav", "duplicate key 'kind'"),
         ("kind: ugv", "kind: *ugv", "aliases"),
         ("kind: ugv", "kind: [ugv", "not valid YAML"),
     ],
 )
-def test_a_wrong_profile_names_file_line_and_what_is_meant(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_error_in_a_profile_has_file_line_and_suggestion(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert old in PROFILE
     path = tmp_path / "robot.yaml"
     path.write_text(PROFILE.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(ConfigurationError) as caught:
         schema.load(path, RobotProfile)
-    assert said in caught.value.what
+    assert message in caught.value.what
     assert caught.value.where.startswith(f"{path}:")
     assert caught.value.remedy
 
@@ -74,13 +74,13 @@ def test_a_wrong_profile_names_file_line_and_what_is_meant(tmp_path: Path, old: 
 @pytest.mark.parametrize(
     ("old", "new", "others"),
     [
-        ("rate: 5Hz", "rate: 5", 0),  # a list of one topic less is no second mistake
-        ("max_speed_m_s: 0.22", "max_speed_m_s: fast", 0),  # neither a whole number nor another
+        ("rate: 5Hz", "rate: 5", 0),  # the missing item of the list is not a second error
+        ("max_speed_m_s: 0.22", "max_speed_m_s: fast", 0),  # neither an integer nor a float
         ("summary: ROBOTIS", "# summary: ROBOTIS", 0),
         ("name: turtlebot3_burger\nsummary: ROBOTIS", "# summary: ROBOTIS", 1),
     ],
 )
-def test_each_mistake_counts_once(tmp_path: Path, old: str, new: str, others: int) -> None:
+def test_each_error_is_counted_once(tmp_path: Path, old: str, new: str, others: int) -> None:
     assert old in PROFILE
     path = tmp_path / "robot.yaml"
     path.write_text(PROFILE.replace(old, new, 1), encoding="utf-8")
@@ -89,7 +89,7 @@ def test_each_mistake_counts_once(tmp_path: Path, old: str, new: str, others: in
     assert ("(1 more after this one)" in caught.value.what) == bool(others), caught.value.what
 
 
-def test_the_line_is_the_right_one(tmp_path: Path) -> None:
+def test_error_has_the_line_of_the_key(tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
     path.write_text(PROFILE.replace("points: 360", "pionts: 360"), encoding="utf-8")
     with pytest.raises(ConfigurationError) as caught:
@@ -98,7 +98,7 @@ def test_the_line_is_the_right_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("- record:", "- recrod:", "unknown key recrod; did you mean 'record'?"),
         ("  - record:", "  - name: up\n    record:", "unknown key name; it is a key of record: write it inside"),
@@ -128,18 +128,18 @@ def test_the_line_is_the_right_one(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_wrong_procedure_names_line_and_what_is_meant(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_error_in_a_procedure_has_line_and_suggestion(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert old in PROCEDURE
     path = tmp_path / "los.yaml"
     path.write_text(PROCEDURE.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(ConfigurationError) as caught:
         schema.load(path, Procedure)
-    assert said in caught.value.what
+    assert message in caught.value.what
     line = int(caught.value.where.rsplit(":", 1)[1])
     assert abs(line - line_of(PROCEDURE, old.splitlines()[0])) <= 1
 
 
-def test_two_robots_may_record_bags_of_two_names_and_not_of_one() -> None:
+def test_bags_of_two_robots_need_different_names() -> None:
     other = "\nsteps:\n  - record: {robot: relay, topics: [/scan], duration: 1s, name: NAME}"
     two = PROCEDURE.replace("\nsteps:", other.replace("NAME", "theirs"), 1)
     procedure = schema.validate(schema.parse(two, source="los.yaml"), Procedure)
@@ -157,29 +157,29 @@ def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("receiver: b", "receiver: c", "names 'c'; the robots are: a, b"),
-        ("receiver: b", "receiver: a", "one robot plays two roles"),
+        ("receiver: b", "receiver: a", "one robot has two roles"),
         ("receiver: b", "reciever: b", "roles.masterless.reciever: did you mean 'receiver'?"),
-        ("  a: {profile", "  A b: {profile", "'A b' cannot be a key here: 'A b' is not a name: small letters"),
+        ("  a: {profile", "  A b: {profile", "'A b' cannot be a key here: 'A b' is not a name"),
         ("{profile: turtlebot3_burger}", "{profile: turtlebot3_burger, hots: x}", "did you mean 'host'?"),
     ],
 )
-def test_a_wrong_site_file_says_so(old: str, new: str, said: str) -> None:
+def test_error_in_a_site_file(old: str, new: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         schema.validate(schema.parse(SITE.replace(old, new, 1), source="fieldkit.yaml"), Site)
-    assert said in caught.value.what
+    assert message in caught.value.what
 
 
-def test_a_part_keeps_its_lines_and_its_place() -> None:
+def test_part_of_a_document_keeps_lines_and_path() -> None:
     document = schema.parse("a:\n  b:\n    robots: 1\n", source="x.yaml").part("a", "b")
     assert document.where(("robots",)) == "x.yaml:3"
     with pytest.raises(ConfigurationError, match=r"in a\.b: "):
         schema.validate(document, Site)
 
 
-def test_a_missing_file_and_a_binary_one_are_named(tmp_path: Path) -> None:
+def test_missing_or_binary_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="cannot be read"):
         schema.read(tmp_path / "none.yaml")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
@@ -197,7 +197,7 @@ def test_on_and_off_stay_text_as_in_yaml_1_2() -> None:
     }
 
 
-def test_an_unknown_name_offers_the_nearest() -> None:
+def test_unknown_name_suggests_the_nearest() -> None:
     with pytest.raises(ConfigurationError) as caught:
         load_profile("turtlebot3_burgr")
     assert "turtlebot3_burger" in caught.value.remedy
@@ -213,14 +213,14 @@ def test_an_unknown_name_offers_the_nearest() -> None:
         ("", "look"),
     ],
 )
-def test_a_word_of_several_names_offers_each(name: str, remedy: str) -> None:
+def test_part_of_several_names_suggests_all(name: str, remedy: str) -> None:
     assert (
         nearest(name, ("rtt_loss", "ip_loss", "delay_s", "cliffs_delta", "rtt_median_s", "up.topic_loss"), "look")
         == remedy
     )
 
 
-def test_a_labs_own_folder_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folder_of_the_lab_takes_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "robots").mkdir()
     own = PROFILE.replace("interface: wlan0", "interface: wlan7")
     (tmp_path / "robots" / "turtlebot3_burger.yaml").write_text(own, encoding="utf-8")
@@ -243,7 +243,7 @@ class Text(schema.Strict):
 @example("on")
 @example("a\N{NEXT LINE}0")
 @example("a\N{LINE SEPARATOR}0\r")
-def test_text_that_looks_like_something_else_survives_being_written_and_read_again(text: str) -> None:
+def test_text_round_trips_even_if_it_looks_like_another_type(text: str) -> None:
     written = Text(text=text)
     assert schema.validate(schema.parse(schema.dump(written), source="x"), Text) == written
 
@@ -255,7 +255,7 @@ class Quantities(schema.Strict):
 
 
 @pytest.mark.parametrize("step", ["50us", "0.000000001s", "0s", "99999999999s"])
-def test_quantities_of_any_size_survive_being_written_and_read_again(step: str) -> None:
+def test_quantities_of_any_size_round_trip(step: str) -> None:
     written = Quantities.model_validate({"step": step, "rate": "3bit/s", "size": "99GB"})
     read = schema.validate(schema.parse(schema.dump(written), source="x"), Quantities)
     assert read.model_dump_json() == written.model_dump_json()
@@ -263,6 +263,6 @@ def test_quantities_of_any_size_survive_being_written_and_read_again(step: str) 
 
 
 @pytest.mark.parametrize("model", [Tools, Payloads, RadioOptions, PhysicsOptions, PolicyChoice, EmulatedOptions])
-def test_defaults_are_what_an_empty_mapping_gives(model: type[Strict]) -> None:
+def test_defaults_equal_those_of_an_empty_mapping(model: type[Strict]) -> None:
     assert model.defaults() == model.model_validate({})
     assert schema.dump(model.defaults()) == schema.dump(model.model_validate({}))

@@ -1,4 +1,4 @@
-"""The pages of the documentation by topic, in a wheel and in a checkout."""
+"""Documentation pages by topic, in a wheel and in a checkout."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from tests.helpers.paths import ROOT
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of the pages in a package as a wheel installs it."""
+    """The folder of the pages in an installed package."""
     docs = tmp_path / "fieldkit" / "data" / "docs"
     for name in ("index", "404", "field", "reference/index", "reference/commands", "studies/mesh"):
         page = docs / f"{name}.html"
@@ -21,7 +21,7 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return docs
 
 
-def test_topics_are_the_pages_of_all_folders(installed: Path) -> None:
+def test_topics_are_pages_of_all_folders(installed: Path) -> None:
     assert documentation.topics() == {
         "commands": installed / "reference" / "commands.html",
         "field": installed / "field.html",
@@ -36,19 +36,19 @@ def test_a_checkout_has_its_markdown_pages() -> None:
     assert documentation.find("steps").path == ROOT / "docs" / "reference" / "steps.md"
 
 
-def test_a_command_is_a_section_of_the_page_of_commands(installed: Path) -> None:
+def test_command_is_a_section_of_the_command_reference(installed: Path) -> None:
     page = documentation.find("trial")
     assert page.uri == (installed / "reference" / "commands.html").as_uri() + "#fieldkit-trial"
 
 
 @pytest.mark.usefixtures("installed")
-def test_an_unknown_topic_gives_the_nearest() -> None:
+def test_unknown_topic_suggests_the_nearest() -> None:
     with pytest.raises(ConfigurationError, match="no topic 'fields'") as caught:
         documentation.find("fields")
     assert caught.value.remedy == "did you mean 'field'?"
 
 
-def test_a_package_without_pages_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_package_without_pages_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(documentation, "_PACKAGE", tmp_path / "fieldkit")
     with pytest.raises(ConfigurationError, match="has no documentation"):
         documentation.topics()

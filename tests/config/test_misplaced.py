@@ -1,4 +1,4 @@
-"""A key that is known at another level is reported as a line that is indented wrongly, not as a typing error."""
+"""A key that is valid at another level is reported as an indentation error, not as a misspelling."""
 
 import copy
 import re
@@ -42,14 +42,14 @@ steps:
 """
 
 
-def refused(text: str, model: type[schema.Strict]) -> ConfigurationError:
+def error_of(text: str, model: type[schema.Strict]) -> ConfigurationError:
     with pytest.raises(ConfigurationError) as caught:
         schema.validate(schema.parse(text, source="f.yaml"), model)
     return caught.value
 
 
 @pytest.mark.parametrize(
-    ("model", "old", "new", "line", "said"),
+    ("model", "old", "new", "line", "message"),
     [
         (
             Site,
@@ -64,25 +64,25 @@ def refused(text: str, model: type[schema.Strict]) -> ConfigurationError:
             "    profile: x",
             "    profile: x\n    patience: 3s",
             4,
-            "patience here; it is a key of the whole file: indent it as robots: is",
+            "patience here; it is a key of the whole file: indent it like robots:",
         ),
-        (Site, "    profile: x", "  profile: x", 2, "keys that belong to this line are indented more than it is"),
+        (Site, "    profile: x", "  profile: x", 2, "indent the keys that belong to this line more than this line"),
         (
             Procedure,
             "to: receiver",
             "to: receiver\n            attempts: 3",
             13,
-            "of the whole file: indent it as steps: is",
+            "of the whole file: indent it like steps:",
         ),
         (
             Procedure,
             "to: receiver",
             "to: receiver\n            robots: []",
             13,
-            "of capture: indent it as during: is",
+            "of capture: indent it like during:",
         ),
         (Procedure, "            to:", "          to:", 12, "unknown key to; it is a key of ping: write it inside"),
-        (Procedure, "            to: receiver", "          robots: []", 12, "of capture: indent it as during: is"),
+        (Procedure, "            to: receiver", "          robots: []", 12, "of capture: indent it like during:"),
         (
             Procedure,
             "command: a",
@@ -95,26 +95,26 @@ def refused(text: str, model: type[schema.Strict]) -> ConfigurationError:
             "command: a",
             "command: a\n      expect:\n        limit: 3s",
             17,
-            "of run: indent it as expect: is",
+            "of run: indent it like expect:",
         ),
         (Procedure, "command: a", "comand: a", 15, "did you mean 'command'"),
     ],
 )
-def test_the_message_says_where_the_line_belongs(
-    model: type[schema.Strict], old: str, new: str, line: int, said: str
+def test_message_gives_the_correct_indentation(
+    model: type[schema.Strict], old: str, new: str, line: int, message: str
 ) -> None:
     text = SITE if model is Site else STEPS
     assert text.count(old) == 1
-    error = refused(text.replace(old, new), model)
+    error = error_of(text.replace(old, new), model)
     assert error.where == f"f.yaml:{line}"
-    assert re.search(said, error.what), error.what
+    assert re.search(message, error.what), error.what
 
 
 PROFILES = sorted((ROOT / "robots").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
-def test_every_key_of_a_section_that_slips_out_of_it_is_sent_back(path: Path) -> None:
+def test_every_key_outside_its_section_is_reported_with_the_section(path: Path) -> None:
     whole = documents.read(path).data
     known = {field.alias or name for name, field in RobotProfile.model_fields.items()}
     moved = [
@@ -133,5 +133,5 @@ def test_every_key_of_a_section_that_slips_out_of_it_is_sent_back(path: Path) ->
         text = documents.to_text(dict([*items[:at], (key, slipped), *items[at:]]))
         assert (
             f"unknown key {key}; it is a key of {section}: indent it below {section}:"
-            in refused(text, RobotProfile).what
+            in error_of(text, RobotProfile).what
         )

@@ -1,4 +1,4 @@
-"""A program of the lab that a procedure names: where it is searched, what is refused, and what is frozen of it."""
+"""Programs of the lab in procedures: search path, rejected files, and the values stored in a plan."""
 
 import hashlib
 import os
@@ -21,7 +21,7 @@ class Holder(Strict):
 
 @pytest.fixture(autouse=True)
 def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A lab with a folder of procedures, which is the current directory."""
+    """A lab with a folder of procedures as the current directory."""
     folder = tmp_path / "lab"
     (folder / "procedures").mkdir(parents=True)
     monkeypatch.chdir(folder)
@@ -34,46 +34,46 @@ def put(name: str, source: str = "procedures/p.yaml") -> LabProgram:
     return held
 
 
-def written(path: str, content: bytes = SCRIPT, mode: int = 0o644) -> None:
+def write_program(path: str, content: bytes = SCRIPT, mode: int = 0o644) -> None:
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_bytes(content)
     Path(path).chmod(mode)
 
 
 @pytest.mark.parametrize(("mode", "executable"), [(0o755, True), (0o744, True), (0o644, False)])
-def test_what_is_frozen_is_hash_size_and_the_right_to_execute(mode: int, executable: bool) -> None:
-    written("tools/probe", mode=mode)
-    found = put("tools/probe")
-    assert found == LabProgram(
+def test_plan_stores_hash_size_and_executable_flag(mode: int, executable: bool) -> None:
+    write_program("tools/probe", mode=mode)
+    program = put("tools/probe")
+    assert program == LabProgram(
         file="tools/probe", sha256=hashlib.sha256(SCRIPT).hexdigest(), size_bytes=len(SCRIPT), executable=executable
     )
-    assert (found.name, found.content()) == ("probe", SCRIPT)
+    assert (program.name, program.content()) == ("probe", SCRIPT)
 
 
-def test_what_is_frozen_is_read_again_and_not_searched() -> None:
-    written("tools/probe")
+def test_stored_program_is_parsed_without_a_search() -> None:
+    write_program("tools/probe")
     frozen = schema.dump(Holder(put=put("tools/probe")))
     Path("tools/probe").unlink()
     assert schema.dump(schema.validate(schema.parse(frozen, source="trial.yaml"), Holder)) == frozen
 
 
-def test_the_folder_of_the_procedure_comes_before_that_of_the_lab(tmp_path: Path) -> None:
-    written("probe")
+def test_folder_of_the_procedure_takes_precedence_over_that_of_the_lab(tmp_path: Path) -> None:
+    write_program("probe")
     assert put("probe").file == "probe"
-    written("procedures/probe", b"other")
+    write_program("procedures/probe", b"other")
     assert (put("probe").file, put("probe").content()) == ("procedures/probe", b"other")
-    written(str(tmp_path / "elsewhere" / "probe"), b"third")
+    write_program(str(tmp_path / "elsewhere" / "probe"), b"third")
     assert put("probe", str(tmp_path / "elsewhere" / "p.yaml")).content() == b"third"
 
 
 def test_a_link_inside_of_the_lab_is_followed() -> None:
-    written("tools/probe")
+    write_program("tools/probe")
     Path("procedures/probe").symlink_to("../tools/probe")
     assert put("probe").file == "tools/probe"
 
 
 @pytest.mark.parametrize(
-    ("name", "make", "why"),
+    ("name", "make", "message"),
     [
         ("absent", lambda: None, "there is no file 'absent'; searched in .*procedures and .*lab"),
         ("/etc/passwd", lambda: None, "not the relative path"),
@@ -83,35 +83,35 @@ def test_a_link_inside_of_the_lab_is_followed() -> None:
         ("5", lambda: None, "the path of a file is needed here"),
         ("[a]", lambda: None, "the path of a file is needed here"),
         ('"a\\u0007b"', lambda: None, "cannot be printed"),
-        ("link", lambda: Path("link").symlink_to("/etc/passwd"), "is a link that leads out of .*lab"),
-        ("etc/passwd", lambda: Path("etc").symlink_to("/etc"), "is a link that leads out of .*lab"),
+        ("link", lambda: Path("link").symlink_to("/etc/passwd"), "is a link to a file outside of .*lab"),
+        ("etc/passwd", lambda: Path("etc").symlink_to("/etc"), "is a link to a file outside of .*lab"),
         ("gone", lambda: Path("gone").symlink_to("nothing"), "cannot be read: No such file"),
         ("loop", lambda: Path("loop").symlink_to("loop"), "cannot be read: Too many levels"),
         ("procedures", lambda: None, "is a folder"),
         ("pipe", lambda: os.mkfifo("pipe"), "cannot be read: it is a pipe"),
-        ("large", lambda: written("large", bytes(programs.MOST_BYTES + 1)), "more than 8.4 MB; install it"),
+        ("large", lambda: write_program("large", bytes(programs.MOST_BYTES + 1)), "more than 8.4 MB; install it"),
     ],
 )
-def test_what_cannot_be_copied_is_refused_at_its_line(name: str, make: Callable[[], None], why: str) -> None:
+def test_invalid_program_is_rejected_with_its_line(name: str, make: Callable[[], None], message: str) -> None:
     make()
-    with pytest.raises(ConfigurationError, match=why) as caught:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         put(name)
     assert caught.value.where == "procedures/p.yaml:2"
 
 
-def test_the_largest_program_is_taken() -> None:
-    written("large", bytes(programs.MOST_BYTES))
+def test_program_of_the_maximum_size_is_accepted() -> None:
+    write_program("large", bytes(programs.MOST_BYTES))
     assert put("large").size_bytes == programs.MOST_BYTES
 
 
-def test_a_program_that_has_changed_or_is_gone_is_refused() -> None:
-    written("probe")
-    found = put("probe")
-    written("probe", SCRIPT + b"#")
+def test_changed_or_missing_program_is_rejected() -> None:
+    write_program("probe")
+    program = put("probe")
+    write_program("probe", SCRIPT + b"#")
     with pytest.raises(ConfigurationError, match="has changed since the procedure was read") as caught:
-        found.content()
+        program.content()
     assert caught.value.where == "probe"
-    assert found.sha256 in caught.value.remedy
+    assert program.sha256 in caught.value.remedy
     Path("probe").unlink()
     with pytest.raises(ConfigurationError, match="cannot be read: No such file"):
-        found.content()
+        program.content()

@@ -1,4 +1,4 @@
-"""Access to robots as `fieldkit stop` reads it: the same as the whole site file gives, despite other errors there."""
+"""Robot access as `fieldkit stop` reads it: equal to the full site file, and tolerant of other errors there."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ roles: {{}}
 FIELDS = ("host", "port", "user", "key", "password", "host_key")
 
 
-def test_the_access_is_that_of_the_whole_site_file(tmp_path: Path) -> None:
+def test_access_equals_that_of_the_full_site_file(tmp_path: Path) -> None:
     path = tmp_path / "fieldkit.yaml"
     path.write_text(SITE, encoding="utf-8")
     site, document = load_site(path)
@@ -35,19 +35,19 @@ def test_the_access_is_that_of_the_whole_site_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("entry", "what"),
     [
-        (f"{{host: h, user: u, port: 0, host_key: {KEY}}}", "port of bad must be a number of 1 to 65535"),
-        (f"{{host: h, user: u, port: '22', host_key: {KEY}}}", "port of bad must be a number of 1 to 65535"),
-        (f"{{host: h, user: u, port: true, host_key: {KEY}}}", "port of bad must be a number of 1 to 65535"),
+        (f"{{host: h, user: u, port: 0, host_key: {KEY}}}", "port of bad must be a number from 1 to 65535"),
+        (f"{{host: h, user: u, port: '22', host_key: {KEY}}}", "port of bad must be a number from 1 to 65535"),
+        (f"{{host: h, user: u, port: true, host_key: {KEY}}}", "port of bad must be a number from 1 to 65535"),
         (f"{{user: u, host_key: {KEY}}}", "host of bad must be a text"),
         (f"{{host: h, host_key: {KEY}}}", "user of bad must be a text"),
         ("{host: h, user: u}", "host_key of bad must be a text: fieldkit enroll bad"),
         (f"{{host: h, user: u, host_key: {KEY}, key: 3}}", "key of bad must be the path of a file"),
         (f"{{host: h, user: u, host_key: {KEY}, password: hunter2}}", "password of bad must be ask or keyring"),
         (f"{{host: h, user: u, host_key: {KEY}, password: [ask]}}", "password of bad must be ask or keyring"),
-        ("nothing", "is not a mapping"),
+        ("nothing", "this entry is not a mapping"),
     ],
 )
-def test_an_error_of_one_robot_keeps_no_other_from_being_reached(entry: str, what: str) -> None:
+def test_error_of_one_robot_does_not_affect_the_others(entry: str, what: str) -> None:
     text = SITE.replace("robots:\n", f"robots:\n  bad: {entry}\n").replace("roles: {}", "rolls: 7\ncontrol: no such")
     accesses = robot_access.read_access(documents.parse(text, source="site.yaml"))
     error = accesses.pop("bad")

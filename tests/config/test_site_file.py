@@ -1,4 +1,4 @@
-"""The site file: one to begin with, and a key pinned without another character changed."""
+"""The site file: the template is valid, and pinning a key changes nothing else."""
 
 import difflib
 import itertools
@@ -34,7 +34,7 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("text", LAYOUTS.values(), ids=LAYOUTS)
-def test_a_key_is_pinned_and_nothing_else_changes(text: str, tmp_path: Path) -> None:
+def test_pinning_changes_nothing_else(text: str, tmp_path: Path) -> None:
     path = tmp_path / "site.yaml"
     path.write_bytes(text.encode())
     before = yaml.safe_load(text)
@@ -43,9 +43,9 @@ def test_a_key_is_pinned_and_nothing_else_changes(text: str, tmp_path: Path) -> 
     before["robots"]["a"]["host_key"] = KEY
     assert yaml.safe_load(after) == before
     bare, old = after.replace(KEY, ""), text.replace(f'"{OTHER}"', "").replace(OTHER, "")
-    changes = [one for one in difflib.ndiff(list(old), list(bare)) if not one.startswith("  ")]
-    assert all(one.startswith("+ ") for one in changes), "nothing is taken away"
-    assert "".join(one[2:] for one in changes).strip(' ,:\r\n"') in {"", "host_key"}
+    changes = [change for change in difflib.ndiff(list(old), list(bare)) if not change.startswith("  ")]
+    assert all(change.startswith("+ ") for change in changes), "nothing is removed"
+    assert "".join(change[2:] for change in changes).strip(' ,:\r\n"') in {"", "host_key"}
 
 
 def blocks(name: str, comment: str, blank: int, indent: int) -> str:
@@ -65,7 +65,7 @@ def blocks(name: str, comment: str, blank: int, indent: int) -> str:
     indent=st.integers(1, 5),
     data=st.data(),
 )
-def test_any_robot_of_any_block_file_gets_one_line(
+def test_pinning_adds_one_line_to_a_robot_in_block_style(
     names: list[str], comment: str, blank: int, indent: int, data: st.DataObject
 ) -> None:
     text = f"# {comment}\nrobots:\n" + "".join(blocks(name, comment, blank, indent) for name in names)
@@ -75,22 +75,22 @@ def test_any_robot_of_any_block_file_gets_one_line(
     assert added == f"{' ' * (indent + 2)}host_key: {KEY}"
     new.remove(added)
     assert new == old
-    # A loader that takes every scalar for text: a robot may be named `on`, which YAML 1.1 takes for a boolean.
+    # `BaseLoader` reads all scalars as text: a robot may be named `on`, a boolean in YAML 1.1.
     read = yaml.load(with_value(text, ("robots", robot, "host_key"), KEY), Loader=yaml.BaseLoader)
     assert read["robots"][robot] == {"profile": "x", "host_key": KEY}
 
 
-def test_what_cannot_be_edited_is_left_as_it_is(tmp_path: Path) -> None:
+def test_file_that_cannot_be_edited_is_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "site.yaml"
     text = "robots:\n  a:\n    profile: |\n      x\n  b: {profile: y}\n"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="cannot be written into") as caught:
+    with pytest.raises(ConfigurationError, match="cannot be inserted") as caught:
         site_file.pin(path, "a", KEY)
-    assert caught.value.remedy == f"write host_key: {KEY}"
+    assert caught.value.remedy == f"add it in an editor: host_key: {KEY}"
     assert path.read_text(encoding="utf-8") == text
 
 
-def test_rights_and_links_stay(tmp_path: Path) -> None:
+def test_permissions_and_symbolic_links_are_kept(tmp_path: Path) -> None:
     real, link = tmp_path / "real.yaml", tmp_path / "site.yaml"
     real.write_text(LAYOUTS["block"], encoding="utf-8")
     real.chmod(0o640)
@@ -102,21 +102,21 @@ def test_rights_and_links_stay(tmp_path: Path) -> None:
     assert sorted(tmp_path.iterdir()) == [real, link]
 
 
-def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "site.yaml"
     path.write_text(LAYOUTS["block"], encoding="utf-8")
 
-    def full(descriptor: int) -> None:
+    def disk_full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("fieldkit.core.files.os.fsync", full)
+    monkeypatch.setattr("fieldkit.core.files.os.fsync", disk_full)
     with pytest.raises(ConfigurationError, match="No space left"):
         site_file.pin(path, "a", KEY)
     assert path.read_text(encoding="utf-8") == LAYOUTS["block"]
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_file_to_begin_with_loads_and_explains_every_line(tmp_path: Path) -> None:
+def test_template_is_valid_and_every_line_has_a_comment(tmp_path: Path) -> None:
     path = tmp_path / "fieldkit.yaml"
     site_file.create(path)
     site, _ = load_site(path)

@@ -1,4 +1,4 @@
-"""What a person can write as YAML: read as it was meant, or refused with line and remedy, and never anything else."""
+"""YAML input: parsed as YAML 1.2 defines it, or rejected with line and remedy."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +20,7 @@ from tests.helpers.paths import DATA, ROOT
 
 
 @pytest.mark.parametrize(
-    ("written", "meant"),
+    ("text", "expected"),
     [
         ("010", 10),
         ("022", 22),
@@ -43,13 +43,13 @@ from tests.helpers.paths import DATA, ROOT
         ('"\\x1b"', "\x1b"),
     ],
 )
-def test_a_scalar_is_what_yaml_1_2_says(written: str, meant: object) -> None:
-    read = schema.parse(f"a: {written}", source="x").data["a"]
-    assert (read, type(read)) == (meant, type(meant))
+def test_scalars_are_parsed_as_in_yaml_1_2(text: str, expected: object) -> None:
+    read = schema.parse(f"a: {text}", source="x").data["a"]
+    assert (read, type(read)) == (expected, type(expected))
 
 
 @pytest.mark.parametrize(
-    ("written", "said"),
+    ("text", "message"),
     [
         ("9" * 19, "beyond 9223372036854775807"),
         ("9" * 5000, "beyond 9223372036854775807"),
@@ -63,7 +63,7 @@ def test_a_scalar_is_what_yaml_1_2_says(written: str, meant: object) -> None:
         ("*b", "aliases"),
         ('"\\0"', "no file can hold"),
         ('"\\ud800"', "no file can hold"),
-        ('"\\U00110000"', "names no character"),
+        ('"\\U00110000"', "an escape or a directive is not valid"),
         ("\x00", "cannot hold the character 0x00"),
         ("\x7f", "cannot hold the character 0x7f"),
         ("[" * 60 + "]" * 60, "nested more than 50 deep"),
@@ -78,27 +78,27 @@ def test_a_scalar_is_what_yaml_1_2_says(written: str, meant: object) -> None:
         ("'b", "unexpected end of stream"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_with_its_line(written: str, said: str) -> None:
+def test_invalid_yaml_is_rejected_with_its_line(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        schema.parse(f"# one\n\na: {written}", source="x")
-    assert said in caught.value.what
+        schema.parse(f"# one\n\na: {text}", source="x")
+    assert message in caught.value.what
     assert caught.value.where == "x:3"
     assert caught.value.remedy
 
 
 @pytest.mark.parametrize(
-    ("data", "line", "said"),
+    ("data", "line", "message"),
     [
         ("a: ä".encode("utf-16"), 1, "not as UTF-16"),
         (b"a: 1\nb: \xff", 2, "save it as UTF-8"),
     ],
 )
-def test_another_encoding_is_named_with_its_line(data: bytes, line: int, said: str, tmp_path: Path) -> None:
+def test_other_encoding_is_rejected_with_its_line(data: bytes, line: int, message: str, tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_bytes(data)
     with pytest.raises(ConfigurationError) as caught:
         schema.read(path)
-    assert (caught.value.where, said in caught.value.remedy) == (f"{path}:{line}", True)
+    assert (caught.value.where, message in caught.value.remedy) == (f"{path}:{line}", True)
 
 
 def test_a_byte_order_mark_and_windows_lines_are_read(tmp_path: Path) -> None:
@@ -109,27 +109,27 @@ def test_a_byte_order_mark_and_windows_lines_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ["/dev/zero", "/"])
-def test_what_never_ends_is_no_file(path: str) -> None:
-    with pytest.raises(ConfigurationError, match="this is no file"):
+def test_devices_and_folders_are_rejected(path: str) -> None:
+    with pytest.raises(ConfigurationError, match="this is not a file"):
         schema.read(Path(path))
 
 
 @pytest.mark.parametrize(
-    ("text", "where", "said"),
+    ("text", "where", "message"),
     [
         ("# lab\n\nbackend: field\n", "x:3", "required key 'robots' is missing"),
-        ("", "x:1", "keys with values are needed here, and nothing stands here"),
+        ("", "x:1", "keys with values are needed here, and there are none"),
         ("robots: {a: {profile: x, host: 10}}\nroles: {}", "x:1", "put it in quotes"),
-        ("robots: {a: {profile: x, port: 1_0}}\nroles: {}", "x:1", "in digits alone"),
+        ("robots: {a: {profile: x, port: 1_0}}\nroles: {}", "x:1", "in digits only"),
         ("robots: {a: {profile: x}}\nroles: {}\npatience: 0.2", "x:3", "write for example 0.2s or 0.2ms"),
         ("robots: {a: {profile: x}}\nroles: {}\npatience: [1]", "x:3", "a number with a unit is needed here"),
         (f"robots: {{a: {{profile: x}}}}\nroles: {{}}\npatience: {'9' * 15}s", "x:3", "too large"),
     ],
 )
-def test_a_site_file_is_told_what_is_needed_and_where(text: str, where: str, said: str) -> None:
+def test_error_in_a_site_file_has_message_and_line(text: str, where: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         schema.validate(schema.parse(text, source="x"), Site)
-    assert (caught.value.where, said in caught.value.what) == (where, True), caught.value
+    assert (caught.value.where, message in caught.value.what) == (where, True), caught.value
 
 
 CAMPAIGN = """\
@@ -151,7 +151,7 @@ FILES: list[tuple[str, type[schema.Strict]]] = [
     ("radio: {loss: 10%, delay: 1ms, rate: 20Mbit/s}\nlate_bound: 100ms\nworld: open\n", EmulatedOptions),
     (CAMPAIGN, CampaignFile),
 ]
-NASTY = (
+INVALID_VALUES = (
     *("", "~", "010", "-1", "9" * 30, "9" * 400 + "s", "1e999", ".5", "1_0", "yes", "1:30", "{}", "[]", "[1]"),
     *("''", '"\\0"', '"\\ud800"', '"\\U00110000"', "*a", "&a b", "!!int x", "|\n  x", "? a", "- a", "<<: {a: b}"),
     *(
@@ -182,29 +182,31 @@ NASTY = (
         "../../etc/passwd",
     ),
 )
-MARKS = "a01 \n\t:-?[]{},#&*!|>'\"%@`\\.~<"
+CHARACTERS = "a01 \n\t:-?[]{},#&*!|>'\"%@`\\.~<"
 
 
-def validated(text: str, model: type[schema.Strict]) -> None:
+def check_text(text: str, model: type[schema.Strict]) -> None:
     try:
-        made = schema.validate(schema.parse(text, source="x.yaml"), model)
+        parsed = schema.validate(schema.parse(text, source="x.yaml"), model)
     except ConfigurationError as error:
-        is_told = error.where.startswith("x.yaml:") and error.remedy and str(error).encode()
-        assert is_told, error  # noqa: PT017 (most files are wrong, and some are not)
+        is_complete = error.where.startswith("x.yaml:") and error.remedy and str(error).encode()
+        assert is_complete, error  # noqa: PT017 (most files are invalid, but some are valid)
     else:
-        assert schema.validate(schema.parse(schema.dump(made), source="y.yaml"), model) == made
+        assert schema.validate(schema.parse(schema.dump(parsed), source="y.yaml"), model) == parsed
 
 
 @st.composite
 def damaged(draw: st.DrawFn) -> tuple[str, type[schema.Strict]]:
-    """A file that ships, with up to three changes, and its model."""
+    """A shipped file with up to three changes, and its model."""
     text, model = draw(st.sampled_from(FILES))
     lines = text.splitlines()
     changes: tuple[Callable[[str], str], ...] = (
-        lambda line: line.partition(":")[0] + ": " + draw(st.sampled_from(NASTY)),
+        lambda line: line.partition(":")[0] + ": " + draw(st.sampled_from(INVALID_VALUES)),
         lambda line: line[: draw(st.integers(0, len(line)))],
         lambda line: f"{line}\n{draw(st.sampled_from(lines))}",
-        lambda line: line.replace(draw(st.sampled_from(line.split() or [""])), draw(st.sampled_from(NASTY)), 1),
+        lambda line: line.replace(
+            draw(st.sampled_from(line.split() or [""])), draw(st.sampled_from(INVALID_VALUES)), 1
+        ),
         lambda line: draw(st.text(st.sampled_from("\0\t\r\x1b\u2028\ud800:\"'[]{}-?!&*%|>#"), max_size=3)) + line,
     )
     for _ in range(draw(st.integers(1, 3))):
@@ -213,17 +215,17 @@ def damaged(draw: st.DrawFn) -> tuple[str, type[schema.Strict]]:
     return "\n".join(lines), model
 
 
-TEXTS = st.text(st.characters(), max_size=40) | st.text(st.sampled_from(MARKS), max_size=40)
+TEXTS = st.text(st.characters(), max_size=40) | st.text(st.sampled_from(CHARACTERS), max_size=40)
 
 
 @given(damaged())
-def test_no_damage_to_a_file_gives_anything_but_our_own_error(file: tuple[str, type[schema.Strict]]) -> None:
-    validated(*file)
+def test_damaged_files_cause_only_configuration_errors(file: tuple[str, type[schema.Strict]]) -> None:
+    check_text(*file)
 
 
 @given(TEXTS)
 @example("%YAML 1." + "9" * 5000 + "\n--- a")
 @example("a: \ud800")
-def test_no_text_gives_anything_but_our_own_error(text: str) -> None:
-    validated(text, Site)
-    validated(f"robots: {text}", Site)
+def test_any_text_causes_only_configuration_errors(text: str) -> None:
+    check_text(text, Site)
+    check_text(f"robots: {text}", Site)

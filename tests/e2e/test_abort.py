@@ -58,11 +58,11 @@ def test_abort_asks_first(tmp_path: Path) -> None:
     (tmp_path / SITE_FILE).write_text(site, encoding="utf-8")
     run = fieldkit(tmp_path, "abort")
     assert run.code == 2
-    assert "somebody must say yes to: end every job of fieldkit on a" in run.err
+    assert "a person must confirm: terminate every job of fieldkit on a" in run.err
     assert "--yes" in run.err
 
 
 def test_emulated_robots_have_nothing_to_abort(tmp_path: Path) -> None:
     run = fieldkit(tmp_path, "abort")
     assert run.code == 0
-    assert "its robots end with their lab" in run.out
+    assert "the robots of this backend run only while their lab runs" in run.out

@@ -101,7 +101,7 @@ def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> 
 
         nothing = answered(tmp_path, "s", "", "s", "", "s", "", "s")
         assert nothing.code == 1, nothing.err
-        assert "give the same command again" in nothing.err
+        assert "run the same command again" in nothing.err
         assert trials(folder) == [], "what is skipped leaves no folder"
 
         first, second = nothing.events("campaign_planned")[0]["trials"]

@@ -92,7 +92,7 @@ def test_the_help_lists_it_and_the_tab_key_completes_it(fieldkit: Fieldkit, tmp_
     ("command", "said"),
     [
         ("absent", "entry point absent = no_such_package:add: it cannot be loaded: ModuleNotFoundError"),
-        ("failing", "entry point failing = failing:add: it cannot say what it takes: RuntimeError: not today"),
+        ("failing", "entry point failing = failing:add: its arguments cannot be declared: RuntimeError: not today"),
         ("unfinished", "entry point unfinished = no_such_package:run: it cannot be loaded: ModuleNotFoundError"),
         ("twice", "several packages add a command 'twice': "),
     ],

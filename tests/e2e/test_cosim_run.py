@@ -147,7 +147,7 @@ def test_replay_and_plot_tell_what_is_no_recording(lab: Path) -> None:
     damaged.write_bytes(damaged.read_bytes()[:-1])
     refused = cosim(lab, "replay", "sim/seed-1")
     assert (refused.code, "was changed after the run" in refused.err) == (4, True), refused.err
-    assert "end it in .svg, .pdf, .png" in cosim(lab, "plot", "sim/seed-2", "--out", "run.txt").err
+    assert "use the suffix .svg, .pdf, .png" in cosim(lab, "plot", "sim/seed-2", "--out", "run.txt").err
     manifest = read_manifest(lab / "sim" / "seed-2")
     about = replace(manifest.about, scenario="- of another version")
     write_manifest(lab / "sim" / "seed-2", replace(manifest, about=about, scenario_hash=about.scenario_hash))
@@ -174,7 +174,7 @@ def test_replay_and_plot_tell_what_is_no_recording(lab: Path) -> None:
         (("run", "pass.yaml", "--out", "pass.yaml"), "cannot be written: File exists", "choose another --out"),
         (("run", "pass.yaml", "--out", "/proc/sim"), "cannot be written: ", "choose another --out"),
         (("rnu",), "COMMAND cannot be 'rnu'", "did you mean 'run'?"),
-        (("run", "pass.yaml", "--polcy", "x"), "does not take '--polcy'", "--policy"),
+        (("run", "pass.yaml", "--polcy", "x"), "has no option or argument '--polcy'", "--policy"),
     ],
 )
 def test_bad_input_is_told_with_a_remedy(lab: Path, words: tuple[str, ...], said: str, remedy: str) -> None:

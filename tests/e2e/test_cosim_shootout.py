@@ -215,7 +215,7 @@ def test_a_policy_that_has_no_window_is_told_and_the_others_go_on(lab: Path) -> 
         (("--window", "1"), "duration '1' has no unit", "1s or 1ms"),
         (("--window", "0ms"), "a window that is not above 0", "--window 1ms,10ms,100ms"),
         (("--bias",), "--bias: one seed has no distribution", "add --seeds 20"),
-        (("--figure", "x.jpg"), "--figure: what 'x.jpg' should be is not clear", ".svg, .pdf, .png"),
+        (("--figure", "x.jpg"), "--figure: 'x.jpg' has no known format", ".svg, .pdf, .png"),
         (("--figure", "none/x.svg"), "none: there is no such folder", "mkdir -p none"),
     ],
 )

@@ -58,7 +58,7 @@ def test_the_interval_counts_samples_within_half_a_second_as_one(size_bytes: int
 
 def test_the_intervals_that_the_page_quotes_are_those_of_its_table() -> None:
     by_cell = {
-        (cell.who, cell.kind, cell.size_bytes, cell.robots, cell.distance_m): cell
+        (cell.middleware, cell.kind, cell.size_bytes, cell.robots, cell.distance_m): cell
         for cell in middleware_page.cells(PAGE)
     }
     text = PAGE.read_text(encoding="utf-8")

@@ -58,7 +58,7 @@ def test_what_passed_is_written_with_its_evidence(measured: Path) -> None:
     [
         (("--repeats", "9"), "undecided"),
         (("--repeats", str(REPEATS), "--max-loss", "20%", "--max-delay", "1us"), "failed|undecided"),
-        (("--size", "10kB"), "no trial there has"),
+        (("--size", "10kB"), "no trial has"),
         (("--repeats", str(REPEATS), "--max-loss", "20%", "--share", "90%"), "undecided.*\n.*29 repeats are needed"),
     ],
 )

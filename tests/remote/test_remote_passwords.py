@@ -155,7 +155,7 @@ def test_without_a_terminal_nobody_can_be_asked() -> None:
 def test_a_password_in_the_site_file_is_refused_and_not_repeated(tmp_path: Path, written: str) -> None:
     path = tmp_path / "fieldkit.yaml"
     path.write_text(site(f"password: {written}"), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="a password never stands in a file") as caught:
+    with pytest.raises(ConfigurationError, match="a password must not be in a file") as caught:
         load_site(path)
     said = f"{caught.value} {caught.value.__cause__}".replace(str(tmp_path), "")
     assert written.strip("'[]") not in said
@@ -164,5 +164,5 @@ def test_a_password_in_the_site_file_is_refused_and_not_repeated(tmp_path: Path,
 def test_a_key_and_a_password_are_one_too_many(tmp_path: Path) -> None:
     path = tmp_path / "fieldkit.yaml"
     path.write_text(site("password: ask, key: ~/.ssh/lab"), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="a key and a password; leave one of them out"):
+    with pytest.raises(ConfigurationError, match="a key and a password; remove one of them"):
         load_site(path)

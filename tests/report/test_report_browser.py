@@ -1,4 +1,4 @@
-"""The report of real trials and of made-up tables, opened in Chromium as its reader opens it."""
+"""Reports of emulated trials and of synthetic tables, opened in Chromium."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,18 +15,18 @@ from tests.helpers.runs import fieldkit, only_trial
 pytestmark = pytest.mark.emulated
 
 A4 = 720
-"""Its width with margins, in pixels of CSS."""
+"""Width of the page inside its margins, CSS pixels."""
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with chromium() as found:
-        yield found
+    with chromium() as launched:
+        yield launched
 
 
 @pytest.fixture(scope="module")
 def lawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the report on a made-up lawn."""
+    """Write the report of synthetic trials; return its path."""
     folder = tmp_path_factory.mktemp("lawn")
     tables.write(folder, [*lawns.lawn(), *dead()], "all.csv")
     run = fieldkit(folder, "report", "all.csv")
@@ -42,55 +42,55 @@ def dead() -> list[tables.RepeatRow]:
 
 
 @pytest.mark.parametrize("width", [PHONE, LAPTOP])
-def test_what_is_missing_is_seen_first_and_in_the_curves(browser: Browser, lawn: Path, width: int) -> None:
-    with opened(browser, lawn, width=width) as found:
-        first = found.page.locator(".headlines .missing strong").nth(1)
+def test_missing_data_is_visible_in_headlines_and_curves(browser: Browser, lawn: Path, width: int) -> None:
+    with opened(browser, lawn, width=width) as opened_page:
+        first = opened_page.page.locator(".headlines .missing strong").nth(1)
         assert first.is_visible()
         assert first.inner_text() == "nothing arrived in 3 repeats"
-        cross = found.page.locator("#rtt-median svg text", has_text="nothing arrived: 3 of 3").first
+        cross = opened_page.page.locator("#rtt-median svg text", has_text="nothing arrived: 3 of 3").first
         assert cross.is_visible()
         assert cross.bounding_box() is not None
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [PHONE, LAPTOP])
-def test_every_figure_shows_on_phone_and_laptop(
+def test_all_figures_are_visible_on_phone_and_laptop(
     browser: Browser, lawn: Path, width: int, scheme: Literal["light", "dark"]
 ) -> None:
-    with opened(browser, lawn, width=width, scheme=scheme) as found:
-        assert found.said == []
-        assert found.asked_for == []
-        figures = found.page.locator("figure")
+    with opened(browser, lawn, width=width, scheme=scheme) as opened_page:
+        assert opened_page.said == []
+        assert opened_page.asked_for == []
+        figures = opened_page.page.locator("figure")
         names = [figure.get_attribute("id") for figure in figures.all()]
         assert {"datagram-loss", "tcp-byte-loss", "rtt-median", "transfer", "rtt-distribution"} <= set(names)
-        for panel in found.page.locator("figure .panels > svg").all():
+        for panel in opened_page.page.locator("figure .panels > svg").all():
             box = panel.bounding_box()
             assert panel.is_visible()
             assert box is not None
             assert box["x"] >= 0
             assert box["x"] + box["width"] <= width
             assert box["height"] > 100
-        assert found.page.evaluate("document.documentElement.scrollWidth") == width
+        assert opened_page.page.evaluate("document.documentElement.scrollWidth") == width
 
 
-def test_on_paper_tables_stay_within_the_page_and_charts_keep_their_size(browser: Browser, lawn: Path) -> None:
-    with opened(browser, lawn, width=A4) as found:
-        found.page.emulate_media(media="print")
-        for table in found.page.locator(".scroll > table").all():
+def test_printed_tables_fit_the_page_and_charts_keep_their_size(browser: Browser, lawn: Path) -> None:
+    with opened(browser, lawn, width=A4) as opened_page:
+        opened_page.page.emulate_media(media="print")
+        for table in opened_page.page.locator(".scroll > table").all():
             box = table.bounding_box()
             assert box is None or box["x"] + box["width"] <= A4, table.inner_text()
-        for panel in found.page.locator(".panels:not(.dense) > svg").all():
+        for panel in opened_page.page.locator(".panels:not(.dense) > svg").all():
             box = panel.bounding_box()
             assert box is not None
             assert box["width"] > A4 / 3
 
 
-def test_dark_and_light_differ_and_text_stands_out(browser: Browser, lawn: Path) -> None:
+def test_text_contrast_in_dark_and_light_scheme(browser: Browser, lawn: Path) -> None:
     for scheme in ("light", "dark"):
-        with opened(browser, lawn, scheme=scheme) as found:
-            assert contrast(found.page.evaluate(PAINT, "p:not(.note)")) >= 7
-            assert contrast(found.page.evaluate(PAINT, ".note")) >= 4.5
-            assert contrast(found.page.evaluate(PAINT, "figure svg text")) >= 7
+        with opened(browser, lawn, scheme=scheme) as opened_page:
+            assert contrast(opened_page.page.evaluate(PAINT, "p:not(.note)")) >= 7
+            assert contrast(opened_page.page.evaluate(PAINT, ".note")) >= 4.5
+            assert contrast(opened_page.page.evaluate(PAINT, "figure svg text")) >= 7
 
 
 PAINT = """selector => {
@@ -102,8 +102,8 @@ PAINT = """selector => {
 
 def contrast(colours: tuple[list[float], list[float]]) -> float:
     """Return the contrast of two colours (WCAG 2.2, relative luminance)."""
-    one, other = (luminance(colour) for colour in colours)
-    return (max(one, other) + 0.05) / (min(one, other) + 0.05)
+    first, second = (luminance(colour) for colour in colours)
+    return (max(first, second) + 0.05) / (min(first, second) + 0.05)
 
 
 def luminance(colour: list[float]) -> float:
@@ -111,21 +111,21 @@ def luminance(colour: list[float]) -> float:
     return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
 
-def test_an_emulated_trial_is_reported_with_links_to_its_evidence(browser: Browser, tmp_path: Path) -> None:
+def test_report_of_an_emulated_trial_links_to_its_evidence(browser: Browser, tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     run = fieldkit(tmp_path, "trial", "los", "30ft", "--repeats", "2", "--record", "1s", "--protocol", "udp")
     assert run.code == 0, run.err
     run = fieldkit(tmp_path, "report", "trials", "--rebuild")
     assert run.code == 0, run.err
-    with opened(browser, tmp_path / "report.html") as found:
-        assert found.said == found.asked_for == []
-        names = [figure.get_attribute("id") for figure in found.page.locator("figure").all()]
+    with opened(browser, tmp_path / "report.html") as opened_page:
+        assert opened_page.said == opened_page.asked_for == []
+        names = [figure.get_attribute("id") for figure in opened_page.page.locator("figure").all()]
         assert "timeline" in names
-        assert found.page.locator("svg.raster").count() == 1
-        boxes = [panel.bounding_box() for panel in found.page.locator(".stacked > svg").all()]
+        assert opened_page.page.locator("svg.raster").count() == 1
+        boxes = [panel.bounding_box() for panel in opened_page.page.locator(".stacked > svg").all()]
         assert len(boxes) >= 3
-        assert len({(box["x"], box["width"]) for box in boxes if box}) == 1, "one axis of time"
-        links = [link.get_attribute("href") or "" for link in found.page.locator("a.mark").all()]
+        assert len({(box["x"], box["width"]) for box in boxes if box}) == 1, "one time axis"
+        links = [link.get_attribute("href") or "" for link in opened_page.page.locator("a.mark").all()]
     trial = only_trial(tmp_path).relative_to(tmp_path)
     assert links == [f"{trial}/repeats/udp-0{number}/" for number in (1, 2)]
     assert all((tmp_path / link / "sender.pcap").is_file() for link in links)

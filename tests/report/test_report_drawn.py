@@ -1,4 +1,4 @@
-"""What figures are given to draw: crosses where nothing arrived, dots of one distance, logarithmic axes, captions."""
+"""Content of figures: crosses where nothing arrived, dots for one distance, logarithmic axes, captions."""
 
 import dataclasses
 import math
@@ -30,21 +30,21 @@ LOST = {"datagrams_received": 0, "datagram_loss": 1.0, "rtt_loss": 1.0, "rtt_med
 
 
 def at(metres: float, repeats: int = 8, **changes: object) -> list[RepeatRow]:
-    """Return repeats at one distance whose round-trip times differ by a hundredth."""
+    """Return repeats at one distance whose round-trip times differ by 1 %."""
     rows = [lawns.row(n, distance=f"{metres:g}m", distance_m=metres) for n in range(1, repeats + 1)]
     return [replace(row, **({"rtt_median_s": 0.010 + 1e-4 * n} | changes)) for n, row in enumerate(rows)]
 
 
 def curves(repeats: Repeats, *names: str) -> list[Chart]:
-    found = at_hand(repeats)
+    evidence = at_hand(repeats)
     cells = aggregate(repeats)
-    return list(distance.charts(cells, Identities(cells), found, names))
+    return list(distance.charts(cells, Identities(cells), evidence, names))
 
 
-def of_dots(repeats: Repeats) -> list[Chart]:
-    found = at_hand(repeats)
+def dot_charts(repeats: Repeats) -> list[Chart]:
+    evidence = at_hand(repeats)
     cells = aggregate(repeats)
-    return list(dots.charts(cells, Identities(cells), found))
+    return list(dots.charts(cells, Identities(cells), evidence))
 
 
 def panel_of(charts: Sequence[Chart]) -> Panel:
@@ -52,7 +52,7 @@ def panel_of(charts: Sequence[Chart]) -> Panel:
     return panel
 
 
-def test_a_curve_does_not_end_where_nothing_arrived() -> None:
+def test_curve_has_a_cross_where_nothing_arrived() -> None:
     (chart,) = curves(parsed([*at(10), *at(20), *at(60, 3, **LOST)]), "rtt_median_s")
     (panel,) = chart.panels
     (cross,) = panel.edges
@@ -64,39 +64,39 @@ def test_a_curve_does_not_end_where_nothing_arrived() -> None:
     assert "a cross at the edge where a condition has no value" in chart.caption
 
 
-def test_a_rate_that_is_missing_has_its_cross_at_the_bottom() -> None:
+def test_cross_of_a_missing_rate_is_at_the_bottom() -> None:
     rows = [*at(10, goodput_bit_s=1e6), *at(20, goodput_bit_s=1e6), *at(60, 3, **LOST)]
     assert [edge.is_high for edge in panel_of(curves(parsed(rows), "goodput_bit_s")).edges] == [False]
 
 
-def test_a_condition_with_no_valid_repeat_has_a_cross_with_how_its_attempts_ended() -> None:
+def test_cross_of_a_condition_without_valid_repeats_shows_the_status_counts() -> None:
     rows = [*at(10), *at(20), *at(60, 2, status="failed", reason="no answer")]
     assert [edge.text for edge in panel_of(curves(parsed(rows), "rtt_median_s")).edges] == [
         "no valid repeat: 2 failed"
     ]
 
 
-def test_a_point_says_how_many_repeats_have_a_value() -> None:
+def test_point_shows_the_number_of_repeats_with_a_value() -> None:
     some = [*at(20, 2), lawns.row(3, distance="20m", distance_m=20.0, **LOST)]
     (chart,) = curves(parsed([*at(10), *some]), "rtt_median_s")
     assert list(chart.panels[0].series[0].notes) == ["", "2 of 3"]
     assert "how many of the valid repeats have a value" in chart.caption
 
 
-def test_no_line_goes_over_a_dead_place_or_through_an_interval_that_says_nothing() -> None:
+def test_line_is_broken_at_missing_values_and_very_wide_intervals() -> None:
     near = [row for metres in (10, 20, 30, 40) for row in at(metres)]
     (series,) = panel_of(curves(parsed(near), "rtt_median_s")).series
     assert (series.join, set(series.breaks)) == ("line", set())
-    dead = [*near, *at(25, 2, **LOST)]
-    (series,) = panel_of(curves(parsed(dead), "rtt_median_s")).series
+    lost = [*near, *at(25, 2, **LOST)]
+    (series,) = panel_of(curves(parsed(lost), "rtt_median_s")).series
     assert set(series.breaks) == {1}
-    # Two repeats that differ much have an interval over the whole axis.
-    vague = [*near, *(replace(row, rtt_median_s=0.001 + 0.03 * n) for n, row in enumerate(at(25, 2)))]
-    (series,) = panel_of(curves(parsed(vague), "rtt_median_s")).series
+    # The interval of two very different repeats spans the whole axis.
+    wide = [*near, *(replace(row, rtt_median_s=0.001 + 0.03 * n) for n, row in enumerate(at(25, 2)))]
+    (series,) = panel_of(curves(parsed(wide), "rtt_median_s")).series
     assert set(series.breaks) == {1, 2}
 
 
-def test_a_broken_line_is_drawn_in_its_stretches() -> None:
+def test_broken_line_is_drawn_in_segments() -> None:
     def lines(breaks: set[int]) -> int:
         series = Series("", Style("blue", "o"), [1.0, 2.0, 3.0, 4.0], [1.0, 2.0, 3.0, 4.0], breaks=breaks)
         return figures.panel_svg(Panel("", "", "", [series], "", top=4.0)).count("stroke-width: 1.4")
@@ -105,11 +105,11 @@ def test_a_broken_line_is_drawn_in_its_stretches() -> None:
     assert lines({0, 1, 2}) == 0
 
 
-def test_quantities_of_one_distance_are_dots_and_no_curve() -> None:
+def test_quantities_of_one_distance_are_dots_not_curves() -> None:
     repeats = parsed(at(10, 3, goodput_bit_s=2e6))
-    made = put_together(repeats, title="", repeat="", command=["fieldkit"])
-    assert made.against_distance == []
-    (chart,) = of_dots(repeats)
+    report = put_together(repeats, title="", repeat="", command=["fieldkit"])
+    assert report.against_distance == []
+    (chart,) = dot_charts(repeats)
     assert chart.title == "All quantities at 10m"
     lanes = {panel.x_label: list(panel.lanes) for panel in chart.panels}
     assert lanes == {
@@ -122,29 +122,29 @@ def test_quantities_of_one_distance_are_dots_and_no_curve() -> None:
     assert sorted(series.x) == pytest.approx([10.1, 500.0])
     assert len(series.behind) == 6
     assert times.x_log
-    assert "quantities" in [section.name for section in made.sections]
+    assert "quantities" in [section.name for section in report.sections]
 
 
-def test_a_distance_for_each_topology_is_no_curve_either() -> None:
+def test_one_distance_per_topology_is_not_a_curve() -> None:
     repeats = parsed([*at(10, 3), *at(20, 3, topology="masterless")])
     assert curves(repeats, "rtt_median_s") == []
-    (chart,) = of_dots(repeats)
+    (chart,) = dot_charts(repeats)
     assert {panel.title for panel in chart.panels} == {"UDP, master, 10m", "UDP, masterless, 20m"}
 
 
-def test_several_distances_are_curves_and_no_dots() -> None:
-    assert of_dots(parsed([*at(10), *at(20)])) == []
+def test_several_distances_are_curves_not_dots() -> None:
+    assert dot_charts(parsed([*at(10), *at(20)])) == []
 
 
-def test_a_condition_of_one_distance_in_which_nothing_arrived_has_a_cross_in_its_lane() -> None:
-    dead = at(10, 2, scenario="nlos", procedure="nlos", **LOST)
-    times = next(panel for panel in of_dots(parsed([*at(10), *dead]))[0].panels if "time" in panel.x_label)
+def test_lane_of_a_condition_without_arrivals_has_a_cross() -> None:
+    lost = at(10, 2, scenario="nlos", procedure="nlos", **LOST)
+    times = next(panel for panel in dot_charts(parsed([*at(10), *lost]))[0].panels if "time" in panel.x_label)
     assert [edge.text for edge in times.edges] == ["nothing arrived: 2 of 2"] * 2
     assert [round(edge.at) for edge in times.edges] == [1, 0] or [round(edge.at) for edge in times.edges] == [0, 1]
 
 
 @given(st.lists(st.floats(1e-6, 1e6), min_size=1))
-def test_an_axis_is_logarithmic_over_more_than_one_and_a_half_decades(values: list[float]) -> None:
+def test_axis_is_logarithmic_over_more_than_1_5_decades(values: list[float]) -> None:
     decades = math.log10(max(values)) - math.log10(min(values))
     if abs(decades - 1.5) > 1e-9:
         assert needs_log(values) is (decades > 1.5)
@@ -153,7 +153,7 @@ def test_an_axis_is_logarithmic_over_more_than_one_and_a_half_decades(values: li
 
 
 @pytest.mark.parametrize(("longest_s", "is_log"), [(0.02, False), (2.0, True)])
-def test_the_axis_of_a_distribution_is_logarithmic_where_that_is_needed(longest_s: float, is_log: bool) -> None:
+def test_axis_of_a_distribution_is_logarithmic_for_a_wide_range(longest_s: float, is_log: bool) -> None:
     rows = at(10, 4)
     rows[-1] = replace(rows[-1], rtt_median_s=longest_s)
     repeats = parsed(rows)
@@ -164,7 +164,7 @@ def test_the_axis_of_a_distribution_is_logarithmic_where_that_is_needed(longest_
     assert chart.panels[0].left == (pytest.approx(10 / 1.1) if is_log else 0)
 
 
-def test_a_flag_is_a_share_of_repeats(tmp_path: Path) -> None:
+def test_flag_is_drawn_as_a_share_of_repeats(tmp_path: Path) -> None:
     columns = trial_columns(recovery.declared(FaultKind.REBOOT))
     name = of_fault(FaultKind.REBOOT, "recovered")
     rows = [{**row, name: n > 1} for metres in (10, 20) for n, row in enumerate(at(metres, 4))]
@@ -176,7 +176,7 @@ def test_a_flag_is_a_share_of_repeats(tmp_path: Path) -> None:
     assert chart.panels[0].series[0].behind == []
 
 
-def test_distances_are_called_as_the_operator_typed_them() -> None:
+def test_distances_have_the_labels_that_the_operator_typed() -> None:
     rows = [*at(10), *(replace(row, distance="60ft") for row in at(18.288))]
     panel = panel_of(curves(parsed(rows), "rtt_median_s"))
     assert [label for _, label in panel.x_ticks] == ["10m", "60ft"]
@@ -192,7 +192,7 @@ def test_a_cross_is_drawn_with_its_text(lanes: tuple[str, ...], is_high: bool) -
     assert "nothing arrived: 3 of 3" in drawn
 
 
-def test_a_value_that_is_only_a_lower_bound_is_drawn_open_and_its_line_ends_there(tmp_path: Path) -> None:
+def test_lower_bound_is_an_open_marker_that_breaks_the_line(tmp_path: Path) -> None:
     columns = trial_columns((*ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS))
     rows = [
         {
@@ -214,11 +214,11 @@ def test_a_value_that_is_only_a_lower_bound_is_drawn_open_and_its_line_ends_ther
     assert {2, 3} <= set(series.breaks)
     assert "a lower bound" in chart.caption
     drawn = figures.panel_svg(chart.panels[0])
-    closed = replace_bounds(chart.panels[0])
+    closed = without_bounds(chart.panels[0])
     assert drawn.count("<path") > figures.panel_svg(closed).count("<path")
 
 
-def replace_bounds(panel: Panel) -> Panel:
-    """Return the panel with every value taken as measured."""
-    series = [dataclasses.replace(one, bounds=()) for one in panel.series]
+def without_bounds(panel: Panel) -> Panel:
+    """Return the panel with no value marked as a bound."""
+    series = [dataclasses.replace(curve, bounds=()) for curve in panel.series]
     return dataclasses.replace(panel, series=series)

@@ -1,4 +1,4 @@
-"""A report with raw evidence at hand: a small trial made by hand, whose every packet and reply is known."""
+"""Reports with raw evidence: a small synthetic trial whose packets and replies are all known."""
 
 import math
 import re
@@ -20,7 +20,7 @@ from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import recorded
 from tests.report.test_report_page import HOSTILE, Elements
 
-STOOD = (0.0, 0.0, 0.2)
+START_M = (0.0, 0.0, 0.2)
 
 
 @pytest.fixture
@@ -29,22 +29,22 @@ def trial(tmp_path: Path) -> Path:
     return recorded.make(tmp_path / "trials")
 
 
-def test_marks_and_names_lead_to_folders_that_are_there(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_links_lead_to_existing_folders(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = trial.parent.parent
     monkeypatch.chdir(lab)
     (lab / "out").mkdir()
     assert main(["report", "trials", "-o", "out/report.html"]) == 0
-    found = Elements((lab / "out" / "report.html").read_text(encoding="utf-8"))
-    links = [value for name, value in found.attributes if name == "href" and value.startswith("../")]
+    elements = Elements((lab / "out" / "report.html").read_text(encoding="utf-8"))
+    links = [value for name, value in elements.attributes if name == "href" and value.startswith("../")]
     assert len(links) == 2 + 1 + 4  # attempts, trial, its files
     assert {link for link in links if not (lab / "out" / link).exists()} == {
         f"../trials/{trial.name}/MANIFEST.sha256"
     }
 
 
-def test_the_lost_packets_are_marked_in_their_places(trial: Path) -> None:
-    found = at_hand(sources.find([trial], print).read())
-    ((raster,),) = (group.rasters for group in bursts.groups(aggregate(found.repeats), found))
+def test_lost_packets_are_marked_at_their_positions(trial: Path) -> None:
+    evidence = at_hand(sources.find([trial], print).read())
+    ((raster,),) = (group.rasters for group in bursts.groups(aggregate(evidence.repeats), evidence))
     assert raster.lines == 1
     assert raster.columns == recorded.PACKETS
     assert raster.runs == [(0, 3, 2), (0, 17, 1)]
@@ -52,20 +52,20 @@ def test_the_lost_packets_are_marked_in_their_places(trial: Path) -> None:
 
 
 def test_each_reply_is_in_the_distribution(trial: Path) -> None:
-    found = at_hand(sources.find([trial], print).read())
-    cells = aggregate(found.repeats)
-    chart, *_ = distribution.charts(cells, Identities(cells), found)
+    evidence = at_hand(sources.find([trial], print).read())
+    cells = aggregate(evidence.repeats)
+    chart, *_ = distribution.charts(cells, Identities(cells), evidence)
     assert chart.title == "Round-trip time: distribution, 8192 bytes"
     ((series,),) = (panel.series for panel in chart.panels)
     assert sorted(set(series.x)) == pytest.approx(sorted(recorded.RTT_MS))
 
 
-def test_the_time_line_has_every_packet_and_reply(trial: Path) -> None:
-    found = at_hand(sources.find([trial], print).read())
-    row = repeat_to_draw(aggregate(found.repeats), found, "")
+def test_time_line_has_all_packets_and_replies(trial: Path) -> None:
+    evidence = at_hand(sources.find([trial], print).read())
+    row = repeat_to_draw(aggregate(evidence.repeats), evidence, "")
     assert row is not None
-    assert found.repeats.texts["status"][row] == "valid"
-    (phases, trips), (packets,) = (chart.panels for chart in timeline.charts(row, found))
+    assert evidence.repeats.texts["status"][row] == "valid"
+    (phases, trips), (packets,) = (chart.panels for chart in timeline.charts(row, evidence))
     assert phases.lanes == ["ping", "receive", "send", "record"]
     counts = {series.label: len(series.x) for series in (*packets.series, *trips.series)}
     lost = len(recorded.LOST)
@@ -76,36 +76,39 @@ def test_the_time_line_has_every_packet_and_reply(trial: Path) -> None:
         "round trip": len(recorded.RTT_MS),
         "no reply": 7,
     }
-    # The receiver's clock is an hour ahead, which nothing in the captures tells.
+    # The receiver's clock is an hour ahead, which cannot be seen in the captures.
     assert max(packets.series[1].x) == pytest.approx(recorded.PACKETS)
 
 
-def test_the_time_line_shows_how_far_apart_robots_were_that_moved(trial: Path) -> None:
+def test_time_line_shows_the_distance_between_moving_robots(trial: Path) -> None:
     began_ns = recorded.START_NS + 10 * recorded.SECOND_NS
     places_m = {Role.SENDER: 1.0, Role.RECEIVER: 4.0}
-    stood = [Whereabouts(0, role, (place_m, 0.0, 0.2)) for role, place_m in places_m.items()]
-    went = [Whereabouts(began_ns + 10**9, Role.SENDER, None), Whereabouts(began_ns + 2 * 10**9, Role.SENDER, STOOD)]
+    initial = [Whereabouts(0, role, (place_m, 0.0, 0.2)) for role, place_m in places_m.items()]
+    moved = [
+        Whereabouts(began_ns + 10**9, Role.SENDER, None),
+        Whereabouts(began_ns + 2 * 10**9, Role.SENDER, START_M),
+    ]
     file = trial / "repeats" / "udp-01" / "track.csv"
-    for moves, panels in (([], 2), (went, 3)):
-        file.write_text(track.text([*stood, *moves]), encoding="ascii")
-        found = at_hand(sources.find([trial], print).read())
-        row = repeat_to_draw(aggregate(found.repeats), found, "")
+    for moves, panels in (([], 2), (moved, 3)):
+        file.write_text(track.text([*initial, *moves]), encoding="ascii")
+        evidence = at_hand(sources.find([trial], print).read())
+        row = repeat_to_draw(aggregate(evidence.repeats), evidence, "")
         assert row is not None
-        chart, _ = timeline.charts(row, found)
+        chart, _ = timeline.charts(row, evidence)
         assert len(chart.panels) == panels
     (series,) = chart.panels[-1].series
     assert list(series.y) == pytest.approx([3.0, math.nan, 4.0], nan_ok=True)
     assert series.x[0] == 0 < series.x[1] == series.x[2] - 1
 
 
-def test_a_repeat_can_be_asked_for(trial: Path) -> None:
-    made = put_together(sources.find([trial], print).read(), title="", repeat="udp-01.void1", command=())
-    assert "one-repeat" not in [section.name for section in made.sections]
-    made = put_together(sources.find([trial], print).read(), title="", repeat=f"{trial.name}/udp-01", command=())
-    assert made.sections[-1].charts[0].title == "Time line of udp-01"
+def test_repeat_of_the_time_line_can_be_selected(trial: Path) -> None:
+    report = put_together(sources.find([trial], print).read(), title="", repeat="udp-01.void1", command=())
+    assert "one-repeat" not in [section.name for section in report.sections]
+    report = put_together(sources.find([trial], print).read(), title="", repeat=f"{trial.name}/udp-01", command=())
+    assert report.sections[-1].charts[0].title == "Time line of udp-01"
 
 
-def test_what_the_operator_wrote_is_text(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_texts_of_the_operator_are_escaped(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(trial.parent.parent)
     plan = store.read_plan(trial).model_copy(update={"notes": HOSTILE, "versions": {HOSTILE: HOSTILE}})
     (trial / PLAN_FILE).write_text(schema.dump(plan), encoding="utf-8")
@@ -116,7 +119,7 @@ def test_what_the_operator_wrote_is_text(trial: Path, monkeypatch: pytest.Monkey
     assert not re.search("[\x00-\x09\x0b-\x1f\u202e]", text)
 
 
-def test_the_same_evidence_gives_the_same_page(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_same_evidence_gives_the_same_page(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(trial.parent.parent)
     pages = []
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""The headline figures: what is missing first, the worst condition before the best, expected quantities first."""
+"""Headlines: missing data first, the worst condition before the best, expected quantities first."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,71 +20,71 @@ LOST = {"datagrams_received": 0, "datagram_loss": 1.0, "rtt_loss": 1.0, "rtt_med
 
 
 def lines(rows: Sequence[RepeatRow], unmeasured: Sequence[str] = ()) -> dict[str, list[str]]:
-    """Return each headline's lines by its subject."""
-    found = at_hand(parsed(rows))
-    made = headlines(aggregate(found.repeats), found, unmeasured)
-    return {headline.subject: texts(headline) for headline in made}
+    """Return the lines of each headline by its subject."""
+    evidence = at_hand(parsed(rows))
+    shown = headlines(aggregate(evidence.repeats), evidence, unmeasured)
+    return {headline.subject: texts(headline) for headline in shown}
 
 
 def texts(headline: Headline) -> list[str]:
-    said = (filter(None, (one.which, one.value, one.interval, one.place)) for one in headline.ends)
-    return [" ".join(parts).replace("\N{NO-BREAK SPACE}", " ") for parts in said]
+    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.ends)
+    return [" ".join(parts).replace("\N{NO-BREAK SPACE}", " ") for parts in lines]
 
 
-def test_a_place_where_nothing_arrived_comes_before_the_largest_loss() -> None:
+def test_condition_without_arrivals_precedes_the_largest_loss() -> None:
     near = [lawns.row(number) for number in (1, 2)]
     middle = [lawns.row(n, distance="90m", distance_m=90.0, rtt_median_s=0.05) for n in (1, 2)]
-    dead = [lawns.row(number, **FAR, **LOST) for number in (1, 2, 3)]
-    said = lines([*near, *middle, *dead])
-    assert said["Repeats"] == ["7 of 7 valid", "nothing arrived in 3 repeats UDP, NLOS, 60m (3 of 3)"]
-    assert said["UDP datagram loss"][0].startswith("most 100 % [43.")
-    assert said["UDP datagram loss"][0].endswith("NLOS, 60m")
-    assert said["UDP datagram loss"][1] == "least 5.56 % LOS, 10ft; LOS, 90m"
-    assert said["RTT with UDP"] == [
+    lost = [lawns.row(number, **FAR, **LOST) for number in (1, 2, 3)]
+    by_subject = lines([*near, *middle, *lost])
+    assert by_subject["Repeats"] == ["7 of 7 valid", "nothing arrived in 3 repeats UDP, NLOS, 60m (3 of 3)"]
+    assert by_subject["UDP datagram loss"][0].startswith("most 100 % [43.")
+    assert by_subject["UDP datagram loss"][0].endswith("NLOS, 60m")
+    assert by_subject["UDP datagram loss"][1] == "least 5.56 % LOS, 10ft; LOS, 90m"
+    assert by_subject["RTT with UDP"] == [
         "nothing arrived NLOS, 60m (3 of 3)",
         "most 50.00 ms [50.00, 50.00]* LOS, 90m",
         "least 16.00 ms [16.00, 16.00]* LOS, 10ft",
     ]
 
 
-def test_a_condition_that_lost_everything_in_some_repeats_says_in_how_many() -> None:
+def test_condition_with_total_loss_in_some_repeats_shows_their_number() -> None:
     rows = [lawns.row(1), lawns.row(2, **LOST), lawns.row(3, **LOST)]
     rows += [lawns.row(number, distance="20ft", distance_m=6.096) for number in (1, 2)]
-    said = lines(rows)
-    assert said["RTT with UDP"] == ["nothing arrived 10ft (2 of 3)", "in all others 16.00 ms"]
-    assert said["Repeats"][1:] == ["nothing arrived in 2 repeats UDP, 10ft (2 of 3)"]
+    by_subject = lines(rows)
+    assert by_subject["RTT with UDP"] == ["nothing arrived 10ft (2 of 3)", "in all others 16.00 ms"]
+    assert by_subject["Repeats"][1:] == ["nothing arrived in 2 repeats UDP, 10ft (2 of 3)"]
 
 
 def test_void_failed_and_planned_conditions_are_counted() -> None:
     rows = [lawns.row(number) for number in (1, 2)]
     rows += [lawns.row(3, status="void", reason="no capture"), lawns.row(4, status="failed", reason="lost")]
     rows += [lawns.row(1, **FAR, status="failed", reason="no answer")]
-    said = lines(rows, ["nlos 90m master"])
-    assert said["Repeats"] == [
+    by_subject = lines(rows, ["nlos 90m master"])
+    assert by_subject["Repeats"] == [
         "2 of 5 valid",
         "2 repeats failed UDP, NLOS, 60m (1 of 1); UDP, LOS, 10ft (1 of 4)",
         "1 repeat void UDP, LOS, 10ft (1 of 4)",
         "1 condition not run nlos 90m master",
     ]
-    assert said["RTT with UDP"][0] == "no valid repeat NLOS, 60m (1 failed)"
+    assert by_subject["RTT with UDP"][0] == "no valid repeat NLOS, 60m (1 failed)"
 
 
-def test_a_void_attempt_whose_repeat_was_done_again_is_no_missing_repeat() -> None:
+def test_void_attempt_of_a_repeated_repeat_is_not_missing() -> None:
     again = lawns.row(1, attempt=2, started_utc_ns=1_795_262_500_000_000_000)
     assert lines([lawns.row(1, status="void", reason="no capture"), again])["Repeats"] == ["1 of 1 valid"]
 
 
-def test_a_value_that_only_some_repeats_have_says_so() -> None:
+def test_value_of_only_some_repeats_shows_their_number() -> None:
     rows = [lawns.row(1), lawns.row(2, rtt_median_s=None), lawns.row(3)]
     assert lines(rows)["RTT with UDP"] == ["no value 10ft (1 of 3)", "16.00 ms [16.00, 16.00]* (2 of 3) 10ft"]
 
 
-def test_pings_of_different_sizes_have_headlines_of_their_own() -> None:
+def test_pings_of_different_sizes_have_separate_headlines() -> None:
     small = [lawns.row(n, rtt_payload_bytes=56, rtt_median_s=0.001, distance="5m", distance_m=5.0) for n in (1, 2)]
     large = [lawns.row(n, rtt_payload_bytes=8192) for n in (1, 2)]
-    said = lines([*small, *large])
-    assert said["RTT with UDP, 56 bytes"] == ["1.00 ms [1.00, 1.00]* 5m"]
-    assert said["RTT with UDP, 8192 bytes"] == ["16.00 ms [16.00, 16.00]* 10ft"]
+    by_subject = lines([*small, *large])
+    assert by_subject["RTT with UDP, 56 bytes"] == ["1.00 ms [1.00, 1.00]* 5m"]
+    assert by_subject["RTT with UDP, 8192 bytes"] == ["16.00 ms [16.00, 16.00]* 10ft"]
 
 
 @pytest.mark.parametrize(
@@ -96,39 +96,42 @@ def test_pings_of_different_sizes_have_headlines_of_their_own() -> None:
         ({"datagram_loss": None, "rtt_loss": None}, False),
     ],
 )
-def test_everything_is_lost_where_no_loss_is_partial(losses: dict[str, float | None], lost: bool) -> None:
+def test_everything_lost_if_all_losses_are_total(losses: dict[str, float | None], lost: bool) -> None:
     assert everything_lost(parsed([lawns.row(1, **losses)])).tolist() == [lost]
 
 
-def test_without_a_loss_of_its_own_a_quantity_is_judged_by_the_other_losses() -> None:
+def test_quantity_without_its_own_loss_uses_the_other_losses() -> None:
     rows = [lawns.row(1), lawns.row(2, **(LOST | {"rtt_loss": None})), lawns.row(3, rtt_median_s=None)]
-    said = lines(rows)["RTT with UDP"]
-    assert said[:2] == ["nothing arrived 10ft (1 of 3)", "no value 10ft (1 of 3)"]
+    shown = lines(rows)["RTT with UDP"]
+    assert shown[:2] == ["nothing arrived 10ft (1 of 3)", "no value 10ft (1 of 3)"]
 
 
-def expecting(folder: Path, *expected: str) -> Evidence:
-    """Return the evidence of a trial made by hand which expects something."""
+def evidence_with(folder: Path, *expected: str) -> Evidence:
+    """Return the evidence of a synthetic trial with expectations."""
     trial = recorded.make(folder)
     plan = store.read_plan(trial)
-    asked = plan.procedure.model_copy(update={"expect": expected})
-    (trial / PLAN_FILE).write_text(schema.dump(plan.model_copy(update={"procedure": asked})), encoding="utf-8")
+    changed = plan.procedure.model_copy(update={"expect": expected})
+    (trial / PLAN_FILE).write_text(schema.dump(plan.model_copy(update={"procedure": changed})), encoding="utf-8")
     return at_hand(sources.find([trial], print).read())
 
 
-def test_what_a_trial_expects_comes_first_and_its_direction_says_what_is_worse(tmp_path: Path) -> None:
-    found = expecting(tmp_path, "ip_loss < 20 %")
-    subjects = [headline.subject for headline in headlines(aggregate(found.repeats), found)]
+def test_expected_quantities_are_first(tmp_path: Path) -> None:
+    evidence = evidence_with(tmp_path, "ip_loss < 20 %")
+    subjects = [headline.subject for headline in headlines(aggregate(evidence.repeats), evidence)]
     assert subjects[:2] == ["Repeats", "IP packet loss"]
     assert subjects.count("IP packet loss") == 1
 
 
-def test_planned_repeats_that_were_never_begun_are_not_run(tmp_path: Path) -> None:
-    found = expecting(tmp_path)
-    plan = next(iter(found.plans.values()))
+def test_planned_repeats_without_an_attempt_are_not_run(tmp_path: Path) -> None:
+    evidence = evidence_with(tmp_path)
+    plan = next(iter(evidence.plans.values()))
     assert plan.repeats == 1
     more = Evidence(
-        found.repeats, {source: plan.model_copy(update={"repeats": 5}) for source in found.plans}, (), frozenset()
+        evidence.repeats,
+        {source: plan.model_copy(update={"repeats": 5}) for source in evidence.plans},
+        (),
+        frozenset(),
     )
-    said = texts(next(iter(headlines(aggregate(found.repeats), more))))
-    assert said[0] == "1 of 5 valid"
-    assert any(line.startswith("4 repeats not run") for line in said)
+    shown = texts(next(iter(headlines(aggregate(evidence.repeats), more))))
+    assert shown[0] == "1 of 5 valid"
+    assert any(line.startswith("4 repeats not run") for line in shown)

@@ -1,4 +1,4 @@
-"""A lab from above: no name leaves the world that is drawn, wherever its robot stands."""
+"""Overview of a lab: names stay inside the drawn world, at any robot position."""
 
 import itertools
 
@@ -11,7 +11,7 @@ from fieldkit.report import figures
 
 
 @pytest.mark.parametrize("area_m", [(400.0, 20.0), (46.0, 24.0)])
-def test_names_at_the_edges_of_the_world_stay_in_it(
+def test_names_at_the_edges_stay_inside_the_world(
     area_m: tuple[float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     east_m, north_m = area_m
@@ -20,12 +20,12 @@ def test_names_at_the_edges_of_the_world_stay_in_it(
     links = [LabLink(ends, 30.0, True, ("concrete", "foliage")) for ends in itertools.combinations(robots, 2)]
     drawn: list[Figure] = []
 
-    def kept(figure: Figure, form: str, *, transparent: bool) -> bytes:
+    def keep_figure(figure: Figure, form: str, *, transparent: bool) -> bytes:
         figure.draw_without_rendering()
         drawn.append(figure)
         return b""
 
-    monkeypatch.setattr(figures, "_saved", kept)
+    monkeypatch.setattr(figures, "_to_bytes", keep_figure)
     figures.overview(Overview("a world with a long name " * 4, area_m, [], robots, links), "png")
     axes = drawn[0].axes[0]
     world = axes.get_window_extent()

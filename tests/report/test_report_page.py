@@ -1,4 +1,4 @@
-"""The page and its figures as bytes and text: the same each time, and nothing of the evidence taken for markup."""
+"""The page and its figures: reproducible bytes, and texts of the evidence are escaped."""
 
 import re
 from html.parser import HTMLParser
@@ -31,7 +31,7 @@ class Elements(HTMLParser):
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return the text of a report on a made-up lawn."""
+    """Return the text of a report of synthetic trials."""
     folder = tmp_path_factory.mktemp("lawn")
     written = folder / "report.html"
     assert main(["report", str(tables.write(folder, lawns.lawn(2))), "-o", str(written)]) == 0
@@ -54,7 +54,7 @@ def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
     assert runs[0]["figures/rtt-median.pdf"].startswith(b"%PDF")
 
 
-def test_texts_of_the_evidence_are_texts_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_texts_of_the_evidence_are_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     hostile = {"procedure": HOSTILE, "scenario": "", "topology": HOSTILE, "backend": HOSTILE, "distance": HOSTILE}
     rows = [lawns.row(number, **hostile, trial=HOSTILE, sender=HOSTILE) for number in (1, 2)]
@@ -62,23 +62,23 @@ def test_texts_of_the_evidence_are_texts_of_the_page(tmp_path: Path, monkeypatch
     folder = tmp_path / "<b>&\"'"
     assert main(["report", str(tables.write(folder, rows)), "--title", HOSTILE]) == 0
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    found = Elements(text)
-    assert "script" not in found.tags
-    assert "b" not in found.tags
-    assert not [name for name, _ in found.attributes if name.startswith("on")]
+    elements = Elements(text)
+    assert "script" not in elements.tags
+    assert "b" not in elements.tags
+    assert not [name for name, _ in elements.attributes if name.startswith("on")]
     assert not {"\x1b", "\u202e"} & set(text)
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
 
 
-def test_ids_are_unique_and_everything_that_is_named_is_there(page: str) -> None:
-    found = Elements(page)
-    assert len(found.ids) == len(set(found.ids))
-    named = {value[1:] for name, value in found.attributes if name.endswith("href") and value.startswith("#")}
-    assert named | set(re.findall(r"url\(#([^)]*)\)", page)) <= set(found.ids)
+def test_ids_are_unique_and_all_references_resolve(page: str) -> None:
+    elements = Elements(page)
+    assert len(elements.ids) == len(set(elements.ids))
+    named = {value[1:] for name, value in elements.attributes if name.endswith("href") and value.startswith("#")}
+    assert named | set(re.findall(r"url\(#([^)]*)\)", page)) <= set(elements.ids)
 
 
-def test_the_page_asks_nobody_for_anything(page: str) -> None:
-    found = Elements(page)
-    outside = [value for name, value in found.attributes if "//" in value and not name.startswith("xmlns")]
+def test_page_has_no_external_references(page: str) -> None:
+    elements = Elements(page)
+    outside = [value for name, value in elements.attributes if "//" in value and not name.startswith("xmlns")]
     assert outside == []
-    assert not {"script", "iframe", "object", "img"} & set(found.tags)
+    assert not {"script", "iframe", "object", "img"} & set(elements.tags)

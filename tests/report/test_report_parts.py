@@ -1,4 +1,4 @@
-"""What stands in a report, against closed forms: packets, distributions, strips, summary, warnings."""
+"""Parts of a report against independent results: packets, distributions, strips, summary, warnings."""
 
 import re
 from pathlib import Path
@@ -40,10 +40,10 @@ def table(folder: Path, rows: list[RepeatRow]) -> Repeats:
 
 
 def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer, list[int]]:
-    """Lay down a recorded transfer without some of its packets, counted from 0, at the receiver.
+    """Write the captures of a recorded transfer, with some packets removed at the receiver (counted from 0).
 
     Returns:
-        The transfer, and which packets are not there in all: on the way some were lost for real.
+        The transfer, and the indices of all missing packets, including those lost in the recording.
     """
     sent = rdpcap(str(CAPTURES / f"{protocol}-sender.pcap"))
     first = next(
@@ -60,17 +60,21 @@ def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer
         "recv.bag",
         captures=("sender.pcap", "receiver.pcap"),
     )
-    ids = [one[IP].id * 65536 + one[IP].frag for one in sent if ours(one, transfer)]
-    gone = {ids[index] for index in lost}
+    ids = [packet[IP].id * 65536 + packet[IP].frag for packet in sent if is_of_transfer(packet, transfer)]
+    removed = {ids[index] for index in lost}
     received = rdpcap(str(CAPTURES / f"{protocol}-receiver.pcap"))
-    kept = [one for one in received if not (ours(one, transfer) and one[IP].id * 65536 + one[IP].frag in gone)]
-    arrived = {one[IP].id * 65536 + one[IP].frag for one in received if ours(one, transfer)}
+    kept = [
+        packet
+        for packet in received
+        if not (is_of_transfer(packet, transfer) and packet[IP].id * 65536 + packet[IP].frag in removed)
+    ]
+    arrived = {packet[IP].id * 65536 + packet[IP].frag for packet in received if is_of_transfer(packet, transfer)}
     (folder / "sender.pcap").write_bytes((CAPTURES / f"{protocol}-sender.pcap").read_bytes())
     wrpcap(str(folder / "receiver.pcap"), kept)
-    return transfer, [index for index, one in enumerate(ids) if one not in arrived - gone]
+    return transfer, [index for index, packet_id in enumerate(ids) if packet_id not in arrived - removed]
 
 
-def ours(packet: object, transfer: Transfer) -> bool:
+def is_of_transfer(packet: object, transfer: Transfer) -> bool:
     if not packet.haslayer(IP):  # type: ignore[attr-defined]
         return False
     header = packet[IP]  # type: ignore[index]
@@ -79,25 +83,25 @@ def ours(packet: object, transfer: Transfer) -> bool:
 
 def test_exactly_the_lost_packets_are_marked(tmp_path: Path) -> None:
     transfer, missing = captured(tmp_path, Protocol.UDP, {2, 3, 7})
-    found = fates.read(AttemptEvidence(tmp_path), transfer)
-    assert found is not None
+    packet_fates = fates.read(AttemptEvidence(tmp_path), transfer)
+    assert packet_fates is not None
     assert {2, 3, 7} <= set(missing)
-    assert np.flatnonzero(found.marked).tolist() == missing
-    assert len(found.received_ns) == len(found.sent_ns) - len(missing)
-    assert (np.diff(found.sent_bytes) > 0).all()
-    assert set(found.received_bytes) == set(found.sent_bytes[~found.marked])
+    assert np.flatnonzero(packet_fates.marked).tolist() == missing
+    assert len(packet_fates.received_ns) == len(packet_fates.sent_ns) - len(missing)
+    assert (np.diff(packet_fates.sent_bytes) > 0).all()
+    assert set(packet_fates.received_bytes) == set(packet_fates.sent_bytes[~packet_fates.marked])
 
 
-def test_tcp_marks_as_many_frames_as_are_counted_as_sent_again(tmp_path: Path) -> None:
+def test_marked_tcp_frames_equal_the_count_of_retransmissions(tmp_path: Path) -> None:
     transfer, _ = captured(tmp_path, Protocol.TCP, set())
-    found = fates.read(AttemptEvidence(tmp_path), transfer)
-    assert found is not None
+    packet_fates = fates.read(AttemptEvidence(tmp_path), transfer)
+    assert packet_fates is not None
     sender, receiver = (pcap.read(tmp_path / name).packets for name in ("sender.pcap", "receiver.pcap"))
-    assert found.marked.sum() == tcp.count(tcp.cross(sender, receiver, transfer)).retransmitted_frames
-    assert found.sent_bytes[0] == found.sent_bytes.min()
+    assert packet_fates.marked.sum() == tcp.count(tcp.cross(sender, receiver, transfer)).retransmitted_frames
+    assert packet_fates.sent_bytes[0] == packet_fates.sent_bytes.min()
 
 
-def test_a_damaged_capture_gives_no_fates(tmp_path: Path) -> None:
+def test_damaged_capture_is_not_read(tmp_path: Path) -> None:
     transfer, _ = captured(tmp_path, Protocol.UDP, set())
     path = tmp_path / "receiver.pcap"
     path.write_bytes(path.read_bytes()[:-3])
@@ -107,7 +111,7 @@ def test_a_damaged_capture_gives_no_fates(tmp_path: Path) -> None:
 
 
 @given(st.lists(st.booleans(), max_size=50))
-def test_runs_are_what_is_marked(marked: list[bool]) -> None:
+def test_runs_cover_the_marked_packets(marked: list[bool]) -> None:
     drawn = np.zeros(len(marked), dtype=np.bool_)
     runs = bursts._runs(np.array(marked, dtype=np.bool_))
     for start, length in runs:
@@ -117,14 +121,14 @@ def test_runs_are_what_is_marked(marked: list[bool]) -> None:
 
 
 @given(st.lists(st.floats(0, 10), min_size=1, max_size=distribution.MOST_STEPS))
-def test_a_distribution_is_scipys(times: list[float]) -> None:
+def test_distribution_equals_that_of_scipy(times: list[float]) -> None:
     x, shares = distribution._steps(np.sort(times))
     expected = stats.ecdf(times).cdf
     for at in times:
         assert shares[np.searchsorted(x, at, side="right") - 1] == pytest.approx(expected.evaluate(at))
 
 
-def test_equal_distances_by_other_names_stand_in_the_order_of_their_names(tmp_path: Path) -> None:
+def test_labels_of_equal_distances_are_sorted_by_text(tmp_path: Path) -> None:
     labels = ("30ft", "9.144m", "914.4cm")
     rows = [lawns.row(number, distance=label, distance_m=9.144) for number, label in enumerate(labels, start=1)]
     cells = aggregate(table(tmp_path, rows))
@@ -139,42 +143,42 @@ def test_a_long_distribution_is_drawn_through_quantiles() -> None:
     assert np.abs(np.searchsorted(times, x, side="right") / len(times) - shares).max() <= 1 / 5000
 
 
-def test_a_strip_of_many_keeps_every_void_one(tmp_path: Path) -> None:
+def test_strip_of_many_repeats_keeps_all_void_ones(tmp_path: Path) -> None:
     rows = [
         lawns.row(number, status="void", reason="no capture") if number % 50 == 0 else lawns.row(number)
         for number in range(1, 2401)
     ]
-    found = at_hand(table(tmp_path, rows))
-    cells = aggregate(found.repeats)
-    ((strip,),) = (group.strips for group in strips.groups(cells, Identities(cells), found))
+    evidence = at_hand(table(tmp_path, rows))
+    cells = aggregate(evidence.repeats)
+    ((strip,),) = (group.strips for group in strips.groups(cells, Identities(cells), evidence))
     assert len(strip.marks) == strips.MOST_MARKS
     assert sum(mark.status == "void" for mark in strip.marks) == 48
     assert strip.left_out == 2400 - strips.MOST_MARKS
     assert strip.marks[-1].title == "udp-2400, void: no capture, UDP datagram loss 5.56 %"
 
 
-@pytest.mark.parametrize(("loss", "said"), [(0.0, "none"), (0.125, "full height 12.5 %")])
-def test_a_strip_says_what_its_height_is(tmp_path: Path, loss: float, said: str) -> None:
-    found = at_hand(
+@pytest.mark.parametrize(("loss", "expected"), [(0.0, "none"), (0.125, "full height 12.5 %")])
+def test_strip_states_its_scale(tmp_path: Path, loss: float, expected: str) -> None:
+    evidence = at_hand(
         table(tmp_path, [lawns.row(1, datagram_loss=loss, datagrams_sent=8, datagrams_received=8 - round(8 * loss))])
     )
-    cells = aggregate(found.repeats)
-    (group,) = strips.groups(cells, Identities(cells), found)
-    assert group.scale == f"UDP datagram loss, {said}"
+    cells = aggregate(evidence.repeats)
+    (group,) = strips.groups(cells, Identities(cells), evidence)
+    assert group.scale == f"UDP datagram loss, {expected}"
 
 
-def test_a_strip_is_of_a_loss_that_its_own_repeats_have(tmp_path: Path) -> None:
-    """Else a repeat of steps that have names would look as if it had lost nothing."""
+def test_strip_shows_a_loss_that_its_repeats_have(tmp_path: Path) -> None:
+    """Otherwise, a repeat with named steps would appear to have no loss."""
     without = dict.fromkeys(("datagram_loss", "datagrams_sent", "datagrams_received"))
     lost = {"ip_loss": 0.5, "ip_packets_sent": 8, "ip_packets_received": 4}
-    found = at_hand(table(tmp_path, [lawns.row(1), lawns.row(2, topology="masterless", **without, **lost)]))
-    cells = aggregate(found.repeats)
-    scales = {group.title: group.scale for group in strips.groups(cells, Identities(cells), found)}
+    evidence = at_hand(table(tmp_path, [lawns.row(1), lawns.row(2, topology="masterless", **without, **lost)]))
+    cells = aggregate(evidence.repeats)
+    scales = {group.title: group.scale for group in strips.groups(cells, Identities(cells), evidence)}
     assert scales["UDP, masterless"] == "IP packet loss, full height 50.0 %"
     assert scales["UDP, master"].startswith("UDP datagram loss")
 
 
-def test_a_series_without_points_takes_no_room() -> None:
+def test_empty_series_does_not_change_the_panel() -> None:
     series = Series("sent", Style("blue", "o", "none"), [1.0, 2.0], [3.0, 4.0])
     empty = Series("lost", Style("lost", "x", "none"), [], [])
     panels = [Panel("packets", "time", "place", kept, "") for kept in ([series], [series, empty])]
@@ -182,49 +186,49 @@ def test_a_series_without_points_takes_no_room() -> None:
     assert Chart("packets", "packets", "", [panels[1]]).legend == {}
 
 
-def test_a_logarithmic_axis_has_its_powers_of_ten_as_numbers() -> None:
+def test_logarithmic_axis_is_labelled_with_powers_of_ten() -> None:
     series = Series("a", Style("blue", "o"), [1, 2], [3.0, 400.0])
     drawn = figures.panel_svg(Panel("", "", "ms", [series], "", bottom=1.0, top=1000.0, log=True))
-    found = re.findall(r"<text[^>]*>([^<]*)</text>", drawn)
-    assert {"1", "10", "100", "1000"} <= set(found)
-    assert not {"200", "500"} & set(found)
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", drawn)
+    assert {"1", "10", "100", "1000"} <= set(texts)
+    assert not {"200", "500"} & set(texts)
 
 
-def test_the_page_warns_of_what_matters(tmp_path: Path) -> None:
+def test_warnings_of_a_page(tmp_path: Path) -> None:
     rows = [
         lawns.row(1, code_sha256="a"),
         lawns.row(2, code_sha256="b", one_way_withheld="the clock drifts"),
         lawns.row(3, code_sha256="b", status="void", reason="tcpdump dropped 3 packets"),
         lawns.row(4, code_sha256="b", distance="20ft", distance_m=6.096, status="failed", reason="no answer"),
     ]
-    found = at_hand(table(tmp_path, rows))
-    cells = aggregate(found.repeats)
-    said = [(one.text, list(map(plain, one.reasons))) for one in summary.warnings(cells, found)]
-    assert said[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
-    assert said[1] == ("1 attempt failed.", ["no answer (1)"])
-    assert said[2] == ("Nothing valid in 1 condition.", ["UDP, 20ft"])
-    assert said[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
-    assert "2 repeats give 50 %" in plain(said[3][0])
-    assert said[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
-    assert said[5][0].startswith("Several versions of fieldkit")
-    assert len(said) == 6
+    evidence = at_hand(table(tmp_path, rows))
+    cells = aggregate(evidence.repeats)
+    shown = [(warning.text, list(map(plain, warning.reasons))) for warning in summary.warnings(cells, evidence)]
+    assert shown[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
+    assert shown[1] == ("1 attempt failed.", ["no answer (1)"])
+    assert shown[2] == ("No valid repeat in 1 condition.", ["UDP, 20ft"])
+    assert shown[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
+    assert "2 repeats give 50 %" in plain(shown[3][0])
+    assert shown[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
+    assert shown[5][0].startswith("Several versions of fieldkit")
+    assert len(shown) == 6
 
 
-def test_the_paragraph_counts_and_places(tmp_path: Path) -> None:
-    found = at_hand(table(tmp_path, lawns.lawn(4)))
-    said = summary.paragraph(aggregate(found.repeats), found).replace("\N{NO-BREAK SPACE}", " ")
-    assert said == (
+def test_summary_paragraph_has_counts_and_conditions(tmp_path: Path) -> None:
+    evidence = at_hand(table(tmp_path, lawns.lawn(4)))
+    paragraph = summary.paragraph(aggregate(evidence.repeats), evidence).replace("\N{NO-BREAK SPACE}", " ")
+    assert paragraph == (
         "24 trials of los and nlos on 2026-11-21 12:00 UTC: 10ft to 55ft; "
         "TCP and UDP; master and masterless; emulated and field robots. 192 attempts: 176 valid, 16 void. "
         "All figures are of the valid ones."
     )
 
 
-def test_a_headline_names_the_ends_with_their_intervals(tmp_path: Path) -> None:
+def test_headline_has_the_extremes_with_their_intervals(tmp_path: Path) -> None:
     rows = [lawns.row(number) for number in (1, 2)]
     rows += [lawns.row(number, distance="20ft", distance_m=6.096, rtt_median_s=0.02) for number in (1, 2)]
-    found = at_hand(table(tmp_path, rows))
-    _, loss, rtt = headlines.headlines(aggregate(found.repeats), found)
+    evidence = at_hand(table(tmp_path, rows))
+    _, loss, rtt = headlines.headlines(aggregate(evidence.repeats), evidence)
     assert (loss.subject, ends(loss)) == ("UDP datagram loss", ["in all conditions 5.56 %"])
     assert rtt.subject == "RTT with UDP"
     assert ends(rtt) == [
@@ -233,14 +237,14 @@ def test_a_headline_names_the_ends_with_their_intervals(tmp_path: Path) -> None:
     ]
 
 
-def test_a_headline_of_several_steps_says_at_which_its_ends_are(tmp_path: Path) -> None:
+def test_headline_of_several_steps_names_the_step_of_each_extreme(tmp_path: Path) -> None:
     pings = {f"{step}.rtt_median_s": at_s for step, at_s in (("small", 0.002), ("middle", 0.004), ("big", 0.016))}
-    columns = trial_columns(named(step, one) for step in ("small", "middle", "big") for one in ping.COLUMNS)
+    columns = trial_columns(named(step, column) for step in ("small", "middle", "big") for column in ping.COLUMNS)
     rows = [{**lawns.row(number), **pings, "rtt_median_s": None} for number in (1, 2)]
     path = tmp_path / "trial.csv"
     path.write_text(to_csv(rows, columns), encoding="utf-8")
-    found = at_hand(read([path], columns))
-    _, _, rtt = headlines.headlines(aggregate(found.repeats), found)
+    evidence = at_hand(read([path], columns))
+    _, _, rtt = headlines.headlines(aggregate(evidence.repeats), evidence)
     assert rtt.subject == "RTT with UDP"
     assert ends(rtt) == [
         "most 16.00 ms [16.00, 16.00]* big, 10ft",
@@ -248,32 +252,32 @@ def test_a_headline_of_several_steps_says_at_which_its_ends_are(tmp_path: Path) 
     ]
 
 
-def test_a_report_of_topics_begins_with_them_and_draws_them(tmp_path: Path) -> None:
+def test_report_of_topics_has_their_headlines_and_charts(tmp_path: Path) -> None:
     topic = {"topic_sent": 20, "topic_received": 18, "topic_loss": 0.1, "topic_delay_median_s": 0.03}
     columns = trial_columns(topics.COLUMNS)
     path = tmp_path / "trial.csv"
     far = {"distance": "20ft", "distance_m": 6.096}
-    rows = [{**lawns.row(number), **topic, **there} for there in ({}, far) for number in (1, 2)]
+    rows = [{**lawns.row(number), **topic, **place} for place in ({}, far) for number in (1, 2)]
     path.write_text(to_csv(rows, columns), encoding="utf-8")
-    found = at_hand(read([path], columns))
-    cells = aggregate(found.repeats)
-    said = {one.subject: ends(one) for one in headlines.headlines(cells, found)}
-    assert said == {
+    evidence = at_hand(read([path], columns))
+    cells = aggregate(evidence.repeats)
+    by_subject = {headline.subject: ends(headline) for headline in headlines.headlines(cells, evidence)}
+    assert by_subject == {
         "Repeats": ["4 of 4 valid"],
         "topic loss": ["in all conditions 10.00 %"],
         "topic delay": ["in all conditions 30.00 ms"],
     }
-    drawn = distance.charts(cells, Identities(cells), found, (*distance.LOSS, *distance.DELAY))
+    drawn = distance.charts(cells, Identities(cells), evidence, (*distance.LOSS, *distance.DELAY))
     assert {"topic-loss", "topic-delay-median"} <= {chart.name for chart in drawn}
 
 
-def test_what_iperf3_measured_is_drawn_against_distance_under_its_own_name(tmp_path: Path) -> None:
+def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> None:
     tested = {"iperf3_throughput_bit_s": 5e6, "iperf3_loss": 0.1, "iperf3_captured_loss": 0.12}
     counts = {"iperf3_datagrams_sent": 100, "iperf3_datagrams_received": 90}
     columns = trial_columns((*iperf3.COLUMNS, *load.COLUMNS))
     path = tmp_path / "trial.csv"
     far = {"distance": "20ft", "distance_m": 6.096}
-    rows = [{**lawns.row(number), **tested, **counts, **there} for there in ({}, far) for number in (1, 2)]
+    rows = [{**lawns.row(number), **tested, **counts, **place} for place in ({}, far) for number in (1, 2)]
     path.write_text(to_csv(rows, columns), encoding="utf-8")
     page = put_together(read([path], columns), title="", repeat="", command=["fieldkit"])
     titles = {section.name: [chart.title for chart in section.charts] for section in page.against_distance}
@@ -282,47 +286,47 @@ def test_what_iperf3_measured_is_drawn_against_distance_under_its_own_name(tmp_p
 
 
 def ends(headline: headlines.Headline) -> list[str]:
-    """Return what a headline says, an end each."""
-    said = (filter(None, (one.which, one.value, one.interval, one.place)) for one in headline.ends)
-    return [plain(" ".join(parts)) for parts in said]
+    """Return one text per end of a headline."""
+    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.ends)
+    return [plain(" ".join(parts)) for parts in lines]
 
 
 def plain(text: str) -> str:
     return text.replace("\N{NO-BREAK SPACE}", " ")
 
 
-def test_round_trips_of_different_sizes_have_charts_of_their_own(tmp_path: Path) -> None:
+def test_pings_of_different_sizes_have_separate_charts(tmp_path: Path) -> None:
     udp = {"rtt_payload_bytes": 8192}
     tcp = {"protocol": "tcp", "rtt_payload_bytes": 502, "rtt_median_s": 0.004}
     far = {"distance": "20ft", "distance_m": 6.096}
-    rows = [lawns.row(number, **one, **there) for one in (udp, tcp) for there in ({}, far) for number in (1, 2)]
-    found = at_hand(table(tmp_path, rows))
-    cells = aggregate(found.repeats)
-    of_rtt = list(distance.charts(cells, Identities(cells), found, ["rtt_median_s"]))
-    assert [(one.name, [panel.title for panel in one.panels]) for one in of_rtt] == [
+    rows = [lawns.row(number, **values, **place) for values in (udp, tcp) for place in ({}, far) for number in (1, 2)]
+    evidence = at_hand(table(tmp_path, rows))
+    cells = aggregate(evidence.repeats)
+    of_rtt = list(distance.charts(cells, Identities(cells), evidence, ["rtt_median_s"]))
+    assert [(chart.name, [panel.title for panel in chart.panels]) for chart in of_rtt] == [
         ("rtt-median-502-bytes", ["TCP, master"]),
         ("rtt-median-8192-bytes", ["UDP, master"]),
     ]
-    distributions = [one.name for one in distribution.charts(cells, Identities(cells), found)]
+    distributions = [chart.name for chart in distribution.charts(cells, Identities(cells), evidence)]
     assert distributions[:2] == ["rtt-distribution-502-bytes", "rtt-distribution-8192-bytes"]
 
 
-def test_points_are_joined_from_four_distances_on_and_repeats_stand_behind(tmp_path: Path) -> None:
+def test_points_are_joined_from_four_distances_with_repeats_in_the_background(tmp_path: Path) -> None:
     for count, join in ((3, "none"), (4, "line")):
         rows = [
             lawns.row(number, distance=f"{metres}m", distance_m=float(metres), rtt_median_s=0.01 * number)
             for metres in range(1, 1 + count)
             for number in (1, 2)
         ]
-        found = at_hand(table(tmp_path / join, rows))
-        cells = aggregate(found.repeats)
-        (chart,) = distance.charts(cells, Identities(cells), found, ["rtt_median_s"])
+        evidence = at_hand(table(tmp_path / join, rows))
+        cells = aggregate(evidence.repeats)
+        (chart,) = distance.charts(cells, Identities(cells), evidence, ["rtt_median_s"])
         (series,) = chart.panels[0].series
         assert series.join == join
         assert [y for _, y in series.behind] == pytest.approx([10, 20] * count)
 
 
-def test_an_interval_that_leaves_the_axis_ends_in_an_arrow_and_a_repeat_beyond_is_not_drawn() -> None:
+def test_interval_beyond_the_axis_has_an_arrow_and_repeats_beyond_it_are_not_drawn() -> None:
     def marks(high: float, repeat: float) -> int:
         series = Series("", Style("blue", "o"), [1.0], [2.0], [1.0], [high], behind=[(1.0, repeat)])
         return figures.panel_svg(Panel("", "", "", [series], "", top=4.0)).count("<use ")
@@ -331,32 +335,33 @@ def test_an_interval_that_leaves_the_axis_ends_in_an_arrow_and_a_repeat_beyond_i
     assert marks(3.0, 8.0) == marks(3.0, 3.0) - 1
 
 
-def test_a_lost_last_ping_stands_behind_the_last_reply() -> None:
+def test_lost_last_ping_is_after_the_last_reply() -> None:
     seq, at_s = np.array([1.0, 2.0, 4.0]), np.array([10.0, 10.5, 11.5])
-    assert timeline.left_at(np.array([0, 3, 5, 7]), seq, at_s) == pytest.approx([9.5, 11.0, 12.0, 13.0])
-    assert timeline.left_at(np.array([2]), seq[:1], at_s[:1]) == pytest.approx([11.0])
+    assert timeline.estimate_send_times(np.array([0, 3, 5, 7]), seq, at_s) == pytest.approx([9.5, 11.0, 12.0, 13.0])
+    assert timeline.estimate_send_times(np.array([2]), seq[:1], at_s[:1]) == pytest.approx([11.0])
 
 
 @pytest.mark.parametrize("procedures", ["los nlos", "nlos", "driveaway los nlos", "abroad los selfheal", "driveaway"])
-def test_los_and_nlos_keep_their_looks_whatever_is_beside_them(tmp_path: Path, procedures: str) -> None:
+def test_los_and_nlos_keep_their_style_among_other_procedures(tmp_path: Path, procedures: str) -> None:
     names = procedures.split()
     scenarios = ["nlos" if name == "nlos" else "los" for name in names]
     rows = [
-        lawns.row(1, scenario=one, procedure=name, trial=name) for one, name in zip(scenarios, names, strict=True)
+        lawns.row(1, scenario=scenario, procedure=name, trial=name)
+        for scenario, name in zip(scenarios, names, strict=True)
     ]
     cells = aggregate(table(tmp_path, rows))
     identities = Identities(cells)
-    found = {str(cell.key["procedure"]): identities.of(cell) for cell in cells}
-    looks = {(one.style.colour, one.style.marker): name for name, one in found.items()}
+    by_procedure = {str(cell.key["procedure"]): identities.of(cell) for cell in cells}
+    looks = {(identity.style.colour, identity.style.marker): name for name, identity in by_procedure.items()}
     assert len(looks) == len(names)
     assert looks.get(("blue", "o")) == next((name for name in ("los", "driveaway") if name in names), None)
     assert looks.get(("red", "s")) == ("nlos" if "nlos" in names else None)
     several = scenarios.count("los") > 1
-    assert {name: one.label for name, one in found.items()} == {
+    assert {name: identity.label for name, identity in by_procedure.items()} == {
         name: name.upper() if name in {"los", "nlos"} else f"LOS, {name}" if several else "LOS" for name in names
     }
 
 
-def test_a_table_that_somebody_edited_leads_to_no_folder(tmp_path: Path) -> None:
-    found = at_hand(table(tmp_path, [lawns.row(1, protocol="../../../etc")]))
-    assert found.attempt(0) is None
+def test_edited_table_cannot_refer_to_other_folders(tmp_path: Path) -> None:
+    evidence = at_hand(table(tmp_path, [lawns.row(1, protocol="../../../etc")]))
+    assert evidence.attempt(0) is None

@@ -1,4 +1,4 @@
-"""Which repeat has its time line in a report that was asked for none."""
+"""The repeat selected for the time line by default."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,8 +21,8 @@ FAR = replace(TCP, distance="55ft", distance_m=16.764)
 
 
 @dataclass(frozen=True, eq=False)
-class Imagined(Evidence):
-    """A table beside which the evidence of some rows is at hand."""
+class PartialEvidence(Evidence):
+    """A table with evidence for some of its rows."""
 
     kept: frozenset[int] = frozenset()
 
@@ -30,11 +30,11 @@ class Imagined(Evidence):
         return AttemptEvidence(Path("repeats")) if row in self.kept else None
 
 
-def drawn(rows: Sequence[RepeatRow], *gone: int) -> int | None:
-    """The row whose time line is drawn, where the evidence of all is at hand but of those."""
+def selected_row(rows: Sequence[RepeatRow], *missing: int) -> int | None:
+    """Return the row selected for the time line if evidence exists for all rows except some."""
     table = parsed([replace(row, repeat=1 + number) for number, row in enumerate(rows)])
-    kept = frozenset(range(len(rows))).difference(gone)
-    return repeat_to_draw(aggregate(table), Imagined(table, {}, (), frozenset(), kept), "")
+    kept = frozenset(range(len(rows))).difference(missing)
+    return repeat_to_draw(aggregate(table), PartialEvidence(table, {}, (), frozenset(), kept), "")
 
 
 def each(row: RepeatRow, name: str, *values: float) -> list[RepeatRow]:
@@ -45,20 +45,20 @@ LOST = [*each(TCP, "tcp_byte_loss", 0.3, 0.2, 0.1), *each(FAR, "tcp_byte_loss", 
 
 
 @pytest.mark.parametrize(
-    ("rows", "gone", "row"),
+    ("rows", "missing", "row"),
     [
-        (LOST, (), 6),  # where most is lost, the median of 0.6, 0.7 and 0.9: none that lost nothing
+        (LOST, (), 6),  # condition of most loss, median of 0.6, 0.7 and 0.9; repeats without loss are excluded
         (LOST, (5,), 3),  # the lower one of two
-        (LOST, (3, 5, 6), 1),  # of those that lost there none is at hand
+        (LOST, (3, 5, 6), 1),  # no evidence of repeats with loss in that condition
         (each(TCP, "tcp_byte_loss", 0.0, 0.0) + each(FAR, "rtt_loss", 0.1), (), None),  # a share without its counts
         (each(TCP, "transfer_s", 1.0, 3.0, 2.0) + each(FAR, "transfer_s", 5.0, 4.0, 9.0), (), 3),  # nothing lost
         (each(replace(TCP, tcp_byte_loss=0.0), "rtt_median_s", 0.3, 0.1, 0.2), (), 2),
         (LOST, range(len(LOST)), None),
         ([replace(LOST[0], status="void"), *LOST[1:3]], (), 2),
-        ([replace(LOST[0], file_loss=0.5), *each(TCP, "file_loss", 0.9)], (), 0),  # TCP's own loss says more
+        ([replace(LOST[0], file_loss=0.5), *each(TCP, "file_loss", 0.9)], (), 0),  # TCP byte loss takes precedence
     ],
 )
-def test_a_repeat_of_median_loss_where_most_is_lost(
-    rows: list[RepeatRow], gone: Sequence[int], row: int | None
+def test_default_is_the_repeat_of_median_loss_in_the_condition_of_most_loss(
+    rows: list[RepeatRow], missing: Sequence[int], row: int | None
 ) -> None:
-    assert drawn(rows, *gone) == row
+    assert selected_row(rows, *missing) == row

@@ -1,4 +1,4 @@
-"""The time line of one repeat: bars of steps, faults and moves, and flows, all on one axis of time."""
+"""Time line of one repeat: bars of steps, faults and moves, and flows, on one time axis."""
 
 import json
 import struct
@@ -21,7 +21,7 @@ from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import recorded
 
 BEGAN_NS = recorded.START_NS + 10 * recorded.SECOND_NS
-"""The recording begins then; the transfer 2 s later, the ping 3 s later."""
+"""Start of the recording; the transfer starts 2 s later, the ping 3 s later."""
 BOOT_S = 100
 
 
@@ -32,7 +32,7 @@ def trial(tmp_path: Path) -> Path:
 
 
 def jobs(trial: Path, **spans: tuple[float, float]) -> Path:
-    """Write when jobs ran on the sender, in seconds since the attempt began; return the attempt's folder."""
+    """Write when jobs ran on the sender, seconds since the attempt began; return the attempt's folder."""
     folder = trial / "repeats" / "udp-01"
     lines = [
         f"{name.replace('__', '.').replace('_', '-')} itself 0 {round(100 * (BOOT_S + start))} {BOOT_S + stop:.2f}"
@@ -45,32 +45,32 @@ def jobs(trial: Path, **spans: tuple[float, float]) -> Path:
 
 
 def panels(trial: Path) -> list[Panel]:
-    found = at_hand(sources.find([trial], print).read())
-    row = repeat_to_draw(aggregate(found.repeats), found, "")
+    evidence = at_hand(sources.find([trial], print).read())
+    row = repeat_to_draw(aggregate(evidence.repeats), evidence, "")
     assert row is not None
-    chart, *_ = timeline.charts(row, found)
+    chart, *_ = timeline.charts(row, evidence)
     assert chart.is_stacked
     return list(chart.panels)
 
 
 def bars(panel: Panel) -> dict[str, tuple[float, float]]:
-    """Return from when until when each lane has a bar, to 10 ms."""
+    """Return start and stop of the bar in each lane, rounded to 10 ms."""
     return {panel.lanes[span.lane]: (round(span.start, 2), round(span.stop, 2)) for span in panel.spans}
 
 
-def test_jobs_have_bars_and_all_panels_one_axis(trial: Path) -> None:
+def test_jobs_have_bars_and_panels_share_one_axis(trial: Path) -> None:
     jobs(trial, capture=(1.0, 6.0), ping=(2.9, 5.0))
-    found = panels(trial)
-    shown = bars(found[0])
+    all_panels = panels(trial)
+    shown = bars(all_panels[0])
     assert shown["capture"][1] - shown["capture"][0] == pytest.approx(5.0, abs=0.02)
     assert shown["ping"][1] - shown["ping"][0] == pytest.approx(2.1, abs=0.02)
     assert shown["send"][0] - shown["capture"][0] == pytest.approx(1.0, abs=0.02)
-    assert len({(panel.left, panel.right) for panel in found}) == 1
-    assert [panel.x_label for panel in found] == [""] * (len(found) - 1) + ["time [s]"]
-    assert found[0].left == 0
+    assert len({(panel.left, panel.right) for panel in all_panels}) == 1
+    assert [panel.x_label for panel in all_panels] == [""] * (len(all_panels) - 1) + ["time [s]"]
+    assert all_panels[0].left == 0
 
 
-def test_a_fault_has_a_bar_for_its_cause_and_one_for_the_time_without_an_answer(trial: Path) -> None:
+def test_fault_has_a_bar_for_its_cause_and_one_for_the_time_without_replies(trial: Path) -> None:
     folder = jobs(trial, fault_link_down=(1.0, 9.0), fault_link_down_heals=(5.0, 8.0))
     (folder / "fault-link-down.txt").write_text("lasted_s 2.000\ninterval_s 0.1\n", encoding="ascii")
     replies = [
@@ -88,14 +88,14 @@ def test_a_fault_has_a_bar_for_its_cause_and_one_for_the_time_without_an_answer(
     assert "fault-link-down" not in shown
 
 
-def test_a_move_has_a_bar_from_its_first_step_to_its_last(trial: Path) -> None:
+def test_move_has_a_bar_from_its_first_to_its_last_position(trial: Path) -> None:
     folder = jobs(trial, capture=(1.0, 9.0))
-    went = [
+    moved = [
         Whereabouts(BEGAN_NS + 2 * 10**9 + round(n * 1e8), Role.RECEIVER, (10.0 + n / 10, 0.0, 0.2))
         for n in range(21)
     ]
-    stood = [Whereabouts(1, Role.RECEIVER, (10.0, 0.0, 0.2)), Whereabouts(1, Role.SENDER, (0.0, 0.0, 0.2))]
-    (folder / track.FILE).write_text(track.text([*stood, *went]), encoding="ascii")
+    initial = [Whereabouts(1, Role.RECEIVER, (10.0, 0.0, 0.2)), Whereabouts(1, Role.SENDER, (0.0, 0.0, 0.2))]
+    (folder / track.FILE).write_text(track.text([*initial, *moved]), encoding="ascii")
     start, stop = bars(panels(trial)[0])["move receiver"]
     assert stop - start == pytest.approx(2.0, abs=0.02)
 
@@ -110,8 +110,8 @@ def test_a_ping_without_any_reply_shows_all_its_losses(trial: Path) -> None:
     assert trips.words == "0 round trips; 10 without a reply"
 
 
-def with_step(trial: Path, text: str) -> None:
-    """Let the trial's procedure have one more step."""
+def add_step(trial: Path, text: str) -> None:
+    """Add a step to the trial's procedure."""
     plan = store.read_plan(trial)
     extra = procedure.Procedure.model_validate(
         {"name": "los", "summary": "s", "scenario": "los", "topology": "master", "protocols": ["udp"], "repeats": 1}
@@ -122,8 +122,8 @@ def with_step(trial: Path, text: str) -> None:
     (trial / PLAN_FILE).write_text(schema.dump(changed), encoding="utf-8")
 
 
-def test_iperf3_has_a_panel_of_its_rate_second_by_second(trial: Path) -> None:
-    with_step(trial, '{"iperf3": {"from": "sender", "to": "receiver", "duration": "3s"}}')
+def test_iperf3_has_a_panel_of_its_rate_per_second(trial: Path) -> None:
+    add_step(trial, '{"iperf3": {"from": "sender", "to": "receiver", "duration": "3s"}}')
     folder = jobs(trial, iperf3_client=(4.0, 7.0))
     intervals = [{"sum": {"seconds": 1.0, "bytes": size}} for size in (125_000, 250_000, 0)]
     test = {"start": {}, "intervals": intervals, "end": {}}
@@ -135,7 +135,7 @@ def test_iperf3_has_a_panel_of_its_rate_second_by_second(trial: Path) -> None:
 
 
 def test_a_topic_has_a_panel_of_its_delays_and_losses(trial: Path) -> None:
-    with_step(
+    add_step(
         trial, '{"topics": {"from": "sender", "to": "receiver", "over": "dds", "rate": "10Hz", "bytes": "100B"}}'
     )
     folder = jobs(trial, publish=(4.0, 7.0))
@@ -157,7 +157,7 @@ def test_a_topic_has_a_panel_of_its_delays_and_losses(trial: Path) -> None:
     log("sender-topic.bin", (0, 1, 2, 3, 4), 0)
     log("receiver-topic.bin", (0, 2, 3), 10**6)
     delays = next(panel for panel in panels(trial) if "beyond its fastest sample" in panel.title)
-    came, lost = delays.series
-    assert list(came.y) == pytest.approx([0.0, 0.0, 5.0])
+    received, lost = delays.series
+    assert list(received.y) == pytest.approx([0.0, 0.0, 5.0])
     assert np.diff(lost.x) == pytest.approx([0.3])
     assert delays.words == "5 samples sent, 2 lost, 3 received"

@@ -301,7 +301,7 @@ def test_what_is_no_message_is_dropped_and_counted_and_others_go_on(monkeypatch:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--from", "ros1", "--to", "dds"), "no topic is named"),
+        (("--from", "ros1", "--to", "dds"), "no topic is given"),
         (("--from", "ros1", "--to", "dds", "/scan"), "'/scan' is no topic and its type"),
         (("--from", "ros1", "--to", "dds", "/scan:sensor_msgs/LasrScan"), "there is no message type"),
         (("--from", "ros1", "--to", "dds", "/marker:visualization_msgs/Marker"), "not the same in ROS 1 and ROS 2"),
@@ -310,11 +310,11 @@ def test_what_is_no_message_is_dropped_and_counted_and_others_go_on(monkeypatch:
         (("--from", "ros1", "--to", "dds", SCAN, "--both", SCAN), "/scan is named twice"),
         (("--from", "dds", "--to", "dds", SCAN), "a bridge from dds to dds is none"),
         (("--from", "ros2", "--to", "dds", SCAN), "cannot be 'ros2'"),
-        (("--from", "ros1", "--to", "dds", SCAN, "--address", "robot"), "'robot' is no IPv4 address"),
-        (("--from", "ros1", "--to", "dds", SCAN, "--master", "http://robot"), "is no host and port"),
-        (("--from", "ros1", "--to", "dds", SCAN, "--domain", "230"), "230 is no domain of ROS 2"),
-        (("--from", "ros1", "--to", "dds", SCAN, "--node", "a b"), "'a b' is no name of a node"),
-        (("--from", "ros1", "--to", "dds", SCAN, "--type", "Radio"), "'Radio' is no type and its file"),
+        (("--from", "ros1", "--to", "dds", SCAN, "--address", "robot"), "'robot' is not an IPv4 address"),
+        (("--from", "ros1", "--to", "dds", SCAN, "--master", "http://robot"), "is not a host and port"),
+        (("--from", "ros1", "--to", "dds", SCAN, "--domain", "230"), "230 is not a domain of ROS 2"),
+        (("--from", "ros1", "--to", "dds", SCAN, "--node", "a b"), "'a b' is not a valid node name"),
+        (("--from", "ros1", "--to", "dds", SCAN, "--type", "Radio"), "'Radio' is not a message type and its file"),
         (
             ("--from", "ros1", "--to", "dds", SCAN, "--type", "lab_msgs/Radio=no.msg"),
             "no.msg: cannot be read",

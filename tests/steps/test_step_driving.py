@@ -142,7 +142,7 @@ def test_invalid_domain_is_reported_with_line_of_profile(domain: str) -> None:
     data = TURTLEBOT.model_dump(mode="json", by_alias=True)
     data["ros"]["environment"] = {"ROS_DOMAIN_ID": domain}
     text = json.dumps(data, indent=1, ensure_ascii=False)
-    with pytest.raises(ConfigurationError, match="no domain of ROS 2; take a whole number from 0 to 232") as caught:
+    with pytest.raises(ConfigurationError, match="not a domain of ROS 2; use a whole number from 0 to 232") as caught:
         schema.validate(schema.parse(text, source="robots/x.yaml"), RobotProfile)
     line = next(number for number, line in enumerate(text.split("\n"), 1) if "ROS_DOMAIN_ID" in line)
     assert caught.value.where == f"robots/x.yaml:{line}"

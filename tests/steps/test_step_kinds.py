@@ -119,7 +119,7 @@ def test_kind_has_the_name_of_its_entry_point(install: Install) -> None:
 
 def test_error_of_unknown_kind_mentions_packages(install: Install) -> None:
     install()
-    with pytest.raises(ValidationError, match=r"unknown key zoom; .* comes with a package to be installed"):
+    with pytest.raises(ValidationError, match=r"unknown key zoom; .* need a package that is not installed"):
         TypeAdapter(tuple[StepEntry, ...]).validate_python([{"zoom": {}}])
 
 

@@ -1,4 +1,4 @@
-"""`fieldkit abort`: end what fieldkit left on the robots, from any laptop."""
+"""`fieldkit abort`: terminate all programs of fieldkit on the robots, from any laptop."""
 
 import argparse
 from typing import Final
@@ -15,27 +15,29 @@ from fieldkit.core.units import format_count
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit abort` takes."""
+    """Declare the arguments of `fieldkit abort`."""
     parser.description = (
-        "End every job of fieldkit on every robot of the site file, of any trial and from any laptop, and break the "
-        "robots' locks. Lists per robot the jobs that were ended, and processes whose folder was removed; `not "
-        "locked` means that no program held the robot. A trial that runs there stops, and reports who aborted it. "
-        "Exit code 3 if a robot was not reached, a job was not ended or, on a full disk, a lock was not broken; 1 "
-        "after the answer no. The other robots are served nevertheless. Emulated robots end with their lab, so "
-        "nothing is done for them."
+        "Terminate every job of fieldkit on every robot of the site file, of any trial and from any laptop, and "
+        "break the robots' locks. Lists per robot the jobs that were terminated, and processes whose folder was "
+        "removed; `not locked` means that no program held the robot. A trial that runs there stops, and reports who "
+        "aborted it. Exit code 3 if a robot was not reached, a job was not terminated or, on a full disk, a lock was "
+        "not broken; 1 after the answer no. The other robots are processed nevertheless. Emulated robots stop with "
+        "their lab, so nothing is done for them."
     )
     shared.add_site(parser)
     parser.add_argument("--yes", action="store_true", help="do not ask; required without a terminal")
     parser.set_defaults(run=run)
 
 
-_NONE: Final = "no robot stands without fieldkit on this backend: its robots end with their lab"
+_NONE: Final = "the robots of this backend run only while their lab runs, so there is nothing to abort"
 
-_ENDS: Final = "It ends when the drone has landed, 60 s after the last heartbeat of its autopilot, or after 10 min"
+_ENDS: Final = (
+    "It terminates when the drone has landed, 60 s after the last heartbeat of its autopilot, or after 10 min"
+)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Abort, and print what was ended robot by robot."""
+    """Abort, and print the terminated jobs robot by robot."""
     from fieldkit.cli import options
     from fieldkit.remote.motion import IN_WORDS, MotionState
     from fieldkit.trial.running import locks
@@ -46,20 +48,20 @@ def run(arguments: argparse.Namespace) -> int:
             if not robots:
                 sink(Note(_NONE))
                 return 0
-            question = f"end every job of fieldkit on {', '.join(robots)}"
+            question = f"terminate every job of fieldkit on {', '.join(robots)}"
             if not arguments.yes and not confirmed(question, unasked="fieldkit abort --yes"):
-                say("nothing was ended")
+                say("nothing was terminated")
                 return FieldkitError.exit_code
-            ended = locks.abort(robots, runtime.me())
-    for robot, one in ended.items():
-        count = f"{format_count(len(one.jobs), 'job')} ended"
-        if one.error is None:
-            say(f"{robot}: {'lock broken' if one.locked else 'not locked'}, {count}")
-        elif one.jobs:
+            results = locks.abort(robots, runtime.me())
+    for robot, result in results.items():
+        count = f"{format_count(len(result.jobs), 'job')} terminated"
+        if result.error is None:
+            say(f"{robot}: {'lock broken' if result.locked else 'not locked'}, {count}")
+        elif result.jobs:
             say(f"{robot}: {count}")
-        say("".join(f"  {job}\n" for job in one.jobs), end="")
-        for program, state in one.landing:
+        say("".join(f"  {job}\n" for job in result.jobs), end="")
+        for program, state in result.landing:
             say(f"  {program.rpartition('/')[2]} still runs: {IN_WORDS[MotionState(state)]}. {_ENDS}")
-        if one.error is not None:
-            show_error(str(one.error))
-    return RobotError.exit_code if any(aborted.error for aborted in ended.values()) else 0
+        if result.error is not None:
+            show_error(str(result.error))
+    return RobotError.exit_code if any(result.error for result in results.values()) else 0

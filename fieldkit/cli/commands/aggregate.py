@@ -7,10 +7,8 @@ from fieldkit.cli.parser import Parser
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit aggregate` takes."""
-    parser.description = (
-        "Put the repeats of any number of trials together, condition by condition, with 95 % intervals."
-    )
+    """Declare the arguments of `fieldkit aggregate`."""
+    parser.description = "Aggregate the repeats of any number of trials, condition by condition, with 95 % intervals."
     parser.epilog = "example: fieldkit aggregate trials --by distance,protocol --quantity ip_loss"
     shared.add_paths(parser)
     shared.add_cells(parser)
@@ -19,8 +17,8 @@ def add(parser: Parser) -> None:
         action="append",
         default=[],
         metavar="NAME",
-        help="column to show, may be given more than once (default: table: an operator's; latex: RTT and losses; "
-        "others: all)",
+        help="column to show; may be given more than once (default: the main ones for table, RTT and losses for "
+        "latex, else all)",
     )
     shared.add_all(parser)
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""`fieldkit bridge`: carry topics between middlewares until a signal, then tell what was carried."""
+"""`fieldkit bridge`: carry topics between middlewares until a signal, then report the counts."""
 
 import argparse
 import ipaddress
@@ -31,14 +31,17 @@ from fieldkit.ros.ports import MOST_DOMAIN
 from fieldkit.ros.types import Distribution, MessageTypes
 
 MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
-"""`agent.middleware.ADAPTERS`, which a test compares, without `ros2`: that needs the Python of a robot's ROS 2."""
+"""The keys of `agent.middleware.ADAPTERS`, which a test compares, without `ros2`.
+
+That adapter needs the Python of a robot's ROS 2.
+"""
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit bridge` takes."""
+    """Declare the arguments of `fieldkit bridge`."""
     parser.description = (
-        "Carry topics from one middleware to another until Ctrl-C or SIGTERM, then report how many messages and how "
-        "late. TOPIC is NAME:TYPE, or NAME:TYPE:QOS. QOS is a profile of ROS 2 (default, sensor_data, "
+        "Carry topics from one middleware to another until Ctrl-C or SIGTERM, then report the number of messages and "
+        "their delay. TOPIC is NAME:TYPE, or NAME:TYPE:QOS. QOS is a profile of ROS 2 (default, sensor_data, "
         "services_default, parameters, parameter_events, system_default), or policies (reliable, best_effort, "
         "keep_all, transient_local, depth=N), or a profile and then policies, separated by commas."
     )
@@ -49,15 +52,15 @@ def add(parser: Parser) -> None:
     parser.add_choice("--from", MIDDLEWARES, dest="near", required=True, help=f"one of: {', '.join(MIDDLEWARES)}")
     parser.add_choice("--to", MIDDLEWARES, dest="far", required=True, help="another of them")
     parser.add_argument("topics", metavar="TOPIC", nargs="*", help="goes from the first to the second")
-    for option, what in (("--back", "goes the other way"), ("--both", "goes both ways")):
+    for option, text in (("--back", "goes in the other direction"), ("--both", "goes in both directions")):
         parser.add_argument(
-            option, metavar="TOPIC", action="append", default=[], help=f"{what}; may be given more than once"
+            option, metavar="TOPIC", action="append", default=[], help=f"{text}; may be given more than once"
         )
     parser.add_argument(
         "--address",
         metavar="IP",
         default="127.0.0.1",
-        help="address of this machine where the others are (default: 127.0.0.1)",
+        help="address of this machine in the network of the other nodes (default: 127.0.0.1)",
     )
     parser.add_argument(
         "--master", metavar="HOST[:PORT]", help="master of ROS 1 (default: ROS_MASTER_URI, or this address and 11311)"
@@ -71,7 +74,7 @@ def add(parser: Parser) -> None:
         metavar="IP",
         action="append",
         default=[],
-        help="who is asked over DDS or Zenoh in place of multicast; may be given more than once",
+        help="peer over DDS or Zenoh, contacted in place of multicast discovery; may be given more than once",
     )
     parser.add_argument(
         "--domain", type=shared.natural, metavar="N", help="domain of ROS 2 (default: ROS_DOMAIN_ID, or 0)"
@@ -93,7 +96,7 @@ def add(parser: Parser) -> None:
         metavar="NAME=FILE",
         action="append",
         default=[],
-        help="a message type of your own and its .msg file; may be given more than once",
+        help="an additional message type and its .msg file; may be given more than once",
     )
     parser.add_argument(
         "--json",
@@ -103,7 +106,7 @@ def add(parser: Parser) -> None:
     parser.set_defaults(run=run)
 
 
-_LOOKS_S: Final = 1.0
+_POLL_S: Final = 1.0
 _ROUTER_PORT: Final = 7447
 _NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
@@ -112,61 +115,65 @@ def run(arguments: argparse.Namespace) -> int:
     """Carry topics until SIGINT or SIGTERM."""
     crossings = _crossings(arguments)
     types = MessageTypes(Distribution(arguments.distribution), dict(map(_definition, arguments.type)))
-    near, far = (Side(over, _network(over, arguments)) for over in (arguments.near, arguments.far))
-    with _until_signal() as over, bridge.bridged(near, far, crossings, types) as carriers:
-        show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C ends it")
-        _watch(carriers, over)
-        told = [carrier.told() for carrier in carriers]
+    near, far = (Side(middleware, _network(middleware, arguments)) for middleware in (arguments.near, arguments.far))
+    with _until_signal() as stopped, bridge.bridged(near, far, crossings, types) as carriers:
+        show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C stops it")
+        _watch(carriers, stopped)
+        counts = [carrier.told() for carrier in carriers]
     if arguments.json:
-        say(json_text([asdict(crossed) for crossed in told]))
+        say(json_text([asdict(crossed) for crossed in counts]))
     else:
-        _show(told)
+        _show(counts)
     return 0
 
 
 def _crossings(arguments: argparse.Namespace) -> list[Crossing]:
-    there = [Crossing.parse(text) for text in (*arguments.topics, *arguments.both)]
+    forward = [Crossing.parse(text) for text in (*arguments.topics, *arguments.both)]
     back = [Crossing.parse(text, back=True) for text in (*arguments.back, *arguments.both)]
-    if not there and not back:
-        raise ConfigurationError("no topic is named", remedy="for example /scan:sensor_msgs/LaserScan")
-    return there + back
+    if not forward and not back:
+        raise ConfigurationError("no topic is given", remedy="for example /scan:sensor_msgs/LaserScan")
+    return forward + back
 
 
 def _definition(text: str) -> tuple[str, str]:
     name, _, path = text.partition("=")
     if "/" not in name or not path:
-        raise ConfigurationError(f"{text!r} is no type and its file", remedy="write it as lab_msgs/Radio=Radio.msg")
+        raise ConfigurationError(
+            f"{text!r} is not a message type and its file", remedy="write it as lab_msgs/Radio=Radio.msg"
+        )
     try:
         return name, Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
-        raise ConfigurationError(f"cannot be read: {why}", where=path, remedy="name a .msg file of ROS") from error
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
+        raise ConfigurationError(f"cannot be read: {reason}", where=path, remedy="name a .msg file of ROS") from error
 
 
-def _network(over: str, arguments: argparse.Namespace) -> Network:
-    """Return how the bridge takes part in a middleware."""
+def _network(middleware: str, arguments: argparse.Namespace) -> Network:
+    """Return the settings with which the bridge joins a middleware."""
     if not _NODE.fullmatch(arguments.node):
-        raise ConfigurationError(f"{arguments.node!r} is no name of a node", remedy="letters, digits and underscores")
+        raise ConfigurationError(
+            f"{arguments.node!r} is not a valid node name", remedy="use letters, digits and underscores"
+        )
     common = {"address": _address(arguments.address), "domain": _domain(arguments.domain), "node": arguments.node}
-    if over == "ros1":
+    if middleware == "ros1":
         uri = os.environ.get("ROS_MASTER_URI", "")
         host, port = _host(arguments.master or urlsplit(uri).netloc or arguments.address, ROS_MASTER_PORT)
         settings = {"patience_s": str(arguments.patience), "tcp_nodelay": "1"}
         return Network(discovery="master", server=host, port=port, settings=settings, **common)
-    if over == "zenoh" and arguments.router:
+    if middleware == "zenoh" and arguments.router:
         host, port = _host(arguments.router, _ROUTER_PORT)
         return Network(discovery="router", server=host, port=port, **common)
     peers = tuple(map(_address, arguments.peer))
-    # Another Zenoh of this machine may have the usual port.
-    own = {"listen/endpoints": json.dumps([f"tcp/{common['address']}:0"])} if over == "zenoh" else {}
-    return Network(discovery="peers" if peers else "multicast", peers=peers, settings=own, **common)
+    # Another Zenoh program of this machine may use the default port.
+    settings = {"listen/endpoints": json.dumps([f"tcp/{common['address']}:0"])} if middleware == "zenoh" else {}
+    return Network(discovery="peers" if peers else "multicast", peers=peers, settings=settings, **common)
 
 
 def _address(text: str) -> str:
     try:
         return str(ipaddress.IPv4Address(text))
     except ValueError:
-        raise ConfigurationError(f"{text!r} is no IPv4 address", remedy="for example 10.42.0.1") from None
+        raise ConfigurationError(f"{text!r} is not an IPv4 address", remedy="for example 10.42.0.1") from None
 
 
 def _host(text: str, usual_port: int) -> tuple[str, int]:
@@ -176,7 +183,7 @@ def _host(text: str, usual_port: int) -> tuple[str, int]:
             return parts.hostname, parts.port or usual_port
     except ValueError:
         pass
-    raise ConfigurationError(f"{text!r} is no host and port", remedy=f"write it as 10.42.0.1:{usual_port}")
+    raise ConfigurationError(f"{text!r} is not a host and port", remedy=f"write it as 10.42.0.1:{usual_port}")
 
 
 def _domain(given: int | None) -> int:
@@ -185,34 +192,37 @@ def _domain(given: int | None) -> int:
     if 0 <= number <= MOST_DOMAIN:
         return number
     raise ConfigurationError(
-        f"{text if given is None else given} is no domain of ROS 2", remedy=f"0 to {MOST_DOMAIN}"
+        f"{text if given is None else given} is not a domain of ROS 2", remedy=f"use 0 to {MOST_DOMAIN}"
     )
 
 
 @contextmanager
 def _until_signal() -> Iterator[threading.Event]:
-    """Give what SIGINT and SIGTERM set while the body runs."""
-    over = threading.Event()
-    before = {number: signal.signal(number, lambda *_: over.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    """Yield an event that SIGINT and SIGTERM set while the body runs."""
+    stopped = threading.Event()
+    previous = {number: signal.signal(number, lambda *_: stopped.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield over
+        yield stopped
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
-def _watch(carriers: Sequence[Carrier], over: threading.Event) -> None:
-    """Wait for the end; tell once of each topic that others have with another type."""
-    known: set[str] = set()
-    while not over.wait(_LOOKS_S):
+def _watch(carriers: Sequence[Carrier], stopped: threading.Event) -> None:
+    """Wait for `stopped`. Report once per topic that other nodes use it with another type."""
+    reported: set[str] = set()
+    while not stopped.wait(_POLL_S):
         for sentence in chain.from_iterable(carrier.other_types() for carrier in carriers):
-            if sentence not in known:
-                known.add(sentence)
-                show_error(f"{sentence}\n  remedy: name the topic with its own type; nothing of the other is carried")
+            if sentence not in reported:
+                reported.add(sentence)
+                show_error(
+                    f"{sentence}\n  remedy: give the topic with the type of its publishers; messages of another type "
+                    "are not carried"
+                )
 
 
-def _show(told: Sequence[Crossed]) -> None:
-    head = ("topic", "way", "messages", "a second", "bytes", "refused", "unreadable", "median", "99 %")
+def _show(counts: Sequence[Crossed]) -> None:
+    head = ("topic", "direction", "messages", "a second", "bytes", "refused", "unreadable", "median", "99 %")
     rows = [
         (
             crossed.topic,
@@ -225,7 +235,7 @@ def _show(told: Sequence[Crossed]) -> None:
             _milliseconds(crossed.delay_median_s),
             _milliseconds(crossed.delay_p99_s),
         )
-        for crossed in told
+        for crossed in counts
     ]
     table(head, rows, right=range(2, len(head)))
 

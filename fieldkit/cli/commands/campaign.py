@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit campaign` takes."""
+    """Declare the arguments of `fieldkit campaign`."""
     parser.description = (
         "Run the trials of a campaign file in a shuffled order; the same command continues them later."
     )
@@ -25,9 +25,9 @@ def add(parser: Parser) -> None:
     shared.add_site(parser)
     shared.add_out(parser, "the campaign's folder goes")
     parser.add_argument(
-        "--dry-run", action="store_true", help="print order, path, time and disk space; touch nothing"
+        "--dry-run", action="store_true", help="print order, path, time and disk space; change nothing"
     )
-    parser.add_argument("--failed", action="store_true", help="redo the repeats that failed, too")
+    parser.add_argument("--failed", action="store_true", help="also repeat the failed repeats")
     shared.add_json(parser)
     shared.add_operator(parser)
     shared.add_junit(parser)
@@ -35,7 +35,7 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run what is left of the campaign."""
+    """Run the remaining trials of the campaign."""
     from fieldkit.campaign import plan
     from fieldkit.campaign.journal import CampaignJournal
     from fieldkit.campaign.runner import CampaignRun
@@ -43,20 +43,20 @@ def run(arguments: argparse.Namespace) -> int:
 
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = options.backend(arguments, sink)
-        asked, document = plan.make_plan(arguments.file, name)
-        folder = arguments.out / f"campaign_{asked.campaign.name}"
-        begun = plan.begun(folder, asked, document)
-        campaign = CampaignRun(begun or asked, CampaignJournal(folder), backend, sink, failed=arguments.failed)
+        planned, document = plan.make_plan(arguments.file, name)
+        folder = arguments.out / f"campaign_{planned.campaign.name}"
+        started = plan.begun(folder, planned, document)
+        campaign = CampaignRun(started or planned, CampaignJournal(folder), backend, sink, failed=arguments.failed)
         campaign.announce()
         if arguments.dry_run:
             return 0
         with options.operator(arguments, sink) as operator:
             outcome = campaign.run(operator, stop)
-    results.keep_junit(arguments, outcome.folders)
-    return _code(outcome, arguments.file, folder)
+    results.write_junit(arguments, outcome.folders)
+    return _exit_code(outcome, arguments.file, folder)
 
 
-def _code(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
+def _exit_code(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
     if outcome.failed:
         failed = format_count(outcome.failed, "repeat")
         remedy = (
@@ -65,10 +65,10 @@ def _code(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
         show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}\n  remedy: {remedy}")
     if outcome.left:
         names = ", ".join(map(str, outcome.left))
-        show_error(f"skipped: {names}\n  remedy: give the same command again to run what was skipped")
+        show_error(f"skipped: {names}\n  remedy: run the same command again for the skipped trials")
     if outcome.unmet:
         unmet = format_count(outcome.unmet, "expectation")
-        show_error(f"{unmet} not shown to hold\n  remedy: {typed('fieldkit', 'aggregate', folder)} tells which")
+        show_error(f"{unmet} not shown to hold\n  remedy: {typed('fieldkit', 'aggregate', folder)} lists them")
     if outcome.failed:
         return EvidenceError.exit_code
     return FieldkitError.exit_code if outcome.left or outcome.unmet else 0

@@ -1,4 +1,4 @@
-"""`fieldkit check`: what a trial needs of robots and laptop, one line each, with what to type where it is not so."""
+"""`fieldkit check`: check the requirements of a trial on robots and laptop, with a remedy for each problem."""
 
 import argparse
 from datetime import UTC, datetime
@@ -14,11 +14,11 @@ from fieldkit.core.prompts import Nobody
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit check` takes."""
+    """Declare the arguments of `fieldkit check`."""
     parser.description = (
         "Check everything that a trial of the procedure needs from the robots and from this machine; change nothing, "
-        "and ask nobody to place robots. `fieldkit trial` does this too, without a test recording. --repeats and "
-        "--record are those of the planned trial, for the estimate of disk space."
+        "and do not ask for robots to be placed. `fieldkit trial` does this too, without a test recording. --repeats "
+        "and --record are those of the planned trial, for the estimate of disk space."
     )
     parser.takes_lengths = True
     parser.epilog = "example: fieldkit check los --topology masterless"
@@ -31,12 +31,12 @@ def add(parser: Parser) -> None:
     parser.set_defaults(run=run)
 
 
-# Nobody is asked to carry anything; robots that fieldkit places itself stand next to each other.
+# No person places robots for a check. Robots that fieldkit places are next to each other.
 _CLOSE = Distance(metres=1.0, label="check")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Check, print every finding, and return whether a trial could begin."""
+    """Check, print every finding, and return 0 if a trial could start."""
     from fieldkit.cli import options
     from fieldkit.trial.request import make_plan
     from fieldkit.trial.running import preflight
@@ -55,4 +55,4 @@ def run(arguments: argparse.Namespace) -> int:
                 sink(finding)
     if not arguments.json:
         show_findings(findings)
-    return RobotError.exit_code if any(one.status is Verdict.FAIL for one in findings) else 0
+    return RobotError.exit_code if any(finding.status is Verdict.FAIL for finding in findings) else 0

@@ -1,6 +1,6 @@
 """Complete command lines in bash, zsh and fish. The only user of argcomplete.
 
-Argcomplete runs fieldkit at each press of the Tab key, so nothing here imports what reads files strictly.
+Argcomplete runs fieldkit at each press of the Tab key, so nothing here imports the strict readers of files.
 """
 
 import argparse
@@ -24,7 +24,7 @@ SHELLS: Final = ("bash", "zsh", "fish")
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit completion` takes."""
+    """Declare the arguments of `fieldkit completion`."""
     parser.description = (
         "Print a script with which the Tab key completes commands, options, robots, procedures, backends and trial "
         "folders. In zsh, compinit must have run before."
@@ -38,34 +38,34 @@ def add(parser: Parser) -> None:
 
 
 PLAN_FILE: Final = "trial.yaml"
-"""`trial.plan.PLAN_FILE`, which a test compares."""
+"""Equal to `trial.plan.PLAN_FILE`; a test compares them."""
 
 _TRIALS: Final = "trials"
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what a shell evaluates."""
+    """Print the script that a shell evaluates."""
     print(shellcode(["fieldkit"], use_defaults=False, shell=arguments.shell), end="")
     return 0
 
 
 def answer(parser: Parser) -> None:
-    """Write how the shell's line may go on, and end the process."""
-    _complete_named(parser)
+    """Write the completions of the shell's command line, and exit."""
+    _declare_command(parser)
     argcomplete.autocomplete(parser, always_complete_options=False, default_completer=_Values())
 
 
-def _complete_named(parser: Parser) -> None:
-    """Let the command in the shell's line know what it takes: argcomplete looks for that before it parses."""
+def _declare_command(parser: Parser) -> None:
+    """Declare the arguments of the command in the shell's line, which argcomplete needs before it parses."""
     words = os.environ["COMP_LINE"].split()
     command = parser.command(words[1]) if len(words) > 1 else None
     if command is not None:
-        with suppress(FieldkitError):  # whoever runs the command is told what is wrong with its package
+        with suppress(FieldkitError):  # running the command reports the error of its package
             command.complete()
 
 
 class _Values(BaseCompleter):
-    """Values of arguments, by the name under which argparse keeps them; a free text has none."""
+    """Completes values of arguments by their names in the namespace of argparse. Free text has no values."""
 
     def __call__(
         self, *, prefix: str, action: argparse.Action, parser: argparse.ArgumentParser, **_: object
@@ -83,7 +83,7 @@ def _robots_of_site() -> list[str]:
     try:
         robots = documents.read(Path(locations.SITE_FILE)).data["robots"]
     except (FieldkitError, KeyError, TypeError):
-        return []  # whoever runs the command is told what is wrong with the file
+        return []  # running the command reports the error of the file
     return list(robots) if isinstance(robots, dict) else []
 
 
@@ -98,17 +98,17 @@ def _robots_of_lab() -> list[str]:
 
 
 def _trials(prefix: str) -> Iterator[str]:
-    """Yield trials where `prefix` leads to, and the folders in which others may be; at first those in `trials`."""
-    folder = os.path.dirname(prefix)  # noqa: PTH120 (a Path forgets `./` and a slash at the end)
-    for place in (folder,) if prefix else ("", _TRIALS):
+    """Yield trials and other folders whose paths start with `prefix`; without a prefix also those in `trials`."""
+    folder = os.path.dirname(prefix)  # noqa: PTH120 (a Path drops `./` and a trailing slash)
+    for parent in (folder,) if prefix else ("", _TRIALS):
         try:
-            with os.scandir(place or ".") as scan:
+            with os.scandir(parent or ".") as scan:
                 entries = sorted(scan, key=lambda entry: entry.name)
         except OSError:
             continue
         for entry in entries:
             if entry.is_dir() and not entry.name.startswith("."):
-                path = os.path.join(place, entry.name)  # noqa: PTH118 (as above)
+                path = os.path.join(parent, entry.name)  # noqa: PTH118 (as above)
                 yield path if os.path.exists(f"{path}/{PLAN_FILE}") else f"{path}/"  # noqa: PTH110 (as above)
 
 

@@ -10,7 +10,7 @@ from fieldkit.core.printing import say
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit docs` takes."""
+    """Declare the arguments of `fieldkit docs`."""
     parser.description = (
         "Open the documentation of this version in a browser. It is installed with fieldkit and needs no network. "
         "TOPIC is the name of a page, such as field, steps or errors, or of a command, such as trial."

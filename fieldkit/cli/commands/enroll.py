@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit enroll` takes."""
+    """Declare the arguments of `fieldkit enroll`."""
     parser.description = (
         "Ask a robot for its SSH host key (ed25519 if it has one) without logging in, show type and fingerprint, ask "
         "for confirmation, and write the key into the site file as host_key; nothing else in the file changes. A key "
@@ -29,12 +29,12 @@ def add(parser: Parser) -> None:
         "--site", type=Path, metavar="FILE", default=Path(SITE_FILE), help=f"site file (default: {SITE_FILE})"
     )
     parser.add_argument("--yes", action="store_true", help="do not ask for confirmation; required without a terminal")
-    parser.add_argument("--replace", action="store_true", help="pin it also in place of another one")
+    parser.add_argument("--replace", action="store_true", help="replace another pinned key")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Pin the key, or say that it is pinned."""
+    """Pin the key, unless it is pinned already."""
     from fieldkit.config import site_file
     from fieldkit.remote.link import over_tcp
     from fieldkit.remote.login import offered_key
@@ -51,13 +51,14 @@ def run(arguments: argparse.Namespace) -> int:
         kind=pinned.kind if pinned else "ssh-ed25519",
     )
     if offered == pinned:
-        say(f"{name}: this key is pinned already: {offered.fingerprint}")
+        say(f"{name}: this key is already pinned: {offered.fingerprint}")
         return 0
     if pinned is not None and not arguments.replace:
         raise HostKeyError(
             f"the host key changed: pinned {pinned.fingerprint}, offered {offered.fingerprint}",
             where=f"{where}: {name}",
-            remedy=f"if it was reinstalled: fieldkit enroll {name} --replace; if not, another computer answers",
+            remedy=f"if the robot was reinstalled: fieldkit enroll {name} --replace; if not, another computer "
+            "answered",
         )
     _show(address, offered, pinned)
     if not arguments.yes and not confirmed("pin it", unasked="compare the fingerprints, then add --yes"):
@@ -69,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _robot(name: str, path: Path) -> "tuple[SiteRobot, str]":
-    """Return a robot of the site file, and where it stands there."""
+    """Return a robot of the site file, and its file and line there."""
     from fieldkit.config.site import load_site
 
     if not path.exists():
@@ -102,6 +103,6 @@ def _pinned(name: str, robot: "SiteRobot", *, or_none: bool) -> HostKey | None:
 
 def _show(address: Address, offered: HostKey, pinned: HostKey | None) -> None:
     if pinned is not None:
-        say(f"pinned until now: {pinned.kind} {pinned.fingerprint}")
+        say(f"pinned before: {pinned.kind} {pinned.fingerprint}")
     say(f"{address.robot} at {address.host} port {address.port} offers: {offered.kind} {offered.fingerprint}")
-    say(f"compare it with what the robot itself says, at its own keyboard:\n  {offered.by_hand}")
+    say(f"compare it with the output of this command on the robot's own console:\n  {offered.by_hand}")

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit export` takes."""
-    parser.description = "Write the rows of trials as one table, or what happened in one trial as a time line."
+    """Declare the arguments of `fieldkit export`."""
+    parser.description = "Write the rows of trials as one table, or the events of one trial as a time line."
     shared.add_paths(parser)
     parser.add_choice(
         "--format",
@@ -29,16 +29,18 @@ def add(parser: Parser) -> None:
         help="csv or parquet: the rows of all trials as one table; mcap: the time line of one trial, for "
         "Foxglove; junit: repeats and expectations, for CI servers",
     )
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help="the file; none may be there")
+    parser.add_argument(
+        "-o", "--out", required=True, type=Path, metavar="FILE", help="the file, which must not exist"
+    )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the file and say how large it is."""
+    """Write the file and print its size."""
     out: Path = arguments.out
     if out.exists():
         raise ConfigurationError(
-            "there is a file of this name, which is not overwritten",
+            "this file exists and is not overwritten",
             where=str(out),
             remedy=typed("mv", out, f"{out}.old") if out.is_file() else "choose another -o",
         )
@@ -79,7 +81,7 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
     folder: Path = arguments.paths[0]
     if len(arguments.paths) > 1:
         raise ConfigurationError(
-            f"an MCAP file holds one trial, {len(arguments.paths)} are named",
+            f"an MCAP file holds one trial, {len(arguments.paths)} are given",
             remedy="one at a time: "
             + typed("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
         )
@@ -92,7 +94,7 @@ def _junit(arguments: argparse.Namespace, file: BinaryIO) -> None:
     from fieldkit.export import junit
     from fieldkit.trial import sources
 
-    # As for measuring anew, which takes trials without a table, too: none may be left out of what a CI server shows.
+    # `rebuild=True` includes trials without a table, because a CI server must show all trials.
     trials = sources.find(arguments.paths, show_note, rebuild=True).tables
     file.write(junit.text(table.parent for table in trials))
 

@@ -10,7 +10,7 @@ from fieldkit.core.printing import say
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit init` takes."""
+    """Declare the arguments of `fieldkit init`."""
     parser.description = "Write a site file in which every line is explained; a file that exists is not overwritten."
     parser.add_argument(
         "--out", type=Path, metavar="FILE", default=Path(SITE_FILE), help=f"the file (default: {SITE_FILE})"
@@ -19,7 +19,7 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the file and print what to type next."""
+    """Write the file and print the next commands."""
     from fieldkit.config import site_file
     from fieldkit.config.site import load_site
 
@@ -30,11 +30,11 @@ def run(arguments: argparse.Namespace) -> int:
     steps = [
         (f"${{EDITOR:-nano}} {typed(path)}", "hosts, users and keys of your robots"),
         *((typed("fieldkit", "enroll", name, *option), f"pin the host key of {name}") for name in site.robots),
-        (typed("fieldkit", "check", *option), "what is missing on the robots"),
+        (typed("fieldkit", "check", *option), "what the robots lack"),
         (typed("fieldkit", "trial", "los", "30ft", "--repeats", 1, *option), "a first trial"),
     ]
     width = max(len(command) for command, _ in steps)
     say(f"wrote {path}; next:")
-    for command, what in steps:
-        say(f"  {command:{width}}  # {what}")
+    for command, purpose in steps:
+        say(f"  {command:{width}}  # {purpose}")
     return 0

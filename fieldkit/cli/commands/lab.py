@@ -1,4 +1,4 @@
-"""`fieldkit lab`: robots to play with, on this machine, as long as one likes."""
+"""`fieldkit lab`: emulated robots on this machine that run until they are taken down."""
 
 import argparse
 import os
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit lab` takes."""
+    """Declare the arguments of `fieldkit lab`."""
     parser.description = "Emulated robots that stay up until they are taken down: one lab per directory."
     actions = parser.add_commands(title="commands", metavar="COMMAND")
     action = actions.add_parser(
         "up",
-        help="bring the robots of the site file up, all in one place, or N alike",
-        description="Bring up every robot of the site file, whatever its roles and its backend, or --robots N alike, "
-        "and return when all can be reached. They are placed in a square in the middle of the world, at most 5 m "
-        "apart, and talk directly to each other; radio, world and ROS are those of the site file's `emulated`. SSH "
-        "does not use the radio: `control: radio` is ignored, with a note. No program listens on the network of this "
-        "machine; the files that others need to reach the robots are in a folder of this user, in memory if there is "
-        "/run/user. The lab ends with its process.",
+        help="start the robots of the site file, all in one place, or N equal ones",
+        description="Start every robot of the site file, whatever its roles and its backend, or N equal ones with "
+        "--robots, and return when all can be reached. They are placed in a square in the middle of the world, at "
+        "most 5 m apart, and communicate directly with each other; radio, world and ROS are those of the site file's "
+        "`emulated`. SSH does not use the radio: `control: radio` is ignored, with a note. No program listens on the "
+        "network of this machine; the files that other programs need to reach the robots are in a folder of this "
+        "user, in memory if there is /run/user. The lab exists as long as its process.",
     )
     shared.add_robots(action)
     action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of everything random (default 1)")
@@ -46,10 +46,10 @@ def add(parser: Parser) -> None:
     action.set_defaults(run=up)
     listing = actions.add_parser(
         "ps",
-        help="list the robots: where they are, what runs on them",
+        help="list the robots with positions and programs",
         description="List the robots: profile, roles, address on the radio, position, programs. --json prints one "
         "object: pid and up_s of the lab, and robots, each with name, profile, roles, address, place_m (metres east, "
-        "north, up) and programs, which is empty for a robot that has ended.",
+        "north, up) and programs, which is empty for a robot that has stopped.",
     )
     listing.add_argument("--json", action="store_true", help="print them as JSON")
     listing.set_defaults(run=list_robots)
@@ -60,15 +60,15 @@ def add(parser: Parser) -> None:
         "shell, and its exit code is that of fieldkit.",
     )
     action.add_argument("robot", metavar="ROBOT", help="name of the robot")
-    action.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND", help="what its shell runs")
+    action.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND", help="command for its shell")
     action.set_defaults(run=shell)
-    _lab_move(actions)
+    _add_move(actions)
     config = actions.add_parser("ssh-config", help="print a configuration for ssh -F, scp -F, rsync and Ansible")
     config.set_defaults(run=print_ssh_config)
-    actions.add_parser("down", help="end the robots").set_defaults(run=down)
+    actions.add_parser("down", help="stop the robots").set_defaults(run=down)
     action = actions.add_parser(
         "plot",
-        help="draw the robots that are up, or would be, from above, and how well they hear each other",
+        help="draw the robots of the lab from above, with the SNR of their links",
         description="Draw the lab from above, with the mean SNR of each link without shadowing, and the obstacles on "
         "it; frames do not arrive over a dotted link. If no lab is up, or with --robots, --site or --backend, draw "
         "what `up` would bring up.",
@@ -80,10 +80,10 @@ def add(parser: Parser) -> None:
     action.set_defaults(run=plot)
 
 
-def _lab_move(actions: Commands) -> None:
+def _add_move(actions: Commands) -> None:
     parser: Parser = actions.add_parser(
         "move",
-        help="put a robot elsewhere, at once",
+        help="move a robot immediately",
         usage="%(prog)s [-h] ROBOT (--to EAST NORTH [UP] | --by EAST NORTH [UP])",
         description="Move a robot immediately, and print its position. --to is a position in the world: lengths east "
         "and north of its corner (20m, 30ft), and the height of the antenna; without UP the robot is on the ground. "
@@ -92,15 +92,15 @@ def _lab_move(actions: Commands) -> None:
     )
     parser.takes_lengths = True
     parser.add_argument("robot", metavar="ROBOT", help="name of the robot")
-    way = parser.add_mutually_exclusive_group(required=True)
-    way.add_argument(
+    group = parser.add_mutually_exclusive_group(required=True)
+    group.add_argument(
         "--to",
         nargs="+",
         type=str.strip,
         metavar="LENGTH",
         help="EAST NORTH [UP] in the world; on the ground without UP",
     )
-    way.add_argument(
+    group.add_argument(
         "--by",
         nargs="+",
         type=str.strip,
@@ -110,36 +110,36 @@ def _lab_move(actions: Commands) -> None:
     parser.set_defaults(run=move)
 
 
-_EXAMPLE: Final = "fieldkit lab move ROBOT --to 20m 10m, or --by 0m -30ft, and 5m for UP where it flies"
+_EXAMPLE: Final = "fieldkit lab move ROBOT --to 20m 10m, or --by 0m -30ft, and 5m for UP if it flies"
 _NEXT: Final = "fieldkit lab ps | shell ROBOT | move ROBOT | ssh-config | down"
 
 
 def up(arguments: argparse.Namespace) -> int:
-    """Bring the robots up; return at once, or when they are down."""
+    """Start the robots, and return when they are up, or with --foreground when they are down."""
     from fieldkit.lab import server
 
     here, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
-    def stay(robots: "Lab") -> None:
+    def announce(robots: "Lab") -> None:
         say(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
-        server.run(here, backend, seed=arguments.seed, sink=_tell, ready=stay)
+        server.run(here, backend, seed=arguments.seed, sink=_show_note, ready=announce)
         return 0
 
-    def work(leave: background.Leave) -> int:
+    def serve(leave: background.Leave) -> int:
         def ready(robots: "Lab") -> None:
             say(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
             leave(here.log)
 
         try:
-            server.run(here, backend, seed=arguments.seed, sink=_tell, ready=ready)
+            server.run(here, backend, seed=arguments.seed, sink=_show_note, ready=ready)
         except FieldkitError as error:
             show_error(str(error))
             return error.exit_code
         return 0
 
-    return background.detached(work)
+    return background.detached(serve)
 
 
 def list_robots(arguments: argparse.Namespace) -> int:
@@ -157,7 +157,7 @@ def list_robots(arguments: argparse.Namespace) -> int:
             ", ".join(robot.roles),
             robot.address,
             _place(robot.place_m),
-            ", ".join(robot.programs) or "ended",
+            ", ".join(robot.programs) or "stopped",
         )
         for robot in state.robots
     ]
@@ -167,7 +167,7 @@ def list_robots(arguments: argparse.Namespace) -> int:
 
 
 def move(arguments: argparse.Namespace) -> int:
-    """Move the robot and say where it is."""
+    """Move the robot and print its position."""
     from fieldkit.lab import client
     from fieldkit.lab.protocol import Destination
 
@@ -183,7 +183,7 @@ def move(arguments: argparse.Namespace) -> int:
 
 
 def shell(arguments: argparse.Namespace) -> int:
-    """Become ssh."""
+    """Replace this process by ssh to the robot."""
     from fieldkit.lab import client, protocol
 
     here = _here()
@@ -195,7 +195,7 @@ def shell(arguments: argparse.Namespace) -> int:
         raise ConfigurationError("there is no ssh", remedy="sudo apt-get install openssh-client")
     terminal = ["-t"] if arguments.command and sys.stdin.isatty() and sys.stdout.isatty() else []
     argv = [program, "-F", str(here.ssh_config), *terminal, arguments.robot, *arguments.command]
-    os.execv(program, argv)  # noqa: S606 (its own words, no shell)
+    os.execv(program, argv)  # noqa: S606 (an argument list, no shell)
 
 
 def print_ssh_config(_: argparse.Namespace) -> int:
@@ -209,7 +209,7 @@ def print_ssh_config(_: argparse.Namespace) -> int:
 
 
 def down(_: argparse.Namespace) -> int:
-    """End the robots."""
+    """Stop the robots."""
     from fieldkit.lab import client
 
     client.end(_here())
@@ -219,7 +219,7 @@ def down(_: argparse.Namespace) -> int:
 
 def plot(arguments: argparse.Namespace) -> int:
     """Draw the lab."""
-    # matplotlib takes half a second to import, which no other command shall pay.
+    # matplotlib takes half a second to import, so other commands must not import it.
     from fieldkit.report import figures, theme
 
     out: Path = arguments.out
@@ -230,12 +230,12 @@ def plot(arguments: argparse.Namespace) -> int:
 
 
 def _place(place_m: Vector) -> str:
-    """Return a place for people, to the centimetre: `198.5, 200, 0.2`."""
+    """Format a position for people, to the centimetre: `198.5, 200, 0.2`."""
     return ", ".join(f"{round(metres, 2):.10g}" for metres in place_m)
 
 
 def _overview(arguments: argparse.Namespace) -> "Overview":
-    """Return the lab that is up; what `up` would bring up if none is, or if the options say which robots."""
+    """Return the lab that is up, or the lab that `up` would start if none is up or options choose its robots."""
     from fieldkit.lab import client
 
     if arguments.robots is None and arguments.site is None and arguments.backend is None:
@@ -249,7 +249,7 @@ def _here() -> LabFolder:
 
 
 def _backend(arguments: argparse.Namespace) -> "LabBackend":
-    """Return what brings up the robots that the options choose."""
+    """Return the backend of the lab that the options choose."""
     from fieldkit.backends.registry import load_backend
     from fieldkit.cli import sites
     from fieldkit.config.site import Site, SiteRobot
@@ -259,7 +259,7 @@ def _backend(arguments: argparse.Namespace) -> "LabBackend":
     name = arguments.backend or sites.DEFAULT_BACKEND
     if arguments.robots is not None:
         if arguments.robots < 1:
-            raise ConfigurationError("--robots: a lab has at least one", remedy="fieldkit lab up --robots 2")
+            raise ConfigurationError("--robots: a lab has at least one robot", remedy="fieldkit lab up --robots 2")
         robots = {
             f"robot-{number}": SiteRobot(profile=arguments.profile) for number in range(1, arguments.robots + 1)
         }
@@ -269,6 +269,6 @@ def _backend(arguments: argparse.Namespace) -> "LabBackend":
     return protocol.of(name, load_backend(name, site, document))
 
 
-def _tell(event: Event) -> None:
+def _show_note(event: Event) -> None:
     if isinstance(event, Note):
         show_note(event.text)

@@ -28,8 +28,8 @@ example: fieldkit middleware recommend trials/ -o config/ --max-loss 1% --max-de
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit middleware` takes."""
-    parser.description = "Configurations of middlewares by what was measured."
+    """Declare the arguments of `fieldkit middleware`."""
+    parser.description = "Configure middlewares by measured trials."
     actions = parser.add_commands(title="commands", metavar="COMMAND")
     action = actions.add_parser(
         "recommend",
@@ -43,15 +43,16 @@ def add(parser: Parser) -> None:
     action.add_argument("trials", type=Path, nargs="+", metavar="TRIALS", help=shared.PATH_HELP)
     action.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="where files are written")
     action.add_argument(
-        "--max-loss", default="1%", metavar="SHARE", help="most samples lost in each repeat (default 1%%)"
+        "--max-loss", default="1%", metavar="SHARE", help="largest loss of samples in each repeat (default 1%%)"
     )
-    action.add_argument("--max-delay", metavar="TIME", help="most delay of 95 %% of the samples sent: 200ms")
+    action.add_argument("--max-delay", metavar="TIME", help="largest delay of 95 %% of the sent samples: 200ms")
     action.add_argument("--size", metavar="BYTES", help="only samples of this size: 100kB (default: all)")
     action.add_argument("--repeats", type=int, default=5, metavar="N", help="valid repeats needed (default 5)")
     action.add_argument(
         "--share",
         metavar="SHARE",
-        help="share of all repeats that must keep it, shown with 95 %% confidence (default: each measured one)",
+        help="share of all repeats that must meet the limits, shown with 95 %% confidence (default: each measured "
+        "one)",
     )
     action.set_defaults(run=recommend)
 
@@ -60,34 +61,34 @@ NOTHING: int = 1
 
 
 def recommend(arguments: argparse.Namespace) -> int:
-    """Write a file for each middleware of which settings passed."""
+    """Write a file for each middleware with settings that passed."""
     from fieldkit.analysis.expectations import MOST_SHARE
     from fieldkit.trial import recommendation, sources
     from fieldkit.trial.link_cells import LinkCriterion
     from fieldkit.trial.recommendation import Assessment
 
     if arguments.repeats < 2:
-        raise ConfigurationError("--repeats: one repeat shows nothing of the spread", remedy="write 2 or more")
+        raise ConfigurationError("--repeats: one repeat does not show the spread", remedy="write 2 or more")
     criterion = LinkCriterion(
-        max_loss=_share(arguments.max_loss, "--max-loss"),
+        max_loss=_parse_share(arguments.max_loss, "--max-loss"),
         max_delay_s=None if arguments.max_delay is None else parse_amount(arguments.max_delay, "s", "--max-delay"),
         size_bytes=None if arguments.size is None else parse_quantity(arguments.size, BYTES_PER_UNIT, "size"),
         repeats=arguments.repeats,
-        share=None if arguments.share is None else _share(arguments.share, "--share", most=MOST_SHARE),
+        share=None if arguments.share is None else _parse_share(arguments.share, "--share", most=MOST_SHARE),
     )
-    found = sources.find(arguments.trials, show_note)
-    judged = recommendation.assess(found.read(undeclared=True), criterion)
-    if not judged:
-        say("no trial there has a step topics of this size; how to run one: fieldkit docs topics")
+    data = sources.find(arguments.trials, show_note)
+    assessments = recommendation.assess(data.read(undeclared=True), criterion)
+    if not assessments:
+        say("no trial has a step topics with samples of this size; to run one, see: fieldkit docs topics")
         return NOTHING
     best: dict[str, Assessment] = {}
-    for assessment in judged:
+    for assessment in assessments:
         word = "passed" if assessment.passed else "failed" if assessment.failed else "undecided"
         say(harmless(f"{word}: {assessment.candidate}"))
         for reason in (*assessment.failed, *assessment.lacking):
             say(harmless(f"  {reason}"))
-        known = best.get(assessment.candidate.over)
-        if assessment.passed and (known is None or assessment.rank < known.rank):
+        current = best.get(assessment.candidate.over)
+        if assessment.passed and (current is None or assessment.rank < current.rank):
             best[assessment.candidate.over] = assessment
     wrote = [_write(arguments, assessment, criterion) for assessment in best.values()]
     if any(wrote):
@@ -96,35 +97,38 @@ def recommend(arguments: argparse.Namespace) -> int:
     return NOTHING
 
 
-def _share(text: str, option: str, most: float = 1.0) -> float:
-    """Return a share that an option gives.
+def _parse_share(text: str, option: str, most: float = 1.0) -> float:
+    """Return the share in an option's value.
 
     Raises:
-        ConfigurationError: It is not a share, or above `most`; or 0, which shows nothing, if `most` is below 1.
+        ConfigurationError: It is not a share, or above `most`; or it is 0, which proves nothing, if `most` is below
+            1.
     """
     share = parse_amount(text, "share", option)
     if share > most or (most < 1 and not share):
         least = "above 0" if most < 1 else "0"
         raise ConfigurationError(
-            f"{option}: {text[:40]!r} is not a share that repeats can keep",
+            f"{option}: {text[:40]!r} is not a share that repeats can show",
             remedy=f"write {least} to {100 * most:g} %",
         )
     return share
 
 
-def _write(arguments: argparse.Namespace, judged: "Assessment", criterion: "LinkCriterion") -> bool:
-    """Write the file of settings that passed; return whether the middleware has one that can hold them."""
+def _write(arguments: argparse.Namespace, assessment: "Assessment", criterion: "LinkCriterion") -> bool:
+    """Write the file of settings that passed. Return False if the middleware has no file that can express them."""
     from fieldkit.trial import recommendation
 
-    over = judged.candidate.over
-    comment = list(recommendation.evidence(judged, criterion))
+    middleware = assessment.candidate.over
+    comment = list(recommendation.evidence(assessment, criterion))
     try:
-        text = configurations.written(over, judged.candidate.transport, judged.candidate.by_path, comment)
+        text = configurations.written(
+            middleware, assessment.candidate.transport, assessment.candidate.by_path, comment
+        )
     except ConfigurationError as error:
         show_note(str(error))
         return False
     arguments.out.mkdir(parents=True, exist_ok=True)
-    path = arguments.out / configurations.FILES[over]
+    path = arguments.out / configurations.FILES[middleware]
     files.write(path, text.encode())
-    say(f"wrote {path}; name it in {configurations.VARIABLES[over]}")
+    say(f"wrote {path}; name it in {configurations.VARIABLES[middleware]}")
     return True

@@ -1,4 +1,4 @@
-"""`fieldkit positions TRIAL [ROLE=FILE ...]`: where robots really stood, from who walked with them."""
+"""`fieldkit positions TRIAL [ROLE=FILE ...]`: measured positions of robots, from files or coordinates."""
 
 import argparse
 from typing import TYPE_CHECKING
@@ -14,42 +14,44 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit positions` takes."""
+    """Declare the arguments of `fieldkit positions`."""
     parser.description = (
-        "Keep files that tell where robots were with a trial, and fill the distance and speed columns "
-        "from them; without any, list who tells it in each repeat."
+        "Store files with measured positions of robots in a trial, and fill the distance and speed columns "
+        "from them. Without files, list the source of the positions in each repeat."
     )
     parser.epilog = "example: fieldkit positions trials/... receiver=walk.gpx sender=48.13740,11.57550 --offset 0.3s"
     parser.takes_lengths = True
     shared.add_trial(parser)
     parser.add_argument(
-        "told",
+        "files",
         metavar="ROLE=FILE",
         nargs="*",
-        help="GPX or CSV of the robot in that role, or where it stood: LAT,LON[,ALT], or X,Y[,Z] with units",
+        help="GPX or CSV file of the robot in that role, or its position: LAT,LON[,ALT], or X,Y[,Z] with units",
     )
     parser.add_argument(
         "--offset", metavar="TIME", default="0s", help="add it to the times of the files: 0.3s, -2s (default: 0s)"
     )
     parser.add_argument(
-        "--gap", metavar="TIME", default="3s", help="nobody knows where a robot was in longer gaps (default: 3s)"
+        "--gap", metavar="TIME", default="3s", help="positions are unknown in longer gaps (default: 3s)"
     )
-    parser.add_argument("--heights", action="store_true", help="let heights over the ellipsoid count, too")
-    parser.add_argument("--clear", action="store_true", help="forget what was given")
+    parser.add_argument("--heights", action="store_true", help="use heights above the ellipsoid, too")
+    parser.add_argument("--clear", action="store_true", help="remove the stored files")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Keep what is given, and print who tells where robots were in each repeat, and how far apart."""
+    """Store the given files, and print the distances in each repeat with their source."""
     from fieldkit.trial import positions
 
-    told = dict(map(positions.told, arguments.told))
-    if told or arguments.clear:
-        if told and arguments.clear:
-            raise ConfigurationError("--clear forgets what was given", remedy="leave it out to give others instead")
+    files = dict(map(positions.told, arguments.files))
+    if files or arguments.clear:
+        if files and arguments.clear:
+            raise ConfigurationError(
+                "--clear removes stored files and takes no new ones", remedy="omit it to replace the stored files"
+            )
         rebuilt = positions.give(
             arguments.trial,
-            told,
+            files,
             offset_s=_offset_s(arguments.offset),
             gap_s=parse_duration_s(arguments.gap),
             heights=arguments.heights,
@@ -67,11 +69,11 @@ def _offset_s(text: str) -> float:
     return -offset_s if text.startswith("-") else offset_s
 
 
-def _lines(one: "Spotted") -> list[str]:
-    """Return what is known of an attempt, a line per figure."""
-    who = one.told_by or "as the lab knows"
-    found = [
-        f"{one.attempt}  {what}: {least:.1f} to {most:.1f} m, {who}"
-        for what, (least, most) in one.distances_m.items()
+def _lines(spotted: "Spotted") -> list[str]:
+    """Return the lines about an attempt, one per distance."""
+    source = spotted.told_by or "positions from the backend"
+    lines = [
+        f"{spotted.attempt}  {pair}: {least:.1f} to {most:.1f} m, {source}"
+        for pair, (least, most) in spotted.distances_m.items()
     ]
-    return found + [f"{one.attempt}  {what}: no distance, {why}" for what, why in one.missing.items()]
+    return lines + [f"{spotted.attempt}  {pair}: no distance, {reason}" for pair, reason in spotted.missing.items()]

@@ -8,7 +8,7 @@ from fieldkit.cli.parser import Parser
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit procedures` takes."""
+    """Declare the arguments of `fieldkit procedures`."""
     parser.description = (
         "List procedures with their files, or check one and print its file. The folder procedures/ of the current "
         "folder comes before the shipped ones: a file of the same name replaces the shipped one."

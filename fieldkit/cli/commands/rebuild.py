@@ -9,7 +9,7 @@ from fieldkit.core.printing import say
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit rebuild` takes."""
+    """Declare the arguments of `fieldkit rebuild`."""
     parser.description = "Make trial.csv and summary.csv again from plan, journal and raw evidence: the same bytes."
     shared.add_trial(parser)
     shared.add_all(parser)
@@ -17,13 +17,13 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Rebuild, show the summary, and say whether bytes changed."""
+    """Rebuild, show the summary, and print which files changed."""
     from fieldkit.cli import summary
     from fieldkit.trial.rebuild import rebuild
 
     rebuilt = rebuild(arguments.trial)
     if not rebuilt.is_summed:
-        show_note(f"{arguments.trial}: there is no manifest to say whether its evidence is as it was kept")
+        show_note(f"{arguments.trial}: there is no manifest to verify its evidence with")
     if left_out := summary.show(rebuilt.cells, every=arguments.all, expected=rebuilt.expected):
         prose(f"{summary.more(left_out)}: add --all")
     say(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")

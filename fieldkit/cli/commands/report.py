@@ -1,4 +1,4 @@
-"""`fieldkit report PATH...`: one page of what trials came to, and its figures."""
+"""`fieldkit report PATH...`: one page with the results of trials, and its figures."""
 
 import argparse
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from fieldkit.core.printing import say
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit report` takes."""
+    """Declare the arguments of `fieldkit report`."""
     parser.description = (
         "Make one HTML file of figures, tables and strips. It begins with what is missing and with the worst "
         "conditions. It opens without a network and contains no script. For the folder of a campaign, or the folder "
@@ -30,25 +30,25 @@ def add(parser: Parser) -> None:
         metavar="FILE",
         help="the page (default report.html)",
     )
-    parser.add_argument("--title", default="", help="its title (default: made of the procedures)")
+    parser.add_argument("--title", default="", help="its title (default: made from the procedures)")
     parser.add_argument(
         "--repeat",
         default="",
         metavar="NAME",
-        help="whose time line is drawn: udp-07, or TRIAL/udp-07 (default: the median one where most is lost)",
+        help="repeat for the time line: udp-07, or TRIAL/udp-07 (default: the median one of the worst cell)",
     )
     parser.add_argument(
         "--quantity",
         action="append",
         default=[],
         metavar="NAME",
-        help="column to draw besides those that are drawn anyway, may be given more than once",
+        help="column to draw in addition to the default ones; may be given more than once",
     )
     parser.add_argument(
         "--figures",
         type=Path,
         metavar="FOLDER",
-        help="keep the figures there too: SVG, PDF and PNG, in the width of a paper's column",
+        help="also write the figures there as SVG, PDF and PNG, in the width of a paper's column",
     )
     parser.set_defaults(run=run)
 
@@ -58,18 +58,18 @@ _PAGE: Final = b"<!DOCTYPE html>"
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the page, and the figures if they are asked for."""
-    # matplotlib takes half a second to import, which no other command shall pay.
+    """Write the page, and with --figures the figures."""
+    # matplotlib takes half a second to import, so other commands must not import it.
     from fieldkit.campaign.unmeasured import unmeasured
     from fieldkit.report import contents, figures, page
     from fieldkit.trial import sources
 
     out, folder = arguments.out, arguments.figures
-    _demand_place(out)
-    found = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
-    chosen = [found.quantity(name).name for name in arguments.quantity]
-    repeats = found.read()
-    made = contents.put_together(
+    _require_writable(out)
+    data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
+    chosen = [data.quantity(name).name for name in arguments.quantity]
+    repeats = data.read()
+    report_contents = contents.put_together(
         repeats,
         title=arguments.title,
         repeat=arguments.repeat,
@@ -77,19 +77,19 @@ def run(arguments: argparse.Namespace) -> int:
         quantities=chosen,
         unmeasured=list(unmeasured(arguments.paths, set(repeats.texts["source"].tolist()), show_note)),
     )
-    with _explained(out, "-o"):
-        files.write(out, page.render(made, out).encode())
+    with _explain_os_errors(out, "-o"):
+        files.write(out, page.render(report_contents, out).encode())
     say(out)
     if folder is not None:
-        with _explained(folder, "--figures"):
+        with _explain_os_errors(folder, "--figures"):
             folder.mkdir(parents=True, exist_ok=True)
-            for path in figures.save(made.charts, folder):
+            for path in figures.save(report_contents.charts, folder):
                 say(path)
     return 0
 
 
-def _demand_place(out: Path) -> None:
-    """Refuse a place where no page can be, before the work: a report may be replaced, nothing else."""
+def _require_writable(out: Path) -> None:
+    """Raise an error before the work if no page can be written there. Only a report may be overwritten."""
     if not out.parent.is_dir():
         raise ConfigurationError(
             "there is no such folder", where=str(out.parent), remedy=typed("mkdir", "-p", out.parent)
@@ -98,23 +98,23 @@ def _demand_place(out: Path) -> None:
         raise ConfigurationError("this is a folder", where=str(out), remedy=f"name a file: {typed('-o', out / _OUT)}")
     if out.exists() and not _is_page(out):
         raise ConfigurationError(
-            "there is a file of this name, which is no page and not overwritten",
+            "this file is not a report, and is not overwritten",
             where=str(out),
             remedy="choose another -o",
         )
 
 
 def _is_page(out: Path) -> bool:
-    """Return whether a file holds a page, or nothing yet; a pipe is not read, which would wait for its writer."""
+    """Return True if a file is a report or empty. A pipe is not read, because that would block."""
     if not out.is_file():
         return False
-    with _explained(out, "-o"), out.open("rb") as file:
+    with _explain_os_errors(out, "-o"), out.open("rb") as file:
         return file.read(len(_PAGE)) in {b"", _PAGE}
 
 
 @contextmanager
-def _explained(path: Path, option: str) -> Iterator[None]:
-    """Say where and with which option the body could not read or write."""
+def _explain_os_errors(path: Path, option: str) -> Iterator[None]:
+    """Turn an OSError of the body into a ConfigurationError with the path and the option."""
     try:
         yield
     except OSError as error:
@@ -124,7 +124,7 @@ def _explained(path: Path, option: str) -> Iterator[None]:
 
 
 def _command(arguments: argparse.Namespace) -> list[str]:
-    """Return the words that make the same page again."""
+    """Return the words of the command that makes the same page again."""
     words = ["fieldkit", "report", *map(str, arguments.paths), "-o", str(arguments.out)]
     words += ["--title", arguments.title] if arguments.title else []
     words += [word for name in arguments.quantity for word in ("--quantity", name)]

@@ -1,4 +1,4 @@
-"""`fieldkit resume TRIAL`: go on with a trial that stopped."""
+"""`fieldkit resume TRIAL`: continue a trial that stopped."""
 
 import argparse
 
@@ -9,16 +9,16 @@ from fieldkit.cli.terminal import interruptible
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit resume` takes."""
+    """Declare the arguments of `fieldkit resume`."""
     parser.description = (
-        "Continue a trial that stopped: by Ctrl-C, a kill, a lost robot or testbed, a full disk. What is done is not "
-        "repeated. Files that differ from their checksums are reported; if trial.csv would have to be made again "
-        "from them, the trial does not continue (exit code 4). Backend and cast must be those that the trial began "
-        "with."
+        "Continue a trial that stopped: by Ctrl-C, a kill, a lost robot or testbed, a full disk. Finished repeats "
+        "are not repeated. Files that differ from their checksums are reported; if trial.csv would have to be made "
+        "again from them, the trial does not continue (exit code 4). Backend and cast must be those that the trial "
+        "began with."
     )
     shared.add_trial(parser, "folder of the trial")
     parser.add_argument(
-        "--failed", action="store_true", help="repeat what failed, too; the failed attempts are kept as void"
+        "--failed", action="store_true", help="also repeat the failed repeats; the failed attempts are kept as void"
     )
     shared.add_site(parser)
     shared.add_operator(parser)
@@ -29,12 +29,12 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run what is left of the trial and print its table."""
+    """Run the remaining repeats of the trial and print its table."""
     from fieldkit.cli import options, results
     from fieldkit.trial.running import opening
     from fieldkit.trial.running.resumption import resumable
 
-    resumable(arguments.trial)  # before anything is said of site files and backends
+    resumable(arguments.trial)  # raise errors of the trial before those of site files and backends
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = options.backend(arguments, sink)
         with options.operator(arguments, sink) as operator:

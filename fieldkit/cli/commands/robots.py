@@ -8,7 +8,7 @@ from fieldkit.cli.parser import Parser
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit robots` takes."""
+    """Declare the arguments of `fieldkit robots`."""
     parser.description = (
         "List robot profiles with their files, or check one and print its file. The folder robots/ of the current "
         "folder comes before the shipped ones: a file of the same name replaces the shipped one."
@@ -18,7 +18,7 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """List robot profiles, or show the one named."""
+    """List robot profiles, or show one."""
     from fieldkit.config.profiles import load_profile
 
     return list_or_show("robots", lambda name: load_profile(name).summary, arguments.profile)

@@ -1,6 +1,7 @@
-"""`fieldkit stop`: stop robots that move by themselves, immediately.
+"""`fieldkit stop`: stop robots that fieldkit moves, immediately.
 
-An operator waits for it, so it imports only what reaches robots: neither pydantic nor the profiles, steps and trials.
+An operator waits for it, so it imports only the code that reaches robots: neither pydantic nor profiles, steps and
+trials.
 """
 
 import argparse
@@ -43,12 +44,14 @@ def add(parser: Parser) -> None:
 
 
 _WITHIN_S: Final = 10.0
-"""For this long a robot is tried; one that is up answers within a second."""
+"""Time limit for each robot; a robot that is up answers within a second."""
 _FIELD: Final = "field"
-_EMULATED: Final = "emulated robots of a trial belong to its fieldkit: stop that one, by Ctrl-C"
+_EMULATED: Final = (
+    "emulated robots of a trial belong to the fieldkit process of that trial: stop that process by Ctrl-C"
+)
 
 Robots = Mapping[str, Shell | FieldkitError]
-"""The connection to each robot by its name, or why there is none."""
+"""The connection to each robot by its name, or the error that prevents it."""
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`fieldkit trial PROCEDURE DISTANCE ...`: the main job."""
+"""`fieldkit trial PROCEDURE DISTANCE ...`: run trials."""
 
 import argparse
 import secrets
@@ -17,10 +17,8 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit trial` takes."""
-    parser.description = (
-        "Run a procedure at one or more distances; each distance is a trial with a folder of its own."
-    )
+    """Declare the arguments of `fieldkit trial`."""
+    parser.description = "Run a procedure at one or more distances; each distance is a trial with a separate folder."
     parser.takes_lengths = True
     parser.epilog = "example: fieldkit trial los 30ft --repeats 3 --record 2s"
     parser.add_argument("procedure", metavar="PROCEDURE", help="name of a procedure, see `fieldkit procedures`")
@@ -35,10 +33,10 @@ def add(parser: Parser) -> None:
         type=shared.free_text,
         metavar="TEXT",
         default="",
-        help="kept with the trial: weather, place, people",
+        help="notes stored with the trial: weather, place, people",
     )
     shared.add_out(parser, "trial folders go")
-    parser.add_argument("--dry-run", action="store_true", help="print every remote command per robot, touch nothing")
+    parser.add_argument("--dry-run", action="store_true", help="print every remote command per robot, change nothing")
     shared.add_json(parser)
     shared.add_all(parser)
     shared.add_operator(parser)
@@ -74,19 +72,21 @@ def run(arguments: argparse.Namespace) -> int:
         for line in (*requests[0].procedure.adjustments(cast), *plans[0].shortfalls()):
             sink(Note(line))
         if arguments.dry_run and arguments.json:
-            dry_run.tell_commands(plans[0], sink)
+            dry_run.report_commands(plans[0], sink)
         elif arguments.dry_run:
             dry_run.print_commands(plans[0])
         if arguments.dry_run:
             return 0
-        # What runs and measures a trial takes pyarrow, which a dry run does not need.
+        # These modules import pyarrow, which a dry run does not need.
         from fieldkit.cli import results
         from fieldkit.trial.running import opening
 
         sink(Note(_announce(plans)))
         with options.operator(arguments, sink) as operator:
-            ended = opening.run(plans, backend, plans[0].cast, arguments.out, sink=sink, operator=operator, stop=stop)
-    return results.report(ended, arguments)
+            outcomes = opening.run(
+                plans, backend, plans[0].cast, arguments.out, sink=sink, operator=operator, stop=stop
+            )
+    return results.report(outcomes, arguments)
 
 
 def _announce(plans: "list[Plan]") -> str:
@@ -94,6 +94,6 @@ def _announce(plans: "list[Plan]") -> str:
 
     protocols = " and ".join(protocol.upper() for protocol in plans[0].protocols)
     places = f" at each of {len(plans)} distances" if len(plans) > 1 else ""
-    lasts = estimates.total(estimates.of_trial(plan, []) for plan in plans)
-    dead = "" if lasts.is_certain else " if links are dead"
-    return f"{format_count(plans[0].repeats, 'repeat')} of {protocols}{places}, about {lasts}{dead}"
+    duration = estimates.total(estimates.of_trial(plan, []) for plan in plans)
+    dead_links = "" if duration.is_certain else " if links are dead"
+    return f"{format_count(plans[0].repeats, 'repeat')} of {protocols}{places}, about {duration}{dead_links}"

@@ -1,4 +1,4 @@
-"""`fieldkit verify TRIAL`: every file against the manifest."""
+"""`fieldkit verify TRIAL`: compare every file with the manifest."""
 
 import argparse
 
@@ -11,7 +11,7 @@ from fieldkit.core.units import format_count
 
 
 def add(parser: Parser) -> None:
-    """Declare what `fieldkit verify` takes."""
+    """Declare the arguments of `fieldkit verify`."""
     parser.description = (
         "Compare every file of a trial with MANIFEST.sha256: changed, missing, not in it, or not a regular file."
     )
@@ -20,15 +20,15 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what differs."""
+    """Print the differences."""
     from fieldkit.trial.manifest import verify
 
     problems = verify(arguments.trial)
     for problem in problems:
         show_error(problem)
     say(
-        f"{format_count(len(problems), 'file')} not as the manifest says"
+        f"{format_count(len(problems), 'file')} different from the manifest"
         if problems
-        else "every file is as its manifest says"
+        else "every file matches the manifest"
     )
     return EvidenceError.exit_code if problems else 0

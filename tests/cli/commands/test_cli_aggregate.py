@@ -1,4 +1,4 @@
-"""`fieldkit aggregate` as researchers call it."""
+"""The command `fieldkit aggregate`."""
 
 import csv
 import io
@@ -42,10 +42,10 @@ def campaign(tmp_path: Path) -> Path:
 
 
 def tcp_repeats(row: RepeatRow, count: int) -> list[RepeatRow]:
-    return [replace(one, ip_loss=None) for one in repeats(row, count)]
+    return [replace(repeat, ip_loss=None) for repeat in repeats(row, count)]
 
 
-def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+def output_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     assert main(["aggregate", *words]) == 0
     return capsys.readouterr().out
 
@@ -72,17 +72,17 @@ def test_expectations_of_trials_under_one_condition_are_judged_together(
     ]  # fmt: skip
     assert shown.out.count("  holds\n") == 2
     assert "1: what it expects is left out: there is no figure 'no_such'" in shown.err.replace(f"/{LOSSY.name}", "")
-    assert "expected" not in said(capsys, str(tmp_path), "--quantity", "datagram_loss")
-    assert "expected" not in said(capsys, str(tmp_path), "--format", "csv")
+    assert "expected" not in output_of(capsys, str(tmp_path), "--quantity", "datagram_loss")
+    assert "expected" not in output_of(capsys, str(tmp_path), "--format", "csv")
 
 
 @pytest.mark.parametrize("form", ["table", "csv", "json", "markdown", "latex"])
-def test_a_figure_that_some_valid_repeats_lack_says_of_how_many_it_is(
+def test_quantity_missing_in_some_repeats_has_its_count(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
 ) -> None:
     rows = repeats(ROW, 10)
     write(tmp_path, [*rows[:7], *(replace(row, rtt_median_s=None) for row in rows[7:])])
-    shown = said(capsys, str(tmp_path), "--format", form, "--quantity", "rtt_median_s")
+    shown = output_of(capsys, str(tmp_path), "--format", form, "--quantity", "rtt_median_s")
     if form == "csv":
         (record,) = records(shown)
         assert (record["n"], record["n_valid"]) == ("7", "10")
@@ -93,11 +93,9 @@ def test_a_figure_that_some_valid_repeats_lack_says_of_how_many_it_is(
         assert "7 of 10" in shown
 
 
-def test_what_differs_behind_one_name_is_told_beside_the_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_different_procedures_of_one_name_cause_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     alike = {"profiles_sha256": "aaaa", "code_sha256": "cccc"}
-    for name, procedure in (("one", "bbbb"), ("two", "dddd")):  # as --record 1s and --record 15s make them
+    for name, procedure in (("one", "bbbb"), ("two", "dddd")):  # as for --record 1s and --record 15s
         write(tmp_path / name, repeats(replace(ROW, trial=name, procedure_sha256=procedure, **alike), 3))
     assert main(["aggregate", str(tmp_path), "--quantity", "ip_loss"]) == 0
     assert capsys.readouterr().err == "note: A procedure is not the same in all its trials\n"
@@ -105,7 +103,7 @@ def test_what_differs_behind_one_name_is_told_beside_the_table(
     assert capsys.readouterr().err == ""
 
 
-def test_round_trips_of_several_sizes_in_one_condition_are_told(
+def test_different_ping_sizes_in_one_condition_cause_a_note(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     udp = replace(ROW, rtt_payload_bytes=8192)
@@ -118,36 +116,36 @@ def test_round_trips_of_several_sizes_in_one_condition_are_told(
     assert capsys.readouterr().err == ""
 
 
-def test_csv_has_the_form_and_the_bytes_of_a_summary(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_csv_equals_the_summary_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [*tcp_repeats(replace(ROW, protocol="tcp"), 3), *repeats(ROW, 3)]
     write(tmp_path / "one", rows)
-    assert said(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(DEFAULT_BY, aggregate(parsed(rows)))
+    assert output_of(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(DEFAULT_BY, aggregate(parsed(rows)))
 
 
-def test_json_says_what_csv_says(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = records(said(capsys, str(campaign), "--format", "csv"))
-    whole = json.loads(said(capsys, str(campaign), "--format", "json"))
+def test_json_and_csv_agree(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = records(output_of(capsys, str(campaign), "--format", "csv"))
+    whole = json.loads(output_of(capsys, str(campaign), "--format", "json"))
     assert whole["by"] == list(DEFAULT_BY)
-    found = [(cell, name, one) for cell in whole["cells"] for name, one in cell["estimates"].items()]
-    assert len(found) == len(lines)
-    for line, (cell, name, one) in zip(lines, found, strict=True):
+    estimates = [(cell, name, estimate) for cell in whole["cells"] for name, estimate in cell["estimates"].items()]
+    assert len(estimates) == len(lines)
+    for line, (cell, name, estimate) in zip(lines, estimates, strict=True):
         assert (line["quantity"], line["n_void"]) == (name, str(cell["n_void"]))
         for column in ("value", "low", "wilson_high", "p95", "events"):
-            assert (float(line[column]) if line[column] else None) == one[column]
+            assert (float(line[column]) if line[column] else None) == estimate[column]
 
 
-def test_cells_are_of_the_columns_asked_for(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cells_are_grouped_by_the_given_columns(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("--by", "distance, scenario", "--quantity", "ip_loss", "--format", "csv")
-    lines = records(said(capsys, str(campaign), *words))
+    lines = records(output_of(capsys, str(campaign), *words))
     keys = [(line["distance"], line["scenario"], line["n"], line["n_void"]) for line in lines]
     assert keys == [(distance, scenario, "8", "2") for distance in ("5m", "30ft") for scenario in ("los", "nlos")]
     assert {line["quantity"] for line in lines} == {"ip_loss"}
 
 
-def test_the_table_says_what_all_have_in_common_and_tells_cells_apart(
+def test_table_shows_common_values_in_the_title_and_differences_in_columns(
     campaign: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = said(capsys, str(campaign), "--by", "distance,backend,protocol", "--quantity", "ip_loss")
+    text = output_of(capsys, str(campaign), "--by", "distance,backend,protocol", "--quantity", "ip_loss")
     assert re.search(r"^repeats, field\n *distance +protocol +valid +void +failed$", text, re.MULTILINE)
     assert re.search(r"^ *5m +udp +16 +4 +0$", text, re.MULTILINE)
     assert re.search(
@@ -161,26 +159,26 @@ def test_the_table_says_what_all_have_in_common_and_tells_cells_apart(
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_a_wanted_width_says_how_many_more_repeats(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_width_gives_the_number_of_repeats_needed(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = (str(campaign), "--by", "protocol", "--width", "1%", "--width", "5 ms")
-    lines = records(said(capsys, *words, "--format", "csv"))
+    lines = records(output_of(capsys, *words, "--format", "csv"))
     for line in lines:
         interval = Interval(*(float(line[name]) for name in ("value", "low", "high")))
         width = 0.01 if line["unit"] == "share" else 0.005
         assert line["more_wanted"] == str(more_wanted(interval, int(line["n"]), width, Kind(line["estimate"])))
     assert {line["more_wanted"] == "0" for line in lines} == {True, False}
-    whole = json.loads(said(capsys, *words, "--format", "json"))
-    counts = [one["more_wanted"] for cell in whole["cells"] for one in cell["estimates"].values()]
+    whole = json.loads(output_of(capsys, *words, "--format", "json"))
+    counts = [estimate["more_wanted"] for cell in whole["cells"] for estimate in cell["estimates"].values()]
     assert [str(count) for count in counts] == [line["more_wanted"] for line in lines]
     (loss,) = (line for line in lines if line["quantity"] == "ip_loss")
-    assert re.search(rf"\bmore\n.*\n *\d+ .* {loss['more_wanted']}\n", said(capsys, *words, "--quantity", "ip_loss"))
+    assert re.search(
+        rf"\bmore\n.*\n *\d+ .* {loss['more_wanted']}\n", output_of(capsys, *words, "--quantity", "ip_loss")
+    )
 
 
-def test_trials_of_the_first_schema_are_put_together_with_those_of_today(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_trials_of_schema_1_are_aggregated_with_new_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     new = write(tmp_path, repeats(ROW, 3))
-    lines = records(said(capsys, str(OLD), str(new), "--by", "protocol", "--format", "csv"))
+    lines = records(output_of(capsys, str(OLD), str(new), "--by", "protocol", "--format", "csv"))
     (loss,) = (line for line in lines if (line["protocol"], line["quantity"]) == ("udp", "ip_loss"))
     lost, sent = 1 + 2 + 2 + 10 + 11 + 12, 3 * 16 + 3 * 216
     assert (loss["n"], loss["events"], loss["trials"]) == ("6", str(lost), str(sent))
@@ -191,8 +189,10 @@ def markdown(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line.strip("|"))] for line in lines]
 
 
-def test_markdown_is_a_table_whose_lines_are_equally_long(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = said(capsys, str(campaign), "--format", "markdown", "--quantity", "ip_loss", "--quantity", "rtt_median_s")
+def test_markdown_table_has_equal_columns_in_all_lines(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = output_of(
+        capsys, str(campaign), "--format", "markdown", "--quantity", "ip_loss", "--quantity", "rtt_median_s"
+    )
     head, rule, *body = markdown(text)
     assert text.startswith("backend field; each value with its 95 % interval.\n\n| ")
     assert head == [
@@ -211,21 +211,23 @@ def test_markdown_is_a_table_whose_lines_are_equally_long(campaign: Path, capsys
 
 
 def latex(text: str) -> tuple[str, list[list[str]]]:
-    """Return the columns of a tabular, and its lines as cells, each repeated over the columns that it spans."""
-    found = re.search(r"\\begin\{tabular\}\{(\w+)\}\n(.*)\\end\{tabular\}", text, re.DOTALL)
-    assert found
-    lines = [line.removesuffix(r" \\") for line in found[2].splitlines() if line.endswith(r" \\")]
-    return found[1], [[one for cell in re.split(r"(?<!\\) & ", line) for one in spanned(cell)] for line in lines]
+    """Return the column specification of a tabular, and its lines as cells, with spanning cells repeated."""
+    match = re.search(r"\\begin\{tabular\}\{(\w+)\}\n(.*)\\end\{tabular\}", text, re.DOTALL)
+    assert match
+    lines = [line.removesuffix(r" \\") for line in match[2].splitlines() if line.endswith(r" \\")]
+    return match[1], [[part for cell in re.split(r"(?<!\\) & ", line) for part in spanned(cell)] for line in lines]
 
 
 def spanned(cell: str) -> Sequence[str]:
-    found = re.fullmatch(r"\\multicolumn\{(\d+)\}\{c\}\{(.*)\}", cell)
-    return [found[2]] * int(found[1]) if found else [cell]
+    match = re.fullmatch(r"\\multicolumn\{(\d+)\}\{c\}\{(.*)\}", cell)
+    return [match[2]] * int(match[1]) if match else [cell]
 
 
-def test_latex_has_distances_down_and_scenarios_across(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_latex_has_rows_of_distances_and_columns_of_scenarios(
+    campaign: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     by = "procedure,distance,distance_m,scenario,protocol,backend"
-    text = said(capsys, str(campaign), "--format", "latex", "--by", by)
+    text = output_of(capsys, str(campaign), "--format", "latex", "--by", by)
     columns, lines = latex(text)
     assert {len(line) for line in lines} == {len(columns)}
     quantities = ["RTT, median (ms)"] * 2 + [r"IP packet loss (\%)", r"TCP byte loss before retransmission (\%)"]
@@ -243,9 +245,9 @@ def test_latex_has_distances_down_and_scenarios_across(campaign: Path, capsys: p
     assert r"\caption{backend field, 8 valid repeats each; in brackets 95 \% intervals.}" in text
 
 
-def test_latex_escapes_what_it_would_read_as_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_latex_escapes_special_characters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [replace(ROW, distance=name, repeat=1 + n) for n, name in enumerate(("5m & 50% #1", r"a_b\c{d}$~^"))]
-    columns, lines = latex(said(capsys, str(write(tmp_path, rows)), "--format", "latex"))
+    columns, lines = latex(output_of(capsys, str(write(tmp_path, rows)), "--format", "latex"))
     assert {len(line) for line in lines} == {len(columns)}
     assert [line[0] for line in lines[3:]] == [
         r"5m \& 50\% \#1",
@@ -253,14 +255,14 @@ def test_latex_escapes_what_it_would_read_as_its_own(tmp_path: Path, capsys: pyt
     ]
 
 
-def test_what_no_repeat_has_is_left_out_and_the_counts_remain(
+def test_quantities_without_values_are_omitted_but_counts_remain(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     failed = str(write(tmp_path, [replace(ROW, status="failed")]))
-    assert re.search(r"^ *0 +0 +1$", said(capsys, failed), re.MULTILINE)
-    assert "| 1 failed |" in said(capsys, failed, "--format", "markdown")
-    assert json.loads(said(capsys, failed, "--format", "json"))["cells"][0]["n_failed"] == 1
+    assert re.search(r"^ *0 +0 +1$", output_of(capsys, failed), re.MULTILINE)
+    assert "| 1 failed |" in output_of(capsys, failed, "--format", "markdown")
+    assert json.loads(output_of(capsys, failed, "--format", "json"))["cells"][0]["n_failed"] == 1
     assert main(["aggregate", failed, "--format", "latex"]) == 4
-    assert "no valid repeat has rtt_median_s" in capsys.readouterr().err
+    assert "no valid repeat has a value of rtt_median_s" in capsys.readouterr().err
     assert main(["aggregate", failed, "--quantity", "jitter_s", "--format", "csv"]) == 0
     assert "note: no valid repeat has jitter_s" in capsys.readouterr().err

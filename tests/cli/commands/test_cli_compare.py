@@ -1,4 +1,4 @@
-"""`fieldkit compare A B` as its user types it."""
+"""The command `fieldkit compare A B`."""
 
 import csv
 import json
@@ -31,7 +31,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(autouse=True)
 def field(lab: Path) -> list[RepeatRow]:
-    """A trial in the field, and the same of emulated robots, whose air loses more and answers as fast."""
+    """Write a field trial and an emulated one with more loss and equal delay; return the rows of the first."""
     rows = bursty(COMPARABLE, 20, seed=1)
     write(lab / "field", rows)
     worse = [
@@ -43,7 +43,7 @@ def field(lab: Path) -> list[RepeatRow]:
     return rows
 
 
-def test_a_run_against_itself_differs_in_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_does_not_differ_from_itself(capsys: pytest.CaptureFixture[str]) -> None:
     assert compare("field field/trial.csv --threshold rtt_median_s=10ms") == 0
     shown = capsys.readouterr()
     assert shown.err == "note: may matter: attempts that the other has too: A has 20, B has 20\n"
@@ -52,7 +52,7 @@ def test_a_run_against_itself_differs_in_nothing(capsys: pytest.CaptureFixture[s
     assert ": 0 differences seen, 0 after correction" in shown.out
 
 
-def test_field_against_simulation_shows_what_differs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_field_and_simulation_differ_in_loss(capsys: pytest.CaptureFixture[str]) -> None:
     assert compare("field sim") == 0
     shown = capsys.readouterr().out
     assert shown.startswith("los, master, 9.144 m, udp: A 20 valid; B 20 valid\n")
@@ -76,7 +76,7 @@ def test_a_threshold_decides_the_exit_code(thresholds: str, code: int, capsys: p
     assert ("\nnot shown to be within " in capsys.readouterr().out) is bool(code)
 
 
-def test_a_condition_of_one_run_alone_is_listed(
+def test_condition_of_only_one_run_is_listed(
     lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
 ) -> None:
     write(lab / "more", [*field, *bursty(TCP, 20, seed=3)])
@@ -88,7 +88,7 @@ def test_a_condition_of_one_run_alone_is_listed(
     assert {row["difference"] for row in rows if row["missing_in"]} == {""}
 
 
-def test_runs_that_are_not_comparable_are_refused_unless_forced(
+def test_runs_that_are_not_comparable_are_rejected_without_force(
     lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
 ) -> None:
     write(lab / "other", [replace(row, procedure_sha256="ffff", sent_bytes=293_797) for row in field])
@@ -99,8 +99,8 @@ def test_runs_that_are_not_comparable_are_refused_unless_forced(
         "error: A and B are not comparable:\n"
         "  procedure_sha256: A has bbbb, B has ffff (los, master, 9.144 m, udp)\n"
         "  sent_bytes, median: A has 230,695 B, B has 293,797 B (los, master, 9.144 m, udp)\n"
-        "  remedy: run both alike (what a name means: fieldkit columns show NAME); "
-        "or, to compare them all the same, add --force\n"
+        "  remedy: run both under the same conditions (to look up a name: fieldkit columns show NAME); "
+        "or, to compare them anyway, add --force\n"
     )
     assert compare("field other --force") == 0
     shown = capsys.readouterr()
@@ -108,7 +108,7 @@ def test_runs_that_are_not_comparable_are_refused_unless_forced(
     assert "no difference seen" in shown.out
 
 
-def test_every_form_says_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_formats_agree(capsys: pytest.CaptureFixture[str]) -> None:
     shown = {}
     for form in ("csv", "json", "markdown", "table"):
         assert compare(f"field sim --threshold ip_loss=2% --format {form}") == 1
@@ -150,20 +150,18 @@ def test_a_lab_has_the_same_hashes_in_the_field_and_emulated(lab: Path) -> None:
     assert field.procedure_sha256 == emulated.procedure_sha256
 
 
-def test_more_than_two_runs_are_named_with_what_shows_them_side_by_side(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_more_than_two_runs_suggest_aggregate(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (lab / "field again").symlink_to("field")
     assert main(["compare", "field", "sim", "field again"]) == 2
-    said = capsys.readouterr().err
-    assert "two runs are compared, A and B, and 3 are named" in said
-    command = said.partition("side by side: fieldkit ")[2].strip()
+    message = capsys.readouterr().err
+    assert "compare takes two runs, A and B, and 3 are given" in message
+    command = message.partition("side by side: fieldkit ")[2].strip()
     assert command == "aggregate field sim 'field again' --by trial,protocol"
     assert main(shlex.split(command)) == 0
     capsys.readouterr()
     with pytest.raises(SystemExit):
         main(["compare", "--help"])
-    assert "A B\n" in capsys.readouterr().out, "it takes two"
+    assert "A B\n" in capsys.readouterr().out, "it accepts two runs"
 
 
 def test_equal_inputs_give_equal_bytes(capsys: pytest.CaptureFixture[str]) -> None:
@@ -175,12 +173,12 @@ def test_equal_inputs_give_equal_bytes(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def far_away(lab: Path, field: list[RepeatRow], *names: str) -> None:
-    """Write the trial of the field as if it had been at other distances, into a folder for each."""
+    """Write the field trial at other distances, each into its folder."""
     for number, name in enumerate(names, start=2):
         write(lab / name, [replace(row, distance_m=9.144 * number, trial=name) for row in field])
 
 
-def test_two_distances_compare_where_the_distance_is_all_that_differs(
+def test_runs_that_differ_only_in_distance_compare_by_protocol(
     lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
 ) -> None:
     far_away(lab, field, "far")
@@ -192,14 +190,17 @@ def test_two_distances_compare_where_the_distance_is_all_that_differs(
     assert compare("field far --by protocol") == 0
     shown = capsys.readouterr()
     assert shown.err.startswith(
-        "note: A and B differ in this, which may be why figures differ: distance_m: A has 9.1"
+        "note: A and B differ in this, which may explain differences between their figures: distance_m: A has 9.1"
     )
     assert shown.out.startswith("udp: A 20 valid; B 20 valid\n")
     assert compare("field far --by protocol --format markdown") == 0
-    assert "- A and B differ in this, which may be why figures differ: distance" in capsys.readouterr().out
+    assert (
+        "- A and B differ in this, which may explain differences between their figures: distance"
+        in capsys.readouterr().out
+    )
 
 
-def test_distances_that_are_mixed_in_a_run_do_not_compare(
+def test_run_with_several_distances_does_not_compare(
     lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
 ) -> None:
     far_away(lab, field, "far/two", "far/three")
@@ -209,7 +210,7 @@ def test_distances_that_are_mixed_in_a_run_do_not_compare(
     assert "or, to compare these: fieldkit compare field far --by protocol --force" in capsys.readouterr().err
 
 
-def test_a_distance_that_differs_excuses_nothing_else(lab: Path, field: list[RepeatRow]) -> None:
+def test_different_distance_does_not_allow_other_differences(lab: Path, field: list[RepeatRow]) -> None:
     write(lab / "other", [replace(row, distance_m=20.0, procedure_sha256="cccc", trial="other") for row in field])
     assert compare("field other --by protocol") == 2
     assert compare("field other --by protocol --force") == 0

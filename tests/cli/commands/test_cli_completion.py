@@ -1,4 +1,4 @@
-"""The Tab key: what real shells make of the words typed so far."""
+"""Tab completion in real shells."""
 
 import os
 import pty
@@ -18,7 +18,7 @@ from tests.helpers.paths import ROOT
 LIMIT_S = 60.0
 BIN = Path(sys.executable).parent
 
-# What is typed, and how the line goes on.
+# The line typed, and the line after Tab.
 LINES = {
     "fieldkit tria": "fieldkit trial ",
     "fieldkit trial driv": "fieldkit trial driveaway ",
@@ -44,12 +44,12 @@ def environment(lab: Path) -> dict[str, str]:
     return {"PATH": f"{BIN}:{os.environ['PATH']}", "HOME": str(lab), "TERM": "dumb", "PS1": "$ "}
 
 
-def answered(lab: Path, line: str) -> list[str]:
-    """Return what fieldkit answers a shell, by argcomplete's protocol."""
+def completions(lab: Path, line: str) -> list[str]:
+    """Return the completions of a line, by the protocol of argcomplete."""
     out = lab / "answer"
-    asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line, "COMP_POINT": str(len(line))}
-    asked |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(out), "_ARGCOMPLETE_SUPPRESS_SPACE": "1"}
-    subprocess.run([BIN / "fieldkit"], cwd=lab, env=environment(lab) | asked, check=True, timeout=LIMIT_S)
+    variables = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line, "COMP_POINT": str(len(line))}
+    variables |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(out), "_ARGCOMPLETE_SUPPRESS_SPACE": "1"}
+    subprocess.run([BIN / "fieldkit"], cwd=lab, env=environment(lab) | variables, check=True, timeout=LIMIT_S)
     return out.read_text(encoding="utf-8").split("\n")
 
 
@@ -60,7 +60,7 @@ def answered(lab: Path, line: str) -> list[str]:
         ("fieldkit lab s", ["shell", "ssh-config"]),
         (
             "fieldkit trial ",
-            sorted(one.stem for one in (ROOT / "procedures").glob("*.yaml")),
+            sorted(path.stem for path in (ROOT / "procedures").glob("*.yaml")),
         ),
         ("fieldkit trial los ", [""]),
         ("fieldkit trial los 30ft --topology ", ["master", "masterless"]),
@@ -76,48 +76,48 @@ def answered(lab: Path, line: str) -> list[str]:
         ("fieldkit campaign n", ["notes.txt"]),
     ],
 )
-def test_values_are_what_is_there(lab: Path, line: str, words: list[str]) -> None:
-    assert answered(lab, line) == words
+def test_values_of_arguments_are_completed(lab: Path, line: str, words: list[str]) -> None:
+    assert completions(lab, line) == words
 
 
 def test_a_damaged_site_file_completes_nothing(lab: Path) -> None:
     (lab / "fieldkit.yaml").write_text("robots: [", encoding="utf-8")
-    assert answered(lab, "fieldkit enroll ") == [""]
+    assert completions(lab, "fieldkit enroll ") == [""]
 
 
-def test_a_trial_is_known_by_its_plan() -> None:
+def test_plan_file_name_equals_that_of_trials() -> None:
     assert completion.PLAN_FILE == PLAN_FILE
 
 
-def test_a_script_for_another_shell_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_unsupported_shell_is_rejected(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["completion", "tcsh"]) == 2
     assert "SHELL cannot be 'tcsh'; it is one of: bash, zsh, fish" in capsys.readouterr().err
 
 
 def after_tab(lab: Path, shell: list[str], setup: str, line: str) -> str:
-    """Type a line and the Tab key into a shell at a terminal of its own; return what it made of the line."""
+    """Type a line and the Tab key into a shell at a pseudo-terminal; return the shell's output."""
     pid, terminal = pty.fork()
     if pid == 0:
         os.chdir(lab)
         os.execvpe(shell[0], shell, environment(lab))
     deadline = Deadline.after(LIMIT_S)
-    said = ""
+    output = ""
 
     def await_text(text: str) -> None:
-        nonlocal said
-        while text not in said:
-            assert select.select([terminal], [], [], deadline.remaining_s)[0], said
-            said += os.read(terminal, 4096).decode(errors="replace")
+        nonlocal output
+        while text not in output:
+            assert select.select([terminal], [], [], deadline.remaining_s)[0], output
+            output += os.read(terminal, 4096).decode(errors="replace")
 
     try:
-        # The words are put together by the shell, so that the echo of what is typed is not taken for them.
+        # The shell joins the parts of the word, so that the echo of the input does not match.
         os.write(terminal, f"{setup}; echo re''ady\n".encode())
         await_text("ready")
-        said = ""
+        output = ""
         os.write(terminal, f"{line}\t".encode())
         await_text(LINES[line].removeprefix(line))
         os.write(terminal, b"\x15exit\n")
-        return said
+        return output
     finally:
         os.close(terminal)
         os.waitpid(pid, 0)

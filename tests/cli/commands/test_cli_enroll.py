@@ -1,4 +1,4 @@
-"""`fieldkit init` and `enroll` against a real sshd: from nothing to a pinned robot."""
+"""The commands `fieldkit init` and `enroll` with a real sshd, from an empty folder to a pinned robot."""
 
 import subprocess
 from pathlib import Path
@@ -40,12 +40,12 @@ def fingerprint(folder: Path, name: str = "host") -> str:
 
 
 def typing(monkeypatch: pytest.MonkeyPatch, *lines: str) -> None:
-    left = list(lines)
+    answers = list(lines)
     monkeypatch.setattr("sys.stdin.isatty", lambda: True)
-    monkeypatch.setattr("builtins.input", lambda: left.pop(0))
+    monkeypatch.setattr("builtins.input", lambda: answers.pop(0))
 
 
-def test_a_key_is_shown_asked_for_and_pinned(
+def test_key_is_shown_and_pinned_after_confirmation(
     lab: Path, server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = lab.read_text(encoding="utf-8")
@@ -57,17 +57,17 @@ def test_a_key_is_shown_asked_for_and_pinned(
     line = f"    host_key: {key_of(server)}\n"
     assert lab.read_text(encoding="utf-8") == before.replace("roles:", f"{line}roles:")
     assert main(["enroll", "turtlebot-1"]) == 0
-    assert "pinned already" in capsys.readouterr().out
+    assert "already pinned" in capsys.readouterr().out
 
 
-def test_no_is_respected(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answer_no_pins_nothing(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = lab.read_text(encoding="utf-8")
     typing(monkeypatch, "no")
     assert main(["enroll", "turtlebot-1"]) == 1
     assert lab.read_text(encoding="utf-8") == before
 
 
-def test_without_a_terminal_yes_must_be_said_beforehand(
+def test_without_a_terminal_option_yes_is_required(
     lab: Path, server: Server, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["enroll", "turtlebot-1"]) == 2
@@ -77,23 +77,23 @@ def test_without_a_terminal_yes_must_be_said_beforehand(
     assert site.robots["turtlebot-1"].host_key == key_of(server)
 
 
-def test_another_key_stops_with_both_fingerprints_until_it_is_to_be_replaced(
+def test_changed_key_is_an_error_with_both_fingerprints_without_replace(
     lab: Path, server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = " ".join(make_key(tmp_path / "other").split()[:2])
     text = lab.read_text(encoding="utf-8").replace("    port:", f"    host_key: {other}  # of May\n    port:")
     lab.write_text(text, encoding="utf-8")
     assert main(["enroll", "turtlebot-1", "--yes"]) == 3
-    said = capsys.readouterr().err
-    assert fingerprint(tmp_path, "other") in said
-    assert fingerprint(server.folder) in said
-    assert "fieldkit enroll turtlebot-1 --replace" in said
+    message = capsys.readouterr().err
+    assert fingerprint(tmp_path, "other") in message
+    assert fingerprint(server.folder) in message
+    assert "fieldkit enroll turtlebot-1 --replace" in message
     assert lab.read_text(encoding="utf-8") == text
     assert main(["enroll", "turtlebot-1", "--yes", "--replace"]) == 0
     assert lab.read_text(encoding="utf-8") == text.replace(other, key_of(server))
 
 
-def test_a_pinned_key_that_cannot_be_read_is_replaced_only_when_asked(lab: Path, server: Server) -> None:
+def test_invalid_pinned_key_is_only_replaced_with_option_replace(lab: Path, server: Server) -> None:
     text = lab.read_text(encoding="utf-8").replace("    port:", "    host_key: nonsense\n    port:")
     lab.write_text(text, encoding="utf-8")
     assert main(["enroll", "turtlebot-1", "--yes"]) == 2
@@ -101,20 +101,20 @@ def test_a_pinned_key_that_cannot_be_read_is_replaced_only_when_asked(lab: Path,
     assert lab.read_text(encoding="utf-8") == text.replace("nonsense", key_of(server))
 
 
-def test_a_robot_that_is_off_is_exit_3(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unreachable_robot_is_exit_3(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lab.write_text(SITE.format(port=1), encoding="utf-8")
     assert main(["enroll", "turtlebot-1", "--yes"]) == 3
     assert "nothing listens on port 1" in capsys.readouterr().err
 
 
-def test_init_leads_to_enroll(
+def test_init_suggests_enroll(
     tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["init", "--out", "lab.yaml"]) == 0
-    said = capsys.readouterr().out
-    assert "fieldkit enroll duckiedrone-1 --site lab.yaml" in said
-    assert "fieldkit trial los 30ft --repeats 1 --site lab.yaml" in said
+    message = capsys.readouterr().out
+    assert "fieldkit enroll duckiedrone-1 --site lab.yaml" in message
+    assert "fieldkit trial los 30ft --repeats 1 --site lab.yaml" in message
     path = tmp_path / "lab.yaml"
     text = path.read_text(encoding="utf-8").replace("10.0.0.2\n", "127.0.0.1\n").replace("22\n", f"{server.port}\n")
     path.write_text(text, encoding="utf-8")
@@ -122,7 +122,7 @@ def test_init_leads_to_enroll(
     assert load_site(path)[0].robots["turtlebot-1"].host_key == key_of(server)
 
 
-def test_dropbear_shows_its_key_in_another_way() -> None:
+def test_fingerprint_command_of_dropbear() -> None:
     text = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
     dropbear, openssh = HostKey(text, "SSH-2.0-dropbear_2022.83"), HostKey(text, "SSH-2.0-OpenSSH_9.2p1")
     assert dropbear == openssh == HostKey(text)

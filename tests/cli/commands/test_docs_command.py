@@ -1,4 +1,4 @@
-"""`fieldkit docs`: open a page, print its path, list all."""
+"""The command `fieldkit docs`: open a page, print its path, list all pages."""
 
 import webbrowser
 
@@ -12,7 +12,7 @@ FIELD = ROOT / "docs" / "field.md"
 
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The addresses that a browser was asked to open."""
+    """The addresses passed to the browser."""
     addresses: list[str] = []
 
     def open_address(address: str) -> bool:
@@ -28,7 +28,7 @@ def test_a_topic_is_opened_in_the_browser(opened: list[str]) -> None:
     assert opened == [FIELD.as_uri()]
 
 
-def test_without_a_topic_the_overview_is_opened(opened: list[str]) -> None:
+def test_overview_is_opened_by_default(opened: list[str]) -> None:
     assert main(["docs"]) == 0
     assert opened == [(ROOT / "docs" / "index.md").as_uri()]
 
@@ -44,7 +44,7 @@ def test_topics_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert {"field", "errors", "reference", "steps"} <= listed
 
 
-def test_a_machine_without_a_browser_gets_the_path(
+def test_path_is_shown_if_no_browser_is_available(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(webbrowser, "open", lambda address: False)

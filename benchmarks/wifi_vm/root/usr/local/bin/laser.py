@@ -1,4 +1,4 @@
-"""The laser of a TurtleBot3: 360 beams, five turns a second, as its driver publishes them on /scan."""
+"""Publish the laser of a TurtleBot3 on /scan like its driver: 360 beams, five turns per second."""
 
 import math
 
