@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as d
 from fieldkit.agent import dialect, mavlink_frames
 from fieldkit.agent.arming import ArmingCheck
 from fieldkit.agent.autopilot import AutopilotState
-from fieldkit.agent.flight_plan import FlightNeeds, FlightPlan, along
+from fieldkit.agent.flight_plan import FlightNeeds, FlightPlan, point_on_path
 from fieldkit.agent.flying.origin import FlightOrigin
 from fieldkit.agent.links.client import MessageRate
 
@@ -66,10 +66,10 @@ def test_what_an_autopilot_says_is_known() -> None:
     assert state.guided
     assert state.dialect is not None
     assert state.dialect.name == "PX4"
-    assert state.place_m == (1.0, -2.0, -3.0)
+    assert state.position_m == (1.0, -2.0, -3.0)
     assert state.speed_m_s == pytest.approx(0.5)
     assert state.yaw_rad == pytest.approx(1.5)
-    assert state.answers == {400: 4}
+    assert state.command_results == {400: 4}
     assert state.said == "mode OFFBOARD, its last text: Arming denied: it falls"
     assert state.texts.new() == ["Arming denied: it falls"]
     assert state.texts.new() == []
@@ -88,7 +88,7 @@ def test_a_stranger_and_a_damaged_frame_count_for_nothing() -> None:
         nowhere.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)),
     ]
     state.receive()
-    assert state.place_m == (1.0, 2.0, 3.0)
+    assert state.position_m == (1.0, 2.0, 3.0)
 
 
 @given(st.lists(st.tuples(st.sampled_from([*mavlink_frames.EXTRA]), st.binary(max_size=60)), max_size=5))
@@ -100,19 +100,19 @@ def test_no_payload_ends_it(payloads: list[tuple[int, bytes]]) -> None:
         total = mavlink_frames.checksum(body + bytes((mavlink_frames.EXTRA[kind],)))
         link.coming.append(b"\xfd" + body + total.to_bytes(2, "little"))
     state.receive()
-    numbers = (*(state.place_m or ()), state.yaw_rad or 0.0, *state.parameters.values())
+    numbers = (*(state.position_m or ()), state.yaw_rad or 0.0, *state.parameters.values())
     assert all(map(math.isfinite, numbers))
     assert all(fault.what and fault.remedy for fault in check.faults())
 
 
 def test_what_it_says_is_what_pymavlink_reads() -> None:
     state, link = talk()
-    state.beat()
+    state.send_heartbeat()
     assert state.dialect is not None
-    state.command(*state.dialect.guide())
+    state.command(*state.dialect.guided_command())
     state.command(dialect.ARM, 1)
-    state.command(*state.dialect.bring_down("land"))
-    state.lead((1.5, -2.5, -3.0), -2.0)
+    state.command(*state.dialect.bring_down_command("land"))
+    state.send_set_point((1.5, -2.5, -3.0), -2.0)
     state.request_stream(mavlink_frames.ATTITUDE, 10.0)
     reader = d.MAVLink(None)
     said = [message for frame in link.sent for message in reader.parse_buffer(frame)]
@@ -122,7 +122,7 @@ def test_what_it_says_is_what_pymavlink_reads() -> None:
     assert (mode.command, mode.param1, mode.param2) == (d.MAV_CMD_DO_SET_MODE, 1, 6)
     assert (arm.command, arm.param1, arm.param2) == (d.MAV_CMD_COMPONENT_ARM_DISARM, 1, 0)
     assert land.command == d.MAV_CMD_NAV_LAND
-    assert state.dialect.bring_down("return") == (d.MAV_CMD_NAV_RETURN_TO_LAUNCH,)
+    assert state.dialect.bring_down_command("return") == (d.MAV_CMD_NAV_RETURN_TO_LAUNCH,)
     assert (lead.x, lead.y, lead.z) == (1.5, -2.5, -3.0)
     assert lead.coordinate_frame == d.MAV_FRAME_LOCAL_NED
     assert lead.yaw == -2.0
@@ -149,7 +149,7 @@ def test_an_answer_to_another_station_and_one_that_is_not_final_are_ignored() ->
         d.MAVLink_statustext_message(d.MAV_SEVERITY_NOTICE, b"Fence Breached"),
         d.MAVLink_statustext_message(d.MAV_SEVERITY_INFO, b"Arming motors"),
     )
-    assert state.answers == {176: d.MAV_RESULT_ACCEPTED, 21: d.MAV_RESULT_FAILED}
+    assert state.command_results == {176: d.MAV_RESULT_ACCEPTED, 21: d.MAV_RESULT_FAILED}
     assert state.texts.new() == ["Fence Breached"]
     assert state.texts.warnings == []
 
@@ -179,5 +179,7 @@ def test_along_it_nobody_goes_faster_than_the_way(
     way: list[tuple[float, float, float]], one_m: float, other_m: float
 ) -> None:
     corners_m = plan(way).corners_m(FlightOrigin("local", "", 0.0, 0.0, 0.0), 0.0)
-    assert math.dist(along(corners_m, one_m), along(corners_m, other_m)) <= abs(one_m - other_m) + 1e-6
-    assert along(corners_m, 1e6) == corners_m[-1]
+    assert (
+        math.dist(point_on_path(corners_m, one_m), point_on_path(corners_m, other_m)) <= abs(one_m - other_m) + 1e-6
+    )
+    assert point_on_path(corners_m, 1e6) == corners_m[-1]

@@ -77,20 +77,20 @@ def test_where_all_is_well_nothing_speaks_against_it() -> None:
     [
         ({"first": beat(d.MAV_AUTOPILOT_GENERIC)}, "its autopilot is neither PX4 nor ArduCopter (0, 2)"),
         ({"first": beat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)}, "its motors turn"),
-        ({"place": None}, "it does not say where it is"),
+        ({"place": None}, "it does not report its position"),
         (
             {"estimate": d.MAVLink_ekf_status_report_message(0xA7, 1, 1, 1, 1, 1)},
             "its estimate of where it is does not hold",
         ),
         ({"estimate": d.MAVLink_estimator_status_message(1, 0x400, *(1,) * 8)}, "flags 0x400"),
-        ({"status": None}, "it does not say how it is"),
-        ({"status": status(charge=19)}, "its battery has 19%, and 20% is the least"),
-        ({"status": status(healthy=0)}, "ArduCopter does not let itself be armed: GPS"),
+        ({"status": None}, "it does not report its status"),
+        ({"status": status(charge=19)}, "its battery has 19%, and 20% is the minimum"),
+        ({"status": status(healthy=0)}, "ArduCopter refuses to be armed: GPS"),
         ({"text": d.MAVLink_statustext_message(2, b"PreArm: Gyros inconsistent")}, "be armed: Gyros inconsistent"),
-        ({"home": None}, "it knows no home"),
-        ({"top": parameter("FENCE_ALT_MAX", 2.5)}, "its own fence ends 2.5 m high, and it is to fly 3 m"),
-        ({"radius": parameter("FENCE_RADIUS", 15)}, "its own fence ends 15 m far from home, and it is to fly 20 m"),
-        ({"back": parameter("RTL_ALT", 1500)}, "it returns 15 m high, and may fly 10 m"),
+        ({"home": None}, "it has no home position"),
+        ({"top": parameter("FENCE_ALT_MAX", 2.5)}, "its own fence ends 2.5 m high, but the flight needs 3 m"),
+        ({"radius": parameter("FENCE_RADIUS", 15)}, "its own fence ends 15 m far from home, but the flight needs 20 m"),
+        ({"back": parameter("RTL_ALT", 1500)}, "it returns at a height of 15 m, but only 10 m are allowed"),
     ],
 )
 def test_what_speaks_against_a_flight_is_said(said: dict[str, Any], what: str) -> None:
@@ -110,7 +110,7 @@ def test_an_emulated_autopilot_is_asked(firmware: Firmware, capsys: pytest.Captu
     with drones.at_udp(firmware=replace(firmware, unfit=lambda _parameters, _battery: unfit)) as port:
         for reasons in ([], ["Gyros inconsistent"]):
             unfit[:] = reasons
-            assert arming.look(f"udpout:127.0.0.1:{port}", replace(NEEDS, ceiling_m=30.0), threading.Event()) == 0
+            assert arming.check_arming(f"udpout:127.0.0.1:{port}", replace(NEEDS, ceiling_m=30.0), threading.Event()) == 0
             *found, told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
             assert told["charge"] == 1.0
             assert [one["what"].rpartition(": ")[2] for one in found] == unfit
@@ -120,5 +120,5 @@ def test_an_emulated_autopilot_is_asked(firmware: Firmware, capsys: pytest.Captu
 
 def test_where_nobody_answers_it_says_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arming, "_HEARTBEAT_S", 0.3)
-    assert arming.look(f"udpin:127.0.0.1:{free_port()}", NEEDS, threading.Event()) == 1
+    assert arming.check_arming(f"udpin:127.0.0.1:{free_port()}", NEEDS, threading.Event()) == 1
     assert "no heartbeat" in capsys.readouterr().err

@@ -39,16 +39,16 @@ def test_modes_of_arducopter_are_those_of_its_table() -> None:
     def mode(name: str) -> tuple[float, ...]:
         return (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, ACM[name])
 
-    assert COPTER.guide() == mode("GUIDED")
-    assert COPTER.bring_down("land") == mode("LAND")
-    assert COPTER.bring_down("return") == mode("RTL")
+    assert COPTER.guided_command() == mode("GUIDED")
+    assert COPTER.bring_down_command("land") == mode("LAND")
+    assert COPTER.bring_down_command("return") == mode("RTL")
     assert [name for name, number in ACM.items() if COPTER.is_guided(number)] == ["GUIDED"]
 
 
 def test_modes_of_px4_are_those_of_its_table() -> None:
     base, main, _ = mavutil.px4_map["OFFBOARD"]
     assert base & d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-    assert PX4.guide() == (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main)
+    assert PX4.guided_command() == (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main)
     guided = [name for name, (_, main, sub) in mavutil.px4_map.items() if PX4.is_guided(main << 16 | sub << 24)]
     assert guided == ["OFFBOARD"]
 
@@ -65,29 +65,34 @@ def test_names_of_modes_are_those_of_the_tables_of_pymavlink() -> None:
 
 
 def test_a_guard_knows_the_modes_of_programs_and_those_in_which_a_drone_comes_down() -> None:
-    assert {name for name, number in ACM.items() if COPTER.is_led(number)} == {"AUTO", "GUIDED"}
-    assert {name for name, number in ACM.items() if COPTER.comes_down(number)} == {
+    assert {name for name, number in ACM.items() if COPTER.is_program_controlled(number)} == {"AUTO", "GUIDED"}
+    assert {name for name, number in ACM.items() if COPTER.lands_or_returns(number)} == {
         *("RTL", "LAND", "SMART_RTL", "AUTO_RTL")
     }
     px4 = {name: main << 16 | sub << 24 for name, (_, main, sub) in mavutil.px4_map.items()}
-    assert {name for name in px4 if PX4.is_led(px4[name])} == {"OFFBOARD", "TAKEOFF", "LOITER", "MISSION"}
-    assert {name for name in px4 if PX4.comes_down(px4[name])} == {"RTL", "LAND"}
+    assert {name for name in px4 if PX4.is_program_controlled(px4[name])} == {
+        "OFFBOARD",
+        "TAKEOFF",
+        "LOITER",
+        "MISSION",
+    }
+    assert {name for name in px4 if PX4.lands_or_returns(px4[name])} == {"RTL", "LAND"}
 
 
 def test_who_speaks_which() -> None:
-    flown = {kind for kind in range(64) if COPTER.speaks(d.MAV_AUTOPILOT_ARDUPILOTMEGA, kind)}
+    flown = {kind for kind in range(64) if COPTER.matches(d.MAV_AUTOPILOT_ARDUPILOTMEGA, kind)}
     named = {kind for kind in range(64) if mavutil.mode_mapping_byname(kind) == ACM}
     assert flown == named
-    assert not COPTER.speaks(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
-    assert PX4.speaks(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
-    assert not PX4.speaks(d.MAV_AUTOPILOT_ARDUPILOTMEGA, d.MAV_TYPE_QUADROTOR)
+    assert not COPTER.matches(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
+    assert PX4.matches(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
+    assert not PX4.matches(d.MAV_AUTOPILOT_ARDUPILOTMEGA, d.MAV_TYPE_QUADROTOR)
 
 
 def test_arducopter_takes_off_by_command_and_is_told_how_fast() -> None:
-    speed, rise = COPTER.take_off(3.0, 0.5)
+    speed, rise = COPTER.take_off_commands(3.0, 0.5)
     assert speed == (d.MAV_CMD_DO_CHANGE_SPEED, d.SPEED_TYPE_CLIMB_SPEED, 0.5)
     assert rise == (d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 3.0)
-    assert PX4.take_off(3.0, 0.5) == ()
+    assert PX4.take_off_commands(3.0, 0.5) == ()
 
 
 @pytest.mark.parametrize(
@@ -105,5 +110,5 @@ def test_arducopter_takes_off_by_command_and_is_told_how_fast() -> None:
 def test_bounds_are_those_that_hold(
     one: FlightDialect, values: dict[str, float], bounds: tuple[float | None, ...]
 ) -> None:
-    found = one.bounds(values)
+    found = one.limits(values)
     assert (found.height_m, found.radius_m, found.return_m) == bounds

@@ -152,6 +152,6 @@ def test_a_drone_whose_motors_stop_is_not_led_any_more(tmp_path: Path) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), agent(plan(tmp_path, port)) as process:
         wait_until_up(autopilot)
         autopilot.vehicle.disarm(force=True)
-        assert process.wait(60) == landing.TAKEN
+        assert process.wait(60) == landing.TAKEN_OVER
         assert process.stderr is not None
         assert b"its motors have stopped" in process.stderr.read()

@@ -38,28 +38,28 @@ def pilot(path: Path, beats: int) -> Iterator["subprocess.Popen[bytes]"]:
 
 def test_an_end_a_suspension_and_a_hang_are_seen(tmp_path: Path) -> None:
     own = LivenessFile(str(tmp_path / "file"), GUARD)
-    assert own.look() == "has ended", "it has not begun"
+    assert own.poll() == "has ended", "it has not begun"
     with pilot(tmp_path / "file", 10**9) as process:
-        wait_until(lambda: own.look() == "", Deadline.after(60))
+        wait_until(lambda: own.poll() == "", Deadline.after(60))
         assert own.other_state == liveness.FLYING
         process.send_signal(signal.SIGSTOP)
-        wait_until(lambda: own.look() == "is suspended", Deadline.after(60))
-        own.end_other()
+        wait_until(lambda: own.poll() == "is suspended", Deadline.after(60))
+        own.kill_other()
         assert process.wait(60) == -signal.SIGKILL
-        assert own.look() == "has ended"
+        assert own.poll() == "has ended"
     with pilot(tmp_path / "file", 5):
-        wait_until(lambda: own.look().startswith("has not run for"), Deadline.after(60))
+        wait_until(lambda: own.poll().startswith("has not run for"), Deadline.after(60))
 
 
 def test_another_process_with_its_number_is_not_ended(tmp_path: Path) -> None:
     """A number is given again later; the time of the start is not."""
     guard = LivenessFile(str(tmp_path / "file"), GUARD)
-    LivenessFile(str(tmp_path / "file"), PILOT).beat(liveness.FLYING)
+    LivenessFile(str(tmp_path / "file"), PILOT).update(liveness.FLYING)
     raw = bytearray((tmp_path / "file").read_bytes())
     raw[8:16] = (1).to_bytes(8, "little")
     (tmp_path / "file").write_bytes(raw)
-    assert guard.look() == "has ended"
-    guard.end_other()
+    assert guard.poll() == "has ended"
+    guard.kill_other()
     assert os.getpid()
 
 

@@ -15,7 +15,7 @@ from fieldkit.agent.flying.origin import (
     OriginError,
     frame_id,
     is_same_frame,
-    settled,
+    resolve_origin,
 )
 
 FIRST = FlightOrigin("local", frame_id("boot", 100.0), 3.0, -4.0, 0.7, 48.0, 11.0)
@@ -23,12 +23,12 @@ metres = st.floats(-200, 200)
 
 
 def test_the_first_start_is_the_origin() -> None:
-    assert settled(None, FIRST) == FIRST
+    assert resolve_origin(None, FIRST) == FIRST
 
 
 def test_a_later_start_keeps_heading_and_place_of_the_first() -> None:
     start = replace(FIRST, x_m=4.0, heading_rad=0.7 + math.pi, latitude_deg=None, longitude_deg=None)
-    origin = settled(FIRST, start)
+    origin = resolve_origin(FIRST, start)
     assert (origin.x_m, origin.y_m, origin.heading_rad) == (3.0, -4.0, 0.7)
 
 
@@ -36,18 +36,18 @@ def test_after_a_reboot_latitude_and_longitude_give_the_place() -> None:
     """A degree of latitude has 111.2 km on a sphere; one of longitude at 48 degrees cos(48 degrees) of that."""
     rebooted = frame_id("boot", 500.0)
     start = replace(FIRST, frame_id=rebooted, x_m=0.0, y_m=0.0, latitude_deg=48.0 + 1.0 / 111_200)
-    origin = settled(FIRST, start)
+    origin = resolve_origin(FIRST, start)
     assert (origin.x_m, origin.y_m) == pytest.approx((-1.0, 0.0), abs=0.01)
     east = replace(start, latitude_deg=48.0, longitude_deg=11.0 + 1.0 / (111_200 * math.cos(math.radians(48))))
-    assert settled(FIRST, east).y_m == pytest.approx(-1.0, abs=0.01)
+    assert resolve_origin(FIRST, east).y_m == pytest.approx(-1.0, abs=0.01)
 
 
 def test_a_start_elsewhere_and_one_after_a_reboot_without_gps_are_refused() -> None:
     unknown = {"latitude_deg": None, "longitude_deg": None}
     with pytest.raises(OriginError, match=r"2\.5 m from the place .* bearing of 90 degrees"):
-        settled(FIRST, replace(FIRST, y_m=FIRST.y_m + START_M + 0.5, **unknown))  # type: ignore[arg-type]
+        resolve_origin(FIRST, replace(FIRST, y_m=FIRST.y_m + START_M + 0.5, **unknown))  # type: ignore[arg-type]
     with pytest.raises(OriginError, match="has rebooted"):
-        settled(FIRST, replace(FIRST, frame_id=frame_id("boot", 500.0), **unknown))  # type: ignore[arg-type]
+        resolve_origin(FIRST, replace(FIRST, frame_id=frame_id("boot", 500.0), **unknown))  # type: ignore[arg-type]
 
 
 def test_frames_of_one_life_are_the_same() -> None:
@@ -77,4 +77,4 @@ def test_a_position_beyond_the_fence_and_its_margin_is_a_breach() -> None:
 
 @given(metres, metres)
 def test_points_are_seen_from_the_origin_as_they_were_given(ahead_m: float, left_m: float) -> None:
-    assert FIRST.seen(FIRST.at(ahead_m, left_m, 0.0)) == pytest.approx((ahead_m, left_m), abs=1e-6)
+    assert FIRST.relative_m(FIRST.position_at(ahead_m, left_m, 0.0)) == pytest.approx((ahead_m, left_m), abs=1e-6)

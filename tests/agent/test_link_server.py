@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as d
 
-from fieldkit.agent.flying.talk import AutopilotTalk
+from fieldkit.agent.flying.talk import AutopilotSession
 from fieldkit.agent.links import places, survey
 from fieldkit.agent.links.client import SharedLink
 from fieldkit.agent.mavlink_frames import ATTITUDE, LOCAL_POSITION_NED
@@ -50,25 +50,25 @@ def connected_by(way: str) -> Iterator[str]:
 
 
 @contextmanager
-def talking(connection: str, clients: int = 1) -> Iterator[list[AutopilotTalk]]:
+def talking(connection: str, clients: int = 1) -> Iterator[list[AutopilotSession]]:
     """Let clients talk with an autopilot over one connection."""
-    talks: list[AutopilotTalk] = []
+    talks: list[AutopilotSession] = []
     try:
-        talks.extend(AutopilotTalk(connection) for _ in range(clients))
+        talks.extend(AutopilotSession(connection) for _ in range(clients))
         yield talks
     finally:
         for talk in talks:
             talk.close()
 
 
-def links_of(talks: list[AutopilotTalk]) -> list[SharedLink]:
+def links_of(talks: list[AutopilotSession]) -> list[SharedLink]:
     """Return the links that clients talk by."""
     links = [talk.drone.link for talk in talks]
     assert all(isinstance(link, SharedLink) for link in links)
     return [link for link in links if isinstance(link, SharedLink)]
 
 
-def until(talks: list[AutopilotTalk], holds: Callable[[], bool]) -> float:
+def until(talks: list[AutopilotSession], holds: Callable[[], bool]) -> float:
     """Let clients talk until something holds; return how long that took."""
     began_s = time.monotonic()
     while not holds():
@@ -103,10 +103,10 @@ def assert_nothing_remains(connection: str) -> None:
 def test_each_connection_carries_pilot_guard_recorder_and_check(way: str) -> None:
     with connected_by(way) as connection:
         with talking(connection, 4) as talks:
-            until(talks, lambda: all(talk.drone.alive and talk.drone.place_m for talk in talks))
+            until(talks, lambda: all(talk.drone.alive and talk.drone.position_m for talk in talks))
             assert len(servers(connection)) == 1
             talks[3].drone.command(512, 148)
-            until(talks, lambda: 512 in talks[3].drone.answers)
+            until(talks, lambda: 512 in talks[3].drone.command_results)
         assert_nothing_remains(connection)
 
 
@@ -144,8 +144,8 @@ def test_a_server_that_was_killed_or_suspended_is_replaced(fault: signal.Signals
             until(talks, lambda: all(link.restarts for link in links))
             until(talks, lambda: all(link.connected for link in links))
             for talk in talks:
-                talk.drone._placed_s = float("-inf")
-            until(talks, lambda: all(talk.drone.place_m for talk in talks))
+                talk.drone._position_s = float("-inf")
+            until(talks, lambda: all(talk.drone.position_m for talk in talks))
             assert len(servers(connection)) == 1
             assert servers(connection) != [pid]
             # The request of the first client is made at the new server, too.
@@ -165,8 +165,8 @@ def test_a_router_that_restarts_ends_no_program() -> None:
             assert all(link.lost_since_s is not None for link in links)
             until(talks, lambda: all(link.connected for link in links))
             for talk in talks:
-                talk.drone._placed_s = float("-inf")
-            until(talks, lambda: all(talk.drone.place_m for talk in talks))
+                talk.drone._position_s = float("-inf")
+            until(talks, lambda: all(talk.drone.position_m for talk in talks))
             assert servers(connection) == [pid]
         assert_nothing_remains(connection)
 

@@ -239,13 +239,13 @@ def test_who_begins_anew_at_another_port_is_spoken_to(monkeypatch: pytest.Monkey
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    device = devices.opened(f"udpin:127.0.0.1:{port}")
+    device = devices.open_device(f"udpin:127.0.0.1:{port}")
     with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
         first.settimeout(60)
         second.settimeout(60)
         for sends, heard_by in ((first, first), (second, first), (second, second)):
             if heard_by is second:
-                monkeypatch.setattr(devices, "_GONE_S", 0.0)
+                monkeypatch.setattr(devices, "_PEER_TIMEOUT_S", 0.0)
             sends.sendto(Sender().frame(drones.beat()), ("127.0.0.1", port))
             select.select([device], [], [], 60)
             assert device.read()
@@ -309,7 +309,7 @@ class Arriving:
 
 @pytest.mark.parametrize(("comes", "denied"), [(False, False), (True, False), (False, True)])
 def test_a_requested_message_has_sixty_seconds_from_the_first_heartbeat(
-    comes: bool, denied: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    comes: bool, is_refused: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     clock, link, sender = FakeClock(), Arriving(), Sender()
     monkeypatch.setattr(mavlink, "time", clock)
@@ -319,8 +319,8 @@ def test_a_requested_message_has_sixty_seconds_from_the_first_heartbeat(
     def turn(at_s: float, *messages: d.MAVLink_message) -> None:
         clock.now_s = 100.0 + at_s
         link.frames = [sender.frame(message) for message in messages]
-        recorder.speak()
-        recorder.take(0.1, link)  # type: ignore[arg-type]
+        recorder.send()
+        recorder.receive(0.1, link)  # type: ignore[arg-type]
         recorder.check()
 
     turn(500.0)  # an autopilot that is switched on late
@@ -329,9 +329,9 @@ def test_a_requested_message_has_sixty_seconds_from_the_first_heartbeat(
     assert not recorder.ready
     if comes:
         turn(559.95, d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0))
-    if denied:
+    if is_refused:
         link.messages = {32: MessageRate(100_000, d.MAV_RESULT_DENIED, 0.0)}
-    if comes or denied:
+    if comes or is_refused:
         turn(560.1, drones.beat())
         assert recorder.ready
         turn(2000.0)
@@ -345,7 +345,7 @@ def test_the_recorder_ends_when_the_time_for_first_messages_is_over(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """An autopilot whose boot takes longer has no position until then."""
-    monkeypatch.setattr(mavlink, "_LATEST_S", 2.0)
+    monkeypatch.setattr(mavlink, "_TIMEOUT_S", 2.0)
     with drones.autopilot_at_udp(firmware=ARDUCOPTER, boot_s=3600.0) as (port, _):
         told = mavlink.FlightRecording(f"udpout:127.0.0.1:{port}", {"32": 100_000})
         with pytest.raises(mavlink.MissingMessageError, match="no message 32 in 2 s"):
@@ -375,7 +375,7 @@ def test_what_cannot_be_opened_is_told(connection: str, complaint: str, program:
     argv = (sys.executable, str(program), "mavlink", told, str(tmp_path / "x.tlog"))
     done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 3
-    assert f"error: MAVLink by {connection}: " in done.stderr
+    assert f"error: MAVLink over {connection}: " in done.stderr
     assert complaint in done.stderr
 
 

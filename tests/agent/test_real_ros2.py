@@ -68,7 +68,7 @@ def test_a_real_node_hears_the_agent_and_is_heard(tmp_path: Path) -> None:
     assert len(seen["heard"]) == COUNT
     for heard, again in zip(map(bytes.fromhex, seen["heard"]), map(bytes.fromhex, seen["again"]), strict=True):
         _, sequence, sent_ns = HEAD.unpack_from(heard, struct.calcsize("<4sIII"))
-        whole = made.make(sequence, sent_ns)
+        whole = made.encode(sequence, sent_ns)
         assert times[sequence] == sent_ns
         # As ROS 2 itself serializes the message, but for what fills the last word.
         assert again.startswith(whole)

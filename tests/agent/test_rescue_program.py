@@ -113,7 +113,7 @@ def test_a_drone_that_a_person_has_taken_over_is_left_alone(
         if firmware is PX4:
             wait_until(lambda: autopilot.vehicle.mode is Mode.LOITER, Deadline.after(60))
         autopilot.vehicle.change_mode(Mode.LOITER if firmware is PX4 else Mode.POSHOLD)
-        assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.TAKEN
+        assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.TAKEN_OVER
         assert autopilot.vehicle.armed
         assert up_m(autopilot) > 0.5 * HEIGHT_M
     assert "nothing more is sent" in capfd.readouterr().err

@@ -10,7 +10,7 @@ def after(speed_m_s: float, turn_rad_s: float, lasts_s: float, rate_hz: float = 
     standstill = Standstill()
     for number in range(round(lasts_s * rate_hz) + 1):
         at_s = number / rate_hz
-        standstill.odometry(100.0 + at_s, OdometryPose(speed_m_s * at_s, 1.0, turn_rad_s * at_s))
+        standstill.add_pose(100.0 + at_s, OdometryPose(speed_m_s * at_s, 1.0, turn_rad_s * at_s))
     return standstill
 
 
@@ -33,5 +33,5 @@ def test_a_robot_that_came_to_a_stop_is_stationary_once_its_motion_is_older_than
     end = OdometryPose(0.5, 1.0, 0.0)
     for number in range(1, 5):
         assert not standstill.stationary
-        standstill.odometry(101.0 + number / 20, end)
+        standstill.add_pose(101.0 + number / 20, end)
     assert standstill.stationary

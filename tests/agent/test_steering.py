@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.agent.drive_plan import BACK, END, OUT, DriveTask, way_s
-from fieldkit.agent.steering import STAND, Driver, DriveVelocity, OdometryPose
+from fieldkit.agent.steering import ZERO_VELOCITY, Driver, DriveVelocity, OdometryPose
 
 TICK_S = 0.05
 TASK = DriveTask(
@@ -96,7 +96,7 @@ def test_it_gets_there_and_back_and_faces_as_before(
     assert (driver.phase, driver.stopped) == ("home", "")
     assert math.dist(robot.pose[:2], start[:2]) < 0.05 + 10 * noise_m
     assert abs(math.remainder(robot.pose.yaw_rad - start.yaw_rad, math.tau)) < 0.1 + 5 * noise_m
-    assert out[-1] == back[-1] == STAND
+    assert out[-1] == back[-1] == ZERO_VELOCITY
     assert within_limits(task, out)
     assert within_limits(task, back)
 
@@ -114,7 +114,7 @@ def test_it_gets_there_and_back_and_faces_as_before(
 def test_no_odometry_and_no_order_make_it_faster_than_it_may(
     told: list[tuple[float, OdometryPose | None, str]],
 ) -> None:
-    driver, now_s, last, stopped = Driver(TASK, 0.0), 0.0, STAND, ""
+    driver, now_s, last, stopped = Driver(TASK, 0.0), 0.0, ZERO_VELOCITY, ""
     for for_s, pose, order in told:
         now_s += for_s
         if pose is not None:
@@ -125,7 +125,7 @@ def test_no_odometry_and_no_order_make_it_faster_than_it_may(
         assert 0 <= velocity.forward_m_s <= TASK.speed_m_s
         assert abs(velocity.turn_rad_s) <= TASK.turn_rad_s
         assert velocity.forward_m_s - last.forward_m_s <= TASK.acceleration_m_s2 * for_s + 1e-9
-        assert not stopped or (velocity == STAND and driver.stopped == stopped), "for good"
+        assert not stopped or (velocity == ZERO_VELOCITY and driver.stopped == stopped), "for good"
         last, stopped = velocity, driver.stopped
 
 
@@ -147,10 +147,10 @@ def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: boo
             driver.renewed(now_s, OUT)
         robot.drive(driver.tick(now_s), TICK_S)
         assert now_s < since_s + 100
-    assert driver.tick(now_s) == STAND
+    assert driver.tick(now_s) == ZERO_VELOCITY
     driver.renewed(now_s, BACK)
     driver.odometry(now_s, robot.odometry())
-    assert driver.tick(now_s + TICK_S) == STAND, "what stops it, stops it for good"
+    assert driver.tick(now_s + TICK_S) == ZERO_VELOCITY, "what stops it, stops it for good"
     return now_s - since_s
 
 
@@ -180,17 +180,17 @@ def test_odometry_that_jumps_and_an_order_to_end_stop_it() -> None:
     driver, robot, since_s = moving()
     robot.pose = robot.pose._replace(x_m=robot.pose.x_m + 1.0)
     driver.odometry(since_s + TICK_S, robot.odometry())
-    assert driver.tick(since_s + TICK_S) == STAND
+    assert driver.tick(since_s + TICK_S) == ZERO_VELOCITY
     assert driver.stopped.startswith("odometry jumped by 1")
     driver, _, since_s = moving()
     driver.renewed(since_s, END)
-    assert (driver.tick(since_s), driver.stopped) == (STAND, "ordered to stop")
+    assert (driver.tick(since_s), driver.stopped) == (ZERO_VELOCITY, "ordered to stop")
 
 
 def test_it_waits_for_its_laptop_and_turns_back_where_it_is() -> None:
     driver = Driver(TASK, 0.0)
     driver.odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
-    assert [driver.tick(number * TICK_S) for number in range(20)] == [STAND] * 20
+    assert [driver.tick(number * TICK_S) for number in range(20)] == [ZERO_VELOCITY] * 20
     driver, robot, since_s = moving(replace(TASK, legs=[(2.0, 0.0), (0.0, 2.0)]))
     farthest = 0.0
     for _ in run(driver, robot, now_s=since_s, order=BACK):
@@ -230,7 +230,7 @@ def test_odometry_that_says_the_same_for_ever_stops_it(told: tuple[float, float]
         way_m += driver.tick(at_s).forward_m_s * TICK_S
         if driver.stopped:
             break
-    assert driver.stopped.startswith("told to drive 1.3 m, it came 0.0 m")
+    assert driver.stopped.startswith("1.3 m were commanded, but by its odometry the robot drove 0.0 m")
     assert way_m < 1.5, "of 5 m to its fence"
 
 
@@ -247,7 +247,7 @@ def test_a_robot_that_is_not_at_its_place_does_not_start(
     start: tuple[float, float, float], last: tuple[float, float, float] | None, why: str
 ) -> None:
     driver = Driver(replace(TASK, origin=(0.0, 0.0, 0.0), last=last), 0.0)
-    assert set(run(driver, Robot(OdometryPose(*start)))) == {STAND}
+    assert set(run(driver, Robot(OdometryPose(*start)))) == {ZERO_VELOCITY}
     assert (driver.stopped, driver.refused) == (why, True)
 
 
@@ -262,7 +262,7 @@ def test_a_gap_between_two_turns_of_the_loop_stops_it_for_good() -> None:
     driver, robot, since_s = moving()
     driver.renewed(since_s + 6.0, OUT)
     driver.odometry(since_s + 6.0, robot.odometry())
-    assert driver.tick(since_s + 6.0) == STAND
+    assert driver.tick(since_s + 6.0) == ZERO_VELOCITY
     assert driver.stopped == "its program was suspended for 6.0 s"
 
 
@@ -277,5 +277,5 @@ def test_with_leave_it_first_returns_along_its_path() -> None:
     assert off_m < 0.2, "round the corner"
     assert driver.driven_m == pytest.approx(3.5, abs=0.3), "the way back is not of the drive"
     driver = Driver(task, 0.0)
-    assert set(run(driver, Robot(OdometryPose(0.5, 2.0, 0.0)))) == {STAND}
+    assert set(run(driver, Robot(OdometryPose(0.5, 2.0, 0.0)))) == {ZERO_VELOCITY}
     assert driver.stopped.endswith("more than 1 m off its path")

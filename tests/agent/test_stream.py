@@ -31,7 +31,7 @@ def streamed(over: str = "dds", size: int = 100, *, patience_s: float = 5.0) -> 
 def test_a_sample_is_a_message_of_ros(size: int) -> None:
     """Byte for byte what rosbags writes of it, in both generations."""
     for over, store in (("dds", shipped().ros2), ("ros1", shipped().ros1)):
-        sample = SampleCodec(streamed(over, size)).make(7, 123_456_789)
+        sample = SampleCodec(streamed(over, size)).encode(7, 123_456_789)
         message = store.deserialize_cdr(sample, TYPE) if over == "dds" else store.deserialize_ros1(sample, TYPE)
         again = store.serialize_cdr(message, TYPE) if over == "dds" else store.serialize_ros1(message, TYPE)
         assert bytes(again) == sample
@@ -43,12 +43,12 @@ def test_a_sample_is_a_message_of_ros(size: int) -> None:
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.sampled_from(["dds", "zenoh", "ros1"]))
 def test_a_sample_is_read_back(sequence: int, at_ns: int, over: str) -> None:
     samples = SampleCodec(streamed(over))
-    assert samples.read(samples.make(sequence, at_ns)) == (sequence, at_ns)
+    assert samples.decode(samples.encode(sequence, at_ns)) == (sequence, at_ns)
 
 
 @given(st.binary(max_size=200))
 def test_what_is_no_sample_is_told_so(data: bytes) -> None:
-    assert SampleCodec(streamed()).read(data) is None
+    assert SampleCodec(streamed()).decode(data) is None
 
 
 class Remembering:
@@ -67,7 +67,7 @@ class Remembering:
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
         deliver(b"something else", 5)
-        deliver(SampleCodec(streamed()).make(3, 17), 20)
+        deliver(SampleCodec(streamed()).encode(3, 17), 20)
         return lambda: 1
 
     def write(self, data: bytes) -> bool:
@@ -112,7 +112,7 @@ def test_a_stream_has_as_many_samples_as_its_rate_and_duration(tmp_path: Path) -
     samples = [one for one in found if one[0] == records.SAMPLE]
     assert len(samples) + skipped == 20
     assert [one[2] for one in samples] == list(range(len(samples)))
-    assert [SampleCodec(streamed()).read(data) for data in middleware.written] == [one[2:] for one in samples]
+    assert [SampleCodec(streamed()).decode(data) for data in middleware.written] == [one[2:] for one in samples]
     assert found[0][0] == records.MATCHED
     assert found[-1] == (records.END, 0, len(samples), 0)
     assert middleware.drained
@@ -155,7 +155,7 @@ def test_a_subscription_logs_what_arrives(tmp_path: Path) -> None:
     over.set()
     stream.subscribe(Remembering(), TOPIC, streamed(), log, over)
     log.end(1)
-    size = len(SampleCodec(streamed()).make(0, 0))
+    size = len(SampleCodec(streamed()).encode(0, 0))
     assert logged(tmp_path / "log") == [
         (records.FOREIGN, len(b"something else"), 0, 0),
         (records.SAMPLE, size, 3, 17),

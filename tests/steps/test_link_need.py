@@ -38,7 +38,7 @@ def test_it_names_the_connection_and_its_programs(connection: str, kind: str) ->
     [
         (CLOSED, "cannot be opened: Connection refused", "this computer has TCP port 5760, /dev/ttyACM0; write"),
         (SILENT, "no heartbeat of an autopilot", "no other one that is usual"),
-        ("error: MAVLink by usb: is not a connection", "is not a connection", "mavlink.connection"),
+        ("error: MAVLink over usb: is not a connection", "is not a connection", "mavlink.connection"),
         ("", "no answer", "mavlink.connection"),
         ("[]", "[]", "mavlink.connection"),
     ],
