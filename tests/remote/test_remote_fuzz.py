@@ -181,7 +181,7 @@ def test_what_the_other_robot_sent_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "scan.bag").write_bytes(b"x")
     sums = hashlib.sha256(b"y").hexdigest().encode() + b"  scan.bag\n"
     content = entry(b".sums-1", sums) + entry(b"scan.bag", b"y") + bytes(1024)
-    with pytest.raises(EvidenceError, match="which it or the other robot sent before"):
+    with pytest.raises(EvidenceError, match="which it or another robot sent before"):
         fetching.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
     assert (tmp_path / "scan.bag").read_bytes() == b"x"
 

@@ -734,7 +734,7 @@ def test_a_robot_that_cannot_be_written_says_so_and_is_aborted_all_the_same(shel
     jobs.install(shell, Deadline.after(30))
     with pytest.raises(RobotError, match="Read-only file system") as caught:
         evidence.begin(robot, f"{FOLDER}-2", "sender", "lo", need_kib=0)
-    assert "a card that fails" in caught.value.remedy
+    assert "a failing SD card" in caught.value.remedy
     (ended,) = jobs.abort(robot, "anna@one", Deadline.after(30)).jobs
     assert ended.endswith("sleep 60")
     jobs.install(shell, Deadline.after(30))

@@ -161,7 +161,8 @@ def test_more_than_is_expected_stays_on_the_robot_and_is_told(
     monkeypatch.setattr(fetching, "ALWAYS_BYTES", 1000)
     monkeypatch.setattr(fetching, "UNEXPECTED_SHARE", 0.0)
     with pytest.raises(
-        EvidenceError, match=r"17 MB wait there \(camera\.bag, scan/scan_0\.db3\), and at most 4\.0 MB are taken"
+        EvidenceError,
+        match=r"17 MB are to be fetched \(camera\.bag, scan/scan_0\.db3\), but at most 4\.0 MB are fetched",
     ):
         fetch(robot, into, expected_bytes=1_000_000)
     assert robot.pieces == []
@@ -176,7 +177,7 @@ def test_more_than_fits_here_stays_on_the_robot_and_is_told(
     robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(files, "free_bytes", lambda _: fetching.RESERVE_BYTES + 5_000_000)
-    with pytest.raises(EvidenceError, match=r"17 MB wait there .* and 5\.0 MB are free here"):
+    with pytest.raises(EvidenceError, match=r"17 MB are to be fetched .* but 5\.0 MB are free here"):
         fetch(robot, into)
 
 
@@ -187,9 +188,7 @@ def test_a_file_that_shrank_meanwhile_is_told(robot: Flaky, into: Path) -> None:
         return False
 
     robot.lost_at = cut
-    with pytest.raises(
-        EvidenceError, match=r"sent 10 bytes of camera\.bag from 4194304 on, where there were 4194304"
-    ):
+    with pytest.raises(EvidenceError, match=r"sent 10 bytes of camera\.bag from byte 4194304 on, instead of 4194304"):
         fetch(robot, into)
 
 
@@ -241,7 +240,7 @@ class Liar(LocalShell):
         ("100 -rf\n", "no plain file"),
         ("-1 a.bag\n", "no plain file"),
         ("a.bag\n", "no plain file"),
-        (f"{10**14} a.bag\n", "wait there"),
+        (f"{10**14} a.bag\n", "are to be fetched"),
         ("".join(f"1 f{number}\n" for number in range(501)), "more than 500 files"),
         ("100 x\n", "sent before"),
         ("100 a.bag\n", "hash differs"),

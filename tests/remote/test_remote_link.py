@@ -206,7 +206,9 @@ def test_a_server_that_floods_us_while_we_are_silent_fills_no_memory(
         wait_until(lambda: not is_up(shell), soon())
         session.end(deadline=soon())
 
-    with pytest.raises(RobotError, match="did not keep to SSH during `true`: it sent more than its window") as caught:
+    with pytest.raises(
+        RobotError, match="violated the SSH protocol during `true`: it sent more than its window"
+    ) as caught:
         run()
     assert "turtle.example" in caught.value.remedy
     assert len(sent) < ENDLESS, "the connection ended"
@@ -314,7 +316,7 @@ def raising(error: OSError) -> Callable[[float], socket.socket]:
             "getent hosts robot",
         ),
         (raising(ConnectionRefusedError()), "nothing listens on port 22", "sudo systemctl start ssh"),
-        (raising(OSError(errno.EHOSTUNREACH, "No route to host")), "there is no way to it", "ip route get robot"),
+        (raising(OSError(errno.EHOSTUNREACH, "No route to host")), "there is no route to it", "ip route get robot"),
         (raising(TimeoutError("timed out")), "did not accept the connection in time", "ping -c 3 robot"),
         (raising(OSError(errno.EPERM, "not permitted")), "cannot be reached for SSH: .*not permitted", "ping"),
     ],

@@ -20,12 +20,12 @@ from hypothesis import strategies as st
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
-from fieldkit.remote.drain import drain, hear
+from fieldkit.remote.drain import drain, wait_for_output
 from fieldkit.remote.link import SPARES, Channel, Link, UnfitServerError
 from fieldkit.remote.script import CALL, SCRIPT, SCRIPT_PATH
 from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshSession, SshShell
-from fieldkit.remote.standing import StandingShell, Turn
+from fieldkit.remote.standing import PersistentShell, RunningCommand
 from tests.helpers.sshd import Server, sshd, wait_until
 from tests.helpers.userlands import USERLANDS, path_of
 
@@ -256,7 +256,7 @@ def test_a_command_whose_link_breaks_is_sent_again(two: Robot) -> None:
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize(("owner", "name"), [(Link, "_open"), (StandingShell, "open")])
+@pytest.mark.parametrize(("owner", "name"), [(Link, "_open"), (PersistentShell, "open")])
 def test_what_is_being_opened_over_the_radio_is_awaited_before_that_is_measured(
     two: Robot, monkeypatch: pytest.MonkeyPatch, owner: type, name: str
 ) -> None:
@@ -274,7 +274,7 @@ def test_what_is_being_opened_over_the_radio_is_awaited_before_that_is_measured(
 
     shell = two.server.shell(on_air=True)
     shell.run(("true",), deadline=soon())
-    shell._connection._link.settle(soon())  # type: ignore[union-attr]
+    shell._connection._link.wait_until_opened(soon())  # type: ignore[union-attr]
     monkeypatch.setattr(owner, name, slowly)
     shell.run((*CALL, "left", ":"), deadline=soon())
     with ThreadPoolExecutor(1) as pool:
@@ -300,10 +300,10 @@ def test_nothing_is_opened_over_the_radio_while_that_is_measured(two: Robot) -> 
         assert opens_or_has() == SPARES - 1
         shell.run((*CALL, "left", ":"), deadline=soon())
         assert opens_or_has() == SPARES - 2
-        assert shell._connection.standing._opener is None
+        assert shell._connection.shells._opener is None
     shell.run((*CALL, "left", ":"), deadline=soon())
     assert opens_or_has() == SPARES
-    assert shell._connection.standing._opener is not None
+    assert shell._connection.shells._opener is not None
     shell.close()
 
 
@@ -396,10 +396,10 @@ def test_output_and_exit_code_are_told_apart_however_they_come(
     taken = threading.Lock()
     taken.acquire()
     try:
-        turn = Turn(cast("Channel", channel), NONCE, taken)
+        turn = RunningCommand(cast("Channel", channel), NONCE, taken)
         into = BytesIO()
-        assert turn.has_begun()
-        assert hear(turn, out[0][:3], deadline=soon(), robot="robot")
+        assert turn.wait_for_start()
+        assert wait_for_output(turn, out[0][:3], deadline=soon(), robot="robot")
         done = drain(turn, into, stdin=None, deadline=soon(), limit_bytes=1 << 20, robot="robot")
         turn.close()
     finally:
@@ -413,4 +413,4 @@ def test_output_and_exit_code_are_told_apart_however_they_come(
 def test_an_end_without_an_exit_code_is_none(end: bytes) -> None:
     channel = Pieces([NONCE + b"\n" + NONCE + end + b"...."], [])
     with pytest.raises(UnfitServerError, match="exit code"):
-        Turn(cast("Channel", channel), NONCE, threading.Lock()).has_begun()
+        RunningCommand(cast("Channel", channel), NONCE, threading.Lock()).wait_for_start()
