@@ -182,7 +182,7 @@ def test_what_a_killed_recorder_of_ros_2_left_beside_its_database_is_saved(tmp_p
     before = {path.name: path.read_bytes() for path in left.iterdir()}
     told = contents.inspect(left)
     assert told.problems == (
-        "there is no metadata.yaml: its recorder was ended before it could close it, or it was copied alone",
+        "there is no metadata.yaml: the recorder was stopped before it closed the bag, or it was not copied",
     )
     assert told.savable == 41
     contents.repair(left, tmp_path / "saved")
@@ -239,7 +239,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("info", "x" * 300), 2, "File name too long"),
         (("info", "none"), 2, "no bag is in this folder"),
         (("info", "pipe.bag"), 2, "this is neither a file nor a folder"),
-        (("info", "text.bag"), 2, "this is no bag of ROS 1, SQLite or MCAP"),
+        (("info", "text.bag"), 2, "this is not a bag of ROS 1, SQLite or MCAP"),
         (("info", "packed.bag.gz"), 2, "remedy: gunzip -k packed.bag.gz, then try again"),
         (("info", "all.db3"), 2, "remedy: mv all.db3 all.db3.bag"),
         (("info", "empty.bag"), 4, "the file is empty"),
@@ -251,8 +251,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("repair", "zeros.mcap", "new"), 4, "the file begins with zeros"),
         (("convert", "nowhere.bag", "new"), 2, "No such file"),
         (("convert", "none", "new"), 2, "no bag is in this folder"),
-        (("repair", "all.bag", "all.bag"), 2, "something is there already"),
-        (("repair", "all.bag", "new"), 2, "a saved bag keeps its format, ros1: the new one is NAME.bag"),
+        (("repair", "all.bag", "all.bag"), 2, "it exists already"),
+        (("repair", "all.bag", "new"), 2, "a repaired bag keeps its format, ros1: the new one must be NAME.bag"),
         (("convert", "all.bag", "no/new"), 2, "cannot write there"),
         (("convert", "all.bag", "new.bag", "--distribution", "humble"), 2, "humble is ROS 2"),
         (("convert", "killed.bag", "new"), 4, "remedy: fieldkit bag repair killed.bag NEW"),

@@ -52,8 +52,8 @@ def test_what_is_no_topic_and_type_is_refused(text: str) -> None:
 def test_delays_are_those_of_sorted_ones_to_a_percent(delays_ns: list[int]) -> None:
     tally = CrossingTally()
     for delay_ns in delays_ns:
-        tally.carried(10, 0, delay_ns)
-    told = tally.told(SCAN, "ros1", "dds")
+        tally.count(10, 0, delay_ns)
+    told = tally.counts(SCAN, "ros1", "dds")
     ordered = sorted(delays_ns)
     for found, share in ((told.delay_median_s, 0.5), (told.delay_p99_s, 0.99)):
         exact_s = ordered[math.ceil(share * len(ordered)) - 1] / 1e9
@@ -63,15 +63,15 @@ def test_delays_are_those_of_sorted_ones_to_a_percent(delays_ns: list[int]) -> N
 def test_rates_are_between_the_first_and_the_last() -> None:
     tally = CrossingTally()
     for number in range(11):
-        tally.carried(100, 0, number * 10**8 + 1)
-    told = tally.told(SCAN, "ros1", "dds")
+        tally.count(100, 0, number * 10**8 + 1)
+    told = tally.counts(SCAN, "ros1", "dds")
     assert (told.messages, told.bytes) == (11, 1100)
     assert told.per_s == pytest.approx(10)
     assert told.bytes_per_s == pytest.approx(1000)
 
 
 def test_nothing_carried_has_no_rate_and_no_delay() -> None:
-    told = CrossingTally().told(SCAN, "ros1", "dds")
+    told = CrossingTally().counts(SCAN, "ros1", "dds")
     assert (told.messages, told.per_s, told.bytes_per_s, told.delay_median_s, told.delay_p99_s) == (
         0,
         None,

@@ -110,7 +110,7 @@ def test_any_text_is_a_definition_or_is_refused(text: str) -> None:
 @pytest.mark.parametrize(("name", "hashes"), [("foxy", False), ("humble", False), ("iron", True), ("rolling", True)])
 def test_hashes_are_told_from_iron_on(name: str, *, hashes: bool) -> None:
     distribution = Distribution.of(name)
-    assert (distribution.tells_hashes, distribution.gid_bytes) == (hashes, 16 if hashes else 24)
+    assert (distribution.has_type_hashes, distribution.gid_bytes) == (hashes, 16 if hashes else 24)
     types, quality = MessageTypes(distribution), PROFILES["default"]
     told = topics.describe(types, "/scan", "sensor_msgs/LaserScan", quality, domain=0, node="n")
     known = types.get("sensor_msgs/LaserScan").rihs01
