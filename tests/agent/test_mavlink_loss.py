@@ -1,4 +1,4 @@
-"""The loss of MAVLink behind a router against the counters of the kernel that dropped the messages."""
+"""The loss of MAVLink behind a router, compared with the counters of the kernel that dropped the messages."""
 
 import json
 import subprocess
@@ -15,15 +15,15 @@ pytestmark = pytest.mark.emulated
 
 LASTS_S = 8
 EDGE = 2
-"""Messages that may differ: one of each stream is on its way when the counters begin."""
+"""Maximum difference in messages: one of each stream is in transit when the counters start."""
 SHARE = 0.12
-"""And this share of the sent ones: the drone sends at multiples of 20 ms, and a late message at the time of a missing
-number looks lost."""
+"""Plus this fraction of the sent messages: the drone sends at multiples of 20 ms, and a late message at the time of a
+missing number counts as lost."""
 
 
 @pytest.mark.quiet
 @pytest.mark.parametrize("percent", [0, 20])
-def test_the_loss_behind_a_router_is_what_the_kernel_dropped(percent: int, tmp_path: Path) -> None:
+def test_loss_behind_a_router_is_that_of_the_kernel(percent: int, tmp_path: Path) -> None:
     log = tmp_path / "mavlink.tlog"
     words = ("unshare", "--net", "--", sys.executable, "-m", "tests.helpers.mavlink_loss")
     done = subprocess.run(
@@ -37,7 +37,7 @@ def test_the_loss_behind_a_router_is_what_the_kernel_dropped(percent: int, tmp_p
     assert done.returncode == 0, done.stderr
     counted = json.loads(done.stdout)
     assert counted["periodic"] > 200
-    assert counted["withheld"] > 10, "numbers have gaps that are no loss"
+    assert counted["withheld"] > 10, "numbers have gaps that are not losses"
     values = tlog.measure(tlog.read(log, drones.SYSTEM, counted["ended_us"]), 0.0).values
     came, sent = int(values["mavlink_periodic"]), int(values["mavlink_periodic_sent"])
     assert abs(sent - came - counted["dropped"]) <= EDGE + SHARE * sent
