@@ -118,7 +118,7 @@ def test_sent_messages_are_those_of_pymavlink() -> None:
     messages = [message for frame in link.sent for message in reader.parse_buffer(frame)]
     beat, mode, arm, land, lead, ask = messages
     assert (beat.type, beat.autopilot) == (d.MAV_TYPE_ONBOARD_CONTROLLER, d.MAV_AUTOPILOT_INVALID)
-    assert {(one.target_system, one.target_component) for one in (mode, arm, land, lead, ask)} == {(7, 1)}
+    assert {(message.target_system, message.target_component) for message in (mode, arm, land, lead, ask)} == {(7, 1)}
     assert (mode.command, mode.param1, mode.param2) == (d.MAV_CMD_DO_SET_MODE, 1, 6)
     assert (arm.command, arm.param1, arm.param2) == (d.MAV_CMD_COMPONENT_ARM_DISARM, 1, 0)
     assert land.command == d.MAV_CMD_NAV_LAND

@@ -58,12 +58,12 @@ def faults(needs: FlightNeeds = NEEDS, first: Any = None, **replaced: Any) -> li
     link.coming = [(first or beat(d.MAV_AUTOPILOT_ARDUPILOTMEGA)).pack(writer)]
     drone.receive()
     check = ArmingCheck(drone, needs)
-    messages = [one for one in {**WITHOUT_FAULT, **replaced}.values() if one is not None]
-    link.coming = [one.pack(writer) for one in messages]
+    messages = [item for item in {**WITHOUT_FAULT, **replaced}.values() if item is not None]
+    link.coming = [item.pack(writer) for item in messages]
     drone.receive()
     reported = list(check.faults())
-    assert all(one.remedy for one in reported)
-    return [one.what for one in reported]
+    assert all(item.remedy for item in reported)
+    return [item.what for item in reported]
 
 
 def test_no_faults_for_a_ready_autopilot() -> None:
@@ -97,7 +97,7 @@ def test_no_faults_for_a_ready_autopilot() -> None:
     ],
 )
 def test_each_fault_is_reported(replaced: dict[str, Any], what: str) -> None:
-    assert any(what in one for one in faults(**replaced)), faults(**replaced)
+    assert any(what in item for item in faults(**replaced)), faults(**replaced)
 
 
 def test_text_in_pieces_is_joined() -> None:
@@ -119,9 +119,9 @@ def test_emulated_autopilots(firmware: Firmware, capsys: pytest.CaptureFixture[s
             )
             *reported, summary = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
             assert summary["charge"] == 1.0
-            assert [one["what"].rpartition(": ")[2] for one in reported] == unfit
-            # The checks of PX4 apply to its present mode, which is not the one of the flight.
-            assert [one["grave"] for one in reported] == [summary["autopilot"] == "ArduCopter"] * len(unfit)
+            assert [item["what"].rpartition(": ")[2] for item in reported] == unfit
+            # The checks of PX4 apply to its present mode, which is not the item of the flight.
+            assert [item["grave"] for item in reported] == [summary["autopilot"] == "ArduCopter"] * len(unfit)
 
 
 def test_missing_heartbeat_is_reported(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -220,7 +220,7 @@ def over_a_serial_line() -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    "way",
+    "connection_kind",
     [over_udp, over_udp_that_speaks_first, over_tcp, over_a_serial_line],
     ids=lambda connection_kind: connection_kind.__name__,
 )
