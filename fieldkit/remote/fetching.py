@@ -63,14 +63,14 @@ class FetchProgress:
     """Progress of the fetch of large files.
 
     Args:
-        tell: Called at times with a text, and the estimated remaining time in seconds.
+        report: Called at times with a text, and the estimated remaining time in seconds.
         is_over: Returns True if the fetch was cancelled.
     """
 
     def __init__(
-        self, tell: Callable[[str, float], None] = lambda *_: None, is_over: Callable[[], bool] = lambda: False
+        self, report: Callable[[str, float], None] = lambda *_: None, is_over: Callable[[], bool] = lambda: False
     ) -> None:
-        self._tell = tell
+        self._report = report
         self._is_over = is_over
         self._total = self._done = self._received = 0
         self._start_s = self._reported_s = 0.0
@@ -100,7 +100,7 @@ class FetchProgress:
         if now_s - self._reported_s >= _REPORT_S:
             self._reported_s = now_s
             remaining_s = (self._total - self._done) * (now_s - self._start_s) / self._received
-            self._tell(f"{format_bytes(self._done)} of {format_bytes(self._total)}", remaining_s)
+            self._report(f"{format_bytes(self._done)} of {format_bytes(self._total)}", remaining_s)
 
 
 def pack_command(folder: str, role: str, interface: str) -> tuple[str, ...]:
