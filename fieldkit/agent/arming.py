@@ -125,7 +125,7 @@ class ArmingCheck:
         return self._drone.dialect is not None and (warned or any(True for _ in self._position()))
 
     @property
-    def done(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether all reports were received, or the time for them has passed."""
         drone, lasted_s = self._drone, time.monotonic() - self._start_s
         if drone.dialect is None or lasted_s > _TIMEOUT_S:
@@ -152,7 +152,7 @@ class ArmingCheck:
         yield from self._position()
         yield from self._battery()
         yield from self._prearm_checks()
-        yield from self._bounds()
+        yield from self._limits()
 
     def _position(self) -> Iterator[ArmingFault]:
         drone = self._drone
@@ -197,7 +197,7 @@ class ArmingCheck:
         remedy = "remove the cause; a ground station (QGroundControl, MAVProxy) shows the same"
         yield ArmingFault(what, remedy, grave=drone.guided or not drone.dialect.checks_present_mode)
 
-    def _bounds(self) -> Iterator[ArmingFault]:
+    def _limits(self) -> Iterator[ArmingFault]:
         drone, needs = self._drone, self._needs
         assert drone.dialect is not None
         limits = drone.dialect.limits(drone.parameters)
@@ -235,7 +235,7 @@ def check_arming(connection: str, needs: FlightNeeds, stop_event: threading.Even
         while not stop_event.is_set():
             check.request_missing()
             session.exchange(_POLL_S)
-            if check.done:
+            if check.is_complete:
                 if not check.is_starting or time.monotonic() > estimate_deadline_s:
                     break
                 check = ArmingCheck(session.drone, needs)

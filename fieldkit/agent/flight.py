@@ -189,7 +189,7 @@ class OffboardPilot:
         check = ArmingCheck(self._drone, self._plan.needs)
         for _ in self._loop.iterate(hold_start):
             check.request_missing()
-            if check.done:
+            if check.is_complete:
                 break
         if reasons := _fault_text(check):
             raise FlightError(REFUSED, reasons)

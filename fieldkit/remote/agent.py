@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.remote.script import HOME, demand
+from fieldkit.remote.script import HOME, require_success
 from fieldkit.remote.shell import Shell
 
 _INSTALL_S: Final = 30.0
@@ -64,4 +64,4 @@ def install(shell: Shell) -> None:
     checked = shell.run(("sh", "-c", _CHECK_SCRIPT, "sh", path, _sha256()), deadline=deadline, check=False)
     if checked.exit_code != 0:
         copied = shell.run(("sh", "-c", _COPY_SCRIPT, "sh", path), stdin=content(), deadline=deadline, check=False)
-        demand(shell, copied, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")
+        require_success(shell, copied, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")

@@ -11,7 +11,7 @@ from fieldkit.core.errors import LinkError, LinkLostError
 from fieldkit.core.units import format_duration
 from fieldkit.remote.identity import Address, Credentials
 from fieldkit.remote.link import BROKEN, Connect, Link, LoginRefusedError, Timing
-from fieldkit.remote.login import closed, log_in
+from fieldkit.remote.login import closed_error, log_in
 from fieldkit.remote.standing import ShellPool
 
 T = TypeVar("T")
@@ -87,7 +87,7 @@ class Connection:
             with self._lock:
                 if ended.is_set():
                     link.close()
-                    raise closed(self.address)
+                    raise closed_error(self.address)
                 lost_at_s, self._lost_at_s = self._lost_at_s, None
                 self._reopened_at_s = time.monotonic() if self._was_up else None
                 self._link, self._was_up = link, True
@@ -98,7 +98,7 @@ class Connection:
             self._notice(f"{self.address.robot}: the link is back after {duration}")
         return link
 
-    def run_persistently(self, attempt: Callable[[Deadline], T], deadline: Deadline) -> T:
+    def run_with_retries(self, attempt: Callable[[Deadline], T], deadline: Deadline) -> T:
         """Return the result of `attempt`, which is repeated after each loss of the link.
 
         Only a link that was open before is reopened, so that a wrong address is reported immediately. A repeated
@@ -115,7 +115,7 @@ class Connection:
                 return attempt(deadline)
             except (LinkError, LoginRefusedError) as error:
                 if ended.is_set():
-                    raise closed(self.address) from error
+                    raise closed_error(self.address) from error
                 if not isinstance(error, (LinkLostError, LoginRefusedError)) or not self._was_up:
                     raise
                 self._wait_for_link(error, final, ended)
@@ -142,7 +142,7 @@ class Connection:
         pause_s = self._pause_s
         while not until.expired:
             if ended.wait(min(pause_s, until.remaining_s)):
-                raise closed(self.address) from error
+                raise closed_error(self.address) from error
             try:
                 self.link(until.later(self._timing.connect_s))
             except (LinkLostError, LoginRefusedError) as retry_error:
@@ -178,7 +178,7 @@ class Connection:
             self._notice(f"{self.address.robot}: the link is lost; for {wait} at most its radio is being measured")
         while silence_s := self._silence_s():
             if ended.wait(min(_POLL_S, silence_s)):
-                raise closed(self.address) from error
+                raise closed_error(self.address) from error
         return initial_s
 
     def open_spares(self, link: Link, shell_command: str | None) -> None:

@@ -5,7 +5,7 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.remote.command import printable
-from fieldkit.remote.script import CALL, HOME, REPLY_S, call, demand, word
+from fieldkit.remote.script import CALL, HOME, REPLY_S, call, require_success, word
 from fieldkit.remote.shell import Shell
 
 MIN_FREE_KIB: Final = 100 * 1024
@@ -56,7 +56,7 @@ def begin(
     """
     command = begin_command(folder, role, interface, old=old, token=token, need_kib=need_kib)
     done = shell.run(command, deadline=Deadline.after(REPLY_S), check=False)
-    demand(shell, done)
+    require_success(shell, done)
     return printable(done.stdout)
 
 

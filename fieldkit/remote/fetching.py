@@ -14,7 +14,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, LinkError, RobotError
 from fieldkit.core.units import format_bytes
 from fieldkit.remote import archive
-from fieldkit.remote.script import CALL, call, complaint
+from fieldkit.remote.script import CALL, call, error_message
 from fieldkit.remote.shell import Shell
 
 PIECE_BYTES: Final = 1 << 22
@@ -182,7 +182,7 @@ def _fetch_small(
 
 def _pack_error(error: RobotError, folder: str) -> RobotError:
     """Return the error that the job script reported when it packed a folder."""
-    reported = complaint(error.what.encode())
+    reported = error_message(error.what.encode())
     if reported.startswith(_NO_FOLDER):
         return NoFolderError(f"it no longer has {reported.removeprefix('no ')}", where=error.where)
     if reported.startswith(_LATE):
@@ -239,12 +239,12 @@ class _LargeFile:
         if self._sum() != digest.hexdigest():
             part.unlink()  # the pieces of an earlier call may be wrong
             raise EvidenceError(f"hash differs: {self.name}", where=self.shell.robot)
-        path = _place(into, self.name, self.shell.robot)
+        path = _target_path(into, self.name, self.shell.robot)
         try:
             # Reserve the name first, because the files of another robot are fetched at the same time.
             path.open("xb").close()
         except FileExistsError as error:
-            raise _sent_before(self.name, self.shell.robot) from error
+            raise _duplicate_error(self.name, self.shell.robot) from error
         part.rename(path)
 
     def _piece(self, start: int, to: Path) -> bytes:
@@ -302,9 +302,9 @@ def _require_own(name: str, robot: str, foreign: Callable[[str], str | None]) ->
 def _write(member: archive.TarMember, into: Path, robot: str) -> str:
     """Write a member to a new file; return its hash."""
     try:
-        file = _place(into, member.name, robot).open("xb")
+        file = _target_path(into, member.name, robot).open("xb")
     except FileExistsError as error:
-        raise _sent_before(member.name, robot) from error
+        raise _duplicate_error(member.name, robot) from error
     digest = hashlib.sha256()
     with file:
         for chunk in member.chunks:
@@ -313,17 +313,17 @@ def _write(member: archive.TarMember, into: Path, robot: str) -> str:
     return digest.hexdigest()
 
 
-def _place(into: Path, name: str, robot: str) -> Path:
+def _target_path(into: Path, name: str, robot: str) -> Path:
     """Return the path for a file of this name; its folder is created."""
     path = into / name
     try:
         path.parent.mkdir(exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise _sent_before(name, robot) from error
+        raise _duplicate_error(name, robot) from error
     return path
 
 
-def _sent_before(name: str, robot: str) -> EvidenceError:
+def _duplicate_error(name: str, robot: str) -> EvidenceError:
     return EvidenceError(f"sent {name}, which it or another robot sent before", where=robot)
 
 

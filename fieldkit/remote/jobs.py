@@ -12,7 +12,17 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.model import Protocol
 from fieldkit.remote.command import printable
-from fieldkit.remote.script import CALL, HOME, REPLY_S, SCRIPT, SCRIPT_PATH, call, complaint, demand, install
+from fieldkit.remote.script import (
+    CALL,
+    HOME,
+    REPLY_S,
+    SCRIPT,
+    SCRIPT_PATH,
+    call,
+    error_message,
+    install,
+    require_success,
+)
 from fieldkit.remote.shell import Completed, Session, Shell
 
 __all__ = [
@@ -151,7 +161,7 @@ def start(shell: Shell, job: Job) -> None:
     """
     within_s = REPLY_S - READY_S + job.ready_s
     done = shell.run(command("start", job), deadline=Deadline.after(within_s), check=False)
-    demand(shell, done, remedy=f"look into {job.folder} on the robot")
+    require_success(shell, done, remedy=f"look into {job.folder} on the robot")
 
 
 @dataclass(frozen=True)
@@ -216,7 +226,7 @@ def serve(shell: Shell, job: Job) -> Pending:
     session = shell.begin(command("serve", job), deadline=Deadline.after(REPLY_S), until=_READY_OUTPUT)
     if not session.told:
         done = session.end(deadline=Deadline.after(REPLY_S), check=False)
-        demand(shell, done, remedy=f"look into {job.folder} on the robot")
+        require_success(shell, done, remedy=f"look into {job.folder} on the robot")
     return Pending(shell, job, session)
 
 
@@ -306,7 +316,7 @@ def abort(shell: Shell, who: str, deadline: Deadline) -> Aborted:
     done = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
     output, error = done.stdout, None
     try:
-        demand(shell, done)
+        require_success(shell, done)
     except RobotError as script_error:
         error = script_error
     landing = tuple((match["program"].decode(), match["state"].decode()) for match in _LANDING_LINE.finditer(output))
@@ -323,6 +333,6 @@ def _script(job: Job) -> Sequence[str]:
 
 
 def _exit_code(shell: Shell, job: Job, done: Completed) -> int:
-    if complaint(done.stderr):
-        demand(shell, done, remedy=f"look into {job.folder} on the robot")
+    if error_message(done.stderr):
+        require_success(shell, done, remedy=f"look into {job.folder} on the robot")
     return done.exit_code

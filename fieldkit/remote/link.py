@@ -228,7 +228,7 @@ class Link:
                 remedy=f"continue only if it was reinstalled: fieldkit enroll {address.robot} --replace",
             )
         self.doing = "answer the login"
-        _, transport = self._up()
+        _, transport = self._connected()
         count = 0
         for attempt in _attempts(transport, address, credentials):
             with contextlib.suppress(paramiko.AuthenticationException):
@@ -250,7 +250,7 @@ class Link:
             ExpiredError: The deadline passed, or `ended` was set.
             OSError, SSHException, EOFError: The connection broke.
         """
-        _, transport = self._up()
+        _, transport = self._connected()
         channel = bounded(lambda: self._channel(transport), deadline, ended, what="get a channel")
         bounded(lambda: channel.exec_command(command), deadline, ended, what="start")
         self.acknowledge()
@@ -261,12 +261,12 @@ class Link:
 
     def acknowledge(self) -> None:
         """Send the TCP acknowledgement now, so that no delayed one collides with packets of the robot's command."""
-        stream, _ = self._up()
+        stream, _ = self._connected()
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
     def extend_timeout(self, seconds: float) -> None:
         """Extend `Timing.dead_s`, the time that the peer may be silent, by some seconds."""
-        stream, _ = self._up()
+        stream, _ = self._connected()
         _set_timeout(stream, self._timing.dead_s + seconds)
 
     def open_spares(self) -> None:
@@ -274,12 +274,12 @@ class Link:
 
         Must be called after a command has ended. At its start the answers would collide with its packets.
         """
-        _, transport = self._up()
+        _, transport = self._connected()
         if _closes_spares(transport):
             return
         with self._lock:
             missing = max(0, SPARES - len(self._spares))
-            self._spares += [self._opening(transport) for _ in range(missing)]
+            self._spares += [self._open_in_background(transport) for _ in range(missing)]
 
     def wait_until_opened(self, deadline: Deadline) -> None:
         """Wait until all channels are opened that are opened in advance, or the deadline has passed."""
@@ -293,7 +293,7 @@ class Link:
         Raises:
             OSError, SSHException, EOFError: The connection broke, or the server refuses more.
         """
-        _, transport = self._up()
+        _, transport = self._connected()
         if _closes_spares(transport):
             return None
         with self._lock:
@@ -313,7 +313,7 @@ class Link:
                 if not (channel := spare.result()).closed:
                     return channel
 
-    def _opening(self, transport: paramiko.Transport) -> "Future[Channel]":
+    def _open_in_background(self, transport: paramiko.Transport) -> "Future[Channel]":
         future: Future[Channel] = Future()
 
         def work() -> None:
@@ -351,7 +351,7 @@ class Link:
             transport.close()
             stream.close()
 
-    def _up(self) -> tuple[socket.socket, paramiko.Transport]:
+    def _connected(self) -> tuple[socket.socket, paramiko.Transport]:
         if self._stream is None or self._transport is None:
             raise EOFError("not connected")
         return self._stream, self._transport

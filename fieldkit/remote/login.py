@@ -34,7 +34,7 @@ def log_in(
         ConfigurationError: There is no key for the login.
     """
     link = Link(connect, timing)
-    with _explained(link, address, ended):
+    with _converting_errors(link, address, ended):
         bounded(lambda: link.log_in(address, credentials), deadline, ended)
     return link
 
@@ -46,12 +46,12 @@ def offered_key(address: Address, connect: Connect, *, deadline: Deadline, kind:
         LinkLostError: The robot was not reached, or did not answer before the deadline.
     """
     link, never = Link(connect, Timing()), threading.Event()
-    with _explained(link, address, never), contextlib.closing(link):
+    with _converting_errors(link, address, never), contextlib.closing(link):
         return bounded(lambda: link.exchange_keys(kind), deadline, never)
 
 
 @contextlib.contextmanager
-def _explained(link: Link, address: Address, ended: threading.Event) -> Iterator[None]:
+def _converting_errors(link: Link, address: Address, ended: threading.Event) -> Iterator[None]:
     """Close a link that could not be opened, and convert its exception to an error with a remedy."""
     try:
         yield
@@ -60,7 +60,7 @@ def _explained(link: Link, address: Address, ended: threading.Event) -> Iterator
         if isinstance(error, FieldkitError) or not isinstance(error, BROKEN):
             raise
         if ended.is_set():
-            raise closed(address) from error
+            raise closed_error(address) from error
         if isinstance(error, UnfitServerError):
             raise RobotError(
                 f"its SSH server cannot be trusted with a login: {error}",
@@ -71,7 +71,7 @@ def _explained(link: Link, address: Address, ended: threading.Event) -> Iterator
         raise LinkLostError(what, where=address.robot, remedy=remedy) from error
 
 
-def closed(address: Address) -> LinkError:
+def closed_error(address: Address) -> LinkError:
     """Return the error of a wait that `close` ended."""
     return LinkError("fieldkit closed the connection", where=address.robot)
 

@@ -9,7 +9,7 @@ from typing import Final
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.threads import together
-from fieldkit.remote.script import SCRIPT, SCRIPT_PATH, call, demand, word
+from fieldkit.remote.script import SCRIPT, SCRIPT_PATH, call, require_success, word
 from fieldkit.remote.shell import Shell
 
 _LINE: Final = re.compile(r"(?P<program>\S+/\.jobs/\S+) (?P<state>[a-z]+)")
@@ -91,7 +91,7 @@ def halt(shell: Shell, who: str, deadline: Deadline) -> Halted:
     done = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
     error = None
     try:
-        demand(shell, done)
+        require_success(shell, done)
     except FieldkitError as script_error:
         error = script_error
     return Halted(_states(done.stdout), error)

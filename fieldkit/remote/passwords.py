@@ -24,7 +24,7 @@ def at_terminal(user: str, host: str, robot: str) -> str:
         raise ConfigurationError(
             f"the password of {user}@{host} must be typed, and there is no terminal to ask at",
             where=robot,
-            remedy=f"{_store(user, host)}, and write `password: keyring`; or use a key",
+            remedy=f"{_store_command(user, host)}, and write `password: keyring`; or use a key",
         )
     return getpass.getpass(f"password of {user}@{host} ({robot}): ")
 
@@ -46,12 +46,12 @@ def in_keyring(user: str, host: str, robot: str) -> str:
         ) from error
     if password is None:
         raise ConfigurationError(
-            f"the keyring has no password of {user}@{host}", where=robot, remedy=_store(user, host)
+            f"the keyring has no password of {user}@{host}", where=robot, remedy=_store_command(user, host)
         )
     return password
 
 
-def _store(user: str, host: str) -> str:
+def _store_command(user: str, host: str) -> str:
     """Return the command that stores a password; in an environment of pipx, `keyring` is not on the PATH."""
     program = ("keyring",) if shutil.which("keyring") else (sys.executable, "-m", "keyring")
     return typed(*program, "set", SERVICE, f"{user}@{host}")

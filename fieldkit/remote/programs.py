@@ -3,7 +3,7 @@
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.remote.script import HOME, REPLY_S, demand
+from fieldkit.remote.script import HOME, REPLY_S, require_success
 from fieldkit.remote.shell import Shell
 
 _MIN_BYTES_PER_S: Final = 14_000.0
@@ -56,4 +56,4 @@ def place(shell: Shell, folder: str, at: str, content: bytes, sha256: str, *, ex
     )
     deadline = Deadline.after(2 * REPLY_S + len(content) / _MIN_BYTES_PER_S)
     copied = shell.run(argv, stdin=content, deadline=deadline, check=False)
-    demand(shell, copied, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")
+    require_success(shell, copied, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")

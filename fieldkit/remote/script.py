@@ -79,7 +79,7 @@ def install(shell: Shell, deadline: Deadline) -> None:
     copied = shell.run(
         ("sh", "-c", _COPY_SCRIPT, "sh", HOME, SCRIPT_PATH), stdin=SCRIPT, deadline=deadline, check=False
     )
-    demand(
+    require_success(
         shell,
         copied,
         remedy=_INSTALL if _MISSING_PROGRAM in copied.stderr else f"on the robot: touch ~/{HOME}/x; df -h ~",
@@ -95,17 +95,17 @@ def call(shell: Shell, verb: str, *words: str, deadline: Deadline) -> bytes:
         RobotError: The script failed.
     """
     done = shell.run((*CALL, verb, *words), deadline=deadline, check=False)
-    demand(shell, done)
+    require_success(shell, done)
     return done.stdout
 
 
-def demand(shell: Shell, done: Completed, *, remedy: str = "") -> None:
+def require_success(shell: Shell, done: Completed, *, remedy: str = "") -> None:
     """Check that a call of the script succeeded; raises as `call` otherwise."""
     if done.exit_code == 0:
         return
     # A login shell that refuses the login (nologin) prints its message to either stream.
     output = printable(done.stderr or done.stdout) or "no message"
-    what = complaint(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {output}"
+    what = error_message(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {output}"
     match done.exit_code:
         case 75 if held := _HELD.match(what):  # exit codes of the script, see common.sh
             age, remaining = (format_duration(float(held[name])) for name in ("age", "rest"))
@@ -130,7 +130,7 @@ def word(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9._@-]", "_", text)[:80] or "-"
 
 
-def complaint(stderr: bytes) -> str:
+def error_message(stderr: bytes) -> str:
     """Return the error message of the script as one line; empty if standard error contains none."""
     reason, _, log = stderr.partition(_MESSAGE_PREFIX)[2].partition(b"\n")
     return ": ".join(text for text in (printable(reason), printable(log)) if text)

@@ -110,7 +110,7 @@ class SshShell:
             link, channel = _start(
                 self._connection, argv, within, ends_on_request=ends_on_request, has_input=has_input
             )
-            with _explained(self._connection.address, link, argv), contextlib.ExitStack() as stack:
+            with _converting_errors(self._connection.address, link, argv), contextlib.ExitStack() as stack:
                 stack.enter_context(contextlib.closing(channel))
                 told = not until or wait_for_output(channel, until, deadline=within, robot=self.robot)
                 link.acknowledge()
@@ -124,7 +124,7 @@ class SshShell:
                 told=told,
             )
 
-        return self._connection.run_persistently(attempt, deadline)
+        return self._connection.run_with_retries(attempt, deadline)
 
     def silence(self, seconds: float) -> contextlib.AbstractContextManager[None]:
         """Keep the connection silent during the body, if it crosses the radio under test; as `Shell.silence`."""
@@ -192,7 +192,7 @@ class SshSession:
             self._running = None
             output.seek(0)
             output.truncate()
-            with _explained(self._connection.address, link, self._argv), contextlib.closing(channel):
+            with _converting_errors(self._connection.address, link, self._argv), contextlib.closing(channel):
                 pending_input = stdin if self._ends_on_request or self._has_input else None
                 if isinstance(channel, RunningCommand):  # it has no standard input that could be closed
                     pending_input = None
@@ -205,7 +205,7 @@ class SshSession:
                 self._connection.open_spares(link, shell_command)
                 return done
 
-        exit_code, stderr = self._connection.run_persistently(attempt, deadline)
+        exit_code, stderr = self._connection.run_with_retries(attempt, deadline)
         if check and exit_code != 0:
             raise RobotError(
                 f"`{quote(self._argv)}` ended with exit code {exit_code}: "
@@ -234,7 +234,7 @@ def _start(
     ended = connection.ended
     link = connection.link(deadline)
     try:
-        with _explained(connection.address, link, argv):
+        with _converting_errors(connection.address, link, argv):
             running = None
             if _is_call(argv) and not has_input:
                 running = connection.shells.begin(
@@ -252,7 +252,7 @@ def _is_call(argv: Sequence[str]) -> bool:
 
 
 @contextlib.contextmanager
-def _explained(address: Address, link: Link, argv: Sequence[str]) -> Iterator[None]:
+def _converting_errors(address: Address, link: Link, argv: Sequence[str]) -> Iterator[None]:
     """Convert exceptions of paramiko, the socket and the deadline to errors with robot, command and remedy."""
     command, robot = quote(argv), address.robot
     try:

@@ -178,12 +178,12 @@ class RunningCommand:
             self._out.feed(self._channel.recv(_CHUNK))
         if self._channel.recv_stderr_ready():
             self._err.feed(self._channel.recv_stderr(_CHUNK))
-        return self._ended or self._cut
+        return self._ended or self._is_cut_off
 
     @property
     def closed(self) -> bool:
         """Whether no more output can arrive because the channel has ended."""
-        return self._cut
+        return self._is_cut_off
 
     @property
     def status_event(self) -> threading.Event:
@@ -253,7 +253,7 @@ class RunningCommand:
         return self._end_event.is_set()
 
     @property
-    def _cut(self) -> bool:
+    def _is_cut_off(self) -> bool:
         """Whether the channel has ended, and all received data have been read."""
         ended = self._channel.closed or self._channel.eof_received
         return bool(ended) and not (self._channel.recv_ready() or self._channel.recv_stderr_ready())

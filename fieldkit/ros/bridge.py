@@ -139,11 +139,11 @@ def bridged(near: Side, far: Side, crossings: Sequence[Crossing], types: Message
     """
     check(near, far, crossings, types)
     with ExitStack() as stack:
-        sides = [stack.enter_context(_started(side)) for side in (near, far)]
+        sides = [stack.enter_context(_running_side(side)) for side in (near, far)]
         carriers: list[Carrier] = []
         for number, crossing in enumerate(crossings, 1):
             source, target = reversed(sides) if crossing.back else sides
-            carriers.append(_carrier(crossing, source, target, types, number))
+            carriers.append(_create_carrier(crossing, source, target, types, number))
             stack.callback(carriers[-1].end)
         yield carriers
 
@@ -177,7 +177,7 @@ def _is_ros1(*sides: "Side | _RunningSide") -> bool:
 
 
 @contextmanager
-def _started(side: Side) -> Iterator[_RunningSide]:
+def _running_side(side: Side) -> Iterator[_RunningSide]:
     """Start the middleware of a side, and stop it after the body."""
     with ExitStack() as stack:
         if _is_ros1(side):
@@ -191,7 +191,7 @@ def _started(side: Side) -> Iterator[_RunningSide]:
         yield _RunningSide(side.over, side.network, running)
 
 
-def _carrier(
+def _create_carrier(
     crossing: Crossing, source: _RunningSide, target: _RunningSide, types: MessageTypes, number: int
 ) -> Carrier:
     sides = (source, target)

@@ -88,4 +88,4 @@ def server_pid(connection: str) -> int:
     """Return the process id of the link server."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client, places.address(connection) as address:
         client.connect(address)
-        return places.peer(client)[0]
+        return places.peer_credentials(client)[0]

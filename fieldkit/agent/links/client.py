@@ -199,7 +199,7 @@ class SharedLink:
     def _is_suspended(self) -> bool:
         assert self._server is not None
         try:
-            with open(f"/proc/{places.peer(self._server)[0]}/stat", encoding="utf-8") as file:  # noqa: PTH123
+            with open(f"/proc/{places.peer_credentials(self._server)[0]}/stat", encoding="utf-8") as file:  # noqa: PTH123
                 return file.read().rpartition(")")[2].split()[0] in ("T", "t")
         except (OSError, IndexError):
             return True
@@ -207,7 +207,7 @@ class SharedLink:
     def _kill_server(self) -> None:
         """Kill the server. Its socket is open, so no other process can have its pid."""
         assert self._server is not None
-        pid, uid = places.peer(self._server)
+        pid, uid = places.peer_credentials(self._server)
         if pid > 1 and uid == os.geteuid():
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -252,7 +252,7 @@ class SharedLink:
         except (FileNotFoundError, ConnectionRefusedError, ConnectionResetError):
             server.close()
             return None
-        if places.peer(server)[1] != os.geteuid():
+        if places.peer_credentials(server)[1] != os.geteuid():
             server.close()
             raise PermissionError(f"another user serves {self._connection}")
         server.setblocking(False)

@@ -82,7 +82,7 @@ def remove(connection: str) -> None:
             os.unlink(f"{folder()}/{name(connection)}.{suffix}")  # noqa: PTH108
 
 
-def peer(stream: socket.socket) -> tuple[int, int]:
+def peer_credentials(stream: socket.socket) -> tuple[int, int]:
     """Return the process id and the user id of the other end of a Unix-domain socket."""
     packed = stream.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     pid, uid, _ = _CREDENTIALS.unpack(packed)

@@ -238,7 +238,7 @@ class LinkServer:
     def _accept(self) -> None:
         with suppress(OSError):  # the client has disconnected already
             stream, _ = self._listener.accept()
-            if places.peer(stream)[1] != os.geteuid() or len(self._clients) >= _MAX_CLIENTS:
+            if places.peer_credentials(stream)[1] != os.geteuid() or len(self._clients) >= _MAX_CLIENTS:
                 stream.close()
                 return
             self._clients[stream.fileno()] = LinkClient(stream)
