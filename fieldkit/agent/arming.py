@@ -13,7 +13,7 @@ from typing import Iterator
 from fieldkit.agent.autopilot import PREFLIGHT, AutopilotState
 from fieldkit.agent.dialect import PREARM_CHECKS
 from fieldkit.agent.flight_plan import FlightNeeds
-from fieldkit.agent.flying.session import AutopilotSession
+from fieldkit.agent.flying.talk import AutopilotSession
 from fieldkit.agent.mavlink_frames import HOME_POSITION, LOCAL_POSITION_NED, SYS_STATUS
 
 _POLL_S = 0.1

@@ -12,7 +12,7 @@ from typing import Callable, Iterator
 
 from fieldkit.agent.autopilot import AutopilotState
 from fieldkit.agent.dialect import ARM
-from fieldkit.agent.flying.session import AutopilotSession
+from fieldkit.agent.flying.talk import AutopilotSession
 from fieldkit.agent.mavlink_frames import ACCEPTED
 from fieldkit.agent.px4 import Px4
 

@@ -16,7 +16,7 @@ from fieldkit.agent.flight_plan import LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying import liveness
 from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING, LivenessFile
 from fieldkit.agent.flying.loop import GAP_S, HEARTBEAT_S, RATE_HZ
-from fieldkit.agent.flying.session import AutopilotSession
+from fieldkit.agent.flying.talk import AutopilotSession
 from fieldkit.agent.landing import (
     CANCELLED,
     LEASE_EXPIRED,

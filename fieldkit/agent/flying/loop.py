@@ -10,7 +10,7 @@ from fieldkit.agent.autopilot import AutopilotState
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying.liveness import FLYING, IDLE, LANDING, PILOT, LivenessFile
 from fieldkit.agent.flying.origin import FlightFence, FlightOrigin, Position
-from fieldkit.agent.flying.session import AutopilotSession
+from fieldkit.agent.flying.talk import AutopilotSession
 from fieldkit.agent.landing import (
     CANCELLED,
     COMMAND_TIMEOUT_S,

@@ -9,7 +9,7 @@ from fieldkit.agent.autopilot import GUARD, AutopilotState
 from fieldkit.agent.flight_plan import FlightPlan
 from fieldkit.agent.flying import liveness
 from fieldkit.agent.flying.liveness import LivenessFile
-from fieldkit.agent.flying.session import AutopilotSession
+from fieldkit.agent.flying.talk import AutopilotSession
 from fieldkit.agent.landing import (
     MANUAL_ACTION,
     REFUSED,

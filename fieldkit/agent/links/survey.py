@@ -11,7 +11,7 @@ from contextlib import closing
 from typing import Iterator
 
 from fieldkit.agent.autopilot import PREFLIGHT
-from fieldkit.agent.flying.session import AutopilotSession
+from fieldkit.agent.flying.talk import AutopilotSession
 
 _HEARTBEAT_S = 5.0
 _POLL_S = 0.1
