@@ -1,4 +1,4 @@
-"""Programs for robots, beside shell: the standard library and a middleware's own binding, Python 3.8 and later.
+"""Python programs that run on robots. They need Python 3.8, the standard library and the binding of a middleware.
 
-Carried there as one file (`fieldkit.remote.agent`), so nothing here imports another room.
+They are copied to robots as one file (`fieldkit.remote.agent`), so this package imports no other package of fieldkit.
 """

@@ -1,7 +1,7 @@
-"""The program on a robot: `agent.pyz VERB JSON [LOG]`; the JSON says what to do, and `_USAGE` lists the verbs.
+"""The program on a robot: `agent.pyz VERB JSON [LOG]`.
 
-Arguments: the verb, the JSON, and for all but a router, a flight and its checks a log. It says `up` on standard error
-when it is, and ends well on SIGINT and SIGTERM.
+The verb selects the task (`_USAGE` lists the verbs), the JSON object contains its parameters, and some verbs write a
+log file. The program writes `up` to standard error when it is ready, and stops cleanly on SIGINT and SIGTERM.
 """
 
 from __future__ import annotations
@@ -23,147 +23,147 @@ from fieldkit.agent.stream import Stream
 
 _USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route|fly|arming|survey|link JSON"
 
-Told = Mapping[str, Any]
+Arguments = Mapping[str, Any]
 
 
-class EndRequest(threading.Event):
-    """Asks the program to end; a signal handler's request is visible before the next statement of the main thread.
+class StopRequest(threading.Event):
+    """An event that stops the program. A signal handler's request is visible before the main thread's next statement.
 
-    A program that was suspended (SIGSTOP) when the signal came sees it before it sends anything.
+    A program that was suspended (SIGSTOP) when the signal arrived therefore sends nothing before it stops.
     """
 
     _signalled = False
 
-    def from_signal(self) -> None:
-        """Ask from a signal handler."""
+    def set_from_signal(self) -> None:
+        """Set the event from a signal handler."""
         self._signalled = True
-        # In a thread of its own: this one may be inside `wait` and have the lock that `set` waits for.
+        # In a separate thread: the main thread may be inside `wait` and hold the lock that `set` needs.
         threading.Thread(target=self.set).start()
 
     def is_set(self) -> bool:
-        """Return whether the program is to end."""
+        """Return True if the program must stop."""
         return self._signalled or super().is_set()
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run a command line; return its exit code."""
+    """Run a command line and return its exit code."""
     if len(argv) == 3 and argv[0] in _WITH_LOG:
-        work = partial(_WITH_LOG[argv[0]], path=argv[2])
+        run = partial(_WITH_LOG[argv[0]], path=argv[2])
     elif len(argv) == 2 and argv[0] in _WITHOUT_LOG:
-        work = partial(_WITHOUT_LOG[argv[0]])
+        run = partial(_WITHOUT_LOG[argv[0]])
     else:
         sys.stderr.write(f"{_USAGE}\n")
         return 2
-    over = EndRequest()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: over.from_signal())
+    stop_event = StopRequest()
+    for signal_number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signal_number, lambda *_: stop_event.set_from_signal())
     try:
-        return work(json.loads(argv[1]), over)
+        return run(json.loads(argv[1]), stop_event)
     except (MiddlewareError, LogError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 3
 
 
-def _route(told: Told, over: threading.Event) -> int:
-    """Route for other Zenoh sessions until `over` is set."""
-    from fieldkit.agent import zenoh  # noqa: PLC0415 (only where it is asked for)
+def _route(arguments: Arguments, stop_event: threading.Event) -> int:
+    """Run a Zenoh router until `stop_event` is set."""
+    from fieldkit.agent import zenoh  # noqa: PLC0415 (loaded only if needed)
 
-    router = zenoh.route(Network(**told["network"]))
-    _say(f"up, {router.version}")
-    while not over.wait(stream.WAKES_S):
+    router = zenoh.route(Network(**arguments["network"]))
+    _report(f"up, {router.version}")
+    while not stop_event.wait(stream.WAIT_S):
         pass
     router.close()
     return 0
 
 
-def _record(told: Told, over: threading.Event, path: str) -> int:
-    """Record MAVLink until `over` is set."""
-    from fieldkit.agent import mavlink  # noqa: PLC0415 (only where it is asked for)
+def _record(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
+    """Record MAVLink until `stop_event` is set."""
+    from fieldkit.agent import mavlink  # noqa: PLC0415 (loaded only if needed)
 
-    with _talking(told["connection"]):
+    with _naming_connection(arguments["connection"]):
         try:
-            mavlink.record(mavlink.FlightRecording(**told), path, over)
+            mavlink.record(mavlink.FlightRecording(**arguments), path, stop_event)
         except mavlink.MissingMessageError as error:
             raise MiddlewareError(str(error)) from error
     return 0
 
 
-def _drive(told: Told, over: threading.Event, path: str) -> int:
-    """Drive a robot along its way; return an exit code, which says whether it came back home."""
-    begun = middleware.adapter(told["over"])(Network(**told["network"]))
+def _drive(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
+    """Drive a robot along its path; return the exit code: 0 if it came back to its origin, 4 if it stopped before."""
+    session = middleware.adapter(arguments["over"])(Network(**arguments["network"]))
     try:
-        _say(f"up, {begun.version}")
-        stopped = drive.drive(begun, told, Path(path), over)
+        _report(f"up, {session.version}")
+        stopped = drive.drive(session, arguments, Path(path), stop_event)
     except OSError as error:
-        raise MiddlewareError(f"it stands: {path} cannot be written: {error.strerror}") from error
+        raise MiddlewareError(f"the robot was stopped: {path} cannot be written: {error.strerror}") from error
     finally:
-        begun.close()
+        session.close()
     if stopped:
-        _say(f"stopped: {stopped}")
+        _report(f"stopped: {stopped}")
     return 4 if stopped else 0
 
 
-def _fly(told: Told, over: threading.Event) -> int:
-    """Fly a drone, or watch one that others fly; return the exit code."""
-    from fieldkit.agent import flight, flight_plan  # noqa: PLC0415 (only where it is asked for)
+def _fly(arguments: Arguments, stop_event: threading.Event) -> int:
+    """Fly a drone, guard it or rescue it, as the plan requires; return the exit code."""
+    from fieldkit.agent import flight, flight_plan  # noqa: PLC0415 (loaded only if needed)
 
-    with _talking(told["connection"]):
-        return flight.fly(flight_plan.FlightPlan(**told), over)
-
-
-def _look(told: Told, over: threading.Event) -> int:
-    """Say what speaks against a flight; return the exit code."""
-    from fieldkit.agent import arming, flight_plan  # noqa: PLC0415 (only where it is asked for)
-
-    with _talking(told["connection"]):
-        return arming.look(told["connection"], flight_plan.FlightNeeds(**told["needs"]), over)
+    with _naming_connection(arguments["connection"]):
+        return flight.fly(flight_plan.FlightPlan(**arguments), stop_event)
 
 
-def _survey(told: Told, over: threading.Event) -> int:
-    """Print whether a connection works, and which others there may be; return the exit code."""
-    from fieldkit.agent.links import survey  # noqa: PLC0415 (only where it is asked for)
+def _check_arming(arguments: Arguments, stop_event: threading.Event) -> int:
+    """Print the reasons against a flight; return the exit code."""
+    from fieldkit.agent import arming, flight_plan  # noqa: PLC0415 (loaded only if needed)
 
-    with _talking(told["connection"]):
-        return survey.survey(told["connection"], over)
+    with _naming_connection(arguments["connection"]):
+        return arming.check_arming(arguments["connection"], flight_plan.FlightNeeds(**arguments["needs"]), stop_event)
 
 
-def _link(told: Told, over: threading.Event) -> int:
-    """Serve a connection to an autopilot for the other programs here, in a process of its own."""
-    from fieldkit.agent.links import server  # noqa: PLC0415 (only where it is asked for)
+def _survey(arguments: Arguments, stop_event: threading.Event) -> int:
+    """Print whether a connection works, and other possible connections; return the exit code."""
+    from fieldkit.agent.links import survey  # noqa: PLC0415 (loaded only if needed)
 
-    with _talking(told["connection"]):
-        server.serve(told["connection"], over)
+    with _naming_connection(arguments["connection"]):
+        return survey.survey(arguments["connection"], stop_event)
+
+
+def _link(arguments: Arguments, stop_event: threading.Event) -> int:
+    """Start a link server, which shares a connection to an autopilot between the programs on this computer."""
+    from fieldkit.agent.links import server  # noqa: PLC0415 (loaded only if needed)
+
+    with _naming_connection(arguments["connection"]):
+        server.serve(arguments["connection"], stop_event)
     return 0
 
 
 @contextmanager
-def _talking(connection: str) -> Iterator[None]:
-    """Say of what goes wrong with a connection to an autopilot which one it was."""
+def _naming_connection(connection: str) -> Iterator[None]:
+    """Add the name of the connection to errors of a connection to an autopilot."""
     try:
         yield
     except (OSError, ValueError) as error:
-        raise MiddlewareError(f"MAVLink by {connection}: {error}") from error
+        raise MiddlewareError(f"MAVLink over {connection}: {error}") from error
 
 
-def _stream(told: Told, over: threading.Event, path: str, *, publishes: bool) -> int:
-    """Be one end of a stream."""
-    what = Stream(**told["stream"])
-    start = middleware.adapter(what.over)
+def _stream(arguments: Arguments, stop_event: threading.Event, path: str, *, publishes: bool) -> int:
+    """Publish a stream of samples, or subscribe to it."""
+    settings = Stream(**arguments["stream"])
+    start = middleware.adapter(settings.over)
     log = Log(path)
-    log.origin(time.time_ns(), records.PUBLISHER if publishes else records.SUBSCRIBER, told["topic"]["name"])
+    log.origin(time.time_ns(), records.PUBLISHER if publishes else records.SUBSCRIBER, arguments["topic"]["name"])
     log.note(records.BEGUN, time.time_ns())
-    begun = start(Network(**told["network"]))
+    session = start(Network(**arguments["network"]))
     try:
-        _say(f"up, {begun.version}")
-        work = stream.publish if publishes else stream.subscribe
-        work(begun, Topic.from_json(told["topic"]), what, log, over)
+        _report(f"up, {session.version}")
+        transfer = stream.publish if publishes else stream.subscribe
+        transfer(session, Topic.from_json(arguments["topic"]), settings, log, stop_event)
     finally:
-        begun.close()
+        session.close()
     log.end(time.time_ns())
     return 0
 
 
-def _say(text: str) -> None:
+def _report(text: str) -> None:
     sys.stderr.write(f"{text}\n")
     sys.stderr.flush()
 
@@ -177,7 +177,7 @@ _WITH_LOG: Mapping[str, Callable[..., int]] = {
 _WITHOUT_LOG: Mapping[str, Callable[..., int]] = {
     "route": _route,
     "fly": _fly,
-    "arming": _look,
+    "arming": _check_arming,
     "survey": _survey,
     "link": _link,
 }

@@ -1,10 +1,10 @@
-"""ArduCopter, as a program that flies a drone sees it (ArduPilot's other vehicles have other modes)."""
+"""Flight dialect of ArduCopter. ArduPilot's other vehicles have other modes."""
 
 from __future__ import annotations
 
 from typing import Mapping, Sequence
 
-from fieldkit.agent.dialect import CHANGE_SPEED, CUSTOM_MODE, SET_MODE, TAKE_OFF, AutopilotBounds, Command
+from fieldkit.agent.dialect import CHANGE_SPEED, CUSTOM_MODE, SET_MODE, TAKE_OFF, AutopilotLimits, Command
 from fieldkit.agent.mavlink_frames import EKF_STATUS_REPORT
 
 _ARDUPILOT = 3
@@ -39,65 +39,71 @@ _MODES = {
     _AUTO_RTL: "AUTO_RTL",
     28: "TURTLE",
 }
-"""Its modes by their numbers (ArduCopter/mode.h; https://ardupilot.org/copter/docs/parameters.html#fltmode1)."""
+"""Names of its modes by number (ArduCopter/mode.h; https://ardupilot.org/copter/docs/parameters.html#fltmode1)."""
 _CLIMB_SPEED = 2
 _FENCE_TOP, _FENCE_CIRCLE = 1, 2
 
 
 class ArduCopter:
-    """See `FlightDialect`. On the ground it ignores set-points: it takes off by command, and follows them then.
+    """Dialect of ArduCopter. On the ground it ignores set-points: it takes off by command, and then follows them.
 
-    In GUIDED it holds the last position without any time limit (GUID_TIMEOUT is for velocities).
+    In GUIDED it holds the last position without a time limit (GUID_TIMEOUT applies to velocities only).
     """
 
     name = "ArduCopter"
-    guided = "GUIDED"
-    estimate = EKF_STATUS_REPORT
-    bounds_from: Sequence[str] = ("FENCE_ENABLE", "FENCE_TYPE", "FENCE_ALT_MAX", "FENCE_RADIUS", "RTL_ALT|RTL_ALT_M")
-    says_now = False
+    guided_mode = "GUIDED"
+    estimate_message = EKF_STATUS_REPORT
+    limit_parameters: Sequence[str] = (
+        "FENCE_ENABLE",
+        "FENCE_TYPE",
+        "FENCE_ALT_MAX",
+        "FENCE_RADIUS",
+        "RTL_ALT|RTL_ALT_M",
+    )
+    checks_present_mode = False
 
-    def speaks(self, autopilot: int, vehicle: int) -> bool:
-        """See `FlightDialect.speaks`."""
+    def matches(self, autopilot: int, vehicle: int) -> bool:
+        """Return True for an ArduPilot on a multicopter or helicopter."""
         return autopilot == _ARDUPILOT and vehicle in _COPTERS
 
     def is_guided(self, mode: int) -> bool:
-        """See `FlightDialect.is_guided`."""
+        """Return True in GUIDED."""
         return mode == _GUIDED
 
-    def is_led(self, mode: int) -> bool:
-        """See `FlightDialect.is_led`: in LOITER and the others a person flies it."""
+    def is_program_controlled(self, mode: int) -> bool:
+        """Return True in AUTO and GUIDED; in LOITER and the other modes a person flies it."""
         return mode in (_AUTO, _GUIDED)
 
-    def comes_down(self, mode: int) -> bool:
-        """See `FlightDialect.comes_down`."""
+    def lands_or_returns(self, mode: int) -> bool:
+        """Return True in RTL, LAND, SMART_RTL and AUTO_RTL."""
         return mode in (_RTL, _LAND, _SMART_RTL, _AUTO_RTL)
 
-    def waits(self, mode: int) -> bool:  # noqa: ARG002
-        """See `FlightDialect.waits`: it stays in GUIDED."""
+    def is_failsafe_hold(self, mode: int) -> bool:  # noqa: ARG002
+        """Return False: without set-points it stays in GUIDED."""
         return False
 
     def mode_name(self, mode: int) -> str:
-        """See `FlightDialect.mode_name`."""
+        """Return the name of a mode, or its number if the mode is unknown."""
         return _MODES.get(mode, str(mode))
 
-    def guide(self) -> Command:
-        """See `FlightDialect.guide`."""
+    def guided_command(self) -> Command:
+        """Return the command that selects GUIDED."""
         return (SET_MODE, CUSTOM_MODE, _GUIDED)
 
-    def take_off(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
-        """See `FlightDialect.take_off`; before 4.1 it climbs as fast as WPNAV_SPEED_UP says."""
+    def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
+        """Return the commands for climb speed and take-off; before 4.1 WPNAV_SPEED_UP sets the climb speed."""
         return (CHANGE_SPEED, _CLIMB_SPEED, climb_m_s), (TAKE_OFF, 0, 0, 0, 0, 0, 0, height_m)
 
-    def bring_down(self, how: str) -> Command:
-        """See `FlightDialect.bring_down`."""
+    def bring_down_command(self, how: str) -> Command:
+        """Return the command that selects RTL or LAND."""
         return (SET_MODE, CUSTOM_MODE, _RTL if how == "return" else _LAND)
 
-    def bounds(self, values: Mapping[str, float]) -> AutopilotBounds:
-        """See `FlightDialect.bounds`; RTL_ALT is in cm, and RTL_ALT_M took its place in 4.7."""
+    def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
+        """Return its limits; RTL_ALT is in cm, and RTL_ALT_M replaced it in 4.7."""
         fences = int(values.get("FENCE_TYPE", 0)) if values.get("FENCE_ENABLE") else 0
-        back_m = values["RTL_ALT"] / 100 if "RTL_ALT" in values else values.get("RTL_ALT_M")
-        return AutopilotBounds(
+        return_m = values["RTL_ALT"] / 100 if "RTL_ALT" in values else values.get("RTL_ALT_M")
+        return AutopilotLimits(
             height_m=values.get("FENCE_ALT_MAX") if fences & _FENCE_TOP else None,
             radius_m=values.get("FENCE_RADIUS") if fences & _FENCE_CIRCLE else None,
-            return_m=back_m,
+            return_m=return_m,
         )

@@ -1,4 +1,4 @@
-"""Ask an autopilot whether it may be armed for a flight; say what speaks against that, and what to do about it."""
+"""Check whether an autopilot can be armed for a flight, and report each reason against it with a remedy."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from typing import Iterator
 from fieldkit.agent.autopilot import PREFLIGHT, AutopilotState
 from fieldkit.agent.dialect import PREARM_CHECKS
 from fieldkit.agent.flight_plan import FlightNeeds
-from fieldkit.agent.flying.talk import AutopilotTalk
+from fieldkit.agent.flying.talk import AutopilotSession
 from fieldkit.agent.mavlink_frames import HOME_POSITION, LOCAL_POSITION_NED, SYS_STATUS
 
-_TURN_S = 0.1
-_AGAIN_S = 0.4
-"""After so long without an answer a question is asked again."""
+_POLL_S = 0.1
+_RETRY_S = 0.4
+"""Retry interval of a request without an answer."""
 _HEARTBEAT_S = 5.0
-_PATIENCE_S = 5.0
-"""So long it waits for what every autopilot says."""
-_SPARE_S = 1.5
-"""And so long for what only some do."""
-_STARTS_S = 10.0
-"""A preflight check waits this long for an estimate of position: the autopilot may have been switched on just now."""
+_TIMEOUT_S = 5.0
+"""Timeout for reports that every autopilot sends."""
+_OPTIONAL_TIMEOUT_S = 1.5
+"""Timeout for reports that only some autopilots send."""
+_ESTIMATE_TIMEOUT_S = 10.0
+"""Timeout for a position estimate: the autopilot may have been switched on just before."""
 _NO_ESTIMATE = "Need Position Estimate"
-"""Text of an ArduCopter whose estimate is not ready."""
-_SETTLED_S = 0.3
-"""So long after its checks ran its status is that of these."""
+"""Text of an ArduCopter whose position estimate is not ready."""
+_RESULT_DELAY_S = 0.3
+"""Delay after the arming checks until SYS_STATUS contains their result."""
 _RATE_HZ = 5.0
 
 _PREARM = 0x10000000
@@ -49,23 +49,23 @@ _SENSORS = {
     0x1000000: "logging",
     0x2000000: "battery",
 }
-"""Bits of MAV_SYS_STATUS_SENSOR, of those that a person can do something about."""
+"""Bits of MAV_SYS_STATUS_SENSOR for sensors that an operator can repair."""
 _PREFIXES = ("PreArm: ", "Preflight Fail: ")
-"""What texts that say why it may not be armed begin with: ArduPilot's, PX4's."""
+"""Prefixes of the texts with which ArduPilot and PX4 explain why they cannot be armed."""
 
-_ATTITUDE, _ACROSS, _UPWARDS, _BLIND = 1, 8 | 16 | 256 | 512, 32 | 64, 128
-"""ESTIMATOR_STATUS_FLAGS: attitude; position across, relative or absolute, of now or foreseen; position upwards; none
-but a guess that it does not move (CONST_POS_MODE)."""
+_ATTITUDE, _HORIZONTAL, _VERTICAL, _ASSUMED = 1, 8 | 16 | 256 | 512, 32 | 64, 128
+"""ESTIMATOR_STATUS_FLAGS: attitude; horizontal position, relative or absolute, present or predicted; vertical
+position; only the assumption that the vehicle does not move (CONST_POS_MODE)."""
 
 
 @dataclass(frozen=True)
 class ArmingFault:
-    """What speaks against a flight.
+    """A reason against a flight.
 
     Attributes:
-        what: In one sentence without a full stop.
-        remedy: What to do about it.
-        grave: Whether it is known to; else it may be otherwise in the mode in which it is flown.
+        what: The reason, one sentence without a full stop.
+        remedy: The remedy.
+        grave: True if it prevents the flight; False if it may not apply in the mode in which the drone is flown.
     """
 
     what: str
@@ -74,166 +74,173 @@ class ArmingFault:
 
 
 class ArmingCheck:
-    """Questions to an autopilot that stands, and what it answers.
+    """Requests reports from an autopilot on the ground, and evaluates them.
 
     Args:
-        drone: The autopilot, whose heart was heard.
-        needs: What is to be flown.
+        drone: The autopilot; its heartbeat was received.
+        needs: Requirements of the flight.
     """
 
     def __init__(self, drone: AutopilotState, needs: FlightNeeds) -> None:
         self._drone = drone
         self._needs = needs
-        self._began_s = time.monotonic()
-        self._asked_s = 0.0
+        self._start_s = time.monotonic()
+        self._retry_s = 0.0
         self._checked_s: float | None = None
         drone.status = drone.estimate = None
-        drone.texts.forget()
-        drone.answers.pop(PREARM_CHECKS, None)
+        drone.texts.clear()
+        drone.command_results.pop(PREARM_CHECKS, None)
 
-    def ask(self) -> None:
-        """Request what it has not reported yet; to be called with each turn."""
+    def request_missing(self) -> None:
+        """Request the missing reports; must be called in each iteration of the loop."""
         drone, now_s = self._drone, time.monotonic()
-        if self._checked_s is None and PREARM_CHECKS in drone.answers:
+        if self._checked_s is None and PREARM_CHECKS in drone.command_results:
             self._checked_s = now_s
-        if now_s < self._asked_s or drone.dialect is None:
+        if now_s < self._retry_s or drone.dialect is None:
             return
-        self._asked_s = now_s + _AGAIN_S
-        for kind, value in ((SYS_STATUS, drone.status), (LOCAL_POSITION_NED, drone.place_m)):
+        self._retry_s = now_s + _RETRY_S
+        for kind, value in ((SYS_STATUS, drone.status), (LOCAL_POSITION_NED, drone.position_m)):
             if value is None:
                 drone.request_stream(kind, _RATE_HZ)
         if drone.estimate is None:
-            drone.request_stream(drone.dialect.estimate, _RATE_HZ)
+            drone.request_stream(drone.dialect.estimate_message, _RATE_HZ)
         if self._checked_s is None:
             drone.command(PREARM_CHECKS)
         if self._needs.returns and not drone.has_home:
-            drone.ask_once(HOME_POSITION)
+            drone.request_once(HOME_POSITION)
         for name in self._missing():
-            drone.ask_parameter(name)
+            drone.request_parameter(name)
 
     def _missing(self) -> list[str]:
-        """Return the parameters that it has not told."""
+        """Return the names of the parameters that it has not reported."""
         dialect = self._drone.dialect
-        either = [names.split("|") for names in dialect.bounds_from] if dialect else []
-        told = self._drone.parameters.keys()
-        return [name for names in either if told.isdisjoint(names) for name in names]
+        alternatives = [names.split("|") for names in dialect.limit_parameters] if dialect else []
+        reported = self._drone.parameters.keys()
+        return [name for names in alternatives if reported.isdisjoint(names) for name in names]
 
     @property
     def is_starting(self) -> bool:
-        """Whether its estimate of position is not ready, as within about 30 s after it was switched on."""
+        """Whether its position estimate is not ready, which takes about 30 s after it was switched on."""
         warned = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
         return self._drone.dialect is not None and (warned or any(True for _ in self._position()))
 
     @property
-    def done(self) -> bool:
-        """Whether it has said all, or had the time to."""
-        drone, lasted_s = self._drone, time.monotonic() - self._began_s
-        if drone.dialect is None or lasted_s > _PATIENCE_S:
+    def is_complete(self) -> bool:
+        """Whether all reports were received, or the time for them has passed."""
+        drone, lasted_s = self._drone, time.monotonic() - self._start_s
+        if drone.dialect is None or lasted_s > _TIMEOUT_S:
             return True
-        if drone.status is None or drone.place_m is None:
+        if drone.status is None or drone.position_m is None:
             return False
-        if lasted_s > _SPARE_S:
+        if lasted_s > _OPTIONAL_TIMEOUT_S:
             return True
         home = drone.has_home or not self._needs.returns
-        checked = self._checked_s is not None and drone.status.heard_s > self._checked_s + _SETTLED_S
+        checked = self._checked_s is not None and drone.status.received_s > self._checked_s + _RESULT_DELAY_S
         return checked and home and drone.estimate is not None and not self._missing()
 
     def faults(self) -> Iterator[ArmingFault]:
-        """Yield what speaks against the flight."""
+        """Yield the reasons against the flight."""
         drone = self._drone
         if drone.dialect is None:
             what = "its autopilot is neither PX4 nor ArduCopter ({}, {})".format(*drone.family)
-            yield ArmingFault(f"{what}: MAV_AUTOPILOT, MAV_TYPE", "fly it otherwise; a step mavlink records it")
+            yield ArmingFault(
+                f"{what}: MAV_AUTOPILOT, MAV_TYPE", "fly it by other means; a step mavlink records the flight"
+            )
             return
         if drone.armed:
             yield ArmingFault("its motors turn", "land it first")
         yield from self._position()
-        yield from self._power()
-        yield from self._own_checks()
-        yield from self._bounds()
+        yield from self._battery()
+        yield from self._prearm_checks()
+        yield from self._limits()
 
     def _position(self) -> Iterator[ArmingFault]:
         drone = self._drone
-        if drone.place_m is None:
-            remedy = "wait for its GPS, or see that its camera or flow sensor sees the ground, and that it runs"
-            yield ArmingFault("it does not say where it is (LOCAL_POSITION_NED)", remedy)
+        if drone.position_m is None:
+            remedy = "wait for its GPS, or check that its camera or flow sensor runs and faces the ground"
+            yield ArmingFault("it does not report its position (LOCAL_POSITION_NED)", remedy)
         flags = drone.estimate
         if flags is not None and not (
-            flags & _ATTITUDE and flags & _ACROSS and flags & _UPWARDS and not flags & _BLIND
+            flags & _ATTITUDE and flags & _HORIZONTAL and flags & _VERTICAL and not flags & _ASSUMED
         ):
-            what = f"its estimate of where it is does not hold (flags {flags:#x})"
+            what = f"its position estimate is not valid (flags {flags:#x})"
             yield ArmingFault(what, "wait for its GPS, camera or flow sensor; do not move it meanwhile")
         if self._needs.returns and not drone.has_home:
-            what = "it knows no home, and is to return there where the trial is cut short"
+            what = "it has no home position, but must return there if the trial is aborted"
             yield ArmingFault(what, "wait for its GPS, or write on_abort: land in the procedure")
 
-    def _power(self) -> Iterator[ArmingFault]:
-        status, least = self._drone.status, self._needs.least_charge
+    def _battery(self) -> Iterator[ArmingFault]:
+        status, minimum = self._drone.status, self._needs.least_charge
         if status is None:
-            yield ArmingFault("it does not say how it is (SYS_STATUS)", "see which messages its link lets through")
-        elif status.charge is not None and status.charge < least:
-            what = f"its battery has {status.charge:.0%}, and {least:.0%} is the least"
-            yield ArmingFault(what, "charge it, or put in another; mavlink.least_charge in its profile says how much")
+            yield ArmingFault("it does not report its status (SYS_STATUS)", "check which messages its link forwards")
+        elif status.charge is not None and status.charge < minimum:
+            what = f"its battery has {status.charge:.0%}, and {minimum:.0%} is the minimum"
+            yield ArmingFault(
+                what, "charge or replace the battery; mavlink.least_charge in its profile sets the minimum"
+            )
 
-    def _own_checks(self) -> Iterator[ArmingFault]:
+    def _prearm_checks(self) -> Iterator[ArmingFault]:
         drone = self._drone
         assert drone.dialect is not None
-        why = [
+        reasons = [
             text[len(prefix) :] for text in drone.texts.warnings for prefix in _PREFIXES if text.startswith(prefix)
         ]
-        ill = drone.status.ill if drone.status else 0
-        if not why and not ill & _PREARM:
+        unhealthy = drone.status.unhealthy if drone.status else 0
+        if not reasons and not unhealthy & _PREARM:
             return
-        why = (
-            list(dict.fromkeys(why)) or drone.texts.warnings or [name for bit, name in _SENSORS.items() if ill & bit]
+        reasons = (
+            list(dict.fromkeys(reasons))
+            or drone.texts.warnings
+            or [name for bit, name in _SENSORS.items() if unhealthy & bit]
         )
-        what = f"{drone.dialect.name} does not let itself be armed: {', '.join(why) or 'it does not say why'}"
-        remedy = "see to that; a ground station (QGroundControl, MAVProxy) shows the same"
-        yield ArmingFault(what, remedy, grave=drone.guided or not drone.dialect.says_now)
+        what = f"{drone.dialect.name} refuses to be armed: {', '.join(reasons) or 'it gives no reason'}"
+        remedy = "remove the cause; a ground station (QGroundControl, MAVProxy) shows the same"
+        yield ArmingFault(what, remedy, grave=drone.guided or not drone.dialect.checks_present_mode)
 
-    def _bounds(self) -> Iterator[ArmingFault]:
+    def _limits(self) -> Iterator[ArmingFault]:
         drone, needs = self._drone, self._needs
         assert drone.dialect is not None
-        own = drone.dialect.bounds(drone.parameters)
-        for most_m, flown_m, what in (
-            (own.height_m, needs.highest_m, "high"),
-            (own.radius_m, needs.farthest_m, "far from home"),
+        limits = drone.dialect.limits(drone.parameters)
+        for limit_m, needed_m, what in (
+            (limits.height_m, needs.highest_m, "high"),
+            (limits.radius_m, needs.farthest_m, "far from home"),
         ):
-            if most_m is not None and flown_m > most_m:
+            if limit_m is not None and needed_m > limit_m:
                 yield ArmingFault(
-                    f"its own fence ends {most_m:g} m {what}, and it is to fly {flown_m:g} m",
-                    f"less in the procedure, or a wider fence: {', '.join(drone.dialect.bounds_from)}",
+                    f"its own fence ends {limit_m:g} m {what}, but the flight needs {needed_m:g} m",
+                    "shorten the flight in the procedure, or widen the fence: "
+                    + ", ".join(drone.dialect.limit_parameters),
                 )
-        if needs.returns and own.return_m is not None and own.return_m > needs.ceiling_m:
-            what = f"it returns {own.return_m:g} m high, and may fly {needs.ceiling_m:g} m"
-            remedy = f"on_abort: land, or a lower {drone.dialect.bounds_from[-1].replace('|', ' or ')}"
-            yield ArmingFault(what, f"{remedy}; limits.max_height_m in its profile says how high")
+        if needs.returns and limits.return_m is not None and limits.return_m > needs.ceiling_m:
+            what = f"it returns at a height of {limits.return_m:g} m, but only {needs.ceiling_m:g} m are allowed"
+            remedy = f"write on_abort: land, or lower {drone.dialect.limit_parameters[-1].replace('|', ' or ')}"
+            yield ArmingFault(what, f"{remedy}; limits.max_height_m in its profile sets the allowed height")
 
 
-def look(connection: str, needs: FlightNeeds, over: threading.Event) -> int:
-    """Ask an autopilot, and print a line of JSON for each fault, and one with its family; return the exit code.
+def check_arming(connection: str, needs: FlightNeeds, stop_event: threading.Event) -> int:
+    """Check an autopilot; print one JSON object per fault, and one with its family and charge; return the exit code.
 
     Raises:
         OSError: The connection cannot be opened.
-        ValueError: It is not the name of a connection.
+        ValueError: The name of the connection is invalid.
     """
-    with closing(AutopilotTalk(connection, component=PREFLIGHT)) as talk:
-        end_s = time.monotonic() + _HEARTBEAT_S
-        while not talk.drone.alive and not over.is_set():
-            if time.monotonic() > end_s:
+    with closing(AutopilotSession(connection, component=PREFLIGHT)) as session:
+        heartbeat_deadline_s = time.monotonic() + _HEARTBEAT_S
+        while not session.drone.alive and not stop_event.is_set():
+            if time.monotonic() > heartbeat_deadline_s:
                 sys.stderr.write(f"error: no heartbeat of an autopilot at {connection} in {_HEARTBEAT_S:g} s\n")
                 return 1
-            talk.turn(_TURN_S)
-        check, starts_s = ArmingCheck(talk.drone, needs), time.monotonic() + _STARTS_S
-        while not over.is_set():
-            check.ask()
-            talk.turn(_TURN_S)
-            if check.done:
-                if not check.is_starting or time.monotonic() > starts_s:
+            session.exchange(_POLL_S)
+        check, estimate_deadline_s = ArmingCheck(session.drone, needs), time.monotonic() + _ESTIMATE_TIMEOUT_S
+        while not stop_event.is_set():
+            check.request_missing()
+            session.exchange(_POLL_S)
+            if check.is_complete:
+                if not check.is_starting or time.monotonic() > estimate_deadline_s:
                     break
-                check = ArmingCheck(talk.drone, needs)
-    dialect, status = talk.drone.dialect, talk.drone.status
+                check = ArmingCheck(session.drone, needs)
+    dialect, status = session.drone.dialect, session.drone.status
     lines = [json.dumps(asdict(fault)) for fault in check.faults()]
-    told = {"autopilot": dialect.name if dialect else "", "charge": status.charge if status else None}
-    sys.stdout.write("\n".join([*lines, json.dumps(told), ""]))
+    reported = {"autopilot": dialect.name if dialect else "", "charge": status.charge if status else None}
+    sys.stdout.write("\n".join([*lines, json.dumps(reported), ""]))
     return 0

@@ -1,4 +1,4 @@
-"""A clock that also counts the time for which the whole computer was suspended: CLOCK_BOOTTIME (clock_gettime(2))."""
+"""CLOCK_BOOTTIME (clock_gettime(2)): a monotonic clock that includes the time in which the computer was suspended."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import time
 
 
 def now_s() -> float:
-    """Return the time in seconds since the computer was switched on; of the monotonic clock if that is unknown."""
+    """Return the time since boot in seconds, or the monotonic clock if CLOCK_BOOTTIME is not available."""
     if hasattr(time, "CLOCK_BOOTTIME"):
         return time.clock_gettime(time.CLOCK_BOOTTIME)
     return time.monotonic()
 
 
 def boot_id() -> str:
-    """Return what identifies this run of the kernel (random(4)); empty if that is unknown."""
+    """Return the boot ID of the kernel (random(4)), or an empty text if it is unknown."""
     try:
         with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:  # noqa: PTH123 (Python 3.8)
             return file.read(100).strip()

@@ -1,8 +1,8 @@
-"""DDS by CycloneDDS' Python binding, which its package calls `cyclonedds`. Its only importer.
+"""DDS with the Python binding of CycloneDDS, the package `cyclonedds`. Only this module imports it.
 
-Samples go through as bytes: the binding writes and takes serialized data (`_clayer`), in 2 us where its own
-serializing takes 30 us and more. The library wants to know a type all the same, so it is built member by member;
-others are told its name alone.
+Samples are passed through as bytes: the binding writes and takes serialized data (`_clayer`) in 2 us, whereas its
+serializer needs 30 us and more. The library needs a type nevertheless, which is built member by member; other
+participants receive only its name.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from fieldkit.agent import graph
 from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Quality, Topic, version_of
 
 BLOCKS_NS = 1_000_000_000
-"""How long a write may block where a reliable reader lags behind, with all samples kept; ROS 2 waits without end."""
+"""Time for which a write may block if a reliable reader is too slow and all samples are kept; ROS 2 has no limit."""
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
-_AT_ONCE = 256
-_MOST_ENDS = 4096
-_OPERATIONS = 14
-_TELLING = slice(8, 11)
-"""Where `type_id`, `type_map` and `type_info` stand among the operations of a type."""
-_WAKES_NS = 100_000_000
+_BATCH = 256
+_MAX_ENDPOINTS = 4096
+_OPERATION_COUNT = 14
+_DESCRIPTIONS = slice(8, 11)
+"""Indices of `type_id`, `type_map` and `type_info` in the operations of a type."""
+_WAIT_NS = 100_000_000
 _UNLIMITED = -1
 
-_LANGUAGE: Mapping[str, Any] = {
+_PRIMITIVE_TYPES: Mapping[str, Any] = {
     "bool": bool,
     "byte": types.uint8,
     "char": types.uint8,
@@ -58,16 +58,16 @@ _LANGUAGE: Mapping[str, Any] = {
 
 
 def start(network: Network) -> DdsMiddleware:
-    """Start a participant; see `middleware.start`."""
+    """Start a participant; raises `MiddlewareError` if CycloneDDS does not start."""
     return DdsMiddleware(network)
 
 
 def configuration(network: Network) -> str:
-    """Return CycloneDDS' configuration: one interface, ports that are known, and how others are found."""
+    """Return the configuration of CycloneDDS: one interface, predictable ports, and discovery."""
     multicast = "true" if network.discovery == "multicast" else "false"
-    wanted = {
+    requested = {
         "General/AllowMulticast": multicast,
-        # Ports by RTPS' own rule, so that peers without multicast, and captures, know them.
+        # Ports by the formula of RTPS, so that peers without multicast and evaluations of captures can compute them.
         "Discovery/ParticipantIndex": "auto",
         **network.settings,
     }
@@ -76,81 +76,85 @@ def configuration(network: Network) -> str:
         "General": f"<Interfaces><NetworkInterface address={quoteattr(network.address)}/></Interfaces>",
         "Discovery": f"<Peers>{peers}</Peers>" if peers else "",
     }
-    return f"<CycloneDDS><Domain>{_elements(wanted, fixed)}</Domain></CycloneDDS>"
+    return f"<CycloneDDS><Domain>{_elements(requested, fixed)}</Domain></CycloneDDS>"
 
 
-def _elements(wanted: Mapping[str, str], fixed: Mapping[str, str]) -> str:
-    """Return settings by their path as nested elements; `@` begins the name of an attribute."""
-    inside: dict[str, dict[str, str]] = {name: {} for name in fixed}
+def _elements(requested: Mapping[str, str], fixed: Mapping[str, str]) -> str:
+    """Return settings, given by their paths, as nested XML elements; `@` precedes the name of an attribute."""
+    nested_settings: dict[str, dict[str, str]] = {name: {} for name in fixed}
     leaves = []
-    for path, value in wanted.items():
+    for path, value in requested.items():
         name, _, rest = path.partition("/")
-        own, _, attribute = name.partition("@")
+        element, _, attribute = name.partition("@")
         if rest:
-            inside.setdefault(name, {})[rest] = value
+            nested_settings.setdefault(name, {})[rest] = value
         elif attribute:
-            leaves.append(f"<{own} {attribute}={quoteattr(value)}/>")
+            leaves.append(f"<{element} {attribute}={quoteattr(value)}/>")
         else:
             leaves.append(f"<{name}>{escape(value)}</{name}>")
-    nested = (f"<{name}>{fixed.get(name, '')}{_elements(rest, {})}</{name}>" for name, rest in inside.items())
-    return "".join([*leaves, *nested])
+    nested_elements = (
+        f"<{name}>{fixed.get(name, '')}{_elements(rest, {})}</{name}>" for name, rest in nested_settings.items()
+    )
+    return "".join([*leaves, *nested_elements])
 
 
-def quality(wanted: Quality, user_data: str, *, writes: bool) -> Qos:
-    """Return a quality of service in DDS' terms, of a writer or a reader."""
+def quality(requested: Quality, user_data: str, *, writes: bool) -> Qos:
+    """Return a quality of service as DDS policies of a writer or a reader."""
     policies = [Policy.DataRepresentation(use_cdrv0_representation=True)]
-    if wanted.reliability == "reliable":
+    if requested.reliability == "reliable":
         policies.append(Policy.Reliability.Reliable(BLOCKS_NS))
-    elif wanted.reliability == "best_effort":
+    elif requested.reliability == "best_effort":
         policies.append(Policy.Reliability.BestEffort)
-    if wanted.history == "keep_all":
+    if requested.history == "keep_all":
         policies.append(Policy.History.KeepAll)
-    elif wanted.history == "keep_last" and wanted.depth:
-        policies.append(Policy.History.KeepLast(wanted.depth))
-    policies += _durability(wanted, writes=writes)
-    if wanted.deadline_ns is not None:
-        policies.append(Policy.Deadline(wanted.deadline_ns))
-    if wanted.lifespan_ns is not None and writes:
-        policies.append(Policy.Lifespan(wanted.lifespan_ns))
+    elif requested.history == "keep_last" and requested.depth:
+        policies.append(Policy.History.KeepLast(requested.depth))
+    policies += _durability(requested, writes=writes)
+    if requested.deadline_ns is not None:
+        policies.append(Policy.Deadline(requested.deadline_ns))
+    if requested.lifespan_ns is not None and writes:
+        policies.append(Policy.Lifespan(requested.lifespan_ns))
     if user_data:
         policies.append(Policy.Userdata(user_data.encode()))
     return Qos(*policies)
 
 
-def _durability(wanted: Quality, *, writes: bool) -> list[Any]:
-    """Return the policies of durability; what a writer keeps for late readers DDS says apart, and is 1 otherwise."""
-    if wanted.durability != "transient_local":
-        return [Policy.Durability.Volatile] if wanted.durability == "volatile" else []
-    kept = Policy.History.KeepAll if wanted.history == "keep_all" else Policy.History.KeepLast(wanted.depth or 1)
-    service = [Policy.DurabilityService(0, kept, *[_UNLIMITED] * 3)] if writes else []
+def _durability(requested: Quality, *, writes: bool) -> list[Any]:
+    """Return the durability policies. The history for late readers is a separate policy, whose default depth is 1."""
+    if requested.durability != "transient_local":
+        return [Policy.Durability.Volatile] if requested.durability == "volatile" else []
+    history = (
+        Policy.History.KeepAll if requested.history == "keep_all" else Policy.History.KeepLast(requested.depth or 1)
+    )
+    service = [Policy.DurabilityService(0, history, *[_UNLIMITED] * 3)] if writes else []
     return [Policy.Durability.TransientLocal, *service]
 
 
 def struct_type(topic: Topic) -> type:
-    """Return the topic's type as the binding's own, member by member."""
-    return _make(topic.type, topic, {})
+    """Return the topic's type as a struct type of the binding."""
+    return _make_struct(topic.type, topic, {})
 
 
-def _make(name: str, topic: Topic, made: dict[str, type]) -> type:
+def _make_struct(name: str, topic: Topic, made: dict[str, type]) -> type:
     if name in made:
         return made[name]
     annotations: dict[str, Any] = {}
     for member, kind, count in topic.members[name]:
-        one = _make(kind, topic, made) if kind in topic.members else _LANGUAGE[kind]
+        value_type = _make_struct(kind, topic, made) if kind in topic.members else _PRIMITIVE_TYPES[kind]
         if count is None:
-            annotations[member] = one
+            annotations[member] = value_type
         elif count > 0:
-            annotations[member] = types.array[one, count]
+            annotations[member] = types.array[value_type, count]
         else:
-            annotations[member] = types.sequence[one, -count] if count else types.sequence[one]
-    # The binding turns points into the colons of IDL.
+            annotations[member] = types.sequence[value_type, -count] if count else types.sequence[value_type]
+    # The binding converts dots to the double colons of IDL.
     typename = topic.dds_types[name].replace("::", ".")
     made[name] = make_idl_struct(name.rpartition("/")[2], typename, annotations)
     return made[name]
 
 
 def padded(data: bytes) -> bytes:
-    """Return a sample as it goes on the wire: filled to words of 4 bytes, the number of bytes added in its header.
+    """Return a sample as sent: padded to a multiple of 4 bytes, with the number of added bytes in its header.
 
     RTPS 2.5, section 10.2 (the two lowest bits of the encapsulation's options, of XTypes 1.3, section 7.6.3.1.2).
     """
@@ -159,33 +163,34 @@ def padded(data: bytes) -> bytes:
 
 
 def unpadded(data: bytes) -> bytes:
-    """Return a sample as it was before `padded`."""
+    """Return a sample without the padding of `padded`."""
     added = data[3] & 3 if len(data) > 3 else 0
     return data if not added else data[:3] + bytes([data[3] & ~3]) + data[4:-added]
 
 
-def keep_type_untold(topic: DdsTopic) -> Any:  # noqa: ANN401 (of ctypes)
-    """Have discovery tell a topic's type by its name alone; before any end of it is made.
+def hide_type_description(topic: DdsTopic) -> Any:  # noqa: ANN401 (of ctypes)
+    """Make discovery announce a topic's type by its name only; must be called before endpoints are created.
 
-    CycloneDDS 11.0 cannot read descriptions of types by Fast DDS 3, which ROS 2 Kilted has, and where both ends tell
-    one, those that do not agree never match. The binding has no option for it, so the three functions that give the
-    description are taken out of the type's table (`struct ddsi_sertype_ops`), if that looks as it must.
+    CycloneDDS 11.0 cannot read the type descriptions of Fast DDS 3 (ROS 2 Kilted), and endpoints never match if both
+    announce descriptions that differ. The binding has no option for this, so the three functions that return the
+    description are removed from the type's table of functions (`struct ddsi_sertype_ops`), if it has the expected
+    layout.
 
     Returns:
-        The table, which must live as long as the topic; None where nothing was changed.
+        The table, which must live as long as the topic; None if nothing was changed.
     """
     library = loaded_library()
     sertype = ctypes.POINTER(ctypes.c_void_p)()
     if library.dds_get_entity_sertype(topic._ref, ctypes.byref(sertype)) != 0:
         return None
-    table = ctypes.cast(sertype[0], ctypes.POINTER(ctypes.c_void_p * _OPERATIONS))[0]
+    table = ctypes.cast(sertype[0], ctypes.POINTER(ctypes.c_void_p * _OPERATION_COUNT))[0]
     version = ctypes.cast(library.ddsi_sertype_v0, ctypes.c_void_p).value
-    if table[0] != version or table[1] is not None or None in table[_TELLING]:
+    if table[0] != version or table[1] is not None or None in table[_DESCRIPTIONS]:
         return None
-    own = type(table)(*table)
-    own[_TELLING] = [None] * 3
-    sertype[0] = ctypes.addressof(own)
-    return own
+    replacement = type(table)(*table)
+    replacement[_DESCRIPTIONS] = [None] * 3
+    sertype[0] = ctypes.addressof(replacement)
+    return replacement
 
 
 class DdsMiddleware:
@@ -197,81 +202,81 @@ class DdsMiddleware:
         self._threads: list[threading.Thread] = []
         try:
             self._domain: Domain | None = Domain(network.domain, configuration(network))
-            told = Qos(Policy.Userdata(graph.PARTICIPANT_DATA.encode()))
-            self._participant: DomainParticipant | None = DomainParticipant(network.domain, qos=told)
+            node_info = Qos(Policy.Userdata(graph.PARTICIPANT_DATA.encode()))
+            self._participant: DomainParticipant | None = DomainParticipant(network.domain, qos=node_info)
         except DDSException as error:
             raise MiddlewareError(f"CycloneDDS does not start: {error}") from error
         self._topics: dict[str, DdsTopic] = {}
-        self._untold: list[Any] = []
+        self._type_tables: list[Any] = []
         self._network = network
         self._readers: list[bytes] = []
         self._writers: list[bytes] = []
         self._nodes = self._writer(graph.topic(network.gid_bytes))
-        self._tell_nodes()
+        self._publish_node_info()
 
     def _topic(self, topic: Topic) -> DdsTopic:
         if topic.name not in self._topics:
             made = DdsTopic(self._participant, topic.dds_topic, struct_type(topic))
-            self._untold.append(keep_type_untold(made))
+            self._type_tables.append(hide_type_description(made))
             self._topics[topic.name] = made
         return self._topics[topic.name]
 
     def publisher(self, topic: Topic) -> DdsWriter:
-        """See `Middleware.publisher`."""
+        """Create a data writer for a topic."""
         made = self._writer(topic)
         self._writers.append(made.guid.bytes)
-        self._tell_nodes()
+        self._publish_node_info()
         return DdsWriter(made)
 
     def _writer(self, topic: Topic) -> DataWriter:
-        offered = quality(topic.quality, topic.user_data, writes=True)
-        return DataWriter(DdsPublisher(self._participant), self._topic(topic), qos=offered)
+        qos = quality(topic.quality, topic.user_data, writes=True)
+        return DataWriter(DdsPublisher(self._participant), self._topic(topic), qos=qos)
 
-    def _tell_nodes(self) -> None:
-        """Tell other participants which node all ends belong to."""
+    def _publish_node_info(self) -> None:
+        """Publish to other participants that all endpoints belong to one node."""
         if self._participant is not None:
             guid, network = self._participant.guid.bytes, self._network
-            told = graph.entities_info(guid, network.node, self._readers, self._writers, network.gid_bytes)
-            ddspy_write(self._nodes._ref, padded(told))
+            node_info = graph.entities_info(guid, network.node, self._readers, self._writers, network.gid_bytes)
+            ddspy_write(self._nodes._ref, padded(node_info))
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
-        """See `Middleware.subscribe`."""
-        offered = quality(topic.quality, topic.user_data, writes=False)
-        wanted = Qos(Policy.IgnoreLocal.Participant, base=offered)
-        reader = DataReader(DdsSubscriber(self._participant), self._topic(topic), qos=wanted)
+        """Create a data reader for a topic; return a function that returns the number of matched writers."""
+        qos = quality(topic.quality, topic.user_data, writes=False)
+        requested = Qos(Policy.IgnoreLocal.Participant, base=qos)
+        reader = DataReader(DdsSubscriber(self._participant), self._topic(topic), qos=requested)
         self._readers.append(reader.guid.bytes)
-        self._tell_nodes()
-        thread = threading.Thread(target=self._take, args=(reader, deliver), daemon=True)
+        self._publish_node_info()
+        thread = threading.Thread(target=self._read_samples, args=(reader, deliver), daemon=True)
         thread.start()
         self._threads.append(thread)
         return lambda: len(reader.get_matched_publications())
 
     def other_types(self, topic: Topic) -> set[str]:
-        """See `Middleware.other_types`."""
-        own = topic.dds_types[topic.type]
+        """Return the different types that discovered endpoints use for the topic."""
+        own_type = topic.dds_types[topic.type]
         return {
-            end.type_name
+            endpoint.type_name
             for kind in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
-            for end in BuiltinDataReader(self._participant, kind).read(_MOST_ENDS)
-            if end.topic_name == topic.dds_topic and end.type_name != own
+            for endpoint in BuiltinDataReader(self._participant, kind).read(_MAX_ENDPOINTS)
+            if endpoint.topic_name == topic.dds_topic and endpoint.type_name != own_type
         }
 
-    def _take(self, reader: DataReader, deliver: Deliver) -> None:
-        waiting = WaitSet(self._participant)
-        waiting.attach(ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Any))
+    def _read_samples(self, reader: DataReader, deliver: Deliver) -> None:
+        wait_set = WaitSet(self._participant)
+        wait_set.attach(ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Any))
         while not self._closing.is_set():
-            waiting.wait(_WAKES_NS)
+            wait_set.wait(_WAIT_NS)
             while True:
-                found = ddspy_take(reader._ref, _ANY, _AT_ONCE)
+                samples = ddspy_take(reader._ref, _ANY, _BATCH)
                 at_ns = time.time_ns()
-                if isinstance(found, int) or not found:
+                if isinstance(samples, int) or not samples:
                     break
-                for data, info in found:
+                for data, info in samples:
                     if info.valid_data:
                         deliver(unpadded(data), at_ns)
 
     def close(self) -> None:
-        """See `Middleware.close`."""
+        """Stop the readers and delete the participant."""
         self._closing.set()
         for thread in self._threads:
             thread.join()
@@ -286,14 +291,14 @@ class DdsWriter:
         self._writer = writer
 
     def write(self, data: bytes) -> bool:
-        """See `Publisher.write`."""
+        """Write a sample; return True if CycloneDDS accepted it."""
         return bool(ddspy_write(self._writer._ref, padded(data)) >= 0)
 
     def matched(self) -> int:
-        """See `Publisher.matched`."""
+        """Return the number of matched readers."""
         return len(self._writer.get_matched_subscriptions())
 
     def drain(self, limit_s: float) -> None:
-        """See `Publisher.drain`."""
-        # The binding's own `wait_for_acks` fails by an AttributeError where the time is up (11.0, pub.py).
+        """Wait until all samples are acknowledged, at most for this time."""
+        # The public `wait_for_acks` of the binding raises an AttributeError after a timeout (11.0, pub.py).
         self._writer._wait_for_acks(self._writer._ref, int(limit_s * 1e9))

@@ -1,4 +1,4 @@
-"""Contract of a dialect: all that a program must know of a family of autopilots to fly its drones.
+"""Interface of a flight dialect: the modes, commands and parameters of one family of autopilots.
 
 Commands and their numbers are those of https://mavlink.io/en/messages/common.html.
 """
@@ -14,20 +14,20 @@ ARM, PREARM_CHECKS, REQUEST = 400, 401, 512
 """MAV_CMD: COMPONENT_ARM_DISARM, RUN_PREARM_CHECKS, REQUEST_MESSAGE."""
 
 CUSTOM_MODE = 1
-"""MAV_MODE_FLAG_CUSTOM_MODE_ENABLED: the mode is in a number that each family has for itself."""
+"""MAV_MODE_FLAG_CUSTOM_MODE_ENABLED: the mode is a number that each family of autopilots defines."""
 
 Command = Tuple[float, ...]
-"""Number of a MAV_CMD, and its parameters as far as they are not 0."""
+"""Number of a MAV_CMD, and its parameters; trailing parameters that are 0 are omitted."""
 
 
 @dataclass(frozen=True)
-class AutopilotBounds:
-    """What an autopilot itself keeps to, in metres; None for what it does not limit, or did not say.
+class AutopilotLimits:
+    """Limits that an autopilot enforces, in metres; None if it has no such limit or did not report it.
 
     Attributes:
-        height_m: How high it flies, above home.
-        radius_m: How far from home, over the ground.
-        return_m: How high it rises at least on its way back, above home.
+        height_m: Maximum height above home.
+        radius_m: Maximum horizontal distance from home.
+        return_m: Minimum height above home when it returns.
     """
 
     height_m: float | None = None
@@ -36,48 +36,48 @@ class AutopilotBounds:
 
 
 class FlightDialect(Protocol):
-    """How one family of autopilots is flown.
+    """Modes and commands of one family of autopilots.
 
     Attributes:
-        name: Of the family.
+        name: Name of the family.
         guided: Name of the mode in which it follows set-points.
-        estimate: Message with the flags of its estimate of position.
-        bounds_from: Parameters with its bounds; `|` between names of the same one, of which it has one.
-        says_now: Whether its arming checks are about the mode that it is in now.
+        estimate: Id of the message with the flags of its position estimate.
+        bounds_from: Names of the parameters with its limits; `|` separates alternative names of one parameter.
+        says_now: Whether its arming checks apply to its present mode.
     """
 
     name: str
-    guided: str
-    estimate: int
-    bounds_from: Sequence[str]
-    says_now: bool
+    guided_mode: str
+    estimate_message: int
+    limit_parameters: Sequence[str]
+    checks_present_mode: bool
 
-    def speaks(self, autopilot: int, vehicle: int) -> bool:
-        """Return whether an autopilot is of it: MAV_AUTOPILOT and MAV_TYPE of its heartbeat."""
+    def matches(self, autopilot: int, vehicle: int) -> bool:
+        """Return True if an autopilot belongs to this family, by MAV_AUTOPILOT and MAV_TYPE of its heartbeat."""
 
     def is_guided(self, mode: int) -> bool:
-        """Return whether it follows set-points, by the custom mode of its heartbeat."""
+        """Return True if it follows set-points in a mode, which is the custom mode of its heartbeat."""
 
-    def is_led(self, mode: int) -> bool:
-        """Return whether programs lead it in a mode, by set-points, a mission or commands, and not a person."""
+    def is_program_controlled(self, mode: int) -> bool:
+        """Return True if set-points, a mission or commands control it in a mode, and not a person."""
 
-    def comes_down(self, mode: int) -> bool:
-        """Return whether it lands, or returns to land, by itself in a mode."""
+    def lands_or_returns(self, mode: int) -> bool:
+        """Return True if it lands, or returns and lands, automatically in a mode."""
 
-    def waits(self, mode: int) -> bool:
-        """Return whether its failsafe for missing set-points waits in a mode for what a program commands."""
+    def is_failsafe_hold(self, mode: int) -> bool:
+        """Return True if a mode is the one in which its failsafe for missing set-points holds the position."""
 
     def mode_name(self, mode: int) -> str:
-        """Return the name of a mode; its number for one that is not known."""
+        """Return the name of a mode, or its number if the mode is unknown."""
 
-    def guide(self) -> Command:
-        """Return the command for the mode in which it follows set-points."""
+    def guided_command(self) -> Command:
+        """Return the command that selects the mode in which it follows set-points."""
 
-    def take_off(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
-        """Return the commands for the take-off when it is armed; empty where set-points do it."""
+    def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
+        """Return the commands for the take-off of an armed drone; empty if it takes off by set-points."""
 
-    def bring_down(self, how: str) -> Command:
-        """Return the command to `land` where it is, or to `return`."""
+    def bring_down_command(self, how: str) -> Command:
+        """Return the command to `land` at its present position, or to `return`."""
 
-    def bounds(self, values: Mapping[str, float]) -> AutopilotBounds:
-        """Return its bounds, from the values of the parameters of `bounds_from`."""
+    def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
+        """Return its limits, from the values of the parameters of `limit_parameters`."""

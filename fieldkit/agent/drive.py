@@ -1,8 +1,8 @@
-"""Drive a ground robot along its way by its velocity topic, in a closed loop on its odometry.
+"""Drive a ground robot along its path by its velocity topic, in a closed loop on its odometry.
 
-The laptop says again and again what it wants (`orders`). Where it does not for the lease of the task the robot
-stands: its laptop is gone, or the link to it. Twists go out `RATE_HZ` times a second; a robot's own base stops when
-they end.
+The laptop renews its order repeatedly (`orders`). If it does not do so within the lease of the task, the laptop or
+the link to it is lost, and the robot stops. Twists are published `RATE_HZ` times per second; the base of a robot
+stops when no more Twists arrive.
 """
 
 from __future__ import annotations
@@ -22,110 +22,112 @@ from fieldkit.agent.middleware import Middleware, MiddlewareError, Publisher, To
 from fieldkit.agent.numbered_lines import NumberedLines
 from fieldkit.agent.orders import Orders
 from fieldkit.agent.standstill import Standstill
-from fieldkit.agent.steering import STAND, Driver, DriveVelocity, OdometryPose
+from fieldkit.agent.steering import ZERO_VELOCITY, Driver, DriveVelocity, OdometryPose
 
 RATE_HZ = 20.0
-_ENDS_S = 0.5
-"""For so long zero Twists are sent at the end: one may be lost."""
-_BRAKES_S = 1.5
-"""And for this long at most while odometry shows that the robot still moves."""
-_PATIENCE_S = 15.0
-"""Within this somebody hears the velocity, and odometry comes."""
-_LOG_S = 0.1
+_MIN_STOP_S = 0.5
+"""Minimum time for which zero Twists are published at the end, because one may be lost."""
+_MAX_STOP_S = 1.5
+"""Maximum time for which they are published while odometry shows that the robot still moves."""
+_TIMEOUT_S = 15.0
+"""Timeout for a subscription to the velocity topic, and for the first odometry."""
+_LOG_INTERVAL_S = 0.1
 
 _CDR_HEADER = b"\0\1\0\0"
 _TWIST = struct.Struct("<6d")
 _POSE = struct.Struct("<7d")
 _LENGTH = struct.Struct("<I")
-_LONGEST_TEXT = 1 << 16
+_MAX_STRING_BYTES = 1 << 16
 
 
-def drive(middleware: Middleware, told: Mapping[str, Any], log: Path, over: threading.Event) -> str:
-    """Drive until the robot is back home, something stops it, or `over` is set.
+def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_event: threading.Event) -> str:
+    """Drive until the robot is back at its origin, a limit stops it, or `stop_event` is set.
 
     Args:
-        middleware: It has started.
-        told: `command` and `odometry`, the topics; `task`, what is driven; `orders`, the laptop's file, and
-            `status`, the file in which it finds how far the robot is; `stationary`, a file that is made when the
-            robot is stationary at the end (it may be missing); `cdr`, whether messages are encoded as in
-            ROS 2.
-        log: What is written down, a line of JSON ten times a second.
-        over: Set when it is to end.
+        middleware: The middleware, which is started.
+        arguments: `command` and `odometry`, the topics; `task`, the `DriveTask`; `orders`, the file that the laptop
+            writes; `status`, the file with the progress, which the laptop reads; `stationary`, a file that is
+            created when the robot is stationary at the end (optional); `cdr`, True if messages are encoded in CDR as
+            in ROS 2, False for ROS 1.
+        log: The log file: a line of JSON ten times per second.
+        stop_event: Set when the drive must end.
 
     Returns:
-        Why it ended before its end; empty where the robot is back home.
+        The reason why it ended early; empty if the robot is back at its origin.
 
     Raises:
-        MiddlewareError: Nobody hears the velocity topic, or no odometry comes.
-        OSError: The log cannot be written; the robot stands.
+        MiddlewareError: The velocity topic has no subscription, or no odometry arrives.
+        OSError: The log cannot be written; the robot was stopped.
     """
-    cdr = bool(told["cdr"])
-    publisher = middleware.publisher(Topic.from_json(told["command"]))
-    heard: list[tuple[float, OdometryPose]] = []
+    cdr = bool(arguments["cdr"])
+    publisher = middleware.publisher(Topic.from_json(arguments["command"]))
+    poses: list[tuple[float, OdometryPose]] = []
 
-    def take(data: bytes, _at_ns: int) -> None:
+    def on_odometry(data: bytes, _at_ns: int) -> None:
         pose = read_odometry(data, cdr=cdr)
         if pose is not None:
-            heard.append((now_s(), pose))
+            poses.append((now_s(), pose))
 
-    middleware.subscribe(Topic.from_json(told["odometry"]), take)
-    _wait("nobody hears " + told["command"]["name"], lambda: publisher.matched() > 0, over)
-    _wait("nothing comes from " + told["odometry"]["name"], lambda: bool(heard), over)
-    task = DriveTask.from_json(told["task"])
+    middleware.subscribe(Topic.from_json(arguments["odometry"]), on_odometry)
+    _wait(arguments["command"]["name"] + " has no subscription", lambda: publisher.matched() > 0, stop_event)
+    _wait("no odometry arrives on " + arguments["odometry"]["name"], lambda: bool(poses), stop_event)
+    task = DriveTask.from_json(arguments["task"])
     driver = Driver(task, now_s())
-    orders, status = Orders(told["orders"], ORDERS, task.lease_s), Path(told["status"])
+    orders, status = Orders(arguments["orders"], ORDERS, task.lease_s), Path(arguments["status"])
     with log.open("w", encoding="ascii") as file:
         lines = NumberedLines(file)
-        logged_s, velocity = -math.inf, STAND
+        logged_s, velocity = -math.inf, ZERO_VELOCITY
         if task.origin is not None and task.frame_id != boot_id():
-            driver.odometry(*heard.pop(0))
-            driver.refuse("its computer was restarted since its place was recorded, so its odometry is another one")
+            driver.odometry(*poses.pop(0))
+            driver.refuse(
+                "its computer was restarted after its origin was recorded, so its odometry has another frame"
+            )
         try:
-            while not driver.over and not over.is_set():
-                turn_s = now_s()
-                while heard:
-                    driver.odometry(*heard.pop(0))
-                if orders.look():
-                    driver.renewed(turn_s, orders.order)
-                velocity = driver.tick(turn_s)
-                if over.is_set():  # the signal may have come while this process was suspended
-                    velocity = STAND
+            while not driver.over and not stop_event.is_set():
+                iteration_s = now_s()
+                while poses:
+                    driver.odometry(*poses.pop(0))
+                if orders.poll():
+                    driver.renewed(iteration_s, orders.order)
+                velocity = driver.tick(iteration_s)
+                if stop_event.is_set():  # the signal may have come while this process was suspended
+                    velocity = ZERO_VELOCITY
                 publisher.write(twist(velocity, cdr=cdr))
-                if turn_s - logged_s >= _LOG_S:
-                    logged_s = turn_s
+                if iteration_s - logged_s >= _LOG_INTERVAL_S:
+                    logged_s = iteration_s
                     _report(driver, velocity, lines, status)
-                over.wait(1 / RATE_HZ)
+                stop_event.wait(1 / RATE_HZ)
         finally:
-            _stand(publisher, heard, told.get("stationary", ""), cdr=cdr)
+            _stop_robot(publisher, poses, arguments.get("stationary", ""), cdr=cdr)
         stopped = driver.stopped or ("" if driver.phase == "home" else "ordered to stop")
-        _report(driver, STAND, lines, status, ended=stopped or "home")
+        _report(driver, ZERO_VELOCITY, lines, status, ended=stopped or "home")
     return stopped
 
 
 def twist(velocity: DriveVelocity, *, cdr: bool) -> bytes:
-    """Return a `geometry_msgs/Twist`, serialized: linear x, y, z, then angular x, y, z."""
-    body = _TWIST.pack(velocity.forward_m_s, 0.0, 0.0, 0.0, 0.0, velocity.turn_rad_s)
-    return (_CDR_HEADER if cdr else b"") + body
+    """Return a serialized `geometry_msgs/Twist`: linear x, y, z, then angular x, y, z."""
+    payload = _TWIST.pack(velocity.forward_m_s, 0.0, 0.0, 0.0, 0.0, velocity.turn_rad_s)
+    return (_CDR_HEADER if cdr else b"") + payload
 
 
 def read_odometry(data: bytes, *, cdr: bool) -> OdometryPose | None:
-    """Return the pose in a `nav_msgs/Odometry`; None where it is none.
+    """Return the pose in a serialized `nav_msgs/Odometry`, or None if the data are not a valid one.
 
-    Before it stand a header (in ROS 1 with a number before its time), the name of its frame and that of the robot's;
-    the strings have their length before them, in CDR with the zero at their end, and doubles are aligned to 8 there.
+    The pose follows a header (in ROS 1 with a sequence number before the time), the frame id of the header and the
+    child frame id. Strings follow their length; in CDR they end with a zero byte, and doubles are aligned to 8 bytes.
     """
     if cdr and data[:4] != _CDR_HEADER:
         return None
-    body = data[4:] if cdr else data
-    at = 8 if cdr else 12
+    payload = data[4:] if cdr else data
+    offset = 8 if cdr else 12
     try:
         for _ in range(2):
-            at += -at % 4 if cdr else 0
-            (length,) = _LENGTH.unpack_from(body, at)
-            if length > _LONGEST_TEXT:
+            offset += -offset % 4 if cdr else 0
+            (length,) = _LENGTH.unpack_from(payload, offset)
+            if length > _MAX_STRING_BYTES:
                 return None
-            at += 4 + length
-        x_m, y_m, _, x, y, z, w = _POSE.unpack_from(body, at + (-at % 8 if cdr else 0))
+            offset += 4 + length
+        x_m, y_m, _, x, y, z, w = _POSE.unpack_from(payload, offset + (-offset % 8 if cdr else 0))
     except struct.error:
         return None
     if not all(map(math.isfinite, (x_m, y_m, x, y, z, w))):
@@ -133,71 +135,73 @@ def read_odometry(data: bytes, *, cdr: bool) -> OdometryPose | None:
     return OdometryPose(x_m, y_m, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
-def _wait(what: str, condition: Callable[[], bool], over: threading.Event) -> None:
-    deadline_s = time.monotonic() + _PATIENCE_S
+def _wait(message: str, condition: Callable[[], bool], stop_event: threading.Event) -> None:
+    deadline_s = time.monotonic() + _TIMEOUT_S
     while not condition():
-        if over.wait(0.02) or time.monotonic() > deadline_s:
-            raise MiddlewareError(what)
+        if stop_event.wait(0.02) or time.monotonic() > deadline_s:
+            raise MiddlewareError(message)
 
 
-def _stand(publisher: Publisher, heard: list[tuple[float, OdometryPose]], confirm: str, *, cdr: bool) -> None:
-    """Send zero velocities until the robot is stationary, for `_ENDS_S` at least and `_BRAKES_S` at most.
+def _stop_robot(
+    publisher: Publisher, poses: list[tuple[float, OdometryPose]], stationary_file: str, *, cdr: bool
+) -> None:
+    """Publish zero velocities until the robot is stationary, for at least `_MIN_STOP_S` and at most `_MAX_STOP_S`.
 
     Args:
-        publisher: Of the velocity topic.
-        heard: Poses of the odometry, which other threads append.
-        confirm: File that is made when the robot is stationary; empty for none.
-        cdr: See `twist`.
+        publisher: The publisher of the velocity topic.
+        poses: Poses of the odometry, which other threads append.
+        stationary_file: A file that is created when the robot is stationary; empty for none.
+        cdr: Whether messages are encoded in CDR.
     """
-    began_s, standstill, confirmed = time.monotonic(), Standstill(), False
-    heard.clear()  # poses from before the first zero
+    start_s, standstill, is_confirmed = time.monotonic(), Standstill(), False
+    poses.clear()  # poses from before the first zero
     while True:
-        publisher.write(twist(STAND, cdr=cdr))
-        while heard:
-            standstill.odometry(*heard.pop(0))
-        if standstill.stationary and not confirmed:
-            confirmed = True
-            if confirm:
-                with suppress(OSError):  # a full disk is no reason to send no more zeros
-                    Path(confirm).touch()
-        lasted_s = time.monotonic() - began_s
-        if lasted_s >= _BRAKES_S or (confirmed and lasted_s >= _ENDS_S):
+        publisher.write(twist(ZERO_VELOCITY, cdr=cdr))
+        while poses:
+            standstill.add_pose(*poses.pop(0))
+        if standstill.stationary and not is_confirmed:
+            is_confirmed = True
+            if stationary_file:
+                with suppress(OSError):  # zero Twists must also be published if the disk is full
+                    Path(stationary_file).touch()
+        elapsed_s = time.monotonic() - start_s
+        if elapsed_s >= _MAX_STOP_S or (is_confirmed and elapsed_s >= _MIN_STOP_S):
             return
         time.sleep(1 / RATE_HZ)
 
 
 def _report(driver: Driver, velocity: DriveVelocity, lines: NumberedLines, status: Path, ended: str = "") -> None:
-    """Write where the robot is, to the log from its start on, and to the status for the laptop.
+    """Write the state of the drive to the log, from the start of the path on, and to the status file for the laptop.
 
-    The status has in addition: `pose`, in the frame of the odometry; `frame_id`; `ready`, whether the robot is
-    stationary and may start; `refused`, whether it did not start because it is not where it must be.
+    The status contains in addition: `pose` in the frame of the odometry; `frame_id`; `ready`, whether the robot is
+    stationary and may start; `refused`, whether it did not start because it is not at the required place.
     """
-    here, pose = driver.here, driver.pose
-    if here is None or pose is None:
+    relative_pose, pose = driver.relative_pose, driver.pose
+    if relative_pose is None or pose is None:
         return  # before its origin is known
     line = {
         "utc_ns": time.time_ns(),
         "at_s": round(driver.lasted_s, 3),
         "phase": driver.phase,
-        "x_m": round(here.x_m, 4),
-        "y_m": round(here.y_m, 4),
-        "yaw_rad": round(here.yaw_rad, 4),
+        "x_m": round(relative_pose.x_m, 4),
+        "y_m": round(relative_pose.y_m, 4),
+        "yaw_rad": round(relative_pose.yaw_rad, 4),
         "forward_m_s": round(velocity.forward_m_s, 4),
         "turn_rad_s": round(velocity.turn_rad_s, 4),
         "driven_m": round(driver.driven_m, 3),
-        "left_m": round(driver.left_m, 4),
+        "left_m": round(driver.remaining_m, 4),
         "ended": ended,
     }
     if ended:
         lines.end(line)
     elif driver.phase not in ("waits", "returns"):
         lines.write(line)
-    more = {
+    extra = {
         "pose": [round(value, 6) for value in pose],
         "frame_id": boot_id(),
         "ready": driver.ready,
         "refused": driver.refused,
     }
-    beside = status.with_name(status.name + ".new")
-    beside.write_text(json.dumps({**line, **more}) + "\n", encoding="ascii")
-    beside.replace(status)
+    new_status = status.with_name(status.name + ".new")
+    new_status.write_text(json.dumps({**line, **extra}) + "\n", encoding="ascii")
+    new_status.replace(status)

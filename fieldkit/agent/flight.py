@@ -1,10 +1,10 @@
-"""Fly a drone for a trial, by set-points, and bring it down where the flight is cut short.
+"""Fly a drone for a trial by set-points, and land it if the flight is aborted.
 
-The laptop gives orders in a file, each with a lease: for how many seconds it holds. An order that is not renewed in
-time means that the laptop is gone, and a signal that the job is to end: both bring the drone down, as its plan says.
-A second program on the drone, its guard (`flying.guard`), does so where this one does not run any more, and this one
-where the guard does not. The autopilot's own failsafe is beside both: PX4 has one for missing set-points
-(COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduCopter stays where it is.
+The laptop writes orders to a file. Each order has a lease, the number of seconds for which it is valid. If an order
+is not renewed in time, the laptop or its link is lost; a signal cancels the job. In both cases the drone lands or
+returns, as its plan requires. The same happens if the guard, a second program on the drone (`flying.guard`), stops;
+the guard lands the drone if this program stops. The autopilot has failsafes in addition: PX4 has one for missing
+set-points (COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduCopter holds its position.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from typing import Callable, Sequence
 from fieldkit.agent.arming import ArmingCheck
 from fieldkit.agent.dialect import ARM, Command, FlightDialect
 from fieldkit.agent.flight_log import FlightLog
-from fieldkit.agent.flight_plan import CLIMB, GO, HOME, MISPLACED, FlightPlan, along
+from fieldkit.agent.flight_plan import CLIMB, GO, HOME, MISPLACED, FlightPlan, point_on_path
 from fieldkit.agent.flying import guard, rescue
 from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING
 from fieldkit.agent.flying.loop import FlightLoop
-from fieldkit.agent.flying.origin import FRAME, FlightOrigin, OriginError, Place, frame_id, settled
-from fieldkit.agent.landing import REFUSED, TAKEN, FlightError, alarm, bring_down, say, unhurried
+from fieldkit.agent.flying.origin import FRAME, FlightOrigin, OriginError, Position, frame_id, resolve_origin
+from fieldkit.agent.landing import REFUSED, TAKEN_OVER, FlightError, alarm, bring_down, landing_marker, log_line
 from fieldkit.agent.mavlink_frames import ACCEPTED
 
 _NEAR_M = 0.3
 _SLOW_M_S = 0.2
 _LIFTED_M = 0.3
-"""A drone that is higher than this over the ground has taken off."""
-_RISEN = 0.9
-"""Share of a take-off by command after which set-points lead."""
-_SETTLES_S = 1.0
-"""Set-points are sent for this time before the mode that follows them (PX4 user guide, offboard mode)."""
-_ORIGIN_S = 3.0
-"""Latitude and longitude have this time to arrive; some drones do not know them."""
+"""A drone that is higher than this above the ground has taken off."""
+_RISEN_FRACTION = 0.9
+"""Fraction of the height of a take-off by command after which set-points are sent."""
+_SET_POINTS_S = 1.0
+"""Set-points are sent for this time before the mode that follows them is selected (PX4 user guide, offboard mode)."""
+_COORDINATES_S = 3.0
+"""Timeout for latitude and longitude, which some drones do not know."""
 _BOOT_ID = "/proc/sys/kernel/random/boot_id"
 
 
@@ -46,23 +46,23 @@ class OffboardPilot:
 
     Args:
         plan: The flight.
-        over: Set when the job is to end.
+        stop_event: Set when the job must stop.
 
     Raises:
-        OSError: The connection or the file of liveness cannot be opened.
+        OSError: The connection or the liveness file cannot be opened.
     """
 
-    def __init__(self, plan: FlightPlan, over: threading.Event) -> None:
+    def __init__(self, plan: FlightPlan, stop_event: threading.Event) -> None:
         self._plan = plan
         self._log = FlightLog(plan.log)
-        self._loop = FlightLoop(plan, over, self._log.note)
+        self._loop = FlightLoop(plan, stop_event, self._log.note)
         self._drone = self._loop.drone
 
     def fly(self) -> None:
-        """Fly, as the orders come.
+        """Fly according to the orders.
 
         Raises:
-            FlightError: The flight was cut short; the drone was brought down, where that is ours to do.
+            FlightError: The flight was aborted; the drone has landed if the pilot may control it.
         """
         try:
             self._fly()
@@ -70,180 +70,192 @@ class OffboardPilot:
             if self._loop.state == FLYING:
                 self._give_up(error)
             elif self._loop.state == LANDING:
-                say(alarm(self._drone))
+                log_line(alarm(self._drone))
             raise
         finally:
             self._loop.state = ENDED
-            self._loop.beat()
-            self._loop.talk.close()
+            self._loop.update()
+            self._loop.session.close()
 
     def _give_up(self, error: Exception) -> None:
-        """Bring the drone down where the flight does not go on; errors as `bring_down`, with an alarm in the log."""
+        """Land the drone after an error unless another party flies it; raises as `bring_down`, and logs an alarm."""
         drone = self._drone
-        if isinstance(error, FlightError) and error.code == TAKEN:
+        if isinstance(error, FlightError) and error.code == TAKEN_OVER:
             if drone.armed or not drone.alive:
-                say(alarm(drone))
+                log_line(alarm(drone))
             return
-        say(f"{self._plan.abort}: {error}")
+        log_line(f"{self._plan.abort}: {error}")
         self._loop.state = LANDING
         self._log.phase = "coming down"
         try:
-            with unhurried(self._plan.unhurried):
-                bring_down(self._loop.talk, self._plan.abort, lambda: drone.guided, self._loop.beat)
+            with landing_marker(self._plan.unhurried):
+                bring_down(self._loop.session, self._plan.abort, lambda: drone.guided, self._loop.update)
         except Exception:
-            say(alarm(drone))
+            log_line(alarm(drone))
             raise
-        say("landed")
+        log_line("landed")
 
     def _fly(self) -> None:
         plan, loop = self._plan, self._loop
-        say(f"waiting for the heartbeat of an autopilot at {plan.connection}")
+        log_line(f"waiting for the heartbeat of an autopilot at {plan.connection}")
         loop.wait_for_autopilot()
-        say("ready")
-        dialect, start_m = self._stand()
+        log_line("ready")
+        dialect, start_m = self._wait_until_ready()
         origin = self._origin(start_m)
         loop.begin(origin, start_m[2])
         self._log.begin(origin, start_m[2])
-        say(f"origin {json.dumps(asdict(origin))}")
-        self._enter("standing")
-        loop.until(lambda: loop.orders.order in (CLIMB, HOME))
+        log_line(f"origin {json.dumps(asdict(origin))}")
+        self._start_phase("standing")
+        loop.run_until(lambda: loop.orders.order in (CLIMB, HOME))
         if loop.orders.order == CLIMB:
             corners_m = plan.corners_m(origin, start_m[2])
-            self._rise(dialect, start_m, corners_m[0])
-            self._go(corners_m)
+            self._take_off(dialect, start_m, corners_m[0])
+            self._fly_path(corners_m)
             if plan.end == "return":
                 self._return(origin)
-        self._enter("coming down")
-        loop.state = LANDING if loop.rose else loop.state
-        with unhurried(plan.unhurried):
-            bring_down(loop.talk, "land", lambda: self._drone.guided, loop.beat)
+        self._start_phase("coming down")
+        loop.state = LANDING if loop.has_armed else loop.state
+        with landing_marker(plan.unhurried):
+            bring_down(loop.session, "land", lambda: self._drone.guided, loop.update)
         self._log.end("landed")
-        say("landed")
+        log_line("landed")
 
-    def _stand(self) -> tuple[FlightDialect, Place]:
-        """Return how the drone is flown, and where it is once its motors have stopped and it reports its position."""
+    def _wait_until_ready(self) -> tuple[FlightDialect, Position]:
+        """Wait until the motors have stopped and the position is reported; return the dialect and the position."""
         drone = self._drone
         if drone.dialect is None:
-            raise FlightError(REFUSED, _sentences(ArmingCheck(drone, self._plan.needs)))
+            raise FlightError(REFUSED, _fault_text(ArmingCheck(drone, self._plan.needs)))
         if drone.armed:
-            say("waiting until its motors have stopped: another party flies it, or it is coming down")
-        self._loop.until(lambda: not drone.armed and drone.place_m is not None and drone.yaw_rad is not None)
-        assert drone.place_m is not None
-        return drone.dialect, drone.place_m
+            log_line("waiting until its motors have stopped: another party flies it, or it is landing")
+        self._loop.run_until(lambda: not drone.armed and drone.position_m is not None and drone.yaw_rad is not None)
+        assert drone.position_m is not None
+        return drone.dialect, drone.position_m
 
-    def _origin(self, start_m: Place) -> FlightOrigin:
+    def _origin(self, start_m: Position) -> FlightOrigin:
         """Return the origin in the frame of this start.
 
         Raises:
-            FlightError: The drone is not at the origin of its trial, or it is not known whether it is.
+            FlightError: The drone is not at the origin of its trial, or this is unknown.
         """
-        drone, began_s = self._drone, time.monotonic()
-        self._loop.until(lambda: drone.degrees is not None or time.monotonic() > began_s + _ORIGIN_S)
-        latitude, longitude = drone.degrees or (None, None)
+        drone, start_s = self._drone, time.monotonic()
+        self._loop.run_until(
+            lambda: drone.latitude_longitude is not None or time.monotonic() > start_s + _COORDINATES_S
+        )
+        latitude, longitude = drone.latitude_longitude or (None, None)
         if drone.yaw_rad is None:
             raise FlightError(REFUSED, "it does not report its heading (ATTITUDE)")
         frame = frame_id(_boot_id(), drone.booted_s)
         start = FlightOrigin(FRAME, frame, start_m[0], start_m[1], drone.yaw_rad, latitude, longitude)
         try:
-            return settled(FlightOrigin.of(self._plan.origin) if self._plan.origin else None, start)
+            return resolve_origin(FlightOrigin.from_values(self._plan.origin) if self._plan.origin else None, start)
         except OriginError as error:
-            say(MISPLACED)
+            log_line(MISPLACED)
             raise FlightError(REFUSED, str(error)) from error
 
-    def _rise(self, dialect: FlightDialect, start_m: Place, top_m: Place) -> None:
-        """Arm the drone, if nothing is against it, and rise straight up, then to the first point of its way."""
-        loop, drone, began_s = self._loop, self._drone, time.monotonic()
-        commands = dialect.take_off(self._plan.height_m, self._plan.climb_m_s)
-        waits = None if commands else lambda: start_m
-        if waits is not None:
-            loop.until(lambda: time.monotonic() - began_s > _SETTLES_S, lead=waits)
-        loop.ask(lambda: drone.command(*dialect.guide()), lambda: drone.guided, f"the mode {dialect.guided}", waits)
-        loop.state = FLYING
-        self._demand_armable(waits)
-        loop.ask(lambda: drone.command(ARM, 1), lambda: drone.armed, "to arm", waits)
-        loop.rose = True
-        self._enter("climbing")
-        if commands:
-            self._lift(commands, start_m)
-        way_m, began_s = [drone.place_m or start_m, (*start_m[:2], top_m[2]), top_m], time.monotonic()
-        loop.until(
-            lambda: _near(drone.place_m, top_m) or loop.orders.order == HOME,
-            lead=lambda: along(way_m, (time.monotonic() - began_s) * self._plan.climb_m_s),
+    def _take_off(self, dialect: FlightDialect, start_m: Position, top_m: Position) -> None:
+        """Arm the drone if its checks pass, rise vertically, then fly to the first point of the path."""
+        loop, drone, start_s = self._loop, self._drone, time.monotonic()
+        commands = dialect.take_off_commands(self._plan.height_m, self._plan.climb_m_s)
+        hold_start = None if commands else lambda: start_m
+        if hold_start is not None:
+            loop.run_until(lambda: time.monotonic() - start_s > _SET_POINTS_S, set_point=hold_start)
+        loop.request_missing(
+            lambda: drone.command(*dialect.guided_command()),
+            lambda: drone.guided,
+            f"the mode {dialect.guided_mode}",
+            hold_start,
         )
-        self._enter("up")
-        loop.until(lambda: loop.orders.order in (GO, HOME), lead=lambda: top_m)
+        loop.state = FLYING
+        self._require_armable(hold_start)
+        loop.request_missing(lambda: drone.command(ARM, 1), lambda: drone.armed, "to arm", hold_start)
+        loop.has_armed = True
+        self._start_phase("climbing")
+        if commands:
+            self._climb_by_commands(commands, start_m)
+        path_m, start_s = [drone.position_m or start_m, (*start_m[:2], top_m[2]), top_m], time.monotonic()
+        loop.run_until(
+            lambda: _near(drone.position_m, top_m) or loop.orders.order == HOME,
+            set_point=lambda: point_on_path(path_m, (time.monotonic() - start_s) * self._plan.climb_m_s),
+        )
+        self._start_phase("up")
+        loop.run_until(lambda: loop.orders.order in (GO, HOME), set_point=lambda: top_m)
 
-    def _demand_armable(self, waits: Callable[[], Place] | None) -> None:
-        """Request the arming checks.
+    def _require_armable(self, hold_start: Callable[[], Position] | None) -> None:
+        """Run the arming checks.
 
         Raises:
-            FlightError: It may not be armed; says why, and what to do.
+            FlightError: The drone cannot be armed; the message contains reasons and remedies.
         """
         check = ArmingCheck(self._drone, self._plan.needs)
-        for _ in self._loop.turns(waits):
-            check.ask()
-            if check.done:
+        for _ in self._loop.iterate(hold_start):
+            check.request_missing()
+            if check.is_complete:
                 break
-        if why := _sentences(check):
-            raise FlightError(REFUSED, why)
+        if reasons := _fault_text(check):
+            raise FlightError(REFUSED, reasons)
 
-    def _lift(self, commands: Sequence[Command], start_m: Place) -> None:
-        """Let the drone rise by commands, of which it must do the last, nearly to the height in that one."""
+    def _climb_by_commands(self, commands: Sequence[Command], start_m: Position) -> None:
+        """Let the drone take off by commands, until it is near the target height.
+
+        Only the last command must be accepted.
+        """
         drone, height_m = self._drone, self._plan.height_m
 
         def risen_m() -> float:
-            return start_m[2] - drone.place_m[2] if drone.place_m else 0.0
+            return start_m[2] - drone.position_m[2] if drone.position_m else 0.0
 
-        def risen() -> bool:
-            slow_m = height_m / 2 if drone.speed_m_s < _SLOW_M_S else math.inf
-            return risen_m() > min(_RISEN * height_m, slow_m)
+        def has_risen() -> bool:
+            slow_height_m = height_m / 2 if drone.speed_m_s < _SLOW_M_S else math.inf
+            return risen_m() > min(_RISEN_FRACTION * height_m, slow_height_m)
 
-        *before, last = commands
+        *preceding, last = commands
         for command in commands:
-            drone.answers.pop(int(command[0]), None)
-        for command in before:
-            self._loop.ask(partial(drone.command, *command), partial(self._answered, command[0]), "a speed to climb")
-        # An answer may be lost, and a second command to take off is refused in the air.
-        accepted = lambda: drone.answers.get(int(last[0])) == ACCEPTED or risen_m() > _LIFTED_M  # noqa: E731
-        self._loop.ask(partial(drone.command, *last), accepted, "to take off")
-        self._loop.until(lambda: risen() or self._loop.orders.order == HOME)
+            drone.command_results.pop(int(command[0]), None)
+        for command in preceding:
+            self._loop.command_until(
+                partial(drone.command, *command), partial(self._has_result, command[0]), "a speed to climb"
+            )
+        # The acknowledgement may be lost, and a second command to take off is refused in the air.
+        is_accepted = lambda: drone.command_results.get(int(last[0])) == ACCEPTED or risen_m() > _LIFTED_M  # noqa: E731
+        self._loop.command_until(partial(drone.command, *last), is_accepted, "to take off")
+        self._loop.run_until(lambda: has_risen() or self._loop.orders.order == HOME)
 
-    def _answered(self, command: float) -> bool:
-        return int(command) in self._drone.answers
+    def _has_result(self, command: float) -> bool:
+        return int(command) in self._drone.command_results
 
-    def _go(self, corners_m: Sequence[Place]) -> None:
-        """Fly the way, and wait at its end."""
-        loop, began_s, is_there = self._loop, time.monotonic(), False
+    def _fly_path(self, corners_m: Sequence[Position]) -> None:
+        """Fly the path, and wait at its end for the order `home`."""
+        loop, start_s, has_arrived = self._loop, time.monotonic(), False
         if loop.orders.order == GO:
-            self._enter("flying")
-        for _ in loop.turns(lambda: along(corners_m, (time.monotonic() - began_s) * self._plan.speed_m_s)):
+            self._start_phase("flying")
+        for _ in loop.iterate(lambda: point_on_path(corners_m, (time.monotonic() - start_s) * self._plan.speed_m_s)):
             if loop.orders.order == HOME:
                 return
-            if not is_there and _near(self._drone.place_m, corners_m[-1]):
-                is_there = True
-                self._enter("there")
+            if not has_arrived and _near(self._drone.position_m, corners_m[-1]):
+                has_arrived = True
+                self._start_phase("there")
 
     def _return(self, origin: FlightOrigin) -> None:
-        """Fly to above the origin."""
+        """Fly to the point above the origin."""
         drone = self._drone
-        assert drone.last_place_m is not None, "it has risen"
-        here_m = drone.last_place_m
-        above_m, began_s = origin.at(0.0, 0.0, here_m[2]), time.monotonic()
-        way_m = [here_m, above_m]
-        self._enter("coming back")
-        self._loop.until(
-            lambda: _near(drone.place_m, above_m) and drone.speed_m_s < _SLOW_M_S,
-            lead=lambda: along(way_m, (time.monotonic() - began_s) * self._plan.speed_m_s),
+        assert drone.last_position_m is not None, "it has risen"
+        here_m = drone.last_position_m
+        above_m, start_s = origin.position_at(0.0, 0.0, here_m[2]), time.monotonic()
+        path_m = [here_m, above_m]
+        self._start_phase("coming back")
+        self._loop.run_until(
+            lambda: _near(drone.position_m, above_m) and drone.speed_m_s < _SLOW_M_S,
+            set_point=lambda: point_on_path(path_m, (time.monotonic() - start_s) * self._plan.speed_m_s),
         )
 
-    def _enter(self, phase: str) -> None:
-        """Report what the flight is about from now on."""
+    def _start_phase(self, phase: str) -> None:
+        """Start a phase of the flight: set it for the log file and write it to the log."""
         self._log.phase = phase
-        say(phase)
+        log_line(phase)
 
 
-def fly(plan: FlightPlan, over: threading.Event) -> int:
-    """Fly a drone, or guard it, until the orders end or `over` is set, or rescue it; return the exit code.
+def fly(plan: FlightPlan, stop_event: threading.Event) -> int:
+    """Fly, guard or rescue a drone, as the plan requires; return the exit code.
 
     Raises:
         OSError: The connection cannot be opened.
@@ -252,17 +264,17 @@ def fly(plan: FlightPlan, over: threading.Event) -> int:
         if plan.rescues:
             rescue.rescue(plan)
         elif plan.guards:
-            guard.FlightGuard(plan, over).run()
+            guard.FlightGuard(plan, stop_event).run()
         else:
-            OffboardPilot(plan, over).fly()
+            OffboardPilot(plan, stop_event).fly()
     except FlightError as error:
-        say(f"error: {error}")
+        log_line(f"error: {error}")
         return error.code
     return 0
 
 
 def _boot_id() -> str:
-    """Return the identity of the boot of this computer (random(4)); empty where there is none."""
+    """Return the boot ID of this computer (random(4)), or an empty text if it is unknown."""
     try:
         with open(_BOOT_ID, encoding="ascii") as file:  # noqa: PTH123 (Python 3.8)
             return file.read(100).strip()
@@ -270,10 +282,10 @@ def _boot_id() -> str:
         return ""
 
 
-def _sentences(check: ArmingCheck) -> str:
-    """Return what is against a flight, and what to do about it; empty where nothing is."""
+def _fault_text(check: ArmingCheck) -> str:
+    """Return the reasons against a flight with their remedies; empty if there are none."""
     return "; ".join(f"{fault.what} ({fault.remedy})" for fault in check.faults() if fault.grave)
 
 
-def _near(place_m: Place | None, goal_m: Place) -> bool:
-    return place_m is not None and math.dist(place_m, goal_m) < _NEAR_M
+def _near(position_m: Position | None, goal_m: Position) -> bool:
+    return position_m is not None and math.dist(position_m, goal_m) < _NEAR_M

@@ -1,4 +1,4 @@
-"""The log of a flight: positions by the autopilot, ten times a second, relative to the flight's origin."""
+"""The log of a flight: positions from the autopilot, ten times per second, relative to the flight's origin."""
 
 from __future__ import annotations
 
@@ -13,43 +13,47 @@ from fieldkit.agent.numbered_lines import NumberedLines
 
 
 class FlightLog:
-    """Writes a JSON object a line, as long as there is room: a drone does not come down for a full disk.
+    """Writes one JSON object per line. Write errors stop the log, not the flight: a full disk must not land a drone.
 
     Args:
         path: The file; empty for none.
 
     Attributes:
-        phase: What the flight is about: `standing`, `climbing`, `up`, `flying`, `there`, `coming back` or
-            `coming down`.
+        phase: Phase of the flight: `standing`, `climbing`, `up`, `flying`, `there`, `coming back` or `coming down`.
     """
 
     def __init__(self, path: str) -> None:
         self.phase = ""
         self._lines: NumberedLines | None = None
         self._origin: FlightOrigin | None = None
-        self._ground_m = self._began_s = 0.0
+        self._ground_m = self._start_s = 0.0
         if path:
-            with suppress(OSError):  # the laptop sees that it is missing
+            with suppress(OSError):  # the laptop detects the missing file
                 self._lines = NumberedLines(open(path, "w", encoding="ascii"))  # noqa: SIM115, PTH123 (for the flight)
 
     def begin(self, origin: FlightOrigin, ground_m: float) -> None:
-        """Write the origin, and take it and the position of the ground, down, as reference of all lines."""
-        self._origin, self._ground_m, self._began_s = origin, ground_m, time.monotonic()
+        """Set the reference of all lines, and write the origin.
+
+        Args:
+            origin: The origin.
+            ground_m: Position of the ground, down, in LOCAL_POSITION_NED.
+        """
+        self._origin, self._ground_m, self._start_s = origin, ground_m, time.monotonic()
         self._write({"utc_ns": time.time_ns(), "origin": asdict(origin)})
 
     def note(self, drone: AutopilotState) -> None:
-        """Write where the drone is, its speed and mode, and the rate of its reports; nothing before `begin`."""
-        if self._lines is None or self._origin is None or drone.place_m is None or not self.phase:
+        """Write position, speed and mode of the drone, and the rate of its reports; does nothing before `begin`."""
+        if self._lines is None or self._origin is None or drone.position_m is None or not self.phase:
             return
-        ahead_m, left_m = self._origin.seen(drone.place_m)
+        ahead_m, left_m = self._origin.relative_m(drone.position_m)
         self._write(
             {
                 "utc_ns": time.time_ns(),
-                "at_s": round(time.monotonic() - self._began_s, 3),
+                "at_s": round(time.monotonic() - self._start_s, 3),
                 "phase": self.phase,
                 "ahead_m": round(ahead_m, 3),
                 "left_m": round(left_m, 3),
-                "up_m": round(self._ground_m - drone.place_m[2], 3),
+                "up_m": round(self._ground_m - drone.position_m[2], 3),
                 "speed_m_s": round(drone.speed_m_s, 3),
                 "mode": drone.mode_name,
                 "rate_hz": round(drone.stream_hz(LOCAL_POSITION_NED), 3),
@@ -63,9 +67,9 @@ class FlightLog:
             except OSError:
                 self._lines = None
 
-    def end(self, ended: str) -> None:
-        """Write how the flight ended, and a checksum; a log without them is not complete."""
+    def end(self, result: str) -> None:
+        """Write the result of the flight, and a checksum; a log without them is not complete."""
         if self._lines is not None:
             with suppress(OSError):
-                self._lines.end({"utc_ns": time.time_ns(), "ended": ended})
+                self._lines.end({"utc_ns": time.time_ns(), "ended": result})
         self._lines = None

@@ -1,4 +1,4 @@
-"""Plans of flights, as the laptop sends them to the programs on a drone, and the words of its orders."""
+"""Plans of flights, which the laptop sends to the programs on a drone, and the orders of the laptop."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import math
 from dataclasses import dataclass
 from typing import Any, Mapping, Sequence
 
-from fieldkit.agent.flying.origin import FlightOrigin, Place
+from fieldkit.agent.flying.origin import FlightOrigin, Position
 
 STAY, CLIMB, GO, HOME, LEAVE = "stay", "climb", "go", "home", "leave"
-"""Orders: wait, rise to the height, fly the way, come down, and end with the drone left as it is."""
+"""Orders: wait, rise to the height, fly the path, land, and stop the program without a command to the drone."""
 
 
 MISPLACED = "misplaced"
-"""Line in the log of a pilot that does not fly because the drone is not at the origin of its trial."""
+"""Log line of a pilot that does not fly because the drone is not at the origin of its trial."""
 
 
 @dataclass(frozen=True)
 class FlightNeeds:
-    """What a flight requires of an autopilot.
+    """Requirements of a flight on an autopilot.
 
     Attributes:
-        highest_m: Its largest height over the ground where it starts.
-        farthest_m: Its largest distance from its origin, over the ground.
-        ceiling_m: The largest height that is allowed.
-        least_charge: The charge that its battery must have, of 1.
-        returns: Whether it is to return by itself where the flight is cut short.
+        highest_m: Maximum height of the flight above the ground at its start.
+        farthest_m: Maximum horizontal distance of the flight from its origin.
+        ceiling_m: Maximum allowed height.
+        least_charge: Minimum charge of the battery, from 0 to 1.
+        returns: Whether the drone must return automatically if the flight is aborted.
     """
 
     highest_m: float
@@ -37,27 +37,27 @@ class FlightNeeds:
 
 @dataclass(frozen=True)
 class FlightPlan:
-    """A flight, or the guarding of one.
+    """Parameters of a program that flies, guards or rescues a drone.
 
     Attributes:
-        connection: Where the autopilot is, as `mavlink_links.opened` takes it.
+        connection: Name of the connection to the autopilot, as for `mavlink_links.open_link`.
         orders: The file of orders.
-        abort: How the drone is brought down where the flight is cut short: `land` or `return`.
-        lease_s: For how long the first order is awaited.
-        guards: Whether the program guards the drone, and does not fly it.
-        rescues: Whether it only brings the drone down, because neither its pilot nor its guard runs.
-        end: Where it comes down at the end: `land` where it is, `return` above its origin, at the height it has.
-        height_m: To which height it rises first.
-        legs: The way then, piece by piece: metres ahead, to the left and up, by the heading of the origin.
-        speed_m_s: Its speed along the way.
-        climb_m_s: Its speed while it rises.
-        ceiling_m: The largest height at which it may fly, over the ground where it starts.
-        fence_m: The largest distance from the origin at which it may fly.
-        least_charge: The charge that its battery must have before it rises, of 1.
+        abort: Command if the flight is aborted: `land` or `return`.
+        lease_s: Timeout for the first order.
+        guards: Whether the program guards the drone instead of flying it.
+        rescues: Whether the program only lands the drone, because neither its pilot nor its guard runs.
+        end: End of the flight: `land` at the present position, or `return` at the present height and land there.
+        height_m: Height of the take-off.
+        legs: The path after the take-off: metres ahead, to the left and up per leg, by the heading of the origin.
+        speed_m_s: Speed along the path.
+        climb_m_s: Speed of the take-off.
+        ceiling_m: Maximum height above the ground at the start.
+        fence_m: Maximum horizontal distance from the origin.
+        least_charge: Minimum charge of the battery before the take-off, from 0 to 1.
         origin: Values of the `FlightOrigin` of the trial; None at the first start, which becomes the origin.
-        log: The file of its positions; empty for none.
-        liveness: The file that pilot and guard share (`LivenessFile`); empty where only one of them runs.
-        unhurried: File that exists while the program brings a drone down: it is not killed then.
+        log: The log file of positions; empty for none.
+        liveness: The file that pilot and guard share (`LivenessFile`); empty if only one of them runs.
+        unhurried: A file that exists while the program lands a drone, so that the program is not killed.
     """
 
     connection: str
@@ -81,7 +81,7 @@ class FlightPlan:
 
     @property
     def needs(self) -> FlightNeeds:
-        """What it requires of an autopilot."""
+        """Requirements of the flight on an autopilot."""
         corners_m = self.corners_m(FlightOrigin("", "", 0.0, 0.0, 0.0), 0.0)
         return FlightNeeds(
             highest_m=max(-down_m for _, _, down_m in corners_m),
@@ -91,31 +91,31 @@ class FlightPlan:
             returns=self.abort == "return",
         )
 
-    def corners_m(self, origin: FlightOrigin, ground_m: float) -> list[Place]:
-        """Return the points between which it flies, the first above the origin.
+    def corners_m(self, origin: FlightOrigin, ground_m: float) -> list[Position]:
+        """Return the corners of the path, the first above the origin.
 
         Args:
             origin: The origin, in the frame of this flight.
             ground_m: Position of the ground, down.
         """
         ahead_m, left_m, down_m = 0.0, 0.0, ground_m - self.height_m
-        corners_m = [origin.at(ahead_m, left_m, down_m)]
+        corners_m = [origin.position_at(ahead_m, left_m, down_m)]
         for ahead, left, up in self.legs:
             ahead_m, left_m, down_m = ahead_m + ahead, left_m + left, down_m - up
-            corners_m.append(origin.at(ahead_m, left_m, down_m))
+            corners_m.append(origin.position_at(ahead_m, left_m, down_m))
         return corners_m
 
 
-def along(corners_m: Sequence[Place], way_m: float) -> Place:
-    """Return the point at a distance along a way; its end beyond that."""
+def point_on_path(corners_m: Sequence[Position], distance_m: float) -> Position:
+    """Return the point at a distance along a path, or its end if the path is shorter."""
     for begin, end in zip(corners_m, corners_m[1:]):
-        long_m = math.dist(begin, end)
-        if way_m < long_m:
-            return _between(begin, end, way_m / long_m)
-        way_m -= long_m
+        length_m = math.dist(begin, end)
+        if distance_m < length_m:
+            return _interpolate(begin, end, distance_m / length_m)
+        distance_m -= length_m
     return corners_m[-1]
 
 
-def _between(begin: Place, end: Place, share: float) -> Place:
+def _interpolate(begin: Position, end: Position, share: float) -> Position:
     n, e, d = (b + share * (a - b) for b, a in zip(begin, end))
     return n, e, d

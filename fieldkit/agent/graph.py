@@ -1,8 +1,8 @@
-"""Nodes of a participant of DDS: the topic `ros_discovery_info`, which `ros2 node list` reads.
+"""Nodes of a DDS participant: the topic `ros_discovery_info`, which `ros2 node list` reads.
 
-DDS knows participants and endpoints, ROS 2 nodes with endpoints. Each participant says which of its endpoints belong
-to which node, in a message of rmw_dds_common that every rmw over DDS reads (design.ros2.org, "Node to Participant
-mapping"). The message is small and of one type, so it is packed here.
+DDS has participants and endpoints; ROS 2 has nodes with endpoints. Each participant publishes which of its endpoints
+belong to which node, in a message of rmw_dds_common that every RMW over DDS reads (design.ros2.org, "Node to
+Participant mapping"). The message is small and of one type, so it is packed here.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ from typing import Sequence
 from fieldkit.agent.middleware import Quality, Topic
 
 GID_BYTES = 16
-"""Of an endpoint's name in the message since ROS 2 Iron; 24 until Humble (rmw/types.h, RMW_GID_STORAGE_SIZE)."""
+"""Length of a GID in the message since ROS 2 Iron; 24 until Humble (rmw/types.h, RMW_GID_STORAGE_SIZE)."""
 
 PARTICIPANT_DATA = "enclave=/;"
-"""What a participant tells of itself since ROS 2 Foxy; rmw_fastrtps passes over those that do not."""
+"""User data of a participant since ROS 2 Foxy; rmw_fastrtps ignores participants without them."""
 
 _PACKAGE = "rmw_dds_common/msg"
 _GUID_BYTES = 16
 
 
 def topic(gid_bytes: int = GID_BYTES) -> Topic:
-    """Return the topic by its names over DDS; it has no prefix, since it is none of a node."""
+    """Return the topic with its DDS names, which have no prefix because no node publishes it."""
     members: dict[str, list[tuple[str, str, int | None]]] = {
         "ParticipantEntitiesInfo": [("gid", "Gid", None), ("node_entities_info_seq", "NodeEntitiesInfo", 0)],
         "Gid": [("data", "uint8", gid_bytes)],
@@ -37,13 +37,13 @@ def topic(gid_bytes: int = GID_BYTES) -> Topic:
     return Topic(
         name="ros_discovery_info",
         type=f"{_PACKAGE}/ParticipantEntitiesInfo",
-        # rmw_dds_common's own; a reader that comes late is told what is.
+        # The quality of rmw_dds_common: a late reader receives the last sample.
         quality=Quality(depth=1, durability="transient_local"),
         members={
             f"{_PACKAGE}/{name}": [
-                (member, f"{_PACKAGE}/{kind}" if kind in members else kind, count) for member, kind, count in of
+                (member, f"{_PACKAGE}/{kind}" if kind in members else kind, count) for member, kind, count in layout
             ]
-            for name, of in members.items()
+            for name, layout in members.items()
         },
         dds_topic="ros_discovery_info",
         dds_types={f"{_PACKAGE}/{name}": f"rmw_dds_common::msg::dds_::{name}_" for name in members},
@@ -56,11 +56,11 @@ def entities_info(
     """Return the message of a participant with one node, as CDR in little-endian order.
 
     Args:
-        participant: Its GUID, 16 bytes.
+        participant: GUID of the participant, 16 bytes.
         node: Name of the node, in the root namespace.
         readers: GUID of each of its readers.
-        writers: And of its writers.
-        gid_bytes: How long a name of an endpoint is; what is behind the GUID is 0.
+        writers: GUID of each of its writers.
+        gid_bytes: Length of a GID, which is a GUID padded with zeros.
     """
     packed = bytearray()
 

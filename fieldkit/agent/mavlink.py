@@ -1,8 +1,7 @@
-"""Record what an autopilot sends over MAVLink, and request messages of it.
+"""Record the MAVLink messages of an autopilot, and request messages from it.
 
-The log is a telemetry log (`.tlog`) as QGroundControl, MAVProxy and pymavlink write and read them: each frame as it
-came, behind the time in microseconds since 1970 UTC in 8 bytes, big-endian. Nothing is decoded here but heartbeats of
-autopilots.
+The log is a telemetry log (`.tlog`) in the format of QGroundControl, MAVProxy and pymavlink: each received frame
+follows its time of arrival in microseconds since 1970 UTC, 8 bytes, big-endian. Only heartbeats are decoded here.
 """
 
 from __future__ import annotations
@@ -30,29 +29,30 @@ from fieldkit.agent.mavlink_frames import (
     head,
     is_intact,
 )
-from fieldkit.agent.mavlink_links import opened
+from fieldkit.agent.mavlink_links import open_link
 
 MOST_BYTES = 256 << 20
-"""A log is no longer, whoever floods the recorder."""
+"""Maximum size of a log, for example if another program floods the recorder."""
 
 _STAMP = struct.Struct(">Q")
-_BEATS_S = 1.0
-_ASKS_S = 0.4
-_LATEST_S = 60.0
-"""An ArduCopter sends LOCAL_POSITION_NED about 30 s after its boot, when its estimate has an origin."""
-_ENOUGH = 0.7
-"""Share of a requested rate below which it is not met, as for the link server."""
-_TURN_S = 0.1
+_HEARTBEAT_S = 1.0
+_REQUEST_S = 0.4
+_TIMEOUT_S = 60.0
+"""Timeout for requested messages. ArduCopter sends LOCAL_POSITION_NED about 30 s after its boot, when its position
+estimate has an origin."""
+_MIN_FRACTION = 0.7
+"""Minimum fraction of a requested rate, as for the link server."""
+_POLL_S = 0.1
 
 
 @dataclass(frozen=True)
 class FlightRecording:
-    """What is recorded.
+    """Parameters of a recording.
 
     Attributes:
-        connection: Where the autopilot is, as `mavlink_links.opened` takes it.
-        intervals_us: Wanted time between two messages of an id, which JSON made a text.
-        system: The autopilot's system id; 0 for the first that is heard.
+        connection: Name of the connection to the autopilot, as for `mavlink_links.open_link`.
+        intervals_us: Requested interval by message id, which is a text because keys of JSON are texts.
+        system: System id of the autopilot; 0 for the first one whose heartbeat arrives.
     """
 
     connection: str
@@ -61,16 +61,16 @@ class FlightRecording:
 
 
 class MissingMessageError(Exception):
-    """What was requested does not come."""
+    """A requested message does not arrive."""
 
 
 class FlightRecorder:
-    """Records what an autopilot sends.
+    """Records the messages of an autopilot.
 
     Args:
-        recording: What is recorded.
-        link: To the autopilot.
-        path: The log.
+        recording: Parameters of the recording.
+        link: The connection to the autopilot.
+        path: The log file.
     """
 
     def __init__(self, recording: FlightRecording, link: SharedLink, path: str) -> None:
@@ -83,88 +83,90 @@ class FlightRecorder:
         self._refused: dict[int, int] = {}
         self._slow_s = dict.fromkeys(self._missing, 0.0)
         self._writer = FrameWriter()
-        self._frames = self._bytes = self._left_out = self._sum = 0
-        self._beats_s = self._asks_s = 0.0
-        self._judged_s = self._heard_s = time.monotonic()
+        self._frames = self._bytes = self._left_out = self._checksum = 0
+        self._next_heartbeat_s = self._next_request_s = 0.0
+        self._rates_s = self._heard_s = time.monotonic()
         self._was_ready = False
 
     @property
     def ready(self) -> bool:
-        """Whether each requested message was received, or denied by the autopilot."""
+        """Whether each requested message was received, or refused by the autopilot."""
         self._was_ready |= self._autopilot is not None and self._missing <= set(self._refused)
         return self._was_ready
 
     def check(self) -> None:
-        """Check that what was requested comes in time.
+        """Check that the requested messages arrive in time.
 
         Raises:
-            MissingMessageError: It does not.
+            MissingMessageError: A message has not arrived in time.
         """
-        if not self.ready and self._autopilot is not None and time.monotonic() - self._heard_s > _LATEST_S:
+        if not self.ready and self._autopilot is not None and time.monotonic() - self._heard_s > _TIMEOUT_S:
             missing = ", ".join(str(kind) for kind in sorted(self._missing - set(self._refused)))
             raise MissingMessageError(
-                f"the autopilot has sent no message {missing} in {_LATEST_S:g} s, which was requested "
+                f"the autopilot has not sent the requested message {missing} in {_TIMEOUT_S:g} s "
                 "(ids of https://mavlink.io/en/messages/common.html)"
             )
 
-    def take(self, within_s: float, waiting: selectors.BaseSelector) -> None:
-        """Record what comes next, if anything does."""
-        if not waiting.select(within_s):
+    def receive(self, timeout_s: float, selector: selectors.BaseSelector) -> None:
+        """Record the next frames that arrive within this time."""
+        if not selector.select(timeout_s):
             return
         for frame in self._link.receive():
-            self._note(frame)
-            self._read(head(frame), intact=is_intact(frame))
+            self._write(frame)
+            self._process(head(frame), intact=is_intact(frame))
 
-    def _note(self, frame: bytes) -> None:
+    def _write(self, frame: bytes) -> None:
         if self._bytes + len(frame) + _STAMP.size > MOST_BYTES:
             self._left_out += 1
             return
         record = _STAMP.pack(time.time_ns() // 1000) + frame
         self._log.write(record)
-        self._sum = zlib.crc32(record, self._sum)
+        self._checksum = zlib.crc32(record, self._checksum)
         self._frames += 1
         self._bytes += len(record)
 
-    def _read(self, message: FrameHead, *, intact: bool) -> None:
-        """Note which autopilot it is, and which requested message has come."""
+    def _process(self, message: FrameHead, *, intact: bool) -> None:
+        """Identify the autopilot by its heartbeat, and register the arrival of requested messages."""
         source = message.system, message.component
         if self._autopilot is None:
-            beats = message.kind == HEARTBEAT and len(message.payload) > 5 and message.payload[5] != NO_AUTOPILOT
-            if intact and beats and self._system in (0, message.system):
+            is_heartbeat = (
+                message.kind == HEARTBEAT and len(message.payload) > 5 and message.payload[5] != NO_AUTOPILOT
+            )
+            if intact and is_heartbeat and self._system in (0, message.system):
                 self._autopilot, self._heard_s = source, time.monotonic()
         elif source == self._autopilot:
             self._missing.discard(message.kind)
 
-    def speak(self) -> None:
-        """Send what is due: a heartbeat, and the requests for messages until the link server has them."""
+    def send(self) -> None:
+        """Send heartbeats, and the requests for messages until the link server has them."""
         now_s = time.monotonic()
-        if now_s >= self._beats_s:
-            self._beats_s = now_s + _BEATS_S
+        if now_s >= self._next_heartbeat_s:
+            self._next_heartbeat_s = now_s + _HEARTBEAT_S
             self._link.send(self._writer.heartbeat())
-        if self._autopilot and now_s >= self._asks_s:
-            self._asks_s = now_s + _ASKS_S
+        if self._autopilot and now_s >= self._next_request_s:
+            self._next_request_s = now_s + _REQUEST_S
             for kind, interval_us in self._requested.items():
                 if kind not in self._link.messages:
                     self._link.send(self._writer.command(self._autopilot, SET_MESSAGE_INTERVAL, kind, interval_us))
-        self._judge(now_s)
+        self._update_rates(now_s)
 
-    def _judge(self, now_s: float) -> None:
-        """Note refusals, and for how long each message came slower than requested since the recorder was ready."""
-        lasted_s, self._judged_s = now_s - self._judged_s, now_s
+    def _update_rates(self, now_s: float) -> None:
+        """Update the refused messages, and for each message the time for which it was too slow after `ready`."""
+        elapsed_s, self._rates_s = now_s - self._rates_s, now_s
         for kind, rate in self._link.messages.items():
             if rate.result not in (None, ACCEPTED, *LATER):
                 self._refused[kind] = rate.result
-            elif self.ready and kind in self._slow_s and rate.hz * self._requested[kind] < _ENOUGH * 1e6:
-                self._slow_s[kind] += lasted_s
+            elif self.ready and kind in self._slow_s and rate.hz * self._requested[kind] < _MIN_FRACTION * 1e6:
+                self._slow_s[kind] += elapsed_s
 
     def end(self) -> Mapping[str, Any]:
-        """Close the log, and return what it holds."""
+        """Close the log, and return a summary of its content."""
         os.fsync(self._log.fileno())
         self._log.close()
         return {
             "frames": self._frames,
             "bytes": self._bytes,
-            "crc32": self._sum,
+            "crc32": self._checksum,
             "left_out": self._left_out + self._link.left_out,
             "ended_us": time.time_ns() // 1000,
             "refused": {str(kind): result for kind, result in self._refused.items()},
@@ -172,34 +174,34 @@ class FlightRecorder:
         }
 
 
-def record(recording: FlightRecording, path: str, over: threading.Event) -> None:
-    """Record until `over` is set, then write on standard output as JSON what the log holds.
+def record(recording: FlightRecording, path: str, stop_event: threading.Event) -> None:
+    """Record until `stop_event` is set, then write a summary of the log as JSON to standard output.
 
-    Writes `up` on standard error when the autopilot was heard and each requested message was received or denied.
+    Writes `up` to standard error when a heartbeat arrived and each requested message was received or refused.
 
     Raises:
         OSError: The connection cannot be opened.
         MissingMessageError: A requested message did not come.
     """
-    link = opened(recording.connection)
-    _say(f"waiting for the heartbeat of an autopilot at {recording.connection}")
+    link = open_link(recording.connection)
+    _report(f"waiting for the heartbeat of an autopilot at {recording.connection}")
     recorder = FlightRecorder(recording, link, path)
-    up = False
+    is_ready = False
     try:
-        with selectors.DefaultSelector() as waiting:
-            waiting.register(link.fileno(), selectors.EVENT_READ)
-            while not over.is_set():
-                recorder.speak()
-                recorder.take(_TURN_S, waiting)
+        with selectors.DefaultSelector() as selector:
+            selector.register(link.fileno(), selectors.EVENT_READ)
+            while not stop_event.is_set():
+                recorder.send()
+                recorder.receive(_POLL_S, selector)
                 recorder.check()
-                if not up and recorder.ready:
-                    up = True
-                    _say("up, MAVLink")
+                if not is_ready and recorder.ready:
+                    is_ready = True
+                    _report("up, MAVLink")
     finally:
         sys.stdout.write(json.dumps(recorder.end()) + "\n")
         link.close()
 
 
-def _say(text: str) -> None:
+def _report(text: str) -> None:
     sys.stderr.write(text + "\n")
     sys.stderr.flush()

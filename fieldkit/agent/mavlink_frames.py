@@ -1,4 +1,4 @@
-"""Frames of MAVLink, as far as a recorder and a pilot must know them (https://mavlink.io/en/guide/serialization.html)."""
+"""Parse and create the MAVLink frames that fieldkit uses (https://mavlink.io/en/guide/serialization.html)."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Iterator
 HEARTBEAT, ATTITUDE, LOCAL_POSITION_NED, COMMAND_LONG, COMMAND_ACK, SET_POINT, STATUSTEXT = 0, 30, 32, 76, 77, 84, 253
 SYS_STATUS, PARAM_REQUEST_READ, PARAM_VALUE, GLOBAL_POSITION_INT, HOME_POSITION = 1, 20, 22, 33, 242
 EKF_STATUS_REPORT, ESTIMATOR_STATUS = 193, 230
-"""Ids of messages (https://mavlink.io/en/messages/common.html; EKF_STATUS_REPORT is of ardupilotmega); a set-point is
-SET_POSITION_TARGET_LOCAL_NED."""
+"""Message ids (https://mavlink.io/en/messages/common.html; EKF_STATUS_REPORT is defined in ardupilotmega). SET_POINT
+is SET_POSITION_TARGET_LOCAL_NED."""
 SET_MESSAGE_INTERVAL = 511
-"""MAV_CMD_SET_MESSAGE_INTERVAL: the message, and the time between two in microseconds; 0 for as often as usual."""
+"""MAV_CMD_SET_MESSAGE_INTERVAL: message id, and interval in microseconds; 0 for the default rate."""
 ACCEPTED, IN_PROGRESS = 0, 5
-"""MAV_RESULT: ACCEPTED is the result of a command that is done; IN_PROGRESS is not a final result yet."""
+"""MAV_RESULT: the command is executed (ACCEPTED), or has no final result yet (IN_PROGRESS)."""
 NO_AUTOPILOT = 8
-"""MAV_AUTOPILOT_INVALID: what beats is a ground station, a camera, a logger."""
+"""MAV_AUTOPILOT_INVALID: in heartbeats of ground stations, cameras and loggers."""
 
 OWN_SYSTEM, OWN_COMPONENT = 254, 155
-"""Who the recorder is: MAV_COMP_ID_LOG of a system that no vehicle is."""
+"""System and component id of the recorder: a system id that no vehicle has, and MAV_COMP_ID_LOG."""
 TYPE_LOG = 38
 """MAV_TYPE_LOG."""
 
@@ -29,7 +29,7 @@ _SIGNATURE_BYTES = 13
 _ACTIVE = 4
 """MAV_STATE_ACTIVE."""
 _VERSION = 3
-"""Of MAVLink, as every heartbeat has it."""
+"""MAVLink version in heartbeats."""
 EXTRA = {
     HEARTBEAT: 50,
     ATTITUDE: 39,
@@ -46,13 +46,13 @@ EXTRA = {
     ESTIMATOR_STATUS: 163,
     HOME_POSITION: 104,
 }
-"""What the checksum of a message ends with: of its definition (mavlink.io, serialization, CRC_EXTRA)."""
+"""CRC_EXTRA of each message, a byte that depends on its definition (mavlink.io, serialization)."""
 
 
 def frame_bytes(buffer: bytes | bytearray) -> int | None:
-    """Return the length of the frame that a buffer begins with, by its header; None where that is not whole yet.
+    """Return the length of the frame at the start of a buffer, or None if its header is incomplete.
 
-    The first byte is one of those that frames begin with (mavlink.io, serialization).
+    The first byte must be a start marker of MAVLink 1 or 2 (mavlink.io, serialization).
     """
     if len(buffer) < 3:
         return None
@@ -62,16 +62,17 @@ def frame_bytes(buffer: bytes | bytearray) -> int | None:
 
 
 def frames(buffer: bytearray) -> Iterator[bytes]:
-    """Take the whole frames from a buffer, and what is before, between and behind them and is none.
+    """Yield the complete frames of a buffer, and delete them and all other bytes from it.
 
-    A frame behind which none begins is none: somebody listened from the middle of one on. What may become one stays.
+    A frame is accepted only if another frame or the end of the buffer follows, because a stream may start in the
+    middle of a frame. An incomplete frame stays in the buffer.
     """
     while buffer:
-        begins = buffer[0] in (_MAGIC_1, _MAGIC_2)
-        size = frame_bytes(buffer) if begins else 1
+        is_start = buffer[0] in (_MAGIC_1, _MAGIC_2)
+        size = frame_bytes(buffer) if is_start else 1
         if size is None or len(buffer) < size:
             return
-        if not begins or (len(buffer) > size and buffer[size] not in (_MAGIC_1, _MAGIC_2)):
+        if not is_start or (len(buffer) > size and buffer[size] not in (_MAGIC_1, _MAGIC_2)):
             del buffer[0]
             continue
         yield bytes(buffer[:size])
@@ -79,7 +80,7 @@ def frames(buffer: bytearray) -> Iterator[bytes]:
 
 
 def checksum(data: bytes) -> int:
-    """Return CRC-16/MCRF4XX, which MAVLink calls X.25."""
+    """Return the CRC-16/MCRF4XX, which MAVLink calls X.25."""
     crc = 0xFFFF
     for byte in data:
         low = (byte ^ crc) & 0xFF
@@ -89,48 +90,48 @@ def checksum(data: bytes) -> int:
 
 
 def is_intact(frame: bytes) -> bool:
-    """Return whether a whole frame has the checksum that it must have; unknown, and so not, of most messages."""
-    found = head(frame)
-    if found.kind not in EXTRA:
+    """Return True if the checksum of a complete frame is correct; False for messages that are not in `EXTRA`."""
+    message = head(frame)
+    if message.kind not in EXTRA:
         return False
     end = (6 if frame[0] == _MAGIC_1 else 10) + frame[1]
-    wanted = checksum(frame[1:end] + bytes((EXTRA[found.kind],)))
-    return int.from_bytes(frame[end : end + 2], "little") == wanted
+    expected = checksum(frame[1:end] + bytes((EXTRA[message.kind],)))
+    return int.from_bytes(frame[end : end + 2], "little") == expected
 
 
 class FrameWriter:
-    """Makes own frames, numbered.
+    """Creates frames with sequence numbers.
 
     Args:
-        system: Who sends them.
-        component: And which part of it.
+        system: System id of the sender.
+        component: Component id of the sender.
     """
 
     def __init__(self, system: int = OWN_SYSTEM, component: int = OWN_COMPONENT) -> None:
-        self._own = (system, component)
+        self._address = (system, component)
         self._sequence = 0
 
     def frame(self, kind: int, payload: bytes) -> bytes:
-        """Return the next frame, of MAVLink 2, with this message; zeros at its end are left out."""
+        """Return the next frame of MAVLink 2 with this message; trailing zeros of the payload are omitted."""
         payload = payload.rstrip(b"\0") or payload[:1]
-        head = (len(payload), 0, 0, self._sequence, *self._own)
+        head = (len(payload), 0, 0, self._sequence, *self._address)
         self._sequence = (self._sequence + 1) % 256
         body = bytes(head) + kind.to_bytes(3, "little") + payload
         return bytes((_MAGIC_2,)) + body + checksum(body + bytes((EXTRA[kind],))).to_bytes(2, "little")
 
     def heartbeat(self, vehicle: int = TYPE_LOG) -> bytes:
-        """Return a heartbeat: of a logger, whose silence later lets no autopilot think that its pilot is gone."""
+        """Return a heartbeat. The default type is a logger, whose loss no autopilot treats as a lost pilot."""
         return self.frame(HEARTBEAT, struct.pack("<IBBBBB", 0, vehicle, NO_AUTOPILOT, 0, _ACTIVE, _VERSION))
 
     def command(self, target: tuple[int, int], command: int, *parameters: float) -> bytes:
-        """Return a command to a system and its component; the parameters behind those that are given are 0."""
-        seven = (*parameters, *(0.0,) * (7 - len(parameters)))
-        return self.frame(COMMAND_LONG, struct.pack("<7fHBBB", *seven, command, *target, 0))
+        """Return a command to a system and component; omitted parameters are 0."""
+        padded_parameters = (*parameters, *(0.0,) * (7 - len(parameters)))
+        return self.frame(COMMAND_LONG, struct.pack("<7fHBBB", *padded_parameters, command, *target, 0))
 
 
 @dataclass(frozen=True)
 class FrameHead:
-    """What is read of a frame."""
+    """Message id, sender and payload of a frame."""
 
     kind: int
     system: int
@@ -139,7 +140,7 @@ class FrameHead:
 
 
 def head(frame: bytes) -> FrameHead:
-    """Return who sent a whole frame, of which kind it is, and its payload."""
+    """Return the message id, the sender and the payload of a complete frame."""
     size = frame[1]
     if frame[0] == _MAGIC_1:
         return FrameHead(frame[5], frame[3], frame[4], frame[6 : 6 + size])

@@ -1,4 +1,4 @@
-"""Ways to an autopilot, shared by all programs of fieldkit on its computer (see `fieldkit.agent.links`)."""
+"""Connections to an autopilot, shared by all programs of fieldkit on a computer (see `fieldkit.agent.links`)."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from fieldkit.agent.links.client import MessageRate, SharedLink
 
 
 class FlightLink(Protocol):
-    """A way to an autopilot."""
+    """A connection to an autopilot."""
 
     @property
     def messages(self) -> Mapping[int, MessageRate]:
-        """Messages that were requested, by their ids."""
+        """The requested messages, by id."""
 
     def fileno(self) -> int:
-        """Return the descriptor to wait for; it stays the same."""
+        """Return the file descriptor to wait for, which does not change."""
 
     def receive(self) -> Iterator[bytes]:
-        """Yield the frames that have arrived; bytes that are in none are left out."""
+        """Yield the frames that have arrived; bytes outside frames are ignored."""
 
     def send(self, frame: bytes) -> None:
-        """Send a frame, if that is possible now.
+        """Send a frame; it is dropped if the connection is closed or busy.
 
-        A request for the interval of a message goes to the link server, which weighs those of all programs.
+        A request for the interval of a message goes to the link server, which combines those of all programs.
         """
 
     def close(self) -> None:
-        """End it, and all requests for messages."""
+        """Close the connection, and end all requests for messages."""
 
 
-def opened(connection: str) -> SharedLink:
-    """Return a way to an autopilot, which survives the loss of its connection: the link server opens it again.
+def open_link(connection: str) -> SharedLink:
+    """Open a shared connection to an autopilot. If it is lost, the link server reopens it.
 
     Raises:
         OSError: It cannot be opened.
-        ValueError: It is not the name of a connection.
+        ValueError: The name of the connection is invalid.
     """
     devices.check(connection)
     link = SharedLink(connection)

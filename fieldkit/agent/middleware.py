@@ -1,6 +1,6 @@
-"""One face for middlewares: publish and subscribe to serialized samples.
+"""Common interface of middlewares: publish and subscribe to serialized samples.
 
-Adapters: `dds` (CycloneDDS), `zenoh`, `ros1` (rospy), `ros2` (rclpy). Each is loaded only where it is asked for.
+Adapters: `dds` (CycloneDDS), `zenoh`, `ros1` (rospy), `ros2` (rclpy). Each is imported only when it is used.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ from importlib import metadata
 from typing import Any, Callable, Mapping, Protocol
 
 Deliver = Callable[[bytes, int], None]
-"""Told each sample that arrived, serialized, and when by this robot's clock, in nanoseconds since 1970 UTC."""
+"""Callback for each received sample: its serialized data, and its time of arrival in nanoseconds since 1970 UTC."""
 
 ADAPTERS = ("dds", "zenoh", "ros1", "ros2")
 
 
 class MiddlewareError(Exception):
-    """The middleware is missing, or refused what it was told."""
+    """The middleware is missing, or refused a request."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """A quality of service in ROS 2's words; `system_default` leaves a policy to the middleware.
+    """A quality of service in ROS 2's terms; `system_default` leaves a policy to the middleware.
 
     Attributes:
         reliability: `reliable` or `best_effort`.
         history: `keep_last` or `keep_all`.
-        depth: How many, with `keep_last`; 0 leaves it to the middleware.
+        depth: Number of samples for `keep_last`; 0 leaves it to the middleware.
         durability: `volatile` or `transient_local`.
-        deadline_ns: A sample is expected at least so often; None for never.
-        lifespan_ns: A sample is worth nothing after this time; None for always.
+        deadline_ns: Maximum expected time between two samples; None for no deadline.
+        lifespan_ns: Time after which a sample expires; None for no limit.
     """
 
     reliability: str = "reliable"
@@ -43,22 +43,23 @@ class Quality:
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic by all the names that it has on the wire.
+    """A topic with its names and types for all middlewares.
 
     Attributes:
-        name: `/scan`.
-        type: `sensor_msgs/msg/LaserScan`.
+        name: ROS name, for example `/scan`.
+        type: ROS type, for example `sensor_msgs/msg/LaserScan`.
         quality: Its quality of service.
-        members: Members of its type and of those that it is made of, by name, itself first: of each its name, type,
-            and None for one, 0 for a sequence, the length of an array, or less than 0 for the bound of a sequence.
-        dds_topic: `rt/scan`. For DDS, as are the next two.
-        dds_types: DDS name of each type in `members`.
-        user_data: What endpoints tell of the type.
-        key: Key expression. For Zenoh, as is the next.
-        tokens: Key expressions of the liveliness tokens of a publisher of the topic, and of a subscription;
-            `{zid}` stands for the session.
-        md5: Sum of the type. For ROS 1, as is the next.
-        definition: Text of the type.
+        members: Members of its type, which is the first key, and of all nested types. Each member has its name, its
+            type, and a count: None for a single value, 0 for an unbounded sequence, the length of an array, or the
+            negative bound of a sequence.
+        dds_topic: DDS topic name, for example `rt/scan`.
+        dds_types: DDS type name of each type in `members`.
+        user_data: User data of DDS endpoints, which describe the type.
+        key: Zenoh key expression.
+        tokens: Zenoh key expressions of the liveliness tokens of a publisher of the topic, and of a subscription;
+            `{zid}` is replaced by the id of the session.
+        md5: MD5 sum of the ROS 1 type.
+        definition: Definition of the ROS 1 type.
     """
 
     name: str
@@ -75,30 +76,27 @@ class Topic:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Topic:
-        """Return a topic from what JSON made of it."""
+        """Return a topic from its decoded JSON object."""
         return cls(**{**data, "quality": Quality(**data.get("quality", {}))})
 
 
 @dataclass(frozen=True)
 class Network:
-    """How a robot takes part.
+    """Network settings of a robot's middleware.
 
     Attributes:
-        address: Its IPv4 address on the radio; nothing goes over others, but of ROS 2, whose RMW is set by the
-            robot's own environment.
-        discovery: `multicast`, `peers`, `router` or `master`; of ROS 2 also `environment`, what that says.
+        address: Its IPv4 address on the radio, the only one used. For ROS 2 the robot's environment selects it.
+        discovery: `multicast`, `peers`, `router` or `master`; for ROS 2 also `environment`, the robot's settings.
         peers: Addresses of the other robots, for `peers`.
-        server: Address of who runs the router or the master; of ROS 1, empty for what its setup files say.
-        port: Port of that, or of Zenoh's own listener.
+        server: Address of the router or master; for ROS 1, empty for the one in the robot's setup files.
+        port: Port of the router or master, or of Zenoh's listener.
         domain: ROS domain.
         node: Name of the node.
         transport: `tcp` or `udp`, for Zenoh.
-        gid_bytes: How long the name of an endpoint is in what DDS participants tell of their nodes: 16 since ROS 2
-            Iron, 24 before.
-        settings: The middleware's own settings by their path: `Discovery/SPDPInterval` of CycloneDDS,
-            `transport/link/tx/queue/size/data` of Zenoh,
-            `xmlrpc_port`, `tcpros_port` and `tcp_nodelay` (`1`: do not gather small messages) of ROS 1. Of ROS 2
-            none: its environment has them.
+        gid_bytes: Length of a GID in the node information of DDS participants: 16 since ROS 2 Iron, 24 before.
+        settings: Settings of the middleware by their path: for example `Discovery/SPDPInterval` of CycloneDDS,
+            `transport/link/tx/queue/size/data` of Zenoh; `xmlrpc_port`, `tcpros_port` and `tcp_nodelay` (`1` disables
+            Nagle's algorithm) of ROS 1. None for ROS 2, which uses the environment.
     """
 
     address: str
@@ -114,69 +112,69 @@ class Network:
 
 
 class Publisher(Protocol):
-    """What samples of a topic are written to."""
+    """A publisher of serialized samples."""
 
     def write(self, data: bytes) -> bool:
-        """Send a sample; return whether the middleware took it."""
+        """Send a sample; return True if the middleware accepted it."""
 
     def matched(self) -> int:
-        """Return how many subscriptions are known; of Zenoh, 1 for any number."""
+        """Return the number of matched subscriptions; for Zenoh, 1 for any number."""
 
     def drain(self, limit_s: float) -> None:
-        """Wait until what was sent is acknowledged, where it is, but no longer than this."""
+        """Wait until all samples are acknowledged, at most for this time. Without acknowledgements do nothing."""
 
 
 class Middleware(Protocol):
-    """A middleware that runs."""
+    """A running middleware."""
 
     version: str
 
     def publisher(self, topic: Topic) -> Publisher:
-        """Begin to publish a topic."""
+        """Create a publisher of a topic."""
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
-        """Begin to subscribe to a topic; what its own publishers send is not delivered.
+        """Subscribe to a topic; samples of this middleware's publishers are not delivered.
 
         Args:
-            topic: Which.
-            deliver: Called in a thread of its own for each sample.
+            topic: The topic.
+            deliver: Called in a separate thread for each sample.
 
         Returns:
-            What tells how many publishers are known; of Zenoh, -1.
+            A function that returns the number of matched publishers, or -1 for Zenoh.
         """
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the types, other than the topic's own, that others have under its name, as they are spelt there."""
+        """Return the names of different types that other participants use for the topic, in their spelling."""
 
     def close(self) -> None:
-        """End all of it."""
+        """Close all endpoints and stop the middleware."""
 
 
 def version_of(package: str) -> str:
-    """Return a package's name and version, as its installer noted it."""
+    """Return the name and installed version of a package, or only its name if the version is unknown."""
     try:
         return f"{package} {metadata.version(package)}"
     except metadata.PackageNotFoundError:  # built by hand
         return package
 
 
-def adapter(over: str) -> Callable[[Network], Middleware]:
-    """Load a middleware, which takes a while, and return what starts it.
+def adapter(name: str) -> Callable[[Network], Middleware]:
+    """Import a middleware, which may take seconds, and return the function that starts it.
 
     Args:
-        over: One of `ADAPTERS`.
+        name: One of `ADAPTERS`.
 
     Returns:
-        Told how this robot takes part; raises `MiddlewareError` where it does not start.
+        Starts the middleware with the given network settings; raises `MiddlewareError` if it does not start.
 
     Raises:
         MiddlewareError: It is not installed here.
     """
-    if over not in ADAPTERS:
-        raise MiddlewareError(f"there is no middleware {over!r}; there are {', '.join(ADAPTERS)}")
+    if name not in ADAPTERS:
+        raise MiddlewareError(f"{name!r} is not a middleware; choose one of {', '.join(ADAPTERS)}")
     try:
-        found = importlib.import_module(f"fieldkit.agent.{over}")
+        module = importlib.import_module(f"fieldkit.agent.{name}")
     except ImportError as error:
-        raise MiddlewareError(f"{over} is not installed here: {error}") from error
-    start: Callable[[Network], Middleware] = found.start
+        raise MiddlewareError(f"{name} is not installed here: {error}") from error
+    start: Callable[[Network], Middleware] = module.start
     return start

@@ -1,4 +1,4 @@
-"""Lines of JSON that are numbered, and end with a checksum, so that a log shows what it lacks.
+"""Numbered lines of JSON with a checksum at the end, so that missing lines of a log are detected.
 
 `fieldkit.measure.evidence.numbered_lines` checks them.
 """
@@ -11,7 +11,7 @@ from typing import IO, Any, Mapping
 
 
 class NumberedLines:
-    """A log of JSON objects, a line each.
+    """A log of JSON objects, one per line.
 
     Args:
         lines: The open file.
@@ -21,20 +21,24 @@ class NumberedLines:
         self._lines = lines
         self._count = self._sum = 0
 
-    def write(self, said: Mapping[str, Any]) -> str:
-        """Write a line, with its number as `n`, and return it; raises `OSError` if it cannot be written."""
-        return self._put(self._numbered(said))
+    def write(self, values: Mapping[str, Any]) -> str:
+        """Write a line with its number as `n`, and return it; raises `OSError` if it cannot be written."""
+        return self._append(self._numbered(values))
 
-    def end(self, said: Mapping[str, Any]) -> str:
-        """Write the last line, and return it: `crc32` is the CRC-32 of all before that member; raises as `write`."""
-        line = self._numbered(said)
+    def end(self, values: Mapping[str, Any]) -> str:
+        """Write the last line and return it; its last member `crc32` is the CRC-32 of everything before that member.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        line = self._numbered(values)
         total = zlib.crc32(line.encode("ascii"), self._sum)
-        return self._put(f'{line[:-1]}, "crc32": {total}}}')
+        return self._append(f'{line[:-1]}, "crc32": {total}}}')
 
-    def _numbered(self, said: Mapping[str, Any]) -> str:
-        return json.dumps({"n": self._count, **said})
+    def _numbered(self, values: Mapping[str, Any]) -> str:
+        return json.dumps({"n": self._count, **values})
 
-    def _put(self, line: str) -> str:
+    def _append(self, line: str) -> str:
         self._lines.write(line + "\n")
         self._lines.flush()
         self._sum = zlib.crc32((line + "\n").encode("ascii"), self._sum)

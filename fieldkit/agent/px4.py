@@ -1,10 +1,10 @@
-"""PX4, as a program that flies a drone sees it."""
+"""Flight dialect of PX4."""
 
 from __future__ import annotations
 
 from typing import Mapping, Sequence
 
-from fieldkit.agent.dialect import CUSTOM_MODE, LAND, RETURN, SET_MODE, AutopilotBounds, Command
+from fieldkit.agent.dialect import CUSTOM_MODE, LAND, RETURN, SET_MODE, AutopilotLimits, Command
 from fieldkit.agent.mavlink_frames import ESTIMATOR_STATUS
 
 _PX4 = 12
@@ -37,58 +37,58 @@ _SUB = {
 
 
 class Px4:
-    """See `FlightDialect`. It takes off by set-points, too, and holds without them (COM_OF_LOSS_T)."""
+    """Dialect of PX4. It also takes off by set-points, and holds its position without them (COM_OF_LOSS_T)."""
 
     name = "PX4"
-    guided = "OFFBOARD"
-    estimate = ESTIMATOR_STATUS
-    bounds_from: Sequence[str] = ("GF_MAX_VER_DIST", "GF_MAX_HOR_DIST", "RTL_RETURN_ALT")
-    says_now = True
+    guided_mode = "OFFBOARD"
+    estimate_message = ESTIMATOR_STATUS
+    limit_parameters: Sequence[str] = ("GF_MAX_VER_DIST", "GF_MAX_HOR_DIST", "RTL_RETURN_ALT")
+    checks_present_mode = True
 
-    def speaks(self, autopilot: int, vehicle: int) -> bool:  # noqa: ARG002 (it flies all by the same modes)
-        """See `FlightDialect.speaks`."""
+    def matches(self, autopilot: int, vehicle: int) -> bool:  # noqa: ARG002 (all vehicles have the same modes)
+        """Return True for each PX4."""
         return autopilot == _PX4
 
     def is_guided(self, mode: int) -> bool:
-        """See `FlightDialect.is_guided`."""
+        """Return True in OFFBOARD."""
         return _parts(mode)[0] == _OFFBOARD
 
-    def is_led(self, mode: int) -> bool:
-        """See `FlightDialect.is_led`: AUTO.LOITER follows each take-off and each command to go somewhere."""
+    def is_program_controlled(self, mode: int) -> bool:
+        """Return True in OFFBOARD and in AUTO modes for programs; AUTO.LOITER follows each take-off and each move."""
         main, sub = _parts(mode)
         return main == _OFFBOARD or (main == _AUTO and sub in (_TAKEOFF, _LOITER, _MISSION))
 
-    def comes_down(self, mode: int) -> bool:
-        """See `FlightDialect.comes_down`."""
+    def lands_or_returns(self, mode: int) -> bool:
+        """Return True in AUTO.RTL, AUTO.LAND and AUTO.PRECLAND."""
         main, sub = _parts(mode)
         return main == _AUTO and sub in (_RTL, _LAND, _PRECLAND)
 
-    def waits(self, mode: int) -> bool:
-        """See `FlightDialect.waits`: it holds where no sticks are (COM_OBL_RC_ACT)."""
+    def is_failsafe_hold(self, mode: int) -> bool:
+        """Return True in AUTO.LOITER, its failsafe mode without a remote control (COM_OBL_RC_ACT)."""
         return _parts(mode) == (_AUTO, _LOITER)
 
     def mode_name(self, mode: int) -> str:
-        """See `FlightDialect.mode_name`: `AUTO.LAND`, for example."""
+        """Return the name of a mode, for example `AUTO.LAND`, or its number if the mode is unknown."""
         main, sub = _parts(mode)
         if main not in _MAIN:
             return str(mode)
         return f"AUTO.{_SUB.get(sub, sub)}" if main == _AUTO else _MAIN[main]
 
-    def guide(self) -> Command:
-        """See `FlightDialect.guide`."""
+    def guided_command(self) -> Command:
+        """Return the command that selects OFFBOARD."""
         return (SET_MODE, CUSTOM_MODE, _OFFBOARD)
 
-    def take_off(self, height_m: float, climb_m_s: float) -> Sequence[Command]:  # noqa: ARG002
-        """See `FlightDialect.take_off`."""
+    def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:  # noqa: ARG002
+        """Return no commands: it takes off by set-points."""
         return ()
 
-    def bring_down(self, how: str) -> Command:
-        """See `FlightDialect.bring_down`."""
+    def bring_down_command(self, how: str) -> Command:
+        """Return the command to return or to land."""
         return (RETURN,) if how == "return" else (LAND,)
 
-    def bounds(self, values: Mapping[str, float]) -> AutopilotBounds:
-        """See `FlightDialect.bounds`; 0 is no fence (parameter reference, Geofence)."""
-        return AutopilotBounds(
+    def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
+        """Return its limits; a value of 0 means no fence (parameter reference, Geofence)."""
+        return AutopilotLimits(
             height_m=values.get("GF_MAX_VER_DIST") or None,
             radius_m=values.get("GF_MAX_HOR_DIST") or None,
             return_m=values.get("RTL_RETURN_ALT"),

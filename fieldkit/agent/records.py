@@ -1,9 +1,9 @@
-"""The log of one end of a topic: fixed records behind a magic, each stored at once, so that a kill loses none.
+"""The log of a publisher or subscriber: a magic number and records of fixed size, stored so that a kill loses none.
 
-The log is mapped into memory. A store into it is the kernel's as soon as it is made, as what `write` is given, and
-takes no call of the kernel; the way of a sample is not held up by its record. The file grows by pieces whose room on
-disk is reserved before they are mapped: a full disk is told by an error then, and not by a signal later, as one that
-fails is. What follows the last record of a log that was not ended is zeros.
+The log is mapped into memory. A store into the mapping survives the process, as data passed to `write`, but needs no
+system call, so that logging does not delay samples. The file grows by pieces that are allocated on disk before they
+are mapped: a full disk raises an error then, instead of a signal at a later store. (A failing disk still causes a
+signal.) If a log was not closed, zeros follow its last record.
 
 `fieldkit.measure.transfers.topic_log` reads it.
 """
@@ -18,37 +18,38 @@ import zlib
 
 MAGIC = b"fieldkit topic 1"
 RECORD = struct.Struct("<HHIqqq")
-"""Kind, nothing, size in bytes, sequence number, time when it was sent, time here; nanoseconds since 1970 UTC.
+"""Kind, unused, size in bytes, sequence number, send time, local time; times in nanoseconds since 1970 UTC.
 
-Only a record that is not there has 0 for the time here.
+The local time of a record is never 0, so a record of zeros is an unused one.
 """
 
 SAMPLE = 1
-"""A sample that was sent, with the times in it and when the middleware had taken it; or that arrived, and when."""
+"""A sample. Publisher: with the send time in it, and the local time after the middleware accepted it. Subscriber: the
+local time is that of its arrival."""
 BEGUN = 2
-"""The middleware, which is loaded, begins to look for others."""
+"""The middleware is imported, and its discovery starts."""
 MATCHED = 3
-"""The other end is known."""
+"""The other endpoint was discovered."""
 REFUSED = 4
-"""A sample that the middleware did not take."""
+"""A sample that the middleware did not accept."""
 SKIPPED = 5
-"""Samples whose time passed while one before was being written; `sequence` is their number."""
+"""Samples whose time passed while the previous one was written; `sequence` is their number."""
 FOREIGN = 6
-"""Something arrived that is no sample of this stream."""
+"""A received sample that does not belong to this stream."""
 END = 7
-"""Nothing follows; `sequence` is the number of samples.
+"""The last record; `sequence` is the number of samples.
 
-With `CHECKED` in place of the time when it was sent, `size` is the CRC-32 of the whole file with 0 in that field.
+If the send time is `CHECKED`, `size` is the CRC-32 of the whole file with 0 in that field.
 """
 ORIGIN = 8
-"""The end of the topic that writes the log, `PUBLISHER` or `SUBSCRIBER`, as `sequence`; `size` is the CRC-32 of the
+"""The role of the program that writes the log: `sequence` is `PUBLISHER` or `SUBSCRIBER`, `size` is the CRC-32 of the
 topic's name."""
 
 PUBLISHER, SUBSCRIBER = 1, 2
 CHECKED = 1
 
 PIECE_BYTES = 16 * mmap.ALLOCATIONGRANULARITY
-"""By which a log grows: some 2,000 records, 40 s of a stream at 50 Hz."""
+"""Size by which a log grows: about 2,000 records, 40 s of a stream at 50 Hz."""
 
 
 class LogError(Exception):
@@ -56,13 +57,13 @@ class LogError(Exception):
 
 
 class Log:
-    """A log that is being written, by any number of threads.
+    """Writes a log; its methods may be called by several threads.
 
     Args:
-        path: Where to.
+        path: The file.
 
     Raises:
-        LogError: There is no room for it, or it may not be written there.
+        LogError: The file cannot be created or allocated.
     """
 
     def __init__(self, path: str) -> None:
@@ -72,16 +73,16 @@ class Log:
         try:
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
         except OSError as error:
-            raise self._told(error) from error
+            raise self._log_error(error) from error
         self._map_from(0)
         self._piece[: len(MAGIC)] = MAGIC
-        self._at = len(MAGIC)
+        self._offset = len(MAGIC)
 
     def note(self, kind: int, at_ns: int, *, size: int = 0, sequence: int = 0, sent_ns: int = 0) -> None:
         """Write a record.
 
         Raises:
-            LogError: The disk is full. The log has all that was noted before.
+            LogError: The disk is full. The log contains all earlier records.
         """
         record = RECORD.pack(kind, 0, size, sequence, sent_ns, at_ns)
         with self._lock:
@@ -89,15 +90,20 @@ class Log:
             self._samples += kind == SAMPLE
 
     def _write(self, record: bytes) -> None:
-        end = self._at + RECORD.size
+        end = self._offset + RECORD.size
         if end > PIECE_BYTES:
-            self._map_from(self._begins + self._at)
-            end = self._at + RECORD.size
-        self._piece[self._at : end] = record
-        self._at = end
+            self._map_from(self._piece_start + self._offset)
+            end = self._offset + RECORD.size
+        self._piece[self._offset : end] = record
+        self._offset = end
 
     def origin(self, at_ns: int, end: int, topic: str) -> None:
-        """Write which end of which topic writes this log; see `ORIGIN`.
+        """Write an `ORIGIN` record.
+
+        Args:
+            at_ns: The local time.
+            end: `PUBLISHER` or `SUBSCRIBER`.
+            topic: The topic's name.
 
         Raises:
             LogError: As `note`.
@@ -105,37 +111,37 @@ class Log:
         self.note(ORIGIN, at_ns, size=zlib.crc32(topic.encode()), sequence=end)
 
     def end(self, at_ns: int) -> None:
-        """Write that nothing follows, with a checksum, and see that it is on disk.
+        """Write the last record with a checksum, and flush the file to disk.
 
         Raises:
             LogError: The disk is full.
         """
         with self._lock:
             blank = RECORD.pack(END, 0, 0, self._samples, CHECKED, at_ns)
-            self._write(RECORD.pack(END, 0, self._sum(blank), self._samples, CHECKED, at_ns))
+            self._write(RECORD.pack(END, 0, self._checksum(blank), self._samples, CHECKED, at_ns))
             self._piece.close()
-            os.ftruncate(self._file, self._begins + self._at)
+            os.ftruncate(self._file, self._piece_start + self._offset)
             os.fsync(self._file)
             os.close(self._file)
 
-    def _sum(self, end: bytes) -> int:
-        """Return the CRC-32 of what was written and the end of it; the file is read piece by piece."""
-        total, at, size = 0, 0, self._begins + self._at
-        while at < size:
-            piece = os.pread(self._file, min(PIECE_BYTES, size - at), at)
-            total, at = zlib.crc32(piece, total), at + len(piece)
+    def _checksum(self, end: bytes) -> int:
+        """Return the CRC-32 of the written file and its last record; the file is read piece by piece."""
+        total, offset, size = 0, 0, self._piece_start + self._offset
+        while offset < size:
+            piece = os.pread(self._file, min(PIECE_BYTES, size - offset), offset)
+            total, offset = zlib.crc32(piece, total), offset + len(piece)
         return zlib.crc32(end, total)
 
     def _map_from(self, position: int) -> None:
-        """Map a piece of the log that begins at a position, or at the page that this is in."""
-        at = position % mmap.ALLOCATIONGRANULARITY
-        begins = position - at
+        """Map a piece of the log that starts at the page of a position, and continue to write at that position."""
+        offset = position % mmap.ALLOCATIONGRANULARITY
+        piece_start = position - offset
         try:
-            os.posix_fallocate(self._file, begins, PIECE_BYTES)
-            self._piece = mmap.mmap(self._file, PIECE_BYTES, offset=begins)
+            os.posix_fallocate(self._file, piece_start, PIECE_BYTES)
+            self._piece = mmap.mmap(self._file, PIECE_BYTES, offset=piece_start)
         except OSError as error:
-            raise self._told(error) from error
-        self._begins, self._at = begins, at
+            raise self._log_error(error) from error
+        self._piece_start, self._offset = piece_start, offset
 
-    def _told(self, error: OSError) -> LogError:
+    def _log_error(self, error: OSError) -> LogError:
         return LogError(f"the log {self._path} cannot be written: {error.strerror}")

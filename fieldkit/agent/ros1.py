@@ -1,6 +1,6 @@
-"""ROS 1 by rospy, over TCPROS. Its only importer.
+"""ROS 1 with rospy, over TCPROS. This is the only module that imports rospy.
 
-Samples go through as bytes: in messages of a type made here, with the sum of the real one.
+Samples are passed through as bytes, in messages of a type that is created here with the MD5 sum of the real type.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from xmlrpc.client import Error as XmlRpcError
 try:
     import rospy
 except ImportError:
-    # Debian's ROS is there for Debian's own Python.
+    # Debian installs its ROS packages for Debian's Python only.
     sys.path.append("/usr/lib/python3/dist-packages")
     import rospy
 from rosgraph import Master, MasterException
@@ -23,87 +23,95 @@ from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Topic, 
 
 MASTER_PORT = 11311
 PORTS = ("xmlrpc_port", "tcpros_port")
-"""Of a node, as settings name them; without, any."""
+"""Settings for the ports of a node; without them, any free port is used."""
 
-_LONG = 1000
-_TRIES_S = 0.05
-_PATIENCE_S = 10.0
+_MAX_QUEUE = 1000
+_RETRY_S = 0.05
+_MASTER_TIMEOUT_S = 10.0
 
 
 def start(network: Network) -> Ros1Middleware:
-    """Register a node with the master; see `middleware.start`."""
+    """Register a node with the master; raises `MiddlewareError` if no master answers or rospy does not start."""
     return Ros1Middleware(network)
 
 
 class Ros1Middleware:
-    """A node. rospy knows one per process."""
+    """A node. rospy supports one node per process."""
 
     def __init__(self, network: Network) -> None:
         self.version = version_of("rospy")
-        if network.server:  # else what its setup files say
+        if network.server:  # otherwise the setup files of the robot select the master
             os.environ["ROS_MASTER_URI"] = f"http://{network.server}:{network.port or MASTER_PORT}"
             os.environ["ROS_IP"] = network.address
             os.environ.pop("ROS_HOSTNAME", None)
         os.environ.setdefault("ROS_MASTER_URI", f"http://localhost:{MASTER_PORT}")
-        _wait_for_master(float(network.settings.get("patience_s", _PATIENCE_S)))
+        _wait_for_master(float(network.settings.get("patience_s", _MASTER_TIMEOUT_S)))
         ports = {name: int(network.settings.get(name, 0)) for name in PORTS}
-        self._at_once = network.settings.get("tcp_nodelay", "0") == "1"
+        self._tcp_nodelay = network.settings.get("tcp_nodelay", "0") == "1"
         try:
             rospy.init_node(network.node, disable_signals=True, **ports)
         except rospy.ROSException as error:
             raise MiddlewareError(f"rospy does not start: {error}") from error
 
     def publisher(self, topic: Topic) -> Ros1Publisher:
-        """See `Middleware.publisher`."""
-        kind = _kind(topic)
+        """Create a publisher of a topic; `transient_local` latches the last sample."""
+        message_class = _message_class(topic)
         latch = topic.quality.durability == "transient_local"
-        made = rospy.Publisher(topic.name, kind, queue_size=_queue(topic), latch=latch, tcp_nodelay=self._at_once)
-        return Ros1Publisher(made, kind)
+        endpoint = rospy.Publisher(
+            topic.name, message_class, queue_size=_queue_size(topic), latch=latch, tcp_nodelay=self._tcp_nodelay
+        )
+        return Ros1Publisher(endpoint, message_class)
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
-        """See `Middleware.subscribe`."""
-        own = rospy.get_name()
+        """Subscribe to a topic; return a function that returns the number of connected publishers."""
+        own_name = rospy.get_name()
 
-        def take(message: Any) -> None:  # noqa: ANN401 (untyped)
+        def on_message(message: Any) -> None:  # noqa: ANN401 (untyped)
             at_ns = time.time_ns()
-            if message._connection_header["callerid"] != own:
+            if message._connection_header["callerid"] != own_name:
                 deliver(bytes(message._buff), at_ns)
 
-        # By the sum of the type, so that publishers of another one refuse. The buffer is rospy's own, of 64 KiB: it
-        # is made anew for each read, and larger ones, of the kernel, cost more than a small message does.
-        made = rospy.Subscriber(topic.name, _kind(topic), take, queue_size=_queue(topic), tcp_nodelay=self._at_once)
-        return lambda: int(made.get_num_connections())
+        # The MD5 sum of the type makes publishers of another type refuse the connection. The buffer is rospy's
+        # default of 64 KiB: it is allocated for each read, and larger ones would cost more than a small message.
+        endpoint = rospy.Subscriber(
+            topic.name,
+            _message_class(topic),
+            on_message,
+            queue_size=_queue_size(topic),
+            tcp_nodelay=self._tcp_nodelay,
+        )
+        return lambda: int(endpoint.get_num_connections())
 
     def other_types(self, topic: Topic) -> set[str]:
-        """See `Middleware.other_types`: the master knows one, that of the last publisher."""
-        own = rospy.get_name()
+        """Return the topic's type at the master if it differs; the master stores only that of the last publisher."""
+        own_name = rospy.get_name()
         try:
-            master = Master(own)
-            known = dict(master.getTopicTypes())
+            master = Master(own_name)
+            types = dict(master.getTopicTypes())
             publishers, subscribers, _ = master.getSystemState()
         except (OSError, MasterException, XmlRpcError):
             return set()
-        # The type of a topic stays known when its nodes are gone.
-        if not any(name == topic.name and set(nodes) - {own} for name, nodes in publishers + subscribers):
+        # The master keeps the type of a topic after its nodes have stopped.
+        if not any(name == topic.name and set(nodes) - {own_name} for name, nodes in publishers + subscribers):
             return set()
-        return {known.get(topic.name, "*")} - {"*", _ros1_type(topic)}
+        return {types.get(topic.name, "*")} - {"*", _ros1_type(topic)}
 
     def close(self) -> None:
-        """See `Middleware.close`."""
+        """Shut the node down."""
         rospy.signal_shutdown("done")
 
 
-def _wait_for_master(patience_s: float) -> None:
-    """Wait until the master answers; rospy itself would wait without end.
+def _wait_for_master(timeout_s: float) -> None:
+    """Wait until the master answers; rospy would wait without a limit.
 
     Raises:
-        MiddlewareError: It does not.
+        MiddlewareError: The master does not answer in time.
     """
-    deadline_s = time.monotonic() + patience_s
+    deadline_s = time.monotonic() + timeout_s
     while not _master_answers():
         if time.monotonic() > deadline_s:
             raise MiddlewareError(f"no ROS master answers at {os.environ['ROS_MASTER_URI']}")
-        time.sleep(_TRIES_S)
+        time.sleep(_RETRY_S)
 
 
 def _master_answers() -> bool:
@@ -118,8 +126,8 @@ def _ros1_type(topic: Topic) -> str:
     return topic.type.replace("/msg/", "/")
 
 
-def _kind(topic: Topic) -> type:
-    """Return a class of messages that are bytes, with the name, the sum and the text of the topic's type."""
+def _message_class(topic: Topic) -> type:
+    """Return a class for serialized messages, with the name, MD5 sum and definition of the topic's type."""
     attributes = {
         "_type": _ros1_type(topic),
         "_md5sum": topic.md5,
@@ -130,27 +138,27 @@ def _kind(topic: Topic) -> type:
     return type(topic.type.rpartition("/")[2], (rospy.AnyMsg,), attributes)
 
 
-def _queue(topic: Topic) -> int:
-    return topic.quality.depth if topic.quality.history == "keep_last" and topic.quality.depth else _LONG
+def _queue_size(topic: Topic) -> int:
+    return topic.quality.depth if topic.quality.history == "keep_last" and topic.quality.depth else _MAX_QUEUE
 
 
 class Ros1Publisher:
-    """A publisher of one type."""
+    """A publisher of serialized messages of one type."""
 
-    def __init__(self, publisher: Any, kind: type) -> None:  # noqa: ANN401 (untyped)
+    def __init__(self, publisher: Any, message_class: type) -> None:  # noqa: ANN401 (untyped)
         self._publisher = publisher
-        self._kind = kind
+        self._message_class = message_class
 
     def write(self, data: bytes) -> bool:
-        """See `Publisher.write`."""
-        message = self._kind()
+        """Publish a sample."""
+        message = self._message_class()
         message._buff = data
         self._publisher.publish(message)
         return True
 
     def matched(self) -> int:
-        """See `Publisher.matched`."""
+        """Return the number of connected subscriptions."""
         return int(self._publisher.get_num_connections())
 
     def drain(self, limit_s: float) -> None:
-        """See `Publisher.drain`: TCPROS tells nobody."""
+        """Do nothing: TCPROS has no acknowledgements."""

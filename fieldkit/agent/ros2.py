@@ -1,6 +1,6 @@
-"""ROS 2 by its own client library, rclpy, over whatever RMW the robot's environment selects. Its only importer.
+"""ROS 2 with its client library rclpy, over the RMW of the robot's environment. Only this module imports rclpy.
 
-Samples go through as bytes: rclpy publishes what is serialized, and hands it on so where a subscription is `raw`.
+Samples are passed through as bytes: rclpy publishes serialized messages, and a `raw` subscription delivers them.
 """
 
 from __future__ import annotations
@@ -20,68 +20,68 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Quality, Topic, version_of
 
-_WAKES_S = 0.1
+_SPIN_S = 0.1
 
 
 def start(network: Network) -> Ros2Middleware:
-    """Start a node; see `middleware.start`."""
+    """Start a node; raises `MiddlewareError` if ROS 2 does not start."""
     return Ros2Middleware(network)
 
 
 def environment(network: Network) -> dict[str, str]:
-    """Return the variables by which ROS 2 takes part as it is told; all others are the robot's own.
+    """Return the environment variables for these network settings; all others are those of the robot.
 
-    docs.ros.org, "Improved Dynamic Discovery": with `LOCALHOST` nobody is asked by multicast, and static peers are
-    asked all the same. Since ROS 2 Iron; earlier ones know multicast alone.
+    docs.ros.org, "Improved Dynamic Discovery": with `LOCALHOST` there is no multicast on the network, but static
+    peers are contacted. Available since ROS 2 Iron; earlier versions support multicast only.
     """
-    found = {"ROS_DOMAIN_ID": str(network.domain)}
+    variables = {"ROS_DOMAIN_ID": str(network.domain)}
     if network.discovery != "environment":
-        found["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST" if network.discovery == "peers" else "SUBNET"
-        found["ROS_STATIC_PEERS"] = ";".join(network.peers) if network.discovery == "peers" else ""
-    return found
+        variables["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST" if network.discovery == "peers" else "SUBNET"
+        variables["ROS_STATIC_PEERS"] = ";".join(network.peers) if network.discovery == "peers" else ""
+    return variables
 
 
-def profile(wanted: Quality) -> QoSProfile:
-    """Return a quality of service as rclpy has it, which has ROS 2's own names."""
+def profile(requested: Quality) -> QoSProfile:
+    """Return a quality of service as a profile of rclpy."""
     policies: dict[str, Any] = {
-        "reliability": ReliabilityPolicy[wanted.reliability.upper()],
-        "history": HistoryPolicy[wanted.history.upper()],
-        "depth": wanted.depth,
-        "durability": DurabilityPolicy[wanted.durability.upper()],
+        "reliability": ReliabilityPolicy[requested.reliability.upper()],
+        "history": HistoryPolicy[requested.history.upper()],
+        "depth": requested.depth,
+        "durability": DurabilityPolicy[requested.durability.upper()],
     }
-    for name, time_ns in (("deadline", wanted.deadline_ns), ("lifespan", wanted.lifespan_ns)):
+    for name, time_ns in (("deadline", requested.deadline_ns), ("lifespan", requested.lifespan_ns)):
         if time_ns is not None:
             policies[name] = Duration(nanoseconds=time_ns)
     return QoSProfile(**policies)
 
 
 def message_type(name: str) -> Any:  # noqa: ANN401 (generated)
-    """Return the class of a message type, `std_msgs/msg/UInt8MultiArray`.
+    """Return the class of a message type, for example `std_msgs/msg/UInt8MultiArray`.
 
     Raises:
         MiddlewareError: This ROS 2 has no such type.
     """
-    package, kind, short = name.split("/")
+    package, package_part, short = name.split("/")
     try:
-        return getattr(importlib.import_module(f"{package}.{kind}"), short)
+        return getattr(importlib.import_module(f"{package}.{package_part}"), short)
     except (ImportError, AttributeError) as error:
         raise MiddlewareError(f"this ROS 2 has no {name}: {error}") from error
 
 
 class Ros2Middleware:
-    """A node with nothing but the topics that it is asked for: no parameters, no log on `/rosout`."""
+    """A node with the requested topics only: no parameter services, no log on `/rosout`."""
 
     def __init__(self, network: Network) -> None:
-        # Both came with Iron.
+        # Iron introduced both static peers and type hashes.
         if network.discovery == "peers" and find_spec("rclpy.type_hash") is None:
-            raise MiddlewareError("ROS 2 knows no static peers before Iron: name them in the settings of its RMW")
+            raise MiddlewareError("ROS 2 has no static peers before Iron: set the peers in the settings of its RMW")
         os.environ.update(environment(network))
         if network.discovery != "environment":
             os.environ.pop("ROS_LOCALHOST_ONLY", None)
-        # One of our own: rclpy leaves the handling of signals alone then.
+        # With a separate context rclpy installs no signal handlers.
         self._context = Context()
         try:
-            # Else a file per run stays in the robot's ~/.ros/log.
+            # Without this, each run leaves a file in the robot's ~/.ros/log.
             rclpy.init(args=["--ros-args", "--disable-external-lib-logs"], context=self._context)
             self._node = rclpy.create_node(
                 network.node,
@@ -91,53 +91,53 @@ class Ros2Middleware:
                 start_parameter_services=False,
             )
             self.version = f"{version_of('rclpy')}, {rclpy.get_rmw_implementation_identifier()}"
-        except RuntimeError as error:  # which rclpy's own errors are
+        except RuntimeError as error:  # the base class of rclpy's errors
             raise MiddlewareError(f"ROS 2 does not start: {error}") from error
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._own: set[tuple[str, str]] = set()
+        self._roles: set[tuple[str, str]] = set()
 
     def publisher(self, topic: Topic) -> Ros2Publisher:
-        """See `Middleware.publisher`."""
-        self._claim("publish", topic)
+        """Create a publisher of a topic."""
+        self._require_single_role("publish", topic)
         return Ros2Publisher(
             self._node.create_publisher(message_type(topic.type), topic.name, profile(topic.quality))
         )
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
-        """See `Middleware.subscribe`."""
-        self._claim("subscribe", topic)
+        """Subscribe to a topic; return a function that returns the number of matched publishers."""
+        self._require_single_role("subscribe", topic)
 
-        def take(data: bytes) -> None:
+        def on_message(data: bytes) -> None:
             deliver(data, time.time_ns())
 
-        kind, wanted = message_type(topic.type), profile(topic.quality)
-        made = self._node.create_subscription(kind, topic.name, take, wanted, raw=True)
+        message_class, qos = message_type(topic.type), profile(topic.quality)
+        subscription = self._node.create_subscription(message_class, topic.name, on_message, qos, raw=True)
         if self._thread is None:
             self._thread = threading.Thread(target=self._spin, daemon=True)
             self._thread.start()
-        if hasattr(made, "get_publisher_count"):  # since Jazzy
-            return lambda: int(made.get_publisher_count())
+        if hasattr(subscription, "get_publisher_count"):  # since Jazzy
+            return lambda: int(subscription.get_publisher_count())
         return lambda: int(self._node.count_publishers(topic.name))
 
-    def _claim(self, verb: str, topic: Topic) -> None:
-        """Refuse both ends of one topic: rclpy cannot keep from a subscription what its own node publishes."""
-        self._own.add((verb, topic.name))
-        if {("publish", topic.name), ("subscribe", topic.name)} <= self._own:
-            raise MiddlewareError(f"rclpy would hear itself on {topic.name}")
+    def _require_single_role(self, role: str, topic: Topic) -> None:
+        """Refuse to publish and subscribe to one topic: rclpy cannot hide a node's samples from its subscription."""
+        self._roles.add((role, topic.name))
+        if {("publish", topic.name), ("subscribe", topic.name)} <= self._roles:
+            raise MiddlewareError(f"rclpy would receive its own samples on {topic.name}")
 
     def _spin(self) -> None:
         while not self._closing.is_set():
-            self._executor.spin_once(timeout_sec=_WAKES_S)
+            self._executor.spin_once(timeout_sec=_SPIN_S)
 
     def other_types(self, topic: Topic) -> set[str]:
-        """See `Middleware.other_types`."""
+        """Return the different types that other nodes use for the topic."""
         return set(dict(self._node.get_topic_names_and_types()).get(topic.name, ())) - {topic.type}
 
     def close(self) -> None:
-        """See `Middleware.close`."""
+        """Stop the node."""
         self._closing.set()
         if self._thread is not None:
             self._thread.join()
@@ -153,18 +153,18 @@ class Ros2Publisher:
         self._publisher = publisher
 
     def write(self, data: bytes) -> bool:
-        """See `Publisher.write`."""
+        """Publish a sample; return False if the RMW does not accept it in time."""
         try:
             self._publisher.publish(data)
-        except RuntimeError:  # the RMW did not take it in its time
+        except RuntimeError:  # a timeout of the RMW
             return False
         return True
 
     def matched(self) -> int:
-        """See `Publisher.matched`."""
+        """Return the number of matched subscriptions."""
         return int(self._publisher.get_subscription_count())
 
     def drain(self, limit_s: float) -> None:
-        """See `Publisher.drain`: since Humble, where it is told."""
+        """Wait until all samples are acknowledged, which rclpy supports since Humble."""
         if hasattr(self._publisher, "wait_for_all_acked"):
             self._publisher.wait_for_all_acked(Duration(nanoseconds=int(limit_s * 1e9)))

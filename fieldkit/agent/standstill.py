@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from fieldkit.agent.drive_plan import wrapped
+from fieldkit.agent.drive_plan import wrap_angle
 from fieldkit.agent.steering import OdometryPose
 
 WITHIN_S = 0.2
-"""Poses over this time are compared."""
+"""Time span of the compared poses."""
 _MOVED_M, _TURNED_RAD = 0.005, 0.02
-"""A change of pose above these in `WITHIN_S` is motion, below it noise: 0.025 m/s and 0.1 rad/s."""
+"""A larger change of the pose in `WITHIN_S` is motion, a smaller one is noise: 0.025 m/s and 0.1 rad/s."""
 
 
 class Standstill:
@@ -20,8 +20,8 @@ class Standstill:
     def __init__(self) -> None:
         self._poses: deque[tuple[float, OdometryPose]] = deque()
 
-    def odometry(self, at_s: float, pose: OdometryPose) -> None:
-        """Take in a pose, with the time of a monotonic clock at which it was received."""
+    def add_pose(self, at_s: float, pose: OdometryPose) -> None:
+        """Add a pose with its time of arrival by a monotonic clock."""
         self._poses.append((at_s, pose))
         while len(self._poses) > 1 and at_s - self._poses[1][0] >= WITHIN_S:
             self._poses.popleft()
@@ -34,6 +34,6 @@ class Standstill:
         newest = self._poses[-1][1]
         return all(
             math.hypot(pose.x_m - newest.x_m, pose.y_m - newest.y_m) <= _MOVED_M
-            and abs(wrapped(pose.yaw_rad - newest.yaw_rad)) <= _TURNED_RAD
+            and abs(wrap_angle(pose.yaw_rad - newest.yaw_rad)) <= _TURNED_RAD
             for _, pose in self._poses
         )

@@ -1,7 +1,7 @@
-"""Zenoh by Eclipse's binding, which its package calls `eclipse-zenoh`, as rmw_zenoh uses it. Its only importer.
+"""Zenoh with the binding of the package `eclipse-zenoh`, compatible with rmw_zenoh. Only this module imports it.
 
-docs/design.md of github.com/ros2/rmw_zenoh: the key expression has the type's name and hash, each sample an
-attachment, each node and endpoint a liveliness token. What the key expressions are, the laptop says
+By docs/design.md of github.com/ros2/rmw_zenoh the key expression contains the type's name and hash, each sample has
+an attachment, and each node and endpoint a liveliness token. The laptop computes the key expressions
 (`fieldkit.ros.names`).
 """
 
@@ -19,29 +19,29 @@ import zenoh.ext
 from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Topic, version_of
 
 PORT = 7447
-"""Zenoh's own."""
+"""Default port of Zenoh."""
 
 GID_BYTES = 16
 ATTACHMENT = struct.Struct(f"<qqB{GID_BYTES}s")
-"""Sequence number, time in nanoseconds since 1970 UTC, and identifier of the publisher, as zenoh::ext::Serializer
-writes them: integers little-endian, bytes behind their number (attachment_helpers.cpp, from rmw_zenoh 0.6 on)."""
+"""Sequence number, time in nanoseconds since 1970 UTC, and identifier of the publisher, in the format of
+zenoh::ext::Serializer: little-endian integers, bytes after their count (attachment_helpers.cpp, rmw_zenoh >= 0.6)."""
 
 
 def start(network: Network) -> ZenohMiddleware:
-    """Open a session; see `middleware.start`."""
+    """Open a session; raises `MiddlewareError` if Zenoh does not start."""
     return ZenohMiddleware(network, "client" if network.discovery == "router" else "peer")
 
 
 def route(network: Network) -> ZenohMiddleware:
-    """Open a session that routes for others."""
+    """Open a session that is a router for other sessions."""
     return ZenohMiddleware(network, "router")
 
 
 def configuration(network: Network, mode: str) -> dict[str, Any]:
-    """Return Zenoh's configuration by paths: one address, and how others are found."""
+    """Return the configuration of Zenoh by path: the address of this robot, and discovery."""
     port = network.port or PORT
-    to = {"peers": network.peers, "router": (network.server,)}.get(network.discovery, ())
-    found: dict[str, Any] = {
+    addresses = {"peers": network.peers, "router": (network.server,)}.get(network.discovery, ())
+    config: dict[str, Any] = {
         "mode": mode,
         "scouting/multicast/enabled": network.discovery == "multicast",
         "scouting/multicast/interface": network.address,
@@ -49,13 +49,13 @@ def configuration(network: Network, mode: str) -> dict[str, Any]:
         "timestamping/enabled": True,
     }
     if mode == "client":
-        del found["listen/endpoints"]
+        del config["listen/endpoints"]
     if mode != "router":
-        found["connect/endpoints"] = [f"{network.transport}/{address}:{port}" for address in to]
-        # The other end may not be up yet.
-        found["connect/timeout_ms"] = -1
-        found["connect/exit_on_failure"] = False
-    return {**found, **{path: _value(text) for path, text in network.settings.items()}}
+        config["connect/endpoints"] = [f"{network.transport}/{address}:{port}" for address in addresses]
+        # The other robot may not be ready yet.
+        config["connect/timeout_ms"] = -1
+        config["connect/exit_on_failure"] = False
+    return {**config, **{path: _value(text) for path, text in network.settings.items()}}
 
 
 def _value(text: str) -> Any:  # noqa: ANN401 (of JSON)
@@ -66,19 +66,19 @@ def _value(text: str) -> Any:  # noqa: ANN401 (of JSON)
 
 
 def gid(token: str) -> bytes:
-    """Return an identifier of a publisher, made of its token.
+    """Return the identifier of a publisher, a hash of its token.
 
-    rmw_zenoh takes XXH3 of it, which no standard library has; nobody compares the two, only who sent with who sent
-    before.
+    rmw_zenoh uses XXH3, which the standard library lacks. Receivers use the identifier only to distinguish
+    publishers, so another hash is compatible.
     """
     return hashlib.md5(token.encode()).digest()  # noqa: S324 (no secret)
 
 
 class ZenohMiddleware:
-    """A session.
+    """A Zenoh session.
 
     Args:
-        network: How this robot takes part.
+        network: The network settings.
         mode: `peer`, `client` or `router`.
     """
 
@@ -94,63 +94,63 @@ class ZenohMiddleware:
         self._declared: list[Any] = []
 
     def publisher(self, topic: Topic) -> ZenohPublisher:
-        """See `Middleware.publisher`."""
+        """Create a publisher of a topic."""
         quality = topic.quality
-        reliable = quality.reliability != "best_effort"
-        blocks = reliable and quality.history == "keep_all"
+        is_reliable = quality.reliability != "best_effort"
+        is_blocking = is_reliable and quality.history == "keep_all"
         options: Any = {
-            "reliability": zenoh.Reliability.RELIABLE if reliable else zenoh.Reliability.BEST_EFFORT,
-            "congestion_control": zenoh.CongestionControl.BLOCK if blocks else zenoh.CongestionControl.DROP,
+            "reliability": zenoh.Reliability.RELIABLE if is_reliable else zenoh.Reliability.BEST_EFFORT,
+            "congestion_control": zenoh.CongestionControl.BLOCK if is_blocking else zenoh.CongestionControl.DROP,
         }
         if quality.durability == "transient_local":
             cache = zenoh.ext.CacheConfig(max_samples=quality.depth or 1)
-            made: Any = zenoh.ext.declare_advanced_publisher(
+            endpoint: Any = zenoh.ext.declare_advanced_publisher(
                 self._session, topic.key, cache=cache, publisher_detection=True, **options
             )
             # An advanced publisher does not report whether a subscription matches it; a plain one with its key does.
             matching: Any = self._session.declare_publisher(topic.key, **options)
         else:
-            made = matching = self._session.declare_publisher(topic.key, **options)
-        return ZenohPublisher(made, matching, gid(self._tell(topic, "publisher")))
+            endpoint = matching = self._session.declare_publisher(topic.key, **options)
+        return ZenohPublisher(endpoint, matching, gid(self._declare_tokens(topic, "publisher")))
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
-        """See `Middleware.subscribe`."""
+        """Subscribe to a topic; return a function that returns -1, because Zenoh does not count publishers."""
 
-        def take(sample: Any) -> None:  # noqa: ANN401 (untyped)
+        def on_sample(sample: Any) -> None:  # noqa: ANN401 (untyped)
             at_ns = time.time_ns()
             deliver(sample.payload.to_bytes(), at_ns)
 
         origin = zenoh.Locality.REMOTE
         if topic.quality.durability == "transient_local":
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-            made: Any = zenoh.ext.declare_advanced_subscriber(
-                self._session, topic.key, take, history=history, allowed_origin=origin
+            endpoint: Any = zenoh.ext.declare_advanced_subscriber(
+                self._session, topic.key, on_sample, history=history, allowed_origin=origin
             )
         else:
-            made = self._session.declare_subscriber(topic.key, take, allowed_origin=origin)
-        self._declared.append(made)
-        self._tell(topic, "subscription")
+            endpoint = self._session.declare_subscriber(topic.key, on_sample, allowed_origin=origin)
+        self._declared.append(endpoint)
+        self._declare_tokens(topic, "subscription")
         return lambda: -1
 
     def other_types(self, topic: Topic) -> set[str]:
-        """See `Middleware.other_types`: by liveliness tokens, whose last parts are topic, type, hash and quality."""
-        domain, kind, rihs01 = topic.key.split("/")[0], *topic.key.split("/")[-2:]
-        ends = f"@ros2_lv/{domain}/**/{topic.name.replace('/', '%')}/*/*/*"
-        found = (
-            str(reply.ok.key_expr).split("/")[-3:-1] for reply in self._session.liveliness().get(ends) if reply.ok
+        """Return the different types of the topic in liveliness tokens, which end with topic, type, hash and QoS."""
+        domain, own_name, own_hash = topic.key.split("/")[0], *topic.key.split("/")[-2:]
+        tokens = f"@ros2_lv/{domain}/**/{topic.name.replace('/', '%')}/*/*/*"
+        types = (
+            str(reply.ok.key_expr).split("/")[-3:-1] for reply in self._session.liveliness().get(tokens) if reply.ok
         )
-        return {name for name, other in found if (name, other) != (kind, rihs01)}
+        return {name for name, type_hash in types if (name, type_hash) != (own_name, own_hash)}
 
-    def _tell(self, topic: Topic, end: str) -> str:
-        """Declare the tokens of an end of a topic; return the last, which is its own."""
+    def _declare_tokens(self, topic: Topic, role: str) -> str:
+        """Declare the liveliness tokens of an endpoint; return the last one, which identifies the endpoint."""
         token = topic.key
-        for template in topic.tokens.get(end, ()):
+        for template in topic.tokens.get(role, ()):
             token = template.replace("{zid}", str(self._session.zid()))
             self._declared.append(self._session.liveliness().declare_token(token))
         return token
 
     def close(self) -> None:
-        """See `Middleware.close`."""
+        """Close the session."""
         self._declared.clear()
         self._session.close()
 
@@ -165,15 +165,15 @@ class ZenohPublisher:
         self._sequence = 0
 
     def write(self, data: bytes) -> bool:
-        """See `Publisher.write`."""
+        """Publish a sample."""
         self._sequence += 1
         attachment = ATTACHMENT.pack(self._sequence, time.time_ns(), GID_BYTES, self._gid)
         self._publisher.put(data, attachment=attachment)
         return True
 
     def matched(self) -> int:
-        """See `Publisher.matched`."""
+        """Return 1 if a subscription matches, else 0."""
         return int(self._matching.matching_status.matching)
 
     def drain(self, limit_s: float) -> None:
-        """See `Publisher.drain`: Zenoh tells nobody."""
+        """Do nothing: Zenoh has no acknowledgements."""

@@ -1,6 +1,6 @@
-"""What a bag holds, and whether it is whole; saving what can be read of a damaged one; conversion.
+"""Inspect, check, repair and convert bags.
 
-Every bag is opened by `worker`, in a process of its own whose memory, time and disk are bounded.
+Each bag is opened by `worker`, in a separate process with limited memory, time and disk space.
 """
 
 import tempfile
@@ -16,8 +16,8 @@ from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError, Js
 
 _WORKER: Final = Confined("fieldkit.bags.worker")
 
-_GROWS: Final = 4
-"""What is written may be so many times as large as what is read: unpacked, and with an index."""
+_MAX_GROWTH: Final = 4
+"""Maximum ratio of written to read bytes: the output may be uncompressed, and has an index."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class BagTopic:
     Attributes:
         name: Its name.
         type: Message type, `package/msg/Name`.
-        messages: How many there are.
+        messages: Number of messages.
     """
 
     name: str
@@ -37,17 +37,17 @@ class BagTopic:
 
 @dataclass(frozen=True)
 class BagContents:
-    """What a bag holds.
+    """The contents of a bag.
 
     Attributes:
-        format: What it is made of.
+        format: Its format.
         size_bytes: Size of its data files.
-        topics: Its topics, sorted by name; none where its index cannot be read.
+        topics: Its topics, sorted by name; empty if its index cannot be read.
         started_utc_ns: Time of the first message by the recorder's clock, nanoseconds since 1970.
         duration_s: Time from the first message to the last, in seconds.
-        compression: Of ROS 2's bags, `none` or `zstd`.
-        problems: Why it is not whole, a sentence each.
-        savable: How many messages can be read in spite of them; None for a bag without problems.
+        compression: Compression of a ROS 2 bag: `none` or `zstd`.
+        problems: Its damages, one sentence each.
+        savable: Number of messages that can be recovered; None for a bag without problems.
     """
 
     format: BagFormat
@@ -61,17 +61,17 @@ class BagContents:
 
     @property
     def messages(self) -> int:
-        """How many messages there are by its index."""
+        """Number of messages by its index."""
         return sum(topic.messages for topic in self.topics)
 
 
 @dataclass(frozen=True)
 class Written:
-    """What became of a bag that was made of another one.
+    """The result of a repair or a conversion.
 
     Attributes:
-        messages: How many messages were saved; None where all were converted.
-        notes: What there is to say of it, a sentence each.
+        messages: Number of recovered messages; None for a conversion, which converts all messages.
+        notes: Remarks on the new bag, one sentence each.
     """
 
     messages: int | None
@@ -79,65 +79,65 @@ class Written:
 
 
 def inspect(path: Path, *, read_all: bool = False) -> BagContents:
-    """Return what the bag at a path holds.
+    """Return the contents of the bag at a path.
 
     Args:
-        path: A file, or the folder of a bag of ROS 2.
-        read_all: Read and decode every message, which takes time, to find what an index does not tell.
+        path: A file, or the folder of a ROS 2 bag.
+        read_all: Whether to read and decode all messages, which takes time, to find damages beyond the index.
 
     Raises:
         ConfigurationError: There is no bag, or it cannot be opened.
-        EvidenceError: Nothing was written in it, or looking at it takes more memory or time than one of its size may.
+        EvidenceError: It is empty, or reading it exceeds the limits of memory or time for its size.
     """
     bag = find(path)
-    found = _asked(bag, {"do": "inspect", "all": read_all})
+    answer = _ask_worker(bag, {"do": "inspect", "all": read_all})
     return BagContents(
         bag.format,
         bag.size_bytes,
-        tuple(BagTopic(*one) for one in found["topics"]),
-        found["started_utc_ns"],
-        found["duration_s"],
-        found["compression"],
-        tuple(found["problems"]),
-        found["saved"]["messages"] if "saved" in found else None,
+        tuple(BagTopic(*topic) for topic in answer["topics"]),
+        answer["started_utc_ns"],
+        answer["duration_s"],
+        answer["compression"],
+        tuple(answer["problems"]),
+        answer["saved"]["messages"] if "saved" in answer else None,
     )
 
 
 def repair(path: Path, to: Path) -> Written:
-    """Write what can be read of a damaged bag into a new one of the same format, with an index; the old one stays.
+    """Write the readable messages of a damaged bag to a new bag of the same format; the damaged bag is not changed.
 
     Raises:
-        ConfigurationError: As `inspect`; or `to` is there already, or its name is not one for the format.
+        ConfigurationError: As `inspect`; or `to` exists already, or its name does not fit the format.
         EvidenceError: As `inspect`; or no message can be read.
     """
     bag = find(path)
     if (bag.format is BagFormat.ROS1) != (to.suffix == ".bag"):
-        wanted = "NAME.bag" if bag.format is BagFormat.ROS1 else "a folder, whose name does not end in .bag"
+        required = "NAME.bag" if bag.format is BagFormat.ROS1 else "a folder, whose name does not end in .bag"
         raise ConfigurationError(
-            f"a saved bag keeps its format, {bag.format}: the new one is {wanted}", where=str(to)
+            f"a repaired bag keeps its format, {bag.format}: the new one must be {required}", where=str(to)
         )
 
-    def ask(place: Path) -> Written:
-        found = _asked(bag, {"do": "repair", "to": str(place)})
-        if not found["messages"]:
-            why = f"no message can be saved: {found['why']}"
-            raise EvidenceError(why, where=str(path), remedy=LAST_RESORT.get(bag.format, ""))
-        return Written(found["messages"], (found["why"],) if found["why"] else ())
+    def write(temporary_path: Path) -> Written:
+        answer = _ask_worker(bag, {"do": "repair", "to": str(temporary_path)})
+        if not answer["messages"]:
+            what = f"no message can be saved: {answer['why']}"
+            raise EvidenceError(what, where=str(path), remedy=LAST_RESORT.get(bag.format, ""))
+        return Written(answer["messages"], (answer["why"],) if answer["why"] else ())
 
-    return _written(to, ask)
+    return _write_atomically(to, write)
 
 
 def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distribution: str = "") -> Written:
-    """Write a bag in another format: `NAME.bag` for ROS 1, else a folder for ROS 2.
+    """Write a bag in another format: `NAME.bag` for ROS 1, otherwise a folder for ROS 2.
 
     Args:
-        path: A whole bag.
-        to: The new one.
-        storage: What a bag of ROS 2 is made of.
-        distribution: Whose message types it has; those of Noetic or Jazzy if empty.
+        path: An undamaged bag.
+        to: The new bag.
+        storage: Storage format of a ROS 2 bag.
+        distribution: ROS distribution of its message types; Noetic or Jazzy if empty.
 
     Raises:
-        ConfigurationError: As `inspect`; or `to` is there already, or the distribution is not one for its format.
+        ConfigurationError: As `inspect`; or `to` exists already, or the distribution does not fit its format.
         EvidenceError: As `inspect`; or the bag is damaged, or cannot be converted.
     """
     bag, is_ros1 = find(path), to.suffix == ".bag"
@@ -146,7 +146,7 @@ def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distri
         raise ConfigurationError(
             f"{distribution} is ROS {'1' if distribution == 'noetic' else '2'}",
             where=str(to),
-            remedy="call the new bag NAME.bag for ROS 1, or otherwise for ROS 2",
+            remedy="name the new bag NAME.bag for ROS 1, or without .bag for ROS 2",
         )
     contents = inspect(path)
     if contents.problems:
@@ -155,31 +155,34 @@ def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distri
             where=str(path),
             remedy=typed("fieldkit", "bag", "repair", path, "NEW"),
         )
-    question = {"do": "convert", "storage": storage.value, "distribution": distribution}
-    return _written(to, lambda place: Written(None, tuple(_asked(bag, question | {"to": str(place)})["notes"])))
+    request = {"do": "convert", "storage": storage.value, "distribution": distribution}
+    return _write_atomically(
+        to,
+        lambda temporary_path: Written(None, tuple(_ask_worker(bag, request | {"to": str(temporary_path)})["notes"])),
+    )
 
 
-def _written(to: Path, write: Callable[[Path], Written]) -> Written:
-    """Let a bag be written beside its place, and put it there when it is whole."""
+def _write_atomically(to: Path, write: Callable[[Path], Written]) -> Written:
+    """Write a bag to a temporary folder beside its destination, and rename it when it is complete."""
     if to.exists() or to.is_symlink():
-        raise ConfigurationError("something is there already", where=str(to), remedy="choose another name")
+        raise ConfigurationError("it exists already", where=str(to), remedy="choose another name")
     try:
         with tempfile.TemporaryDirectory(prefix=f".{to.name}-", dir=to.parent) as folder:
-            place = Path(folder, to.name)
-            found = write(place.absolute())
-            place.rename(to)
+            temporary_path = Path(folder, to.name)
+            result = write(temporary_path.absolute())
+            temporary_path.rename(to)
     except OSError as error:
         raise ConfigurationError(
             f"cannot write there: {error.strerror or error}",
             where=str(to),
-            remedy="name a place in a folder that is there, and that you may write to",
+            remedy="choose a path in an existing folder with write permission",
         ) from error
-    return found
+    return result
 
 
-def _asked(bag: BagFiles, question: Json) -> Json:
-    size_bytes = _GROWS * sum(given_bytes(file) for file in bag.files)
+def _ask_worker(bag: BagFiles, request: Json) -> Json:
+    size_bytes = _MAX_GROWTH * sum(given_bytes(file) for file in bag.files)
     try:
-        return _WORKER.ask({"path": str(bag.path.absolute()), **question}, size_bytes)
+        return _WORKER.ask({"path": str(bag.path.absolute()), **request}, size_bytes)
     except ConfinedAnswerError as error:
         raise EvidenceError(f"the bag cannot be read: {error}", where=str(bag.path)) from error

@@ -1,4 +1,4 @@
-"""Formats of bags, told by the first bytes of their files."""
+"""Formats of bags, detected by the first bytes of their files."""
 
 import os
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ _MAGIC_BYTES: Final = 16
 
 
 class BagFormat(StrEnum):
-    """What a bag is made of; its value is how people and `--storage` call it."""
+    """Format of a bag; the value is the name for users and for `--storage`."""
 
     ROS1 = "ros1"
     SQLITE = "sqlite3"
@@ -22,7 +22,7 @@ class BagFormat(StrEnum):
 
 
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
-"""Stands at the end of a whole file, too, behind its index."""
+"""Magic number at the start of a file, and also at the end of a complete one, after the index."""
 
 _MAGIC: Final = {
     b"#ROSBAG V2.0\n": BagFormat.ROS1,
@@ -31,7 +31,7 @@ _MAGIC: Final = {
 }
 """wiki.ros.org/Bags/Format/2.0; sqlite.org/fileformat.html, 1.3; mcap.dev/spec, "Magic"."""
 
-_WHAT_TO_NAME: Final = "name a .bag, .db3 or .mcap file, or its own folder"
+_WHAT_TO_NAME: Final = "name a .bag, .db3 or .mcap file, or its folder"
 
 _COMPRESSED: Final = {
     b"\x1f\x8b": "gunzip -k",
@@ -41,23 +41,23 @@ _COMPRESSED: Final = {
     b"\x04\x22\x4d\x18": "unlz4",
     b"PK\x03\x04": "unzip",
 }
-"""What unpacks a whole file, by its first bytes (RFC 1952, 8878; the formats' own descriptions)."""
+"""Programs that decompress a file, by its first bytes (RFC 1952, 8878; the specifications of the other formats)."""
 
 
 LAST_RESORT: Final = {BagFormat.SQLITE: "SQLite may read more of it: sqlite3 OLD.db3 .recover | sqlite3 NEW.db3"}
-"""What may help where fieldkit can read nothing."""
+"""What an operator can try if fieldkit cannot read any message."""
 
 
 @dataclass(frozen=True)
 class BagFiles:
-    """Where a bag lies.
+    """The files of a bag.
 
     Attributes:
-        path: As it was named: a file, or the folder of a bag of ROS 2.
-        format: What it is made of.
-        files: Its data files, in the order of their names, which is that of recording.
-        closed: Whether its recorder wrote the metadata of a bag of ROS 2, which a file of MCAP alone has inside;
-            always so for ROS 1, whose index is inside.
+        path: The path given by the user: a file, or the folder of a ROS 2 bag.
+        format: Its format.
+        files: Its data files, sorted by name, which is the order of recording.
+        closed: Whether the recorder has written the metadata of a ROS 2 bag: metadata.yaml, or the end of a single
+            MCAP file. Always True for ROS 1, whose index is in the file and is checked later.
     """
 
     path: Path
@@ -67,16 +67,16 @@ class BagFiles:
 
     @property
     def size_bytes(self) -> int:
-        """The size of all data files."""
+        """Total size of the data files."""
         return sum(file.stat().st_size for file in self.files)
 
 
 def find(path: Path) -> BagFiles:
-    """Return the bag at a path: a file of any format, or the folder that ROS 2 makes.
+    """Return the bag at a path: a file of any format, or the folder of a ROS 2 bag.
 
     Raises:
-        ConfigurationError: There is nothing, it cannot be opened, or it is no bag.
-        EvidenceError: It is a file in which nothing was ever written.
+        ConfigurationError: The path does not exist, cannot be opened, or is not a bag.
+        EvidenceError: The file is empty or begins with zeros.
     """
     try:
         if path.is_dir():
@@ -91,67 +91,67 @@ def find(path: Path) -> BagFiles:
         ) from error
 
 
-def _of_file(path: Path, form: BagFormat) -> BagFiles:
-    if form is BagFormat.ROS1:
+def _of_file(path: Path, bag_format: BagFormat) -> BagFiles:
+    if bag_format is BagFormat.ROS1:
         if path.suffix not in _ROS1_SUFFIXES:
             raise ConfigurationError(
-                "a bag of ROS 1 is called NAME.bag", where=str(path), remedy=typed("mv", path, f"{path}.bag")
+                "a ROS 1 bag must be named NAME.bag", where=str(path), remedy=typed("mv", path, f"{path}.bag")
             )
-        return BagFiles(path, form, (path,), closed=True)
+        return BagFiles(path, bag_format, (path,), closed=True)
     if not (path.parent / METADATA).is_file():
-        return BagFiles(path, form, (path,), _closed_itself(path, form))
-    whole = _in_folder(path.parent)
-    return whole if whole.files == (path,) else BagFiles(path, form, (path,), closed=True)
+        return BagFiles(path, bag_format, (path,), _is_closed_mcap(path, bag_format))
+    folder_bag = _in_folder(path.parent)
+    return folder_bag if folder_bag.files == (path,) else BagFiles(path, bag_format, (path,), closed=True)
 
 
 def _in_folder(folder: Path) -> BagFiles:
     files = sorted(file for file in folder.iterdir() if file.is_file())
-    found = [(file, form) for file in files if (form := _format_or_none(file)) is not None]
-    if len(found) == 1 and not (folder / METADATA).is_file():
-        return _of_file(*found[0])
-    formats = {form for _, form in found}
+    bag_files = [(file, bag_format) for file in files if (bag_format := _format_or_none(file)) is not None]
+    if len(bag_files) == 1 and not (folder / METADATA).is_file():
+        return _of_file(*bag_files[0])
+    formats = {bag_format for _, bag_format in bag_files}
     if not formats:
         raise ConfigurationError("no bag is in this folder", where=str(folder), remedy=_WHAT_TO_NAME)
     if len(formats) > 1 or formats == {BagFormat.ROS1}:
-        names = ", ".join(file.name for file, _ in found)
+        names = ", ".join(file.name for file, _ in bag_files)
         raise ConfigurationError(
             f"this folder holds several bags: {names}", where=str(folder), remedy="name one of them"
         )
-    return BagFiles(folder, formats.pop(), tuple(file for file, _ in found), (folder / METADATA).is_file())
+    return BagFiles(folder, formats.pop(), tuple(file for file, _ in bag_files), (folder / METADATA).is_file())
 
 
-def _closed_itself(file: Path, form: BagFormat) -> bool:
-    """Return whether a file says that its recorder closed it; one of SQLite never does."""
-    if form is not BagFormat.MCAP:
+def _is_closed_mcap(file: Path, bag_format: BagFormat) -> bool:
+    """Return True if a file shows that its recorder closed it, which only MCAP files do."""
+    if bag_format is not BagFormat.MCAP:
         return False
-    with file.open("rb") as opened:
-        opened.seek(-len(_MCAP_MAGIC), os.SEEK_END)
-        return opened.read() == _MCAP_MAGIC
+    with file.open("rb") as stream:
+        stream.seek(-len(_MCAP_MAGIC), os.SEEK_END)
+        return stream.read() == _MCAP_MAGIC
 
 
 def _format(file: Path) -> BagFormat:
     if file.exists() and not file.is_file():
         raise ConfigurationError("this is neither a file nor a folder", where=str(file), remedy=_WHAT_TO_NAME)
-    form = _format_or_none(file)
-    if form is not None:
-        return form
+    bag_format = _format_or_none(file)
+    if bag_format is not None:
+        return bag_format
     head = _head(file)
     if not head.strip(b"\0"):
         problem = "the file is empty" if not head else "the file begins with zeros"
-        remedy = "was the recorder ended, or its power cut, before it was on disk?"
+        remedy = "was the recorder stopped, or its power cut, before the file was written to disk?"
         raise EvidenceError(problem, where=str(file), remedy=remedy)
     if unpack := next((program for magic, program in _COMPRESSED.items() if head.startswith(magic)), ""):
         problem, remedy = "this file is compressed as a whole", f"{typed(*unpack.split(), file)}, then try again"
     else:
-        problem, remedy = "this is no bag of ROS 1, SQLite or MCAP", _WHAT_TO_NAME
+        problem, remedy = "this is not a bag of ROS 1, SQLite or MCAP", _WHAT_TO_NAME
     raise ConfigurationError(problem, where=str(file), remedy=remedy)
 
 
 def _format_or_none(file: Path) -> BagFormat | None:
     head = _head(file)
-    return next((form for magic, form in _MAGIC.items() if head.startswith(magic)), None)
+    return next((bag_format for magic, bag_format in _MAGIC.items() if head.startswith(magic)), None)
 
 
 def _head(file: Path) -> bytes:
-    with file.open("rb") as opened:
-        return opened.read(_MAGIC_BYTES)
+    with file.open("rb") as stream:
+        return stream.read(_MAGIC_BYTES)

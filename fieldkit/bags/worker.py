@@ -1,6 +1,7 @@
-"""What opens bags with libraries: looks into them, saves what can be saved, converts. Run confined, by `bags`.
+"""The process that opens bags with libraries: inspects, repairs and converts them.
 
-Whatever a robot brings may be made to harm (`fieldkit.measure.evidence.confined`).
+`fieldkit.bags.contents` runs it in a sandbox, because files from a robot may be malicious
+(`fieldkit.measure.evidence.confined`).
 """
 
 import contextlib
@@ -26,54 +27,54 @@ from fieldkit.bags.salvage import BagConnection, DamagedError
 from fieldkit.measure.evidence import bag_paths, confined
 from fieldkit.measure.evidence.confined import Json
 
-_MOST_PROBLEMS: Final = 20
+_MAX_PROBLEMS: Final = 20
 _METADATA_VERSION: Final = 9
-"""Of ROS 2 Jazzy and later; older ones read it but for the QoS."""
+"""Version of ROS 2 Jazzy and later; older distributions can read it except for the QoS."""
 
 _UNKNOWN_HASH: Final = "RIHS01_" + 64 * "0"
-"""In place of the hash of a type whose definition a bag does not hold, and fieldkit does not know."""
+"""Hash of a type whose definition is neither in the bag nor known to fieldkit."""
 
 
-def answer(question: Json) -> Json:
-    """Answer what `bags` asks.
+def answer(request: Json) -> Json:
+    """Execute a request of `fieldkit.bags.contents`.
 
     Raises:
-        Exception: The bag cannot be read at all; any, as the libraries raise for bytes that are no bag.
+        Exception: The bag cannot be read; the libraries raise exceptions of any type for invalid bytes.
     """
-    path = Path(question["path"])
-    if question["do"] == "inspect":
-        return inspect(find(path), read_all=question["all"])
-    if question["do"] == "repair":
-        return repair(find(path), Path(question["to"]))
-    return converted(find(path), Path(question["to"]), question["storage"], question["distribution"])
+    path = Path(request["path"])
+    if request["do"] == "inspect":
+        return inspect(find(path), read_all=request["all"])
+    if request["do"] == "repair":
+        return repair(find(path), Path(request["to"]))
+    return convert_bag(find(path), Path(request["to"]), request["storage"], request["distribution"])
 
 
-# Looking into it.
+# Inspection.
 
 
 def inspect(bag: BagFiles, *, read_all: bool) -> Json:
-    """Return what a bag holds by its index, and its problems; with `read_all` every message is read and decoded."""
-    found: Json = {"topics": [], "started_utc_ns": 0, "duration_s": 0.0, "compression": "none"}
+    """Return the contents of a bag by its index, and its problems; `read_all` reads and decodes all messages."""
+    result: Json = {"topics": [], "started_utc_ns": 0, "duration_s": 0.0, "compression": "none"}
     problems = list(_unclosed(bag))
     if not problems:
         try:
             with _reader(bag) as reader:
-                found |= _contents(reader)
+                result |= _contents(reader)
             if read_all:
                 problems += _problems(bag)
-        except Exception as error:  # noqa: BLE001 (as `answer`; what is wrong is what is asked for)
-            problems.append(_told(error))
+        except Exception as error:  # noqa: BLE001 (as for `answer`; the error is a part of the result)
+            problems.append(_error_text(error))
     if problems:
-        saved = _savable(bag)
-        found |= {"saved": saved}
-        if not bag.closed and saved["why"]:  # nothing else has looked into the files
+        saved = _count_recoverable(bag)
+        result |= {"saved": saved}
+        if not bag.closed and saved["why"]:  # the files were not read otherwise
             problems.append(saved["why"])
-    return found | {"problems": problems[:_MOST_PROBLEMS]}
+    return result | {"problems": problems[:_MAX_PROBLEMS]}
 
 
 def _unclosed(bag: BagFiles) -> Iterator[str]:
     if not bag.closed:
-        yield "there is no metadata.yaml: its recorder was ended before it could close it, or it was copied alone"
+        yield "there is no metadata.yaml: the recorder was stopped before it closed the bag, or it was not copied"
 
 
 def _reader(bag: BagFiles) -> rosbag1.Reader | rosbag2.Reader:
@@ -85,26 +86,26 @@ def _reader(bag: BagFiles) -> rosbag1.Reader | rosbag2.Reader:
 def _contents(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
     by_topic: Counter[tuple[str, str]] = Counter()
     if isinstance(reader, rosbag1.Reader):
-        for one in reader.connections:
-            by_topic[one.topic, one.msgtype] += sum(
-                info.connection_counts.get(one.id, 0) for info in reader.chunk_infos
+        for connection in reader.connections:
+            by_topic[connection.topic, connection.msgtype] += sum(
+                info.connection_counts.get(connection.id, 0) for info in reader.chunk_infos
             )
         compression = "none"
     else:
-        for one in reader.connections:
-            by_topic[one.topic, one.msgtype] += one.msgcount
+        for connection in reader.connections:
+            by_topic[connection.topic, connection.msgtype] += connection.msgcount
         compression = reader.compression_format or "none"
     return {
         "topics": [[topic, kind, count] for (topic, kind), count in sorted(by_topic.items())],
         "started_utc_ns": reader.start_time if reader.message_count else 0,
-        # rosbags counts to one nanosecond after the last message.
+        # The duration of rosbags ends one nanosecond after the last message.
         "duration_s": max(reader.duration - 1, 0) / 1e9,
         "compression": compression,
     }
 
 
 def _problems(bag: BagFiles) -> Iterator[str]:
-    """Read every message, and yield what is wrong."""
+    """Read all messages, and yield the problems."""
     read: Counter[str] = Counter()
     undecoded: dict[str, str] = {}
     with _any_reader(bag) as reader:
@@ -118,39 +119,41 @@ def _problems(bag: BagFiles) -> Iterator[str]:
             try:
                 reader.deserialize(data, connection.msgtype)
             except Exception as error:  # noqa: BLE001 (as `answer`)
-                which = f"message {read[connection.topic]} of {connection.topic}"
-                undecoded[connection.msgtype] = f"{which} is no {connection.msgtype}: {_told(error)}"
+                message_name = f"message {read[connection.topic]} of {connection.topic}"
+                undecoded[connection.msgtype] = (
+                    f"{message_name} is not a valid {connection.msgtype}: {_error_text(error)}"
+                )
         if reader.message_count != sum(read.values()):
-            yield f"its index counts {reader.message_count} messages, {sum(read.values())} are there"
+            yield f"its index counts {reader.message_count} messages, but it contains {sum(read.values())}"
         if outside:
-            yield f"{outside} messages lie outside the time that its index tells"
+            yield f"{outside} messages are outside the time range of its index"
     yield from undecoded.values()
 
 
 def _any_reader(bag: BagFiles) -> AnyReader:
-    # A bag in SQLite does not say what its types are made of before ROS 2 Iron.
+    # Before ROS 2 Iron, SQLite bags contain no type definitions.
     return AnyReader([bag.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
 
-def _savable(bag: BagFiles) -> Json:
-    """Return how many messages can be saved, and why no more."""
-    count, why = 0, ""
+def _count_recoverable(bag: BagFiles) -> Json:
+    """Return the number of messages that can be recovered, and the reason why it is not higher."""
+    count, reason = 0, ""
     try:
         for file in bag.files:
             for _ in salvage.messages(bag.format, file):
                 count += 1
     except DamagedError as error:
-        why = str(error)
-    return {"messages": count, "why": why}
+        reason = str(error)
+    return {"messages": count, "why": reason}
 
 
-# Saving it.
+# Repair.
 
 
 def repair(bag: BagFiles, to: Path) -> Json:
-    """Write what can be read of a bag into a new one of the same format; return how much that is."""
+    """Write the readable messages of a bag to a new bag of the same format; return their number."""
     types = get_typestore(Stores.ROS1_NOETIC if bag.format is BagFormat.ROS1 else Stores.ROS2_JAZZY)
-    count, why = 0, ""
+    count, reason = 0, ""
     with _writer(bag.format, to) as writer:
         connections: dict[BagConnection, Connection] = {}
         try:
@@ -161,14 +164,14 @@ def repair(bag: BagFiles, to: Path) -> Json:
                     writer.write(connections[source], at_ns, data)
                     count += 1
         except DamagedError as error:
-            why = str(error)
-    return {"messages": count, "why": why}
+            reason = str(error)
+    return {"messages": count, "why": reason}
 
 
-def _writer(form: BagFormat, to: Path) -> rosbag1.Writer | rosbag2.Writer:
-    if form is BagFormat.ROS1:
+def _writer(bag_format: BagFormat, to: Path) -> rosbag1.Writer | rosbag2.Writer:
+    if bag_format is BagFormat.ROS1:
         return rosbag1.Writer(to)
-    plugin = rosbag2.StoragePlugin.MCAP if form is BagFormat.MCAP else rosbag2.StoragePlugin.SQLITE3
+    plugin = rosbag2.StoragePlugin.MCAP if bag_format is BagFormat.MCAP else rosbag2.StoragePlugin.SQLITE3
     return rosbag2.Writer(to, version=_METADATA_VERSION, storage_plugin=plugin)
 
 
@@ -182,18 +185,18 @@ def _connection(writer: rosbag1.Writer | rosbag2.Writer, source: BagConnection, 
             callerid=source.caller or None,
             latching=int(source.latching),
         )
-    known = source.type in types.fielddefs
-    definition = source.definition or (types.generate_msgdef(source.type, ros_version=2)[0] if known else "")
+    is_known = source.type in types.fielddefs
+    definition = source.definition or (types.generate_msgdef(source.type, ros_version=2)[0] if is_known else "")
     return writer.add_connection(
         source.topic,
         source.type,
         msgdef=definition,
-        rihs01=source.digest or (types.hash_rihs01(source.type) if known else _UNKNOWN_HASH),
+        rihs01=source.digest or (types.hash_rihs01(source.type) if is_known else _UNKNOWN_HASH),
         offered_qos_profiles=parse_qos(source.qos) if source.qos else (),
     )
 
 
-# Converting it.
+# Conversion.
 
 
 def types_of(distribution: str) -> Typestore:
@@ -201,10 +204,10 @@ def types_of(distribution: str) -> Typestore:
     return get_typestore(Stores(f"ros{1 if distribution == 'noetic' else 2}_{distribution}"))
 
 
-def converted(bag: BagFiles, to: Path, storage: str, distribution: str) -> Json:
-    """Write a bag in another format, its types as a distribution has them; return what there is to say of it."""
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):  # which is where answers go
+def convert_bag(bag: BagFiles, to: Path, storage: str, distribution: str) -> Json:
+    """Write a bag in another format with the message types of a distribution; return the remarks of the converter."""
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):  # standard output carries the answers
         convert(
             srcs=[bag.path],
             dst=to,
@@ -219,12 +222,12 @@ def converted(bag: BagFiles, to: Path, storage: str, distribution: str) -> Json:
             exclude_msgtypes=(),
             include_msgtypes=(),
         )
-    return {"notes": said.getvalue().splitlines()[:_MOST_PROBLEMS]}
+    return {"notes": output.getvalue().splitlines()[:_MAX_PROBLEMS]}
 
 
-def _told(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     text = " ".join(str(error)[:1000].split())
-    text = re.sub(r"\('([^']*)',\)", r"\1", text)  # rosbags puts the arguments of another error into its own
+    text = re.sub(r"\('([^']*)',\)", r"\1", text)  # rosbags embeds the arguments of another error in its message
     return f"{text or type(error).__name__}"[:300]
 
 

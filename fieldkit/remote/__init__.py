@@ -1,1 +1,1 @@
-"""Robots at the other end of a connection: commands, detached jobs, files."""
+"""Access to robots over SSH: commands, detached jobs, files."""

@@ -1,7 +1,7 @@
-"""Reader of the one kind of tar that robots send: plain files under short names, nothing else.
+"""Reader of the tar archives that robots send, which may contain regular files with short names only.
 
-Header layout: POSIX.1-2017, pax, "ustar Interchange Format". The standard library's reader knows many extensions, and
-each of them is a way for a robot to say something unforeseen.
+Header layout: POSIX.1-2017, pax, "ustar Interchange Format". The reader of the standard library supports many
+extensions, each of which would let a robot send unexpected content.
 """
 
 from collections.abc import Iterator
@@ -27,8 +27,8 @@ class TarMember:
     """A file in the archive.
 
     Attributes:
-        name: Its name, of printable ASCII; nothing else about it is checked.
-        chunks: Its content, to be read before the next member.
+        name: Its name, printable ASCII; callers must check it further.
+        chunks: Its content, which must be read before the next member.
     """
 
     name: str
@@ -40,10 +40,10 @@ def members(file: IO[bytes], robot: str) -> Iterator[TarMember]:
 
     Args:
         file: The archive, open at its start.
-        robot: Who sent it, for messages.
+        robot: Name of the sending robot, for messages.
 
     Raises:
-        EvidenceError: It is cut short or damaged, has more than `MAX_FILES` files, or something else than files.
+        EvidenceError: It is truncated or damaged, has more than `MAX_FILES` files, or members that are not files.
     """
     for number in range(MAX_FILES + 1):
         header = file.read(_BLOCK)
@@ -54,23 +54,23 @@ def members(file: IO[bytes], robot: str) -> Iterator[TarMember]:
         name, size = _parse(header, robot)
         chunks = _content(file, size, robot)
         yield TarMember(name, chunks)
-        for _ in chunks:  # what the caller left of it
+        for _ in chunks:  # skip the part that the caller has not read
             pass
 
 
 def _parse(header: bytes, robot: str) -> tuple[str, int]:
     if len(header) < _BLOCK:
         raise EvidenceError("its files arrived damaged: the archive ends early", where=robot)
-    # The sum is taken with the field itself as blanks.
+    # The checksum is computed with spaces in the checksum field.
     total = sum(header) - sum(header[_CHECKSUM]) + 8 * ord(" ")
     if _octal(header[_CHECKSUM]) != total:
         raise EvidenceError("its files arrived damaged: a header fails its checksum", where=robot)
     raw = header[_NAME].rstrip(b"\0")
     name = printable(raw)
     size = _octal(header[_SIZE])
-    plain = header[_TYPE] in {b"0", b"\0"} and not any(header[_PREFIX])
-    if not plain or size is None or name.encode() != raw:
-        raise EvidenceError(f"sent {name!r}, which is no plain file of a repeat", where=robot)
+    is_plain = header[_TYPE] in {b"0", b"\0"} and not any(header[_PREFIX])
+    if not is_plain or size is None or name.encode() != raw:
+        raise EvidenceError(f"sent {name!r}, which is not a regular file of a repeat", where=robot)
     return name, size
 
 
@@ -81,9 +81,9 @@ def _octal(field: bytes) -> int | None:
 
 def _content(file: IO[bytes], size: int, robot: str) -> Iterator[bytes]:
     while size > 0:
-        wanted = min(-(-size // _BLOCK), _CHUNK_BLOCKS) * _BLOCK
-        chunk = file.read(wanted)
-        if len(chunk) < wanted:
+        requested = min(-(-size // _BLOCK), _CHUNK_BLOCKS) * _BLOCK
+        chunk = file.read(requested)
+        if len(chunk) < requested:
             raise EvidenceError("its files arrived damaged: the archive ends early", where=robot)
         yield chunk[:size]
         size -= len(chunk)

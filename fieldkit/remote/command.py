@@ -1,4 +1,4 @@
-"""Remote command lines: built as argument lists, quoted here and nowhere else."""
+"""Remote command lines. They are argument lists, and only this module quotes them."""
 
 import re
 import shlex
@@ -8,12 +8,12 @@ from typing import Final
 from fieldkit.core.text import harmless
 
 _STYLE: Final = re.compile(r"\x1b\[[0-9;]*m")
-"""Colours, which robots' tools put even into logs."""
+"""Escape sequences of colours, which some tools write even to logs."""
 
 
 def quote(argv: Sequence[str]) -> str:
-    """Return `argv` as the one string that SSH carries, safe for any POSIX login shell, and for fish."""
-    # fish takes a backslash in single quotes for more than itself; in double quotes all of them agree.
+    """Return `argv` as one string for SSH, quoted for any POSIX login shell and for fish."""
+    # In single quotes fish treats a backslash as an escape character; in double quotes all shells agree.
     return " ".join(shlex.quote(word).replace("\\", "'\"\\\\\"'") for word in argv)
 
 
@@ -33,9 +33,9 @@ def with_environment(
 
 
 def printable(data: bytes, limit: int = 300) -> str:
-    """Return what a robot said as one line, safe in a terminal, a log and a CSV; of long ones the last words."""
+    """Return output of a robot as one line that is safe in a terminal, a log and a CSV; long output is shortened."""
     words = harmless(" ".join(_STYLE.sub("", data.decode("utf-8", "replace")).split()))
     if len(words) <= limit:
         return words
     end = words[-limit:]
-    return end.partition(" ")[2] or end  # a word that was cut at its front may read as another
+    return end.partition(" ")[2] or end  # a word without its start may be misread

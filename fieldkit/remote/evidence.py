@@ -1,11 +1,11 @@
-"""A repeat's folder on the robot: made before, discarded after; its jobs ended."""
+"""The folder of an attempt on a robot: created before it, deleted after it; its jobs are stopped."""
 
 from collections.abc import Collection
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.remote.command import printable
-from fieldkit.remote.script import CALL, HOME, REPLY_S, call, demand, word
+from fieldkit.remote.script import CALL, HOME, REPLY_S, call, require_success, word
 from fieldkit.remote.shell import Shell
 
 MIN_FREE_KIB: Final = 100 * 1024
@@ -20,7 +20,7 @@ def begin_command(
     token: str | None = None,
     need_kib: int = MIN_FREE_KIB,
 ) -> tuple[str, ...]:
-    """Return the command that makes `folder` with the host's state in it; see `begin`."""
+    """Return the command that creates `folder` and records the state of the host in it; see `begin`."""
     lock = "-" if token is None else word(token)
     return (*CALL, "begin", folder, role, interface, str(need_kib), lock, *([old] if old else []))
 
@@ -35,59 +35,59 @@ def begin(
     token: str | None = None,
     need_kib: int = MIN_FREE_KIB,
 ) -> str:
-    """Make the attempt's folder with the host's state in it; repeated, it changes nothing.
+    """Create the attempt's folder and record the state of the host in it; idempotent.
 
     Args:
         shell: The robot.
-        folder: From `jobs.work_folder`.
-        role: Names the state's files.
-        interface: The radio's.
-        old: A folder to remove.
-        token: The trial's lock, which is renewed.
-        need_kib: Free disk that the evidence needs.
+        folder: The folder, from `jobs.work_folder`.
+        role: Role of the robot, the prefix of the files with the state.
+        interface: Network interface of the radio.
+        old: A folder to delete.
+        token: Token of the trial's lock, which is renewed.
+        need_kib: Free disk space that the evidence needs.
 
     Returns:
-        Which boot of the robot it is, as `boot` tells it.
+        The boot ID of the robot, as `boot` returns it.
 
     Raises:
         LinkError: The robot did not answer.
         LockLostError: The lock was broken, or taken over after it had expired.
-        RobotError: Its disk has less free than needed, or cannot be written.
+        RobotError: Its disk has less free space than needed, or cannot be written.
     """
     command = begin_command(folder, role, interface, old=old, token=token, need_kib=need_kib)
     done = shell.run(command, deadline=Deadline.after(REPLY_S), check=False)
-    demand(shell, done)
+    require_success(shell, done)
     return printable(done.stdout)
 
 
 def boot(shell: Shell) -> str:
-    """Return which boot of the robot it is, by the kernel's identification of it.
+    """Return the boot ID of the robot's kernel.
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: It does not say.
+        RobotError: The boot ID cannot be read.
     """
     done = shell.run(("cat", "/proc/sys/kernel/random/boot_id"), deadline=Deadline.after(REPLY_S))
     return printable(done.stdout)
 
 
 def end_jobs(shell: Shell, folder: str) -> None:
-    """End every job of the attempt that still runs; none starts there afterwards. Errors as `begin`."""
+    """Stop all running jobs of the attempt, and prevent that others start; raises as `begin`."""
     call(shell, "end", folder, deadline=Deadline.after(2 * REPLY_S))
 
 
 def end_all(shell: Shell, trial: str) -> None:
-    """End every job of `trial` that still runs; errors as `begin`."""
+    """Stop all running jobs of `trial`; raises as `begin`."""
     call(shell, "halt", f"{HOME}/{trial}", deadline=Deadline.after(2 * REPLY_S))
 
 
 def discard_attempt(shell: Shell, folder: str) -> None:
-    """Remove an attempt's folder from the robot; errors as `begin`."""
+    """Delete an attempt's folder on the robot; raises as `begin`."""
     call(shell, "drop", folder, deadline=Deadline.after(REPLY_S))
 
 
 def discard(shell: Shell, trial: str, *, but: Collection[str] = ()) -> None:
-    """Remove everything of `trial` from the robot but for these attempts' folders; errors as `begin`."""
+    """Delete all files of `trial` on the robot, except the folders of the attempts in `but`; raises as `begin`."""
     if but:
         kept = (folder.rpartition("/")[2] for folder in but)
         call(shell, "tidy", f"{HOME}/{trial}", *kept, deadline=Deadline.after(REPLY_S))

@@ -1,8 +1,8 @@
-# A repeat's folder: made before, sent whole after, with the host's state of both moments.
+# The folder of an attempt: created before it and sent after it, with the state of the host at both times.
 
-PIECE=4194304 # as PIECE_BYTES of evidence.py
+PIECE=4194304 # as PIECE_BYTES of fetching.py
 
-state() { # $1 interface
+state() { # print the state of the host; $1 interface
     interface=$1
     set --
     for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg \
@@ -12,7 +12,7 @@ state() { # $1 interface
     moment
     awk 'FNR == 1 { print "==> " FILENAME " <==" } { print }' "$@"
     echo "==> ip -s link <==" && { ip -s link show dev "$interface" || ip link show dev "$interface"; }
-    PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # which a session without a terminal often lacks
+    PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # often missing in a session without a terminal
     if command -v ethtool >/dev/null; then
         echo "==> ethtool -k <==" && ethtool -k "$interface"
     fi
@@ -21,10 +21,10 @@ state() { # $1 interface
         echo "==> iw station dump <==" && iw dev "$interface" station dump
         echo "==> iw power save <==" && iw dev "$interface" get power_save
     fi
-    echo "==> end <==" # which a full disk refuses
+    echo "==> end <==" # missing if the disk is full
 }
 
-moment() { # which boot it is, and the clock between two readings of the seconds since boot, several times
+moment() { # print the boot ID, and three times the clock between two readings of the seconds since boot
     read -r boot </proc/sys/kernel/random/boot_id
     echo "==> boot <=="
     echo "$boot"
@@ -39,7 +39,7 @@ moment() { # which boot it is, and the clock between two readings of the seconds
     echo "$time"
 }
 
-precise() { # set time to the clock with its fraction of a second, which adjtimex of busybox knows and its date does not
+precise() { # set time to the clock with the fraction of a second, for busybox from its adjtimex
     time=$(date -u +%s.%N)
     case $time in '' | *[!0-9.]* | *.) ;; *) return ;; esac
     time=$(adjtimex 2>/dev/null | awk '
@@ -47,7 +47,7 @@ precise() { # set time to the clock with its fraction of a second, which adjtime
         END { if (s == "" || u == "") exit 1; printf "%d.%09d\n", s, nano ? u : u * 1000 }')
 }
 
-endings() { # how each job of this folder ended: NAME HOW CODE STARTED ENDED, in clock ticks and in seconds since boot
+endings() { # print the end of each job: NAME HOW CODE STARTED ENDED; STARTED in clock ticks, ENDED in seconds since boot
     for meta in .jobs/*; do
         [ -s "$meta/pid" ] || continue
         how=itself code=- ended=-
@@ -60,7 +60,7 @@ endings() { # how each job of this folder ended: NAME HOW CODE STARTED ENDED, in
     done
 }
 
-free() { # set free to the KiB that are free here
+free() { # set free to the free disk space in KiB
     table=$(df -Pk "$base")
     set -- ${table##*
 }
@@ -68,7 +68,7 @@ free() { # set free to the KiB that are free here
     case $free in '' | *[!0-9]*) fail "df says nothing about $base" ;; esac
 }
 
-unwritten() { # say why file $1 cannot be written
+unwritten() { # fail with the reason why file $1 cannot be written
     free
     rm -f -- "$1"
     [ "$free" -gt 64 ] || fail "cannot write $1: No space left on device" "$DISK"
@@ -78,7 +78,7 @@ unwritten() { # say why file $1 cannot be written
 
 begin() {
     dir=$1 role=$2 interface=$3 kib=$4 token=$5 old=${6-}
-    [ -z "$old" ] || remove "$old" # first: what was fetched is not left behind where the lock was lost
+    [ -z "$old" ] || remove "$old" # before the lock is checked, so that fetched files are deleted also without a lock
     [ "$token" = - ] || renew "$token" 0
     free
     [ "$free" -ge "$kib" ] || fail "$free KiB of disk are free, $kib KiB are needed" "$DISK"
@@ -103,7 +103,7 @@ pack() {
     for file in * */*; do
         [ -f "$file" ] && [ ! -L "$file" ] && set -- "$@" "$file"
     done
-    # Names of their own, so that a repeated pack does not write into what the first one still sends.
+    # The names are unique, so that a repeated pack does not overwrite files that the first one still sends.
     wc -c -- "$@" >".sizes-$$" || unwritten ".sizes-$$"
     printf '' >".large-$$" || unwritten ".large-$$"
     exec 6<".sizes-$$"
@@ -134,7 +134,7 @@ sum() {
     exec sha256sum -- "$2"
 }
 
-tidy() { # remove the folders in $1 but for those named behind it
+tidy() { # delete the folders in $1 except those named by the other arguments
     trial=$1
     shift
     for dir in "$trial"/*; do

@@ -1,4 +1,4 @@
-"""Evidence brought from a robot: a repeat's folder fetched whole, each file checked by its hash."""
+"""Fetch the evidence of a repeat from a robot: all files of its folder, each checked by its hash."""
 
 import hashlib
 import re
@@ -14,93 +14,97 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, LinkError, RobotError
 from fieldkit.core.units import format_bytes
 from fieldkit.remote import archive
-from fieldkit.remote.script import CALL, call, complaint
+from fieldkit.remote.script import CALL, call, error_message
 from fieldkit.remote.shell import Shell
 
 PIECE_BYTES: Final = 1 << 22
-"""So much is fetched of a large file at a time; so much of small ones the robot packs into one archive."""
+"""Size of the pieces in which large files are fetched, and maximum total size of the small files in the archive."""
 
 ALWAYS_BYTES: Final = 1 << 30
 EXPECTED_TIMES: Final = 4
 UNEXPECTED_SHARE: Final = 0.1
-"""Large files are taken up to the first, so many times what is expected, or such a share of the free disk, whichever
-is most: a camera may be a better one than the profile says, but no robot shall fill this machine's disk."""
+"""The total size of large files is limited to the largest of `ALWAYS_BYTES`, `EXPECTED_TIMES` the expected size, and
+`UNEXPECTED_SHARE` of the free disk: a camera may send more than its profile says, but must not fill this disk."""
 
 RESERVE_BYTES: Final = 100 << 20
-"""Room that evidence leaves on this machine."""
+"""Disk space of this machine that evidence must leave free."""
 
 _PIECE_S: Final = 300.0
-"""A link that carries less than 14 kB/s for so long carries no evidence."""
+"""Timeout of a piece, which a link with 14 kB/s needs."""
 _SUMMED_BYTES_PER_S: Final = 2e6
-"""How fast the slowest robot makes sums: a tenth of what sha256sum does on a Raspberry Pi Zero."""
+"""Minimum rate of sha256sum on a robot: a tenth of that on a Raspberry Pi Zero."""
 
 _PACKED_BYTES: Final = 2 * PIECE_BYTES
 _CHUNK_BYTES: Final = 1 << 20
 _LIST_CHUNKS: Final = 2
-"""Of 64 KiB each: as many as sums, or sizes, of all files of a folder may take."""
-_TOLD_S: Final = 5.0
+"""Maximum length of the lists of hashes and of sizes, in chunks of 64 KiB."""
+_REPORT_S: Final = 5.0
 
 _NO_FOLDER: Final = "no folder "
 _LATE: Final = "job "
 _SUMS: Final = re.compile(r"\.sums-[0-9]{1,10}\Z", re.ASCII)
 _LARGE: Final = re.compile(r"\.large-[0-9]{1,10}\Z", re.ASCII)
 _SIZE: Final = re.compile(r"[0-9]{1,15}\Z", re.ASCII)
-# Together at most 97 characters, which every tar writes without an extension.
+# At most 97 characters in total, which every tar writes without an extension.
 _PART: Final = r"[A-Za-z0-9][A-Za-z0-9._-]{0,47}"
 _SAFE_NAME: Final = re.compile(rf"{_PART}(/{_PART})?\Z", re.ASCII)
 _SUM_LINE: Final = re.compile(r"([0-9a-f]{64})[ *]{2}(.+)\Z", re.ASCII)
 
 
 class NoFolderError(RobotError):
-    """The robot has no folder of the attempt: it never had, or somebody removed it."""
+    """The robot has no folder of the attempt: it was never created, or it was deleted."""
 
 
 class LateError(RobotError):
-    """All evidence came, and a job that `jobs.stop` let go did not end well."""
+    """All evidence was fetched, but a job for whose end `jobs.stop` did not wait has failed."""
 
 
 class FetchProgress:
-    """How far the fetching of large files is.
+    """Progress of the fetch of large files.
 
     Args:
-        tell: Told at times, in words and with the seconds that the rest takes at the rate so far.
-        is_over: Whether somebody gave the fetch up.
+        report: Called at times with a text, and the estimated remaining time in seconds.
+        is_over: Returns True if the fetch was cancelled.
     """
 
     def __init__(
-        self, tell: Callable[[str, float], None] = lambda *_: None, is_over: Callable[[], bool] = lambda: False
+        self, report: Callable[[str, float], None] = lambda *_: None, is_over: Callable[[], bool] = lambda: False
     ) -> None:
-        self._tell = tell
+        self._report = report
         self._is_over = is_over
-        self._total = self._done = self._came = 0
-        self._began_s = self._told_s = 0.0
+        self._total = self._done = self._received = 0
+        self._start_s = self._reported_s = 0.0
 
     def begin(self, total_bytes: int) -> None:
-        """Begin to fetch files of so many bytes together."""
-        self._total, self._done, self._came = total_bytes, 0, 0
-        self._began_s = self._told_s = time.monotonic()
+        """Start the fetch of files with this total size."""
+        self._total, self._done, self._received = total_bytes, 0, 0
+        self._start_s = self._reported_s = time.monotonic()
 
     def add(self, size_bytes: int, *, had: bool = False) -> None:
-        """Take in that so much is there; `had` if it came by an earlier call.
+        """Add a number of fetched bytes.
+
+        Args:
+            size_bytes: The number.
+            had: Whether an earlier call of `fetch` has fetched them.
 
         Raises:
-            LinkError: Somebody gave the fetch up; asking for another piece would connect again.
+            LinkError: The fetch was cancelled. Without this error the next piece would open the connection again.
         """
         if self._is_over():
-            raise LinkError("the fetch was given up")
+            raise LinkError("the fetch was cancelled")
         self._done += size_bytes
         if had:
             return
-        self._came += size_bytes
+        self._received += size_bytes
         now_s = time.monotonic()
-        if now_s - self._told_s >= _TOLD_S:
-            self._told_s = now_s
-            left_s = (self._total - self._done) * (now_s - self._began_s) / self._came
-            self._tell(f"{format_bytes(self._done)} of {format_bytes(self._total)}", left_s)
+        if now_s - self._reported_s >= _REPORT_S:
+            self._reported_s = now_s
+            remaining_s = (self._total - self._done) * (now_s - self._start_s) / self._received
+            self._report(f"{format_bytes(self._done)} of {format_bytes(self._total)}", remaining_s)
 
 
 def pack_command(folder: str, role: str, interface: str) -> tuple[str, ...]:
-    """Return the command that notes the host's state again and sends every file of `folder`."""
+    """Return the command that records the state of the host again and sends all files of `folder`."""
     return (*CALL, "pack", folder, role, interface)
 
 
@@ -115,29 +119,30 @@ def fetch(
     progress: FetchProgress | None = None,
     foreign: Callable[[str], str | None] = lambda _: None,
 ) -> None:
-    """Let the robot note its state again, copy its files of a repeat into `into` and check each against its hash.
+    """Let the robot record its state again, fetch its files of a repeat, and check the hash of each file.
 
-    What is small comes as one archive, what is large piece by piece: the time for each is bounded, the time for all
-    grows with their size, and what was cut goes on where it was, also in another call.
+    Small files are sent in one archive, large files piece by piece. Each transfer has a timeout, the total time
+    increases with the size, and an interrupted fetch continues from the last piece, also in a later call.
 
     The robot is not trusted: names are checked against a pattern, files that only the laptop or another robot writes
-    are refused, only plain files are taken, in one level of folders at most, and their number and size are bounded.
+    are refused, only regular files in at most one level of folders are accepted, and their number and size are
+    limited.
 
     Args:
         shell: The robot.
-        folder: From `jobs.work_folder`.
-        role: Names the state's files.
-        interface: The radio's.
-        into: Where the files go.
-        expected_bytes: About how much there is; see `EXPECTED_TIMES`.
-        progress: Told how far the large files are.
-        foreign: Returns why a file of this name is none of this robot's, None if it may be.
+        folder: The folder, from `jobs.work_folder`.
+        role: Role of the robot, the prefix of the files with the state.
+        interface: Network interface of the radio.
+        into: The destination folder.
+        expected_bytes: Expected total size; see `EXPECTED_TIMES`.
+        progress: Receives the progress of large files.
+        foreign: Returns the reason why this robot must not send a file of this name, or None if it may.
 
     Raises:
         LinkError: The robot did not answer.
-        LateError: All came, but a job that `jobs.stop` let go did not end well.
-        RobotError: It has no such folder, or could not pack its files; what came is kept then.
-        EvidenceError: What it sent is not whole, not safe, fails its hash, or is more than is expected or fits here.
+        LateError: All files were fetched, but a job for whose end `jobs.stop` did not wait has failed.
+        RobotError: It has no such folder, or could not pack its files; files that arrived are kept.
+        EvidenceError: The files are incomplete, unsafe, fail their hash, or are too large.
     """
     packed = into / f".{role}.tar"
     try:
@@ -145,7 +150,7 @@ def fetch(
     finally:
         packed.unlink(missing_ok=True)
     if large:
-        _demand_room(shell, large, into, expected_bytes)
+        _require_space(shell, large, into, expected_bytes)
         progress = progress or FetchProgress()
         progress.begin(sum(large.values()))
         for name, size_bytes in large.items():
@@ -157,55 +162,55 @@ def fetch(
 def _fetch_small(
     shell: Shell, command: tuple[str, ...], packed: Path, folder: str, foreign: Callable[[str], str | None]
 ) -> tuple[Mapping[str, int], RobotError | None]:
-    """Fetch all small files beside their archive.
+    """Fetch and unpack the archive of all small files.
 
     Returns:
-        The sizes of the large ones by name, and what the robot complained of though all came.
+        The sizes of the large files by name, and the error of the robot if all files arrived nevertheless.
     """
     late: RobotError | None = None
     try:
         shell.fetch(command, packed, deadline=Deadline.after(_PIECE_S), limit_bytes=_PACKED_BYTES)
     except RobotError as error:
-        late = _in_its_words(error, folder)
+        late = _pack_error(error, folder)
     try:
         return _unpack(packed, packed.parent, shell.robot, foreign), late
     except (EvidenceError, FileNotFoundError) as error:
         if isinstance(late, LateError):
-            late = RobotError(late.what, where=late.where, remedy=late.remedy)  # it did not come whole
+            late = RobotError(late.what, where=late.where, remedy=late.remedy)  # the archive is incomplete
         raise late or error from None
 
 
-def _in_its_words(error: RobotError, folder: str) -> RobotError:
-    """Return why the robot could not pack a folder, as it says itself."""
-    said = complaint(error.what.encode())
-    if said.startswith(_NO_FOLDER):
-        return NoFolderError(f"it no longer has {said.removeprefix('no ')}", where=error.where)
-    if said.startswith(_LATE):
-        return LateError(said, where=error.where, remedy=f"look into {folder} on the robot")
-    return RobotError(said, where=error.where, remedy=f"look into {folder} on the robot") if said else error
+def _pack_error(error: RobotError, folder: str) -> RobotError:
+    """Return the error that the job script reported when it packed a folder."""
+    reported = error_message(error.what.encode())
+    if reported.startswith(_NO_FOLDER):
+        return NoFolderError(f"it no longer has {reported.removeprefix('no ')}", where=error.where)
+    if reported.startswith(_LATE):
+        return LateError(reported, where=error.where, remedy=f"look into {folder} on the robot")
+    return RobotError(reported, where=error.where, remedy=f"look into {folder} on the robot") if reported else error
 
 
-def _demand_room(shell: Shell, large: Mapping[str, int], into: Path, expected_bytes: int) -> None:
-    """Refuse what is more than this machine has room for, or far more than the trial was to leave."""
-    waiting = sum(large.values())
+def _require_space(shell: Shell, large: Mapping[str, int], into: Path, expected_bytes: int) -> None:
+    """Raise `EvidenceError` if large files do not fit on this disk, or are much larger than expected."""
+    total = sum(large.values())
     free = files.free_bytes(into)
     limit = max(ALWAYS_BYTES, EXPECTED_TIMES * expected_bytes, UNEXPECTED_SHARE * free)
-    room = free - RESERVE_BYTES + sum(part.stat().st_size for part in into.glob(".*.part"))
-    if waiting > limit:
-        why = f"at most {format_bytes(limit)} are taken where {format_bytes(expected_bytes)} are expected"
-    elif waiting > room:
-        why = f"{format_bytes(max(0, room))} are free here"
+    space = free - RESERVE_BYTES + sum(part.stat().st_size for part in into.glob(".*.part"))
+    if total > limit:
+        reason = f"at most {format_bytes(limit)} are fetched if {format_bytes(expected_bytes)} are expected"
+    elif total > space:
+        reason = f"{format_bytes(max(0, space))} are free here"
     else:
         return
     raise EvidenceError(
-        f"{format_bytes(waiting)} wait there ({', '.join(large)}), and {why}: they stay on the robot",
+        f"{format_bytes(total)} are to be fetched ({', '.join(large)}), but {reason}: they stay on the robot",
         where=shell.robot,
     )
 
 
 @dataclass(frozen=True)
 class _LargeFile:
-    """A large file on a robot, in a folder there."""
+    """A large file in a folder on a robot."""
 
     shell: Shell
     folder: str
@@ -213,18 +218,18 @@ class _LargeFile:
     size_bytes: int
 
     def fetch(self, into: Path, role: str, progress: FetchProgress) -> None:
-        """Fetch it piece by piece, from where an earlier call was cut, and check it against its hash."""
+        """Fetch the file piece by piece, after the pieces of an earlier call, and check its hash."""
         part, piece = into / f".{role}.{self.name.replace('/', '+')}.part", into / f".{role}.piece"
         digest = hashlib.sha256()
         with part.open("ab+") as file:
-            have = min(file.tell(), self.size_bytes) // PIECE_BYTES * PIECE_BYTES
-            file.truncate(have)
+            fetched_bytes = min(file.tell(), self.size_bytes) // PIECE_BYTES * PIECE_BYTES
+            file.truncate(fetched_bytes)
             file.seek(0)
             while chunk := file.read(_CHUNK_BYTES):
                 digest.update(chunk)
-            progress.add(have, had=True)
+            progress.add(fetched_bytes, had=True)
             try:
-                for start in range(have, self.size_bytes, PIECE_BYTES):
+                for start in range(fetched_bytes, self.size_bytes, PIECE_BYTES):
                     content = self._piece(start, piece)
                     digest.update(content)
                     file.write(content)
@@ -232,25 +237,25 @@ class _LargeFile:
             finally:
                 piece.unlink(missing_ok=True)
         if self._sum() != digest.hexdigest():
-            part.unlink()  # what an earlier call fetched may be what is wrong
+            part.unlink()  # the pieces of an earlier call may be wrong
             raise EvidenceError(f"hash differs: {self.name}", where=self.shell.robot)
-        path = _place(into, self.name, self.shell.robot)
+        path = _target_path(into, self.name, self.shell.robot)
         try:
-            # The name is taken before it is used: the other robot is fetched at the same time.
+            # Reserve the name first, because the files of another robot are fetched at the same time.
             path.open("xb").close()
         except FileExistsError as error:
-            raise _sent_before(self.name, self.shell.robot) from error
+            raise _duplicate_error(self.name, self.shell.robot) from error
         part.rename(path)
 
     def _piece(self, start: int, to: Path) -> bytes:
-        number, wanted = start // PIECE_BYTES, min(PIECE_BYTES, self.size_bytes - start)
+        number, expected = start // PIECE_BYTES, min(PIECE_BYTES, self.size_bytes - start)
         command = (*CALL, "piece", self.folder, self.name, str(number), str(PIECE_BYTES))
         self.shell.fetch(command, to, deadline=Deadline.after(_PIECE_S), limit_bytes=PIECE_BYTES)
         content = to.read_bytes()
-        if len(content) < wanted:
-            said = f"sent {len(content)} bytes of {self.name} from {start} on, where there were {wanted}"
-            raise EvidenceError(said, where=self.shell.robot)
-        return content[:wanted]
+        if len(content) < expected:
+            what = f"sent {len(content)} bytes of {self.name} from byte {start} on, instead of {expected}"
+            raise EvidenceError(what, where=self.shell.robot)
+        return content[:expected]
 
     def _sum(self) -> str | None:
         deadline = Deadline.after(_PIECE_S + self.size_bytes / _SUMMED_BYTES_PER_S)
@@ -258,7 +263,7 @@ class _LargeFile:
 
 
 def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str | None]) -> Mapping[str, int]:
-    """Unpack an archive of small files, check them, and return the sizes of the large ones by name."""
+    """Unpack an archive of small files, check them, and return the sizes of the large files by name."""
     sums: dict[str, str] = {}
     large: dict[str, int] = {}
     received: dict[str, str] = {}
@@ -269,11 +274,11 @@ def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str |
             elif _LARGE.match(member.name) and not large:
                 large = _parse_sizes(b"".join(islice(member.chunks, _LIST_CHUNKS)), robot)
                 for name in large:
-                    _demand_own(name, robot, foreign)
+                    _require_own(name, robot, foreign)
             elif not _SAFE_NAME.match(member.name):
-                raise EvidenceError(f"sent {member.name!r}, which is no plain file of a repeat", where=robot)
+                raise EvidenceError(f"sent {member.name!r}, which is not a regular file of a repeat", where=robot)
             else:
-                _demand_own(member.name, robot, foreign)
+                _require_own(member.name, robot, foreign)
                 received[member.name] = _write(member, into, robot)
     wrong = sorted(name for name in sums.keys() | received.keys() if sums.get(name) != received.get(name))
     if wrong or not received:
@@ -281,25 +286,25 @@ def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str |
     return large
 
 
-def _demand_own(name: str, robot: str, foreign: Callable[[str], str | None]) -> None:
-    """Refuse a file that the laptop writes, or another robot.
+def _require_own(name: str, robot: str, foreign: Callable[[str], str | None]) -> None:
+    """Check that the laptop or another robot does not write a file of this name.
 
     Raises:
-        EvidenceError: It is one.
+        EvidenceError: The laptop or another robot writes it.
     """
-    why = "only the laptop writes a file of this name" if laptop_files.reserved(name) else foreign(name)
-    if why:
+    reason = "only the laptop writes a file of this name" if laptop_files.reserved(name) else foreign(name)
+    if reason:
         raise EvidenceError(
-            f"sent {name}: {why}", where=robot, remedy=f"find out what writes {name} on the robot, and rename it"
+            f"sent {name}: {reason}", where=robot, remedy=f"find out what writes {name} on the robot, and rename it"
         )
 
 
 def _write(member: archive.TarMember, into: Path, robot: str) -> str:
-    """Write a file that is not there yet; return its hash."""
+    """Write a member to a new file; return its hash."""
     try:
-        file = _place(into, member.name, robot).open("xb")
+        file = _target_path(into, member.name, robot).open("xb")
     except FileExistsError as error:
-        raise _sent_before(member.name, robot) from error
+        raise _duplicate_error(member.name, robot) from error
     digest = hashlib.sha256()
     with file:
         for chunk in member.chunks:
@@ -308,18 +313,18 @@ def _write(member: archive.TarMember, into: Path, robot: str) -> str:
     return digest.hexdigest()
 
 
-def _place(into: Path, name: str, robot: str) -> Path:
-    """Return where a file of this name goes, its folder made."""
+def _target_path(into: Path, name: str, robot: str) -> Path:
+    """Return the path for a file of this name; its folder is created."""
     path = into / name
     try:
         path.parent.mkdir(exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise _sent_before(name, robot) from error
+        raise _duplicate_error(name, robot) from error
     return path
 
 
-def _sent_before(name: str, robot: str) -> EvidenceError:
-    return EvidenceError(f"sent {name}, which it or the other robot sent before", where=robot)
+def _duplicate_error(name: str, robot: str) -> EvidenceError:
+    return EvidenceError(f"sent {name}, which it or another robot sent before", where=robot)
 
 
 def _parse_sums(content: bytes) -> dict[str, str]:
@@ -329,10 +334,12 @@ def _parse_sums(content: bytes) -> dict[str, str]:
 
 def _parse_sizes(content: bytes, robot: str) -> dict[str, int]:
     lines = content.decode("ascii", "replace").splitlines()
-    found = {name: size for size, _, name in (line.partition(" ") for line in lines)}
-    for name, size in found.items():
+    sizes = {name: size for size, _, name in (line.partition(" ") for line in lines)}
+    for name, size in sizes.items():
         if not _SAFE_NAME.match(name) or not _SIZE.match(size):
-            raise EvidenceError(f"lists {name!r} of {size!r} bytes, which is no plain file of a repeat", where=robot)
-    if len(found) > archive.MAX_FILES:
+            raise EvidenceError(
+                f"lists {name!r} of {size!r} bytes, which is not a regular file of a repeat", where=robot
+            )
+    if len(sizes) > archive.MAX_FILES:
         raise EvidenceError(f"lists more than {archive.MAX_FILES} files", where=robot)
-    return {name: int(size) for name, size in found.items()}
+    return {name: int(size) for name, size in sizes.items()}

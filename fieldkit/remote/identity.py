@@ -1,4 +1,4 @@
-"""Addresses, host keys and credentials: the place of a robot, and the proofs of who is who."""
+"""Addresses, host keys and credentials of robots."""
 
 import base64
 import binascii
@@ -10,7 +10,7 @@ from fieldkit.core.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class Address:
-    """Address of a robot, for messages; the way there is a `Connect`.
+    """Address of a robot, for messages; a `Connect` opens the connection.
 
     Attributes:
         robot: Its name in the lab.
@@ -26,7 +26,7 @@ class Address:
 
     @property
     def by_hand(self) -> str:
-        """What a person types after `ssh` or `ssh-copy-id` to get there."""
+        """The arguments for `ssh` or `ssh-copy-id` to this robot."""
         port = f"-p {self.port} " if self.port != 22 else ""
         return f"{port}{self.user}@{self.host}" if self.user else f"{port}{self.host}"
 
@@ -36,8 +36,8 @@ class HostKey:
     """A public host key.
 
     Attributes:
-        text: As in `known_hosts`: `ssh-ed25519 AAAA...`.
-        server: What the server calls itself, `SSH-2.0-dropbear_2022.83`; empty where it was not asked.
+        text: The key as in `known_hosts`: `ssh-ed25519 AAAA...`.
+        server: Version string of the server, for example `SSH-2.0-dropbear_2022.83`; empty if unknown.
     """
 
     text: str
@@ -45,12 +45,12 @@ class HostKey:
 
     @property
     def kind(self) -> str:
-        """Type of the key: `ssh-ed25519`."""
+        """Type of the key, for example `ssh-ed25519`."""
         return self.text.partition(" ")[0]
 
     @property
     def by_hand(self) -> str:
-        """What a person types on the robot to see its fingerprint; dropbear keeps keys in its own way."""
+        """The command that shows the fingerprint on the robot; dropbear has its own key format."""
         name = "ecdsa" if self.kind.startswith("ecdsa-") else self.kind.removeprefix("ssh-")
         if "dropbear" in self.server:
             return f"dropbearkey -y -f /etc/dropbear/dropbear_{name}_host_key"
@@ -64,10 +64,10 @@ class HostKey:
 
     @classmethod
     def parse(cls, text: str, robot: str) -> "HostKey":
-        """Return the key that is pinned for `robot`, a comment after it left out.
+        """Return the pinned key of `robot`, without the comment after it.
 
         Raises:
-            ConfigurationError: It is none.
+            ConfigurationError: The text is not a host key.
         """
         try:
             kind, encoded = text.split()[:2]
@@ -75,8 +75,8 @@ class HostKey:
         except (ValueError, binascii.Error):
             kind, blob = "", b""
         # RFC 4253, section 6.6: the blob begins with the length of the type, and the type.
-        named = len(kind).to_bytes(4) + kind.encode()
-        if not kind or not blob.startswith(named) or blob == named:
+        prefix = len(kind).to_bytes(4) + kind.encode()
+        if not kind or not blob.startswith(prefix) or blob == prefix:
             raise ConfigurationError(
                 "its pinned host key cannot be read", where=robot, remedy=f"fieldkit enroll {robot} --replace"
             )
@@ -85,12 +85,12 @@ class HostKey:
 
 @dataclass(frozen=True)
 class Credentials:
-    """Proofs that a robot owes us, and we owe it.
+    """The host key by which a robot is identified, and the key or password for the login.
 
     Attributes:
         host_key: Pinned host key.
-        private_key: OpenSSH private key text; None asks the SSH agent, unless there is a password.
-        password: Tried alone where it is given.
+        private_key: OpenSSH private key text; None uses the keys of the SSH agent, unless there is a password.
+        password: The password, which is then the only method; None to use keys.
     """
 
     host_key: HostKey

@@ -1,12 +1,12 @@
-# Jobs that go on without a connection, and the verbs.
+# Jobs that continue without a connection, and the verbs.
 
-launch() { # $1 is start, run or serve
+launch() { # start a job; $1 is start, run or serve
     how=$1 dir=$2 name=$3 limit=$4 ready=$5 within=$6 in=$7 out=$8 log=$9
     shift 9
     enter "$dir"
     meta=$PWD/.jobs/$name
     clock
-    over_s=$((now + ${limit%.*} + within + 10)) # by then the caller has asked, or never will
+    over_s=$((now + ${limit%.*} + within + 10)) # a caller that has not requested the end by then is lost
     if [ -d "$meta" ]; then
         ours=
     elif [ -e .ended ]; then
@@ -37,7 +37,7 @@ launch() { # $1 is start, run or serve
         *1) detach "$@" ;;
     esac
     [ "$how" = serve ] || { rise; return; }
-    # Who joins a job that was up does not mind that it has ended since.
+    # A repeated call for a job that was ready succeeds, even if the job has ended since.
     [ -e "$meta/up" ] || rise
     { printf '' >"$meta/up"; } 2>/dev/null
     echo up
@@ -45,49 +45,50 @@ launch() { # $1 is start, run or serve
     result "$meta"
 }
 
-keep() { # the lock that the folder was made under, until a job with this limit has ended
+keep() { # renew the lock under which the folder was created, until a job with this limit has ended
     token=-
     [ ! -s .began ] || read -r token _ <.began
     [ "$token" = - ] || renew "$token" $((${limit%.*} + within))
 }
 
-give() { # what root made to the owner of this folder, who removes it one day
+give() { # change the owner of $1, which root created, to the owner of this folder, so that it can be deleted
     made=$1
     set -- $(ls -ldn .)
     chown "$3:$4" "$made"
 }
 
-late() {
+late() { # fail because the jobs of this folder were stopped already
     by=
     read -r by 2>/dev/null <.ended
     fail "job $name comes too late: the jobs of $dir were ended${by:+ by $by}"
 }
 
-within_s() { # become the command after $1, which has so many seconds
-    cd / # a folder that is removed meanwhile has nothing left in it: busybox watches for a second longer
+within_s() { # replace the shell by the command after $1, with a timeout of $1 seconds
+    cd / # the timeout of busybox runs a second longer, and must not be a process in a deleted folder
     exec timeout "$@"
 }
 
-conclude() { # end with $1 once the caller closes standard input, which says that it wants to be told, or is never heard of
-    [ ! -c /proc/self/fd/0 ] || exit "$1" # it was /dev/null from the beginning
+conclude() { # exit with $1 when the caller closes standard input to request the result, or after a timeout
+    [ ! -c /proc/self/fd/0 ] || exit "$1" # standard input is /dev/null: report without a request
     clock
     [ "$now" -ge "$over_s" ] || (within_s $((over_s - now)) cat) >/dev/null 2>&1
     case $? in
         0 | 124 | 143) ;;
-        *) while read -r _; do :; done ;; # an old busybox has another timeout
+        *) while read -r _; do :; done ;; # the timeout of old versions of busybox has another syntax
     esac
     exit "$1"
 }
 
 detach() {
-    # In the foreground of a shell of its own, which the job's leader ends: what is started with & ignores SIGINT
-    # for ever, and not every setsid can fork. What the shell says of the end of the other is said with the next command.
+    # The job is started in the foreground of a subshell, which the leader of the job kills. A process that is started
+    # with & ignores SIGINT, and not every setsid can fork. The shell prints a message about the killed subshell with the
+    # next command, so that command is within the redirection, too.
     { (read -r shell _ </proc/self/stat; setsid sh "$self" supervise "$shell" "$@" </dev/null >/dev/null; :); :; } 2>/dev/null
 }
 
-rise() { # wait until the job in $meta is up
+rise() { # wait until the job in $meta is ready
     [ "$how" != run ] || ready=-
-    # What has to begin something takes that long at least, and each look takes from it a part of the processor.
+    # The first pause is longer for a job with a condition: it needs that time at least, and polling uses the processor.
     [ "$ready" = - ] && pause=0.002 || pause=0.01
     clock
     until_s=$((now + within))
@@ -113,10 +114,10 @@ $(tail -n 3 "$log" 2>/dev/null)"
     [ -s "$meta/exit" ] || [ ! -e .ended ] || late
 }
 
-await() { # the end of the job in $1, for $2 seconds at most
+await() { # wait for the end of the job in $1, for at most $2 seconds
     [ -e "$1/pid" ] || result "$1"
     if [ -p "$1/end" ] && [ -w "$1/end" ]; then
-        # Opened for both first, so that opening does not wait for a writer where there is none any more.
+        # First opened for reading and writing, because opening for reading would block without a writer.
         exec 8<>"$1/end" 7<"$1/end" 8>&-
         if [ -z "${2-}" ]; then
             read -r _ <&7
@@ -125,8 +126,8 @@ await() { # the end of the job in $1, for $2 seconds at most
             case $? in 124 | 143) return 1 ;; esac
         fi
     fi
-    # Who has met the end has yet to see the process go. And a job of an older version of this script has no end to
-    # meet, one of root's is not ours to meet, an old busybox has another timeout.
+    # After the end of the FIFO the process may exist for a moment. Polling is also needed for jobs of older versions of
+    # this script without a FIFO, for jobs of root, and for old versions of busybox with another timeout.
     clock
     until_s=$((now + ${2-86400}))
     while alive "$1"; do
@@ -136,7 +137,7 @@ await() { # the end of the job in $1, for $2 seconds at most
     done
 }
 
-settle() { # wait until file $1 has not grown for 20 ms, 2 s at most
+settle() { # wait until file $1 has not grown for 20 ms, for at most 2 s
     n=0 last=-1
     while size=$(wc -c <"$1") && [ "$size" != "$last" ] && [ "$n" -lt 100 ]; do
         last=$size n=$((n + 1))
@@ -144,15 +145,15 @@ settle() { # wait until file $1 has not grown for 20 ms, 2 s at most
     done
 }
 
-ask() { # note that the end of the job in $meta is ours; a full disk must not keep us from ending it
+ask() { # record that fieldkit stops the job in $meta; a full disk must not prevent the stop
     { printf '' >"$meta/asked"; } 2>/dev/null || :
 }
 
-signal() { # send $1 to the group that alive found; a capture may be root's
+signal() { # send signal $1 to the process group from `alive`; with sudo for captures, which run as root
     kill "-$1" "-$pid" 2>/dev/null || sudo -n sh -c 'kill "-$1" "-$2"' sh "$1" "$pid" 2>/dev/null || ! alive "$meta"
 }
 
-remove() { # what is in $1, also where somebody who aborts makes a file in it meanwhile
+remove() { # delete folder $1; a second try, because a concurrent abort may create a file in it
     rm -rf -- "$1" 2>/dev/null || rm -rf -- "$1" 2>/dev/null || sudo -n sh -c 'rm -rf -- "$1"' sh "$1" || fail "cannot remove $1"
 }
 
@@ -169,7 +170,7 @@ stop() {
     result "$meta"
 }
 
-parts() { # whether the job in $meta says $parting in its $log within $1 seconds, and so has nothing left to do but end
+parts() { # true if $log contains $parting within $1 seconds, which shows that the job in $meta has finished its work
     clock
     until_s=$((now + $1))
     until holds "$log" "$parting"; do
@@ -180,7 +181,7 @@ parts() { # whether the job in $meta says $parting in its $log within $1 seconds
     printf '' >"$meta/leaves"
 }
 
-gone() { # the end of every job of this folder that was let go by `stop`; set late to what is wrong with one
+gone() { # wait for the jobs of this folder for which `stop` did not wait; set late to the error of a failed one
     late=
     for meta in .jobs/*; do
         [ -e "$meta/leaves" ] || continue
@@ -192,7 +193,7 @@ gone() { # the end of every job of this folder that was let go by `stop`; set la
     done
 }
 
-end() { # all jobs in the folders $@ and say which: signal all, then give them 2 s together; see `jobs.unhurried_file`
+end() { # stop and list all jobs in the folders $@: SIGINT to all, SIGKILL after 2 s; see `jobs.unhurried_file`
     for dir do
         [ -d "$dir/.jobs" ] && { printf '%s\n' "${by-}" >"$dir/.ended"; } 2>/dev/null
         for meta in "$dir"/.jobs/*; do
@@ -212,7 +213,7 @@ end() { # all jobs in the folders $@ and say which: signal all, then give them 2
     [ -z "$stuck" ] || fail "cannot end$stuck"
 }
 
-describe() { # the job in $meta that alive found
+describe() { # print a line about the job in $meta, after `alive`
     line=
     read -r line <"$meta/command"
     line="${meta%/.jobs/*}/${meta##*/} $pid $line"
@@ -227,7 +228,7 @@ left() {
     return 0
 }
 
-strays() { # list processes in folders of jobs that were removed, and send them $1, if it is given
+strays() { # list processes in deleted folders of jobs, and send them signal $1 if it is given
     home=$(cd "$base" 2>/dev/null && pwd -P) || return 0
     ls -ld /proc/[0-9]*/cwd 2>/dev/null | while read -r line; do
         case $line in *"/cwd -> $home/"*" (deleted)") ;; *) continue ;; esac
@@ -238,14 +239,14 @@ strays() { # list processes in folders of jobs that were removed, and send them 
     done
 }
 
-stand() { # run what standard input asks for, one after the other: a line `NONCE [held] VERB WORD...`, quoted for a shell
+stand() { # run the commands from standard input in sequence, each a line `NONCE [held] VERB WORD...`, quoted for a shell
     echo ready
     while read -r nonce line; do
         echo "$nonce" >&2
         echo "$nonce"
         (eval "main ${line#held }") </dev/null
         code=$?
-        case $line in "held "*) read -r _ || exit ;; esac # until the caller wants to be told
+        case $line in "held "*) read -r _ || exit ;; esac # wait until the caller requests the end
         echo "$nonce $code" >&2
         echo "$nonce $code"
     done

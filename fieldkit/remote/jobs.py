@@ -1,4 +1,7 @@
-"""Detached jobs: a folder, an identity, a log, an exit code and a deadline on the robot; a lost link ends none."""
+"""Detached jobs on a robot, each with a folder, an identity, a log, an exit code and a time limit.
+
+A lost link does not stop them.
+"""
 
 import re
 from collections.abc import Sequence
@@ -9,7 +12,17 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.model import Protocol
 from fieldkit.remote.command import printable
-from fieldkit.remote.script import CALL, HOME, REPLY_S, SCRIPT, SCRIPT_PATH, call, complaint, demand, install
+from fieldkit.remote.script import (
+    CALL,
+    HOME,
+    REPLY_S,
+    SCRIPT,
+    SCRIPT_PATH,
+    call,
+    error_message,
+    install,
+    require_success,
+)
 from fieldkit.remote.shell import Completed, Session, Shell
 
 __all__ = [
@@ -40,29 +53,29 @@ __all__ = [
     "work_folder",
 ]
 
-_UP: Final = b"up\n"
-"""What `job.sh serve` says."""
+_READY_OUTPUT: Final = b"up\n"
+"""Output of `job.sh serve` when a job is ready."""
 
 STILL_RUNNING: Final = 124
 KILLED: Final = 137
 
-_HELD: Final = re.compile(rb"^held \S+ \S", re.MULTILINE)
-_JOB: Final = re.compile(rb"\S+/\S+ [0-9]{1,10} ")
+_HELD_LINE: Final = re.compile(rb"^held \S+ \S", re.MULTILINE)
+_JOB_LINE: Final = re.compile(rb"\S+/\S+ [0-9]{1,10} ")
 
-_LANDS: Final = re.compile(
+_LANDING_LINE: Final = re.compile(
     rb"^lands (?P<program>[!-~]+/\.jobs/[!-~]+) (?P<state>land|return|alarm|landed|silent)$", re.MULTILINE
 )
 
 _LINE_BYTES: Final = 300
 
-# Passes at most $1 bytes of each output of the program on. The exit code is that of the program.
+# Forwards at most $1 bytes of each output of the program. The exit code is that of the program.
 _LIMITED: Final = (
     'n=$1; shift; exec 5>&1 6>&2; exit "$( { { { "$@" 3>&- 5>&- 6>&-; echo $? >&3; } 2>&1 >&4 4>&- 5>&- 6>&- '
     '| head -c "$n" >&6; } 4>&1 | head -c "$n" >&5; } 3>&1 )"'
 )
 
 READY_S: Final = 8
-"""How long a started job may take to be up, shorter than `REPLY_S` so that the robot itself says why it is not."""
+"""Time in which a started job must be ready; shorter than `REPLY_S`, so that the robot can report a failure."""
 
 
 @dataclass(frozen=True)
@@ -70,17 +83,17 @@ class Job:
     """A command that runs detached on a robot.
 
     Attributes:
-        folder: The repeat's folder on the robot, from `work_folder`.
-        name: Unique in its folder.
+        folder: The folder of the attempt on the robot, from `work_folder`.
+        name: A name that is unique in the folder.
         argv: The command.
-        limit_s: The robot itself ends the job when it has been up for this time.
-        log: File in `folder` for its standard error, and its output where `stdout` is None.
-        stdin: File in `folder` that it reads; None for none.
-        stdout: File in `folder` that it writes; None for the log.
-        ready: When a started job counts as up: `log:TEXT`, or from `bound`; None at once.
-        as_root: Run by `sudo -n`.
-        ready_s: How long a started job may take to be up, in whole seconds.
-        output_limit_bytes: Bytes that are kept of standard output, and of standard error; 0 for no limit.
+        limit_s: The robot stops the job when it has been ready for this time.
+        log: File in `folder` for its standard error, and for its standard output if `stdout` is None.
+        stdin: File in `folder` for its standard input; None for none.
+        stdout: File in `folder` for its standard output; None for the log.
+        ready: Condition for a started job to be ready: `log:TEXT`, or from `bound`; None for immediately.
+        as_root: Whether `sudo -n` runs it.
+        ready_s: Time in which it must be ready, in whole seconds.
+        output_limit_bytes: Maximum kept size of standard output, and of standard error; 0 for no limit.
     """
 
     folder: str
@@ -97,67 +110,68 @@ class Job:
 
 
 def work_folder(trial: str, attempt: str) -> str:
-    """Return the folder on the robot for one attempt at a repeat."""
+    """Return the folder on the robot for an attempt of a repeat."""
     return f"{HOME}/{trial}/{attempt}"
 
 
 def exit_file(job: Job) -> str:
-    """Return the file, in the folder of its attempt, that holds the exit code of a job that has ended."""
+    """Return the path of the file with a job's exit code, relative to the folder of its attempt."""
     return f".jobs/{job.name}/exit"
 
 
 def unhurried_file(name: str) -> str:
-    """Return the file, in the folder of its attempt, by which a job says that it needs its time to end.
+    """Return the path of the file that protects a job from SIGKILL, relative to the folder of its attempt.
 
-    Who ends all jobs tells it to end as all others, and does not kill it while that is there.
+    A job creates it while it must not be killed, for example while it lands a drone. When all jobs are stopped, it
+    receives SIGINT as the others, but no SIGKILL while the file exists.
     """
     return f".jobs/{name}/unhurried"
 
 
 def stationary_file(name: str) -> str:
-    """Return the file, in the folder of its attempt, made by a job that drives a robot when it is stationary."""
+    """Return the path of the file that a driving job creates when its robot is stationary; as `exit_file`."""
     return f".jobs/{name}/stationary"
 
 
 def bound(protocol: Protocol, port: int) -> str:
-    """Return the `ready` condition that a socket listens on `port`."""
+    """Return the `ready` condition that a socket is bound to `port`."""
     return f"{protocol}:{port:04X}"
 
 
 def command(verb: str, job: Job) -> tuple[str, ...]:
-    """Return the remote command line that starts (`start`), runs (`run`) or does both to a job (`serve`)."""
+    """Return the remote command line for a job: the function `start`, `run` or `serve` describes each verb."""
     files = (job.stdin or "/dev/null", job.stdout or job.log, job.log)
     options = (f"{job.limit_s:.15g}", job.ready or "-", str(job.ready_s), *files)
     return (*_script(job), verb, job.folder, job.name, *options, *limited_argv(job))
 
 
 def limited_argv(job: Job) -> tuple[str, ...]:
-    """Return the command of a job, inside one that keeps `output_limit_bytes` of each output if there is a limit."""
+    """Return the command of a job, wrapped to limit each output to `output_limit_bytes` if there is a limit."""
     if not job.output_limit_bytes:
         return job.argv
     return ("sh", "-c", _LIMITED, "sh", str(job.output_limit_bytes), *job.argv)
 
 
 def start(shell: Shell, job: Job) -> None:
-    """Start a job, or join one that was started before, and return when it is up.
+    """Start a job and return when it is ready; a job that was started before is not started again.
 
     Raises:
         LinkError: The robot did not answer in time.
-        RobotError: The job ended before it was up, or was not in `ready_s`; the message has the end of its log.
+        RobotError: The job ended before it was ready, or was not ready in time; the message has the end of its log.
     """
     within_s = REPLY_S - READY_S + job.ready_s
     done = shell.run(command("start", job), deadline=Deadline.after(within_s), check=False)
-    demand(shell, done, remedy=f"look into {job.folder} on the robot")
+    require_success(shell, done, remedy=f"look into {job.folder} on the robot")
 
 
 @dataclass(frozen=True)
 class Pending:
-    """A job, or a wait for one, that the robot has accepted; silent on the control connection until `end`.
+    """A started job, or a wait for one. The control connection is silent until `end` is called.
 
     Attributes:
         shell: The robot.
         job: The job.
-        session: Its command.
+        session: The remote command of the job or of the wait.
     """
 
     shell: Shell
@@ -165,18 +179,18 @@ class Pending:
     session: Session
 
     def end(self, within_s: float) -> int:
-        """Wait for the end and return the job's exit code, or `STILL_RUNNING` when a wait gave up.
+        """Wait for the end and return the job's exit code, or `STILL_RUNNING` after the timeout of a wait.
 
         Raises:
             LinkError: The robot did not answer in `within_s`.
-            RobotError: The robot could not start the job, knows no such job, or rebooted while it ran.
+            RobotError: The robot could not start the job, has no such job, or rebooted while it ran.
         """
         done = self.session.end(deadline=Deadline.after(within_s), check=False)
         return _exit_code(self.shell, self.job, done)
 
 
 def begin(shell: Shell, job: Job) -> Pending:
-    """Start a job whose end the robot tells only when asked by `end`, so that its report meets nothing on the air.
+    """Start a job whose end is reported only when `Pending.end` requests it, so that no report disturbs the radio.
 
     Raises:
         LinkError: The robot did not answer.
@@ -185,15 +199,15 @@ def begin(shell: Shell, job: Job) -> Pending:
 
 
 def run(shell: Shell, job: Job) -> int:
-    """Start a job, or join one that was started before, and wait for its end.
+    """Start a job and wait for its end; a job that was started before is not started again.
 
-    Nothing crosses the control connection in between.
+    The control connection is silent while the job runs.
 
     Returns:
         The job's exit code.
 
     Raises:
-        LinkError: The robot did not answer by the end of the job's own limit, `READY_S` later if it has `ready`.
+        LinkError: The robot did not answer by the end of the job's limit, plus `READY_S` if it has `ready`.
         RobotError: The job could not be started.
     """
     session = shell.begin(command("run", job), deadline=Deadline.after(REPLY_S), until=b"")
@@ -201,23 +215,23 @@ def run(shell: Shell, job: Job) -> int:
 
 
 def serve(shell: Shell, job: Job) -> Pending:
-    """Start a job, or join one that was started before, and return when it is up; the robot tells its end unasked.
+    """Start a job and return when it is ready; the robot reports its end without a request.
 
-    Its wait gives up where the job outlives its limit by `REPLY_S`.
+    A job that was started before is not started again. The robot waits for its end until `REPLY_S` after its limit.
 
     Raises:
         LinkError: The robot did not answer in time.
         RobotError: As `start`.
     """
-    session = shell.begin(command("serve", job), deadline=Deadline.after(REPLY_S), until=_UP)
+    session = shell.begin(command("serve", job), deadline=Deadline.after(REPLY_S), until=_READY_OUTPUT)
     if not session.told:
         done = session.end(deadline=Deadline.after(REPLY_S), check=False)
-        demand(shell, done, remedy=f"look into {job.folder} on the robot")
+        require_success(shell, done, remedy=f"look into {job.folder} on the robot")
     return Pending(shell, job, session)
 
 
 def begin_wait(shell: Shell, job: Job, seconds: float) -> Pending:
-    """Begin to wait on the robot for a started job's end, for `seconds` at most.
+    """Start to wait on the robot for the end of a started job, for at most `seconds`.
 
     Raises:
         LinkError: The robot did not answer.
@@ -235,23 +249,23 @@ def stop(
     settle: str | None = None,
     parting: str | None = None,
 ) -> int:
-    """End a job by its recorded identity: `signal` to its group, SIGKILL after `grace_s`.
+    """Stop a job, identified by its recorded process: `signal` to its group, then SIGKILL after `grace_s`.
 
     Args:
         shell: The robot.
-        job: A started job; one that has ended is left alone.
+        job: A started job, which may have ended.
         signal: Name without `SIG`.
-        grace_s: Time to end by itself, whole seconds.
-        settle: File in the job's folder that must have stopped growing first.
-        parting: The job has done its work once its log has this; only `fetching.fetch` then waits for its end,
-            and fails if its exit code is not 0.
+        grace_s: Time until SIGKILL, in whole seconds.
+        settle: File in the job's folder that must stop growing before the signal.
+        parting: Text in the log that shows that the job has finished its work. `stop` then does not wait for its end;
+            `fetching.fetch` does so, and fails if its exit code is not 0.
 
     Returns:
-        The job's exit code, or `KILLED`; 0 where it said `parting`.
+        The job's exit code, or `KILLED`; 0 if `parting` is in its log.
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: The robot knows no such job, or rebooted while it ran.
+        RobotError: The robot has no such job, or rebooted while it ran.
     """
     argv = (
         *_script(job),
@@ -268,7 +282,7 @@ def stop(
 
 
 def left(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
-    """Return one line per job of fieldkit's that still runs on the robot, whatever trial and version started it."""
+    """Return one line per running job of fieldkit on the robot, from any trial and version."""
     return _lines(call(shell, "left", deadline=deadline))
 
 
@@ -277,11 +291,11 @@ class Aborted:
     """Result of `abort` on a robot.
 
     Attributes:
-        locked: Whether somebody held it.
-        jobs: A line per job that was ended or was ordered to end, as from `left`.
-        landing: Programs that still bring a drone down, `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home, each with
-            its `motion.MotionState`.
-        error: What could not be done, if anything.
+        locked: Whether the robot was locked.
+        jobs: A line per stopped or signalled job, as from `left`.
+        landing: Programs that still land a drone, `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home, each with its
+            `motion.MotionState`.
+        error: The error if a part failed; None otherwise.
     """
 
     locked: bool = False
@@ -291,27 +305,27 @@ class Aborted:
 
 
 def abort(shell: Shell, who: str, deadline: Deadline) -> Aborted:
-    """Break the robot's lock in the name of `who` and end every job of any trial.
+    """Break the robot's lock in the name of `who`, and stop all jobs of all trials.
 
-    The script is not installed for it, since a full disk or one that cannot be written may be why somebody aborts.
+    The script is not installed for it, because a full or read-only disk may be the reason for the abort.
 
     Raises:
         LinkError: The robot did not answer.
     """
     argv = ("sh", "-c", 'eval "$(cat)"', SCRIPT_PATH, "abort", who)
     done = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
-    said, error = done.stdout, None
+    output, error = done.stdout, None
     try:
-        demand(shell, done)
-    except RobotError as failed:
-        error = failed
-    landing = tuple((match["program"].decode(), match["state"].decode()) for match in _LANDS.finditer(said))
-    return Aborted(locked=_HELD.search(said) is not None, jobs=_lines(said), landing=landing, error=error)
+        require_success(shell, done)
+    except RobotError as script_error:
+        error = script_error
+    landing = tuple((match["program"].decode(), match["state"].decode()) for match in _LANDING_LINE.finditer(output))
+    return Aborted(locked=_HELD_LINE.search(output) is not None, jobs=_lines(output), landing=landing, error=error)
 
 
 def _lines(output: bytes) -> tuple[str, ...]:
-    # Each begins with what it is, and a command may be long.
-    return tuple(printable(line[:_LINE_BYTES]) for line in output.splitlines() if _JOB.match(line))
+    # A line starts with the identification of the job, and a command may be long.
+    return tuple(printable(line[:_LINE_BYTES]) for line in output.splitlines() if _JOB_LINE.match(line))
 
 
 def _script(job: Job) -> Sequence[str]:
@@ -319,6 +333,6 @@ def _script(job: Job) -> Sequence[str]:
 
 
 def _exit_code(shell: Shell, job: Job, done: Completed) -> int:
-    if complaint(done.stderr):
-        demand(shell, done, remedy=f"look into {job.folder} on the robot")
+    if error_message(done.stderr):
+        require_success(shell, done, remedy=f"look into {job.folder} on the robot")
     return done.exit_code

@@ -1,4 +1,4 @@
-"""Private keys to log in with: from a file that the site file names, or from the SSH agent."""
+"""Private keys for the login: from a file that the site file names, or from the SSH agent."""
 
 import io
 from collections.abc import Sequence
@@ -10,10 +10,10 @@ from fieldkit.core.errors import ConfigurationError, typed
 
 
 def private_keys(text: str | None, *, where: str) -> Sequence[paramiko.PKey]:
-    """Return the key that `text` holds, or without one those of the SSH agent.
+    """Return the key in `text`, or the keys of the SSH agent if `text` is None.
 
     Raises:
-        ConfigurationError: There is none, or it is of no use.
+        ConfigurationError: There is no key, or it cannot be used.
     """
     if text is not None:
         return (_parse_private_key(text, where=where),)
@@ -25,14 +25,14 @@ def private_keys(text: str | None, *, where: str) -> Sequence[paramiko.PKey]:
 
 
 def read_private_key(path: str, *, where: str) -> str:
-    """Return the text of a private key file, once it is known to be of use.
+    """Return the text of a private key file, after a check that the key can be used.
 
     Raises:
-        ConfigurationError: It cannot be read, has a passphrase, or holds no key.
+        ConfigurationError: It cannot be read, has a passphrase, or contains no supported key.
     """
     try:
         text = Path(path).expanduser().read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError, RuntimeError) as error:  # the last of `~NAME`, where nobody has that name
+    except (OSError, UnicodeDecodeError, RuntimeError) as error:  # RuntimeError: `~NAME` for an unknown user
         raise ConfigurationError(
             f"its key {path} cannot be read",
             where=where,
@@ -43,7 +43,7 @@ def read_private_key(path: str, *, where: str) -> str:
 
 
 def _on_key(command: str, path: str) -> str:
-    """Return a command on a key file as it is typed; a shell knows no `~` within quotes."""
+    """Return a shell command with a key file; `~/` stays outside the quotes, where the shell expands it."""
     home = "~/" if path.startswith("~/") else ""
     return f"{command} {home}{typed(path.removeprefix(home))}"
 

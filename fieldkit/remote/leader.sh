@@ -1,16 +1,16 @@
-# The leader of a job's own session and process group. It comes before the other parts, and ends the shell: eight jobs
-# of a repeat have one each, and to read the rest would take each half a millisecond.
+# The leader of the session and process group of a job. This part precedes the other parts and exits the shell: parsing
+# the rest would take half a millisecond for each of the up to eight jobs of a repeat.
 
-bound() { # protocol and port in hex; a TCP listener has state 0A
+bound() { # true if a socket is bound; $1 protocol, $2 port in hex; a TCP listener has state 0A
     if [ "$1" = tcp ] && listening=$(ss -tn state listening "sport = :$((0x$2))" 2>/dev/null); then
-        # It asks for listeners alone; a kernel may take 4 ms to go through each table of all connections.
+        # ss requests listeners only; reading a table of all connections takes up to 4 ms.
         case $listening in *":$((0x$2)) "*) return ;; *) return 1 ;; esac
     fi
     case $1 in tcp) state=0A ;; *) state=07 ;; esac
     grep -qsE "^ *[0-9]+: [0-9A-F]+:$2 [0-9A-F]+:0000 $state " "/proc/net/$1" "/proc/net/${1}6"
 }
 
-holds() { # whether file $1 has a line with $2
+holds() { # true if file $1 has a line that contains $2
     [ -e "$1" ] || return 1
     while read -r line || [ -n "$line" ]; do
         case $line in *"$2"*) return 0 ;; esac
@@ -26,17 +26,17 @@ ready() {
     esac
 }
 
-supervise() { # leader of the job's own session and process group; $1 is the shell that it ends to be detached, or -
+supervise() { # run a job as the leader of its session and process group; $1 is the subshell that is killed to detach, or -
     shell=$1 meta=$2 limit=$3 ready=$4 within=$5 in=$6 out=$7 log=$8
     shift 8
     trap : INT TERM HUP
     [ "$shell" != "$PPID" ] || kill -KILL "$shell"
-    mkfifo "$meta/end" && exec 9<>"$meta/end" # open as long as the job lives: who waits for it meets its end
-    { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # nobody could end it
-    # Who ends all jobs says so before it looks for them: one of the two sees the other.
+    mkfifo "$meta/end" && exec 9<>"$meta/end" # open until the job ends: a reader then receives end-of-file
+    { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # without a record it could not be stopped
+    # `end` writes .ended before it lists the jobs, and this job has written its pid: one of the two detects the other.
     [ ! -e "${meta%/.jobs/*}/.ended" ] || exit "$GENERAL"
-    # A signal that came before this child had its own traps is lost; the exit code then lies there already, or, where
-    # the folder was removed since, the leader is gone.
+    # The watchdog may lose the final signal if it arrives before its traps are reset. Then the exit code exists already
+    # or, if the folder was deleted, the leader has exited.
     (trap - INT TERM HUP
         [ -s "$meta/exit" ] || ! kill -0 $$ 2>/dev/null || { await_ready; nap "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
         </dev/null >/dev/null 2>&1 9>&- &
@@ -44,15 +44,15 @@ supervise() { # leader of the job's own session and process group; $1 is the she
     code=$?
     read -r up _ </proc/uptime && echo "$up" >"$meta/ended"
     echo "$code" >"$meta/exit"
-    kill -TERM 0 # the watchdog, and whatever the command left behind
+    kill -TERM 0 # the watchdog, and remaining processes of the command
     exit "$code"
 }
 
-await_ready() { # until what is ready holds, or $within seconds have passed
+await_ready() { # wait until the job is ready, or $within seconds have passed
     [ "$ready" != - ] || return
     clock
     until_s=$((now + within))
-    # At leisure: a kernel may take 4 ms to go through its table of sockets.
+    # Polled slowly, because reading the table of sockets takes up to 4 ms.
     while nap 0.2 && clock && [ "$now" -le "$until_s" ]; do
         ready "$ready" "$log" && return
     done

@@ -1,4 +1,4 @@
-"""One SSH connection: host key checked, logged in, dead when its peer is silent."""
+"""One SSH connection: checks the host key, logs in, and detects a silent peer."""
 
 import contextlib
 import logging
@@ -19,21 +19,21 @@ from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.keys import private_keys
 
 Connect = Callable[[float], socket.socket]
-"""Returns a fresh connected stream socket to the robot's SSH server within so many seconds, or raises OSError."""
+"""Returns a new socket that is connected to the robot's SSH server; raises OSError after a timeout in seconds."""
 
 Channel = paramiko.Channel
 Transport = paramiko.Transport
 
 SPARES: Final = 2
-"""How many channels a link keeps open for commands to come: one for the next, one while its successor is made."""
+"""Number of channels that are opened in advance: one for the next command, one while its successor is opened."""
 
 BROKEN: Final = (paramiko.SSHException, OSError, EOFError)
-"""What a connection raises when it breaks."""
+"""Exceptions of a broken connection."""
 
-# What goes wrong reaches the operator as an error of ours; without a handler it would be on the terminal as well.
+# Errors are reported by fieldkit's exceptions; without a handler, paramiko would also print them to the terminal.
 logging.getLogger("paramiko").addHandler(logging.NullHandler())
 
-# An RSA key signs with SHA-2: paramiko 5 has no SHA-1.
+# Signature algorithms by key type. RSA keys use SHA-2 only: paramiko 5 has no SHA-1.
 _SIGNATURES: Final = {
     "ssh-ed25519": ("ssh-ed25519",),
     "ecdsa-sha2-nistp256": ("ecdsa-sha2-nistp256",),
@@ -43,35 +43,35 @@ _SIGNATURES: Final = {
 }
 
 
-_BROKEN_WORDS: Final = ("cbc", "md5", "-96")
-"""In names of ciphers and MACs that paramiko takes where a server has no others, and OpenSSH 9 does not."""
+_WEAK_ALGORITHMS: Final = ("cbc", "md5", "-96")
+"""Parts of the names of weak ciphers and MACs, which paramiko would accept and OpenSSH 9 does not."""
 
 _REFUSED: Final = "Unable to open channel"
 
-# RFC 4253, section 6.1 asks for packets of 35,000 bytes at least, and OpenSSH takes 256 KiB.
+# RFC 4253, section 6.1 requires support for packets of 35,000 bytes, and OpenSSH accepts 256 KiB.
 _PACKET_BYTES: Final = 1 << 18
 _BANNER_BYTES: Final = 1 << 16
 
 
 class UnfitServerError(paramiko.SSHException):
-    """The server speaks SSH, and not as one that is safe to talk to."""
+    """The server violates the SSH protocol, or supports only insecure algorithms."""
 
 
 class FloodError(UnfitServerError):
-    """The server sent more than it was allowed to."""
+    """The server sent more data than allowed."""
 
 
 class NoSessionError(paramiko.SSHException):
-    """The server let us in, and opens no channel."""
+    """The server accepted the login, but refuses to open a channel."""
 
 
 class _Packetizer(paramiko.packet.Packetizer):
-    """Reads no longer packet and no longer banner than any server needs; paramiko takes whatever comes.
+    """Limits the length of packets and of the banner, which paramiko does not.
 
     Attributes:
-        acknowledges: Whether what the server answers is acknowledged immediately. OpenSSH's server leaves Nagle's
-            algorithm on (RFC 896): it holds a small packet back until the one before it is acknowledged, which this
-            computer delays by 40 ms (RFC 1122, section 4.2.3.2). Linux ends quick acknowledgement whenever data is
+        acknowledges: Whether answers of the server are acknowledged immediately. OpenSSH's server uses Nagle's
+            algorithm (RFC 896): it delays a small packet until the previous one is acknowledged, which this computer
+            delays by 40 ms (RFC 1122, section 4.2.3.2). Linux leaves the quick acknowledgement mode whenever data is
             sent (tcp(7), TCP_QUICKACK).
     """
 
@@ -79,7 +79,7 @@ class _Packetizer(paramiko.packet.Packetizer):
         super().__init__(stream)
         self.acknowledges = True
         self._stream = stream
-        self._greeting_bytes = 0
+        self._received_banner_bytes = 0
 
     @override
     def send_message(self, data: paramiko.Message) -> None:
@@ -94,16 +94,16 @@ class _Packetizer(paramiko.packet.Packetizer):
         return super().read_all(n, check_rekey)
 
     def _read_timeout(self, timeout: float) -> bytes:
-        """Return a piece of the banner."""
+        """Return a part of the banner."""
         piece: bytes = super()._read_timeout(timeout)  # type: ignore[misc]
-        self._greeting_bytes += len(piece)
-        if self._greeting_bytes > _BANNER_BYTES:
+        self._received_banner_bytes += len(piece)
+        if self._received_banner_bytes > _BANNER_BYTES:
             raise FloodError(f"its banner has more than {_BANNER_BYTES} bytes")
         return piece
 
 
 class _Pipe(paramiko.buffered_pipe.BufferedPipe):  # type: ignore[type-arg]
-    """Holds what a channel's window allows; paramiko keeps all that a server sends before somebody reads it."""
+    """A buffer that is limited to the channel's window; paramiko would buffer any amount of unread data."""
 
     def __init__(self, window_bytes: int) -> None:
         super().__init__()
@@ -117,21 +117,21 @@ class _Pipe(paramiko.buffered_pipe.BufferedPipe):  # type: ignore[type-arg]
 
 
 class LoginRefusedError(RobotError):
-    """The robot answered and did not let us in."""
+    """The robot refused the login."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Waiting times of an SSH connection. The kernel ends one whose peer is silent for about `probe_s` + `dead_s`.
+    """Timeouts of an SSH connection. The kernel closes a connection after about `probe_s` + `dead_s` without answers.
 
     Attributes:
-        connect_s: From the robot's name to the end of the login; shorter than the 10 s in which people hear of a
-            dead link, which may have died while nobody used it.
-        probe_s: Silence after which the kernel asks whether the peer is there, in whole seconds.
-        dead_s: Age of unacknowledged data at which it is not. With SSH keepalives alone, paramiko still called a
-            dead connection active after 25 s (field notes).
-        reply_s: What is left at least to a command that is sent again.
-        pause_s: The first pause between attempts to connect again; each is twice as long, up to `probe_s`.
+        connect_s: Timeout from name resolution to the end of the login; shorter than the 10 s within which a lost
+            link must be reported, because an unused link may have been lost earlier.
+        probe_s: Silence after which the kernel sends keepalive probes, in whole seconds.
+        dead_s: Age of unacknowledged data at which the connection is lost. With SSH keepalives alone, paramiko
+            reported a dead connection as active for more than 25 s (field notes).
+        reply_s: Minimum remaining time of a repeated command.
+        pause_s: First pause between attempts to reconnect; it is doubled after each attempt, up to `probe_s`.
     """
 
     connect_s: float = 8.0
@@ -142,19 +142,19 @@ class Timing:
 
 
 def over_tcp(host: str, port: int) -> Connect:
-    """Return how to reach an SSH server over this computer's network."""
+    """Return a function that connects to an SSH server over this computer's network."""
     return lambda timeout_s: socket.create_connection((host, port), timeout=timeout_s)
 
 
 class Link:
-    """A connection to one SSH server. `close` from another thread ends whatever waits here.
+    """A connection to one SSH server. `close` from another thread ends all waits.
 
     Args:
-        connect: Opens the stream; a backend decides by which way.
-        timing: How long the kernel waits for the peer.
+        connect: Opens the stream; provided by a backend.
+        timing: Timeouts of the connection.
 
     Attributes:
-        doing: What the server is to do next, for messages: `FIRST`, or `send its SSH banner`.
+        doing: The next action of the server, for messages: `FIRST`, or for example `send its SSH banner`.
     """
 
     FIRST: Final = "accept the connection"
@@ -171,39 +171,39 @@ class Link:
 
     @property
     def alive(self) -> bool:
-        """Whether it is logged in and not known to be broken."""
+        """Whether it is logged in, and no error has occurred."""
         return not self._closed and self._transport is not None and self._transport.is_authenticated()
 
-    def greet(self, kind: str) -> HostKey:
-        """Connect, agree on keys, and return the server's host key: of type `kind` if it has one.
+    def exchange_keys(self, kind: str) -> HostKey:
+        """Connect, exchange keys, and return the server's host key, of type `kind` if it has one.
 
         Raises:
             OSError: The stream could not be opened, or broke.
-            SSHException: The server speaks no SSH.
-            UnfitServerError: It offers nothing that is safe.
-            EOFError: It hung up.
+            SSHException: The server does not support SSH.
+            UnfitServerError: It supports only insecure algorithms.
+            EOFError: It closed the connection.
         """
         stream = self._connect(self._timing.connect_s)
-        _watch(stream, self._timing)
+        _enable_keepalive(stream, self._timing)
         transport = paramiko.Transport(stream, packetizer_class=_Packetizer)
         with self._lock:
             self._stream, self._transport = stream, transport
             if self._closed:
                 stream.close()
-        # Who waits for us keeps the deadline; these only must not come sooner.
+        # The caller has a deadline; these timeouts must only be longer.
         transport.banner_timeout = transport.auth_timeout = 2 * self._timing.connect_s
-        kinds = sorted(_SIGNATURES, key=lambda one: one != kind)
+        kinds = sorted(_SIGNATURES, key=lambda key_type: key_type != kind)
         options = transport.get_security_options()
-        options.key_types = [name for one in kinds for name in _SIGNATURES[one]]
-        options.ciphers, options.digests = _safe(options.ciphers), _safe(options.digests)
+        options.key_types = [name for key_type in kinds for name in _SIGNATURES[key_type]]
+        options.ciphers, options.digests = _without_weak(options.ciphers), _without_weak(options.digests)
         self.doing = "send its SSH banner"
-        agreed = threading.Event()
-        transport.start_client(event=agreed)
-        while not agreed.wait(0.02):
+        key_exchanged = threading.Event()
+        transport.start_client(event=key_exchanged)
+        while not key_exchanged.wait(0.02):
             if transport.remote_version:
                 self.doing = "agree on keys"
         if not transport.is_active():
-            error = transport.get_exception() or EOFError("it hung up")
+            error = transport.get_exception() or EOFError("it closed the connection")
             if isinstance(error, paramiko.ssh_exception.IncompatiblePeer):
                 raise UnfitServerError(str(error).partition("(")[2].rstrip(")")) from error
             raise error
@@ -216,94 +216,94 @@ class Link:
         Raises:
             RobotError: The host key is not the pinned one.
             LoginRefusedError: The robot refused the user, the key or the password.
-            ConfigurationError: There is no key to log in with.
-            OSError, SSHException, EOFError: As `greet`.
+            ConfigurationError: There is no key for the login.
+            OSError, SSHException, EOFError: As `exchange_keys`.
         """
         pinned = credentials.host_key
-        offered = self.greet(pinned.kind)
+        offered = self.exchange_keys(pinned.kind)
         if offered != pinned:
             raise HostKeyError(
                 f"the host key changed: pinned {pinned.fingerprint}, offered {offered.fingerprint}",
                 where=address.robot,
-                remedy=f"do not go on, unless it was reinstalled: fieldkit enroll {address.robot} --replace",
+                remedy=f"continue only if it was reinstalled: fieldkit enroll {address.robot} --replace",
             )
         self.doing = "answer the login"
-        _, transport = self._up()
+        _, transport = self._connected()
         count = 0
         for attempt in _attempts(transport, address, credentials):
             with contextlib.suppress(paramiko.AuthenticationException):
                 attempt()
             if transport.is_authenticated():
-                self.replenish()
+                self.open_spares()
                 return
-            if not transport.is_active():  # a server also hangs up on the sixth wrong key
+            if not transport.is_active():  # a server also disconnects after the sixth wrong key
                 break
             count += 1
         if not count:
-            raise EOFError("it hung up")
+            raise EOFError("it closed the connection")
         raise _refused(address, credentials, count)
 
     def begin(self, command: str, deadline: Deadline, ended: threading.Event) -> Channel:
-        """Return the channel of a command that the server has accepted.
+        """Start a command, and return its channel when the server has accepted it.
 
         Raises:
             ExpiredError: The deadline passed, or `ended` was set.
             OSError, SSHException, EOFError: The connection broke.
         """
-        _, transport = self._up()
+        _, transport = self._connected()
         channel = bounded(lambda: self._channel(transport), deadline, ended, what="get a channel")
         bounded(lambda: channel.exec_command(command), deadline, ended, what="start")
         self.acknowledge()
         assert isinstance(transport.packetizer, _Packetizer)
-        # From now on no packet more than necessary: a radio under test may be measured.
+        # From now on only necessary packets are sent, because the radio under test may be measured.
         transport.packetizer.acknowledges = False
         return channel
 
     def acknowledge(self) -> None:
-        """Acknowledge what the robot said now, so that no late acknowledgement meets what its command sends."""
-        stream, _ = self._up()
+        """Send the TCP acknowledgement now, so that no delayed one collides with packets of the robot's command."""
+        stream, _ = self._connected()
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
-    def endure(self, seconds: float) -> None:
-        """Let the peer be silent for so many seconds more than else, before the kernel takes it for gone."""
-        stream, _ = self._up()
-        _bear(stream, self._timing.dead_s + seconds)
+    def extend_timeout(self, seconds: float) -> None:
+        """Extend `Timing.dead_s`, the time that the peer may be silent, by some seconds."""
+        stream, _ = self._connected()
+        _set_timeout(stream, self._timing.dead_s + seconds)
 
-    def replenish(self) -> None:
-        """Begin to open channels for commands to come, so that none waits for its own: call when a command ended.
+    def open_spares(self) -> None:
+        """Start to open channels for later commands, which then need not wait for one.
 
-        Not when one begins: the answers would meet what it sends.
+        Must be called after a command has ended. At its start the answers would collide with its packets.
         """
-        _, transport = self._up()
-        if _hangs_up(transport):
+        _, transport = self._connected()
+        if _closes_spares(transport):
             return
         with self._lock:
-            wanted = max(0, SPARES - len(self._spares))
-            self._spares += [self._opening(transport) for _ in range(wanted)]
+            missing = max(0, SPARES - len(self._spares))
+            self._spares += [self._open_in_background(transport) for _ in range(missing)]
 
-    def settle(self, deadline: Deadline) -> None:
-        """Wait until no channel is being opened ahead, or the deadline has passed."""
+    def wait_until_opened(self, deadline: Deadline) -> None:
+        """Wait until all channels are opened that are opened in advance, or the deadline has passed."""
         with self._lock:
             spares = list(self._spares)
         wait(spares, timeout=deadline.remaining_s)
 
-    def another(self) -> Channel | None:
-        """Return a channel beside the spare ones; None where the server has no room for it.
+    def open_additional(self) -> Channel | None:
+        """Open a channel in addition to the spare ones; return None if the server does not allow it.
 
         Raises:
             OSError, SSHException, EOFError: The connection broke, or the server refuses more.
         """
-        _, transport = self._up()
-        if _hangs_up(transport):
+        _, transport = self._connected()
+        if _closes_spares(transport):
             return None
         with self._lock:
             spares = list(self._spares)
         for spare in spares:
-            spare.result()  # a server that keeps to few has none for this
+            spare.result()  # raises if the server has refused a spare channel, as it would refuse this one
         return self._open(transport)
 
     def _channel(self, transport: paramiko.Transport) -> Channel:
-        """Return an open channel: a spare one, unless the server keeps to fewer or has closed it."""
+        """Return an open channel: a spare one, or a new one if the server has refused or closed the spare ones."""
         while True:
             with self._lock:
                 spare = self._spares.pop(0) if self._spares else None
@@ -313,7 +313,7 @@ class Link:
                 if not (channel := spare.result()).closed:
                     return channel
 
-    def _opening(self, transport: paramiko.Transport) -> "Future[Channel]":
+    def _open_in_background(self, transport: paramiko.Transport) -> "Future[Channel]":
         future: Future[Channel] = Future()
 
         def work() -> None:
@@ -329,7 +329,7 @@ class Link:
         try:
             channel = transport.open_session(timeout=self._channel_s)
         except paramiko.SSHException as error:
-            # Of two channels that are refused at once, paramiko gives the reason to one.
+            # If two channels are refused at the same time, paramiko reports the reason for one only.
             if isinstance(error, paramiko.ChannelException) or _REFUSED in str(error):
                 raise NoSessionError(getattr(error, "text", "it gives no reason")) from error
             raise
@@ -339,11 +339,11 @@ class Link:
 
     @property
     def _channel_s(self) -> float:
-        """How long a channel may take: longer than who waits for it does."""
+        """Timeout for opening a channel; longer than the deadline of the waiting thread."""
         return 2 * self._timing.connect_s
 
     def close(self) -> None:
-        """End the connection, also while it is being made; what runs on the robot goes on."""
+        """Close the connection, also while it is being opened; commands on the robot continue."""
         with self._lock:
             self._closed = True
             stream, transport = self._stream, self._transport
@@ -351,42 +351,42 @@ class Link:
             transport.close()
             stream.close()
 
-    def _up(self) -> tuple[socket.socket, paramiko.Transport]:
+    def _connected(self) -> tuple[socket.socket, paramiko.Transport]:
         if self._stream is None or self._transport is None:
             raise EOFError("not connected")
         return self._stream, self._transport
 
 
-def _hangs_up(transport: paramiko.Transport) -> bool:
-    """Whether the server hangs up over channels that are opened ahead.
+def _closes_spares(transport: paramiko.Transport) -> bool:
+    """Return True if the server closes channels that are opened in advance.
 
-    dropbear (2022.83) closes those that wait for a command when that of another ends.
+    dropbear (2022.83) closes channels without a command when the command of another channel ends.
     """
     return "dropbear" in transport.remote_version
 
 
-def _safe(names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(name for name in names if not any(word in name for word in _BROKEN_WORDS))
+def _without_weak(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name for name in names if not any(word in name for word in _WEAK_ALGORITHMS))
 
 
-def _watch(stream: socket.socket, timing: Timing) -> None:
-    """Let the kernel end the connection when the peer is gone, also while nothing is sent."""
+def _enable_keepalive(stream: socket.socket, timing: Timing) -> None:
+    """Let the kernel close the connection if the peer does not answer, also while no data is sent."""
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    _bear(stream, timing.dead_s)
+    _set_timeout(stream, timing.dead_s)
     stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, timing.probe_s)
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, timing.probe_s)
 
 
-def _bear(stream: socket.socket, seconds: float) -> None:
-    """Let data or probes be unacknowledged for so long: with it set, Linux counts no probes (tcp(7))."""
+def _set_timeout(stream: socket.socket, seconds: float) -> None:
+    """Set the maximum age of unacknowledged data or probes; Linux then ignores the number of probes (tcp(7))."""
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(seconds * 1000))
 
 
 def _attempts(
     transport: paramiko.Transport, address: Address, credentials: Credentials
 ) -> Iterator[Callable[[], object]]:
-    """Yield each way to log in."""
+    """Yield a function for each login method."""
     user, password = address.user, credentials.password
     if password is not None:
         yield lambda: transport.auth_password(user, password)
@@ -397,11 +397,11 @@ def _attempts(
 
 def _refused(address: Address, credentials: Credentials, count: int) -> LoginRefusedError:
     if credentials.password is not None:
-        by, remedy = "the password", f"ssh {address.by_hand}, and log in with that password"
+        method, remedy = "the password", f"ssh {address.by_hand}, and log in with that password"
     else:
-        by, remedy = format_count(count, "key"), f"ssh-copy-id {address.by_hand}"
+        method, remedy = format_count(count, "key"), f"ssh-copy-id {address.by_hand}"
     return LoginRefusedError(
-        f"refused the login of {address.user!r} with {by}",
+        f"refused the login of {address.user!r} with {method}",
         where=address.robot,
         remedy=f"{remedy}; is `user` right in the site file?",
     )

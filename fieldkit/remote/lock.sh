@@ -1,15 +1,16 @@
-# Who holds this robot.
+# The lock of this robot.
 #
-# The lock is the highest-numbered lock.N beside this file that is whole: KIND TOKEN BOOT FROM TO SINCE UNTIL WHO WHAT,
-# where KIND is held, free or aborted, FROM and TO are seconds since boot, SINCE and UNTIL those of the clock.
+# The lock is the complete file lock.N with the highest number in the folder of this script. It contains KIND TOKEN BOOT
+# FROM TO SINCE UNTIL WHO WHAT: KIND is held, free, aborted or stopped, FROM and TO are seconds since boot, SINCE and UNTIL
+# seconds of the clock.
 #
-# Two laptops may come at once, and there may be no flock: each change of the lock is a new file with the next number,
-# which only one can create. The highest number is never removed; so whoever created a number that had been used and
-# removed before finds a higher one. A record is on the disk before it gets its number, and the one before it is there
-# until then: neither a full disk nor the end of power leaves a robot with a lock that says nothing.
+# Two laptops may change the lock at the same time, and flock may be missing: each change creates a new file with the next
+# number, which only one of them can create. The highest number is never deleted, so a process that creates a number which
+# was used and deleted before detects a higher one. A record is flushed to the disk before it gets its number, and the
+# previous record exists until then: neither a full disk nor a power failure leaves a robot without a valid record.
 TTL=3600
 
-newest() { # set n to the highest number, 0 if there is none, read the newest record that is whole, set torn to how many are not
+newest() { # set n to the highest number (0: none) and torn to the number of incomplete records, read the newest complete one
     n=0 best=0 torn=0 kind=free holder=- booted=- from=0 to=0 since=0 until=0 who=- what=-
     for record in "$base"/lock.*; do
         number=${record##*.}
@@ -27,13 +28,13 @@ newest() { # set n to the highest number, 0 if there is none, read the newest re
         elif [ -e "$record" ]; then
             torn=$((torn + 1))
         else
-            newest # a newer one took its place meanwhile
+            newest # it was replaced by a newer record in the meantime
             return
         fi
     done
 }
 
-record() { # KIND TOKEN SECONDS WHO WHAT: write the next record; false if somebody else was sooner, or it cannot be written
+record() { # KIND TOKEN SECONDS WHO WHAT: write the next record; false if another process was faster, or on an error
     clock
     read -r boot </proc/sys/kernel/random/boot_id
     wall
@@ -56,22 +57,22 @@ record() { # KIND TOKEN SECONDS WHO WHAT: write the next record; false if somebo
     done
 }
 
-wall() { # set wall to what the clock says, whatever else `date` does, and to 0 where it tells no time
+wall() { # set wall to the clock in seconds, or to 0 if `date` fails
     wall=$(date +%s)
     wall=${wall##*[!0-9]}
     wall=${wall:-0}
 }
 
-age() { # set age and rest of the record: seconds since it was made, and until it expires; false once it has expired
+age() { # set age and rest to the seconds since the record was made and until it expires; false if it has expired
     clock
     read -r boot </proc/sys/kernel/random/boot_id
     if [ "$booted" = "$boot" ]; then
-        age=$((now - from)) rest=$((to - now)) # a clock that is set meanwhile changes nothing
+        age=$((now - from)) rest=$((to - now)) # independent of changes of the clock
     else
         wall
         age=$((wall - since)) rest=$((until - wall))
     fi
-    # A robot without a battery for its clock may have booted into the past.
+    # The clock of a robot without a battery for it may be in the past after a boot.
     [ "$rest" -gt 0 ] && [ "$age" -ge 0 ]
 }
 
@@ -81,14 +82,14 @@ lock() {
         if [ "$kind" = held ] && [ "$holder" != "$1" ] && age; then
             fail "held $age $rest $since $who $what" "$HELD"
         fi
-        # An older version of this script writes its record after it has created it.
+        # An older version of this script creates the file before it writes the record.
         [ "$torn" -gt 0 ] && [ "$try" -lt 4 ] && nap 0.05 && continue
         record held "$@" && return
     done
     unwritten "$base/lock"
 }
 
-renew() { # the lock of $1: at half its time, or where less than $2 seconds are left, then for half an hour more than those
+renew() { # the lock of token $1 after half of its time, or if less than $2 seconds remain: for at least $2 s + 30 min
     newest
     case $kind:$holder in
         held:"$1")
@@ -99,7 +100,7 @@ renew() { # the lock of $1: at half its time, or where less than $2 seconds are 
             ;;
         held:*) fail "held $since $who $what" "$LOST" ;;
         aborted:"$1" | stopped:"$1") fail "$kind $since $who $what" "$LOST" ;;
-        free:-) lock "$1" "$TTL" somebody "$1" ;; # the robot lost its files
+        free:-) lock "$1" "$TTL" somebody "$1" ;; # the robot has lost its files
         *) fail "gone $since $who $what" "$LOST" ;;
     esac
 }
@@ -129,7 +130,7 @@ abort() {
     [ -z "$full" ] || broken aborted || [ "$kind" != held ] || unwritten "$base/lock"
 }
 
-broken() { # break the lock in the name of $by, as $1 says: aborted or stopped; false if that cannot be written; kind, who and what are those of before
+broken() { # write a record of kind $1 (aborted or stopped) by $by; kind, who and what are then those of the previous record; false on an error
     how=$1
     for try in 1 2 3 4 5 6 7 8; do
         newest

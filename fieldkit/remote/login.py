@@ -1,4 +1,4 @@
-"""Making a connection to a robot: bounded by a deadline, each failure explained with a command to type."""
+"""Log in to a robot within a deadline. Each failure is reported with a command that helps to find the cause."""
 
 import contextlib
 import errno
@@ -12,7 +12,7 @@ from fieldkit.core.errors import FieldkitError, LinkError, LinkLostError, RobotE
 from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.link import BROKEN, Connect, Link, Timing, UnfitServerError
 
-_NO_WAY: Final = {errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN}
+_NO_ROUTE: Final = {errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN}
 
 
 def log_in(
@@ -27,32 +27,32 @@ def log_in(
     """Return a connection that is logged in.
 
     Raises:
-        LinkLostError: The robot was not reached, or did not do its part by the deadline.
+        LinkLostError: The robot was not reached, or did not answer before the deadline.
         LinkError: `ended` was set.
         RobotError: Its host key is not the pinned one.
         LoginRefusedError: It refused the login.
-        ConfigurationError: There is no key to log in with.
+        ConfigurationError: There is no key for the login.
     """
     link = Link(connect, timing)
-    with _explained(link, address, ended):
+    with _converting_errors(link, address, ended):
         bounded(lambda: link.log_in(address, credentials), deadline, ended)
     return link
 
 
 def offered_key(address: Address, connect: Connect, *, deadline: Deadline, kind: str = "ssh-ed25519") -> HostKey:
-    """Return the host key that a server offers, without logging in: of type `kind` if it has one.
+    """Return the host key of a server without a login, of type `kind` if it has one.
 
     Raises:
-        LinkLostError: The robot was not reached, or did not do its part by the deadline.
+        LinkLostError: The robot was not reached, or did not answer before the deadline.
     """
     link, never = Link(connect, Timing()), threading.Event()
-    with _explained(link, address, never), contextlib.closing(link):
-        return bounded(lambda: link.greet(kind), deadline, never)
+    with _converting_errors(link, address, never), contextlib.closing(link):
+        return bounded(lambda: link.exchange_keys(kind), deadline, never)
 
 
 @contextlib.contextmanager
-def _explained(link: Link, address: Address, ended: threading.Event) -> Iterator[None]:
-    """Close a link that could not be made, and say what hung or broke."""
+def _converting_errors(link: Link, address: Address, ended: threading.Event) -> Iterator[None]:
+    """Close a link that could not be opened, and convert its exception to an error with a remedy."""
     try:
         yield
     except BaseException as error:
@@ -60,24 +60,24 @@ def _explained(link: Link, address: Address, ended: threading.Event) -> Iterator
         if isinstance(error, FieldkitError) or not isinstance(error, BROKEN):
             raise
         if ended.is_set():
-            raise closed(address) from error
+            raise closed_error(address) from error
         if isinstance(error, UnfitServerError):
             raise RobotError(
                 f"its SSH server cannot be trusted with a login: {error}",
                 where=address.robot,
                 remedy=f"update it; `ssh -vv {address.by_hand} true` shows what it offers",
             ) from error
-        what, remedy = _said(error, link.doing, address)
+        what, remedy = _explanation(error, link.doing, address)
         raise LinkLostError(what, where=address.robot, remedy=remedy) from error
 
 
-def closed(address: Address) -> LinkError:
+def closed_error(address: Address) -> LinkError:
     """Return the error of a wait that `close` ended."""
     return LinkError("fieldkit closed the connection", where=address.robot)
 
 
-def _said(error: BaseException, doing: str, address: Address) -> tuple[str, str]:
-    """Return what went wrong and the remedy, both for a person."""
+def _explanation(error: BaseException, doing: str, address: Address) -> tuple[str, str]:
+    """Return the message of an error, and its remedy."""
     host = address.host
     cannot = f"{host} cannot be reached for SSH"
     if isinstance(error, socket.gaierror):
@@ -85,14 +85,14 @@ def _said(error: BaseException, doing: str, address: Address) -> tuple[str, str]
     if isinstance(error, ConnectionRefusedError):
         remedy = "start its SSH server (Debian: sudo systemctl start ssh); is `port` right in the site file?"
         return f"{cannot}: nothing listens on port {address.port}", remedy
-    if isinstance(error, OSError) and error.errno in _NO_WAY:
-        return f"{cannot}: there is no way to it", f"ip route get {host}; is this computer in the robots' network?"
+    if isinstance(error, OSError) and error.errno in _NO_ROUTE:
+        return f"{cannot}: there is no route to it", f"ip route get {host}; is this computer in the robots' network?"
     if isinstance(error, TimeoutError):
-        by_hand = f"ping -c 3 {host}" if doing == Link.FIRST else f"ssh -v {address.by_hand}"
-        return f"{host} did not {doing} in time", f"{by_hand}; is the robot up and in range?"
+        command = f"ping -c 3 {host}" if doing == Link.FIRST else f"ssh -v {address.by_hand}"
+        return f"{host} did not {doing} in time", f"{command}; is the robot up and in range?"
     if doing == Link.FIRST:
         return f"{cannot}: {error}", f"ping -c 3 {host}; is the robot up and in range?"
-    return f"{host} broke the connection when it was to {doing}: {_text(error)}", f"ssh -v {address.by_hand}"
+    return f"{host} broke the connection before it could {doing}: {_text(error)}", f"ssh -v {address.by_hand}"
 
 
 def _text(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""Stop what moves robots: programs of the agent that drive or fly them, whatever fieldkit has started them."""
+"""Stop the programs of the agent that drive or fly robots, including those of other instances of fieldkit."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -9,24 +9,24 @@ from typing import Final
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.threads import together
-from fieldkit.remote.script import SCRIPT, SCRIPT_PATH, call, demand, word
+from fieldkit.remote.script import SCRIPT, SCRIPT_PATH, call, require_success, word
 from fieldkit.remote.shell import Shell
 
 _LINE: Final = re.compile(r"(?P<program>\S+/\.jobs/\S+) (?P<state>[a-z]+)")
 
 
 class MotionState(StrEnum):
-    """What a robot does that was told to stop, the worst last; `job.sh` has the same words for each program.
+    """State of a robot after the order to stop, the worst last; `job.sh` uses the same names for each program.
 
     Attributes:
         NOTHING: No program of fieldkit moves it; nothing is sent to it.
         STATIONARY: Its odometry shows no motion.
         LANDED: Its motors have stopped.
-        ENDED: The program has ended without a word about the robot: it had not begun to move it.
-        LAND: A drone is coming down where it is.
-        RETURN: A drone is coming back, and then down.
-        SILENT: The program was signalled and has not confirmed anything. One that drives was killed.
-        ALARM: The program cannot bring its drone down now: its autopilot is not heard, or another party flies it.
+        ENDED: The program has ended without a report about the robot: it had not started to move it.
+        LAND: A drone is landing at its position.
+        RETURN: A drone is returning, and will land then.
+        SILENT: The program received a signal and has not confirmed anything. A driving program was killed.
+        ALARM: The program cannot land its drone now: the autopilot sends no heartbeat, or another party flies it.
     """
 
     NOTHING = "nothing"
@@ -39,18 +39,18 @@ class MotionState(StrEnum):
     ALARM = "alarm"
 
 
-_ORDER: Final = tuple(MotionState)
+_BY_SEVERITY: Final = tuple(MotionState)
 COMING_DOWN: Final = frozenset({MotionState.LAND, MotionState.RETURN})
 
 IN_WORDS: Final[Mapping[MotionState, str]] = {
     MotionState.NOTHING: "nothing of fieldkit moves it; nothing was sent to it",
     MotionState.STATIONARY: "stopped (standing)",
     MotionState.LANDED: "stopped (on the ground)",
-    MotionState.ENDED: "stopped (its program had not begun to move it, or has ended)",
+    MotionState.ENDED: "stopped (its program had not started to move it, or has ended)",
     MotionState.LAND: "coming down (land)",
     MotionState.RETURN: "coming down (return)",
-    MotionState.SILENT: "NOT CONFIRMED: stop it by hand; its program was ended and has not confirmed that it stands",
-    MotionState.ALARM: "ALARM: IT MAY STILL BE IN THE AIR, AND ITS AUTOPILOT IS NOT HEARD OR DOES NOT OBEY. "
+    MotionState.SILENT: "NOT CONFIRMED: stop it by hand; its program was signalled but has not confirmed the stop",
+    MotionState.ALARM: "ALARM: IT MAY STILL BE IN THE AIR, AND ITS AUTOPILOT SENDS NO HEARTBEAT OR DOES NOT OBEY. "
     "TAKE IT OVER BY REMOTE CONTROL, OR COMMAND LAND OR RTL AT THE GROUND STATION",
 }
 
@@ -61,7 +61,7 @@ class Halted:
 
     Attributes:
         programs: State of each program that was stopped, by `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home.
-        error: What could not be done, if anything: the robot was not reached, or its lock not written.
+        error: The error if the robot was not reached or its lock could not be written; None otherwise.
     """
 
     programs: tuple[tuple[str, MotionState], ...] = ()
@@ -69,19 +69,19 @@ class Halted:
 
     @property
     def state(self) -> MotionState:
-        """What the robot does: the worst state of its programs."""
+        """State of the robot: the worst state of its programs."""
         states = (state for _, state in self.programs)
-        return max(states, key=_ORDER.index, default=MotionState.NOTHING)
+        return max(states, key=_BY_SEVERITY.index, default=MotionState.NOTHING)
 
 
 def halt(shell: Shell, who: str, deadline: Deadline) -> Halted:
-    """Stop every program that moves a robot, of any trial, and the trial that holds the robot.
+    """Stop all programs that move a robot, from any trial, and the trial that has locked the robot.
 
-    The script is not installed for it, as for `jobs.abort`: a full disk does not keep a robot from stopping.
+    The script is not installed for it, as for `jobs.abort`: a full disk must not prevent a stop.
 
     Args:
         shell: The robot.
-        who: Named to those whose trial ends.
+        who: Name of the operator, which is reported to the stopped trial.
         deadline: When to give up.
 
     Raises:
@@ -91,14 +91,14 @@ def halt(shell: Shell, who: str, deadline: Deadline) -> Halted:
     done = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
     error = None
     try:
-        demand(shell, done)
-    except FieldkitError as failed:
-        error = failed
+        require_success(shell, done)
+    except FieldkitError as script_error:
+        error = script_error
     return Halted(_states(done.stdout), error)
 
 
 def halt_attempt(shell: Shell, folder: str, who: str, deadline: Deadline) -> Halted:
-    """Stop every program that moves a robot for an attempt, whose folder this is; the robot has the job script.
+    """Stop all programs that move a robot for the attempt with this folder; the job script must be installed.
 
     Raises:
         LinkError: The robot did not answer.
@@ -108,12 +108,12 @@ def halt_attempt(shell: Shell, folder: str, who: str, deadline: Deadline) -> Hal
 
 
 def look(shell: Shell, programs: Iterable[str], deadline: Deadline) -> Halted:
-    """Return the state of programs that `halt_attempt` returned; errors as there."""
+    """Return the present state of programs from `halt_attempt`; raises as that."""
     return Halted(_states(call(shell, "motion_states", *programs, deadline=deadline)))
 
 
 def life_signs(shell: Shell, file: str, deadline: Deadline) -> bytes:
-    """Return the file that the pilot and the guard of a drone share, then /proc/uptime; errors as `halt_attempt`."""
+    """Return the liveness file of the pilot and the guard of a drone, then /proc/uptime; raises as `halt_attempt`."""
     return call(shell, "life_signs", file, deadline=deadline)
 
 
@@ -123,13 +123,13 @@ def halt_all(
     within_s: float,
     report: Callable[[str, Halted], None] = lambda _name, _halted: None,
 ) -> Mapping[str, Halted]:
-    """Stop every program that moves a robot, on all robots in parallel; return the result of each.
+    """Stop all programs that move robots, on all robots in parallel; return the result of each.
 
     Args:
-        robots: From `Backend.standing`.
-        who: See `halt`.
-        within_s: How long each robot may take.
-        report: Receives each result as soon as there is one, in any thread.
+        robots: The robots, from `Backend.standing`.
+        who: Name of the operator, see `halt`.
+        within_s: Timeout for each robot.
+        report: Called with each result as soon as it exists, in any thread.
     """
 
     def stop(name: str) -> Halted:
@@ -149,6 +149,8 @@ def halt_all(
 
 
 def _states(output: bytes) -> tuple[tuple[str, MotionState], ...]:
-    found = map(_LINE.fullmatch, output.decode("utf-8", "replace").splitlines())
-    known = set(MotionState)
-    return tuple((line["program"], MotionState(line["state"])) for line in found if line and line["state"] in known)
+    matches = map(_LINE.fullmatch, output.decode("utf-8", "replace").splitlines())
+    valid_states = set(MotionState)
+    return tuple(
+        (line["program"], MotionState(line["state"])) for line in matches if line and line["state"] in valid_states
+    )

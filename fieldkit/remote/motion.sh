@@ -1,6 +1,6 @@
-# Stop what moves this robot: the agent's programs that drive it, fly it, or watch a drone.
+# Stop the programs of the agent that drive this robot, fly it, or guard a drone.
 
-moves() { # whether the job in $1 is such a program, `drive` or `fly`: sets program
+moves() { # true if the job in $1 is such a program; sets program to `drive` or `fly`
     line=
     read -r line 2>/dev/null <"$1/command" || [ -n "$line" ] || return 1
     case $line in
@@ -10,18 +10,18 @@ moves() { # whether the job in $1 is such a program, `drive` or `fly`: sets prog
     esac
 }
 
-halt_motion() { # in the name of $1, those of folder $2 alone if it is given
+halt_motion() { # in the name of $1; only the programs of folder $2 if it is given
     by=$1 halted=
-    # First of all the signals: they need no room on a disk, and nobody waits.
+    # The signals are sent first: they need no disk space and no wait.
     if [ -n "${2-}" ]; then
         brake "$base/${2#*/}"
     else
         brake "$base"/*/*
         stray_movers
         newest
-        # A trial that holds the robot starts nothing from here on, and learns why from `renew`.
+        # After this the trial that holds the lock starts nothing, and `renew` reports the reason to it.
         [ "$kind" != held ] || broken stopped || full=1
-        brake "$base"/*/* # what was started meanwhile
+        brake "$base"/*/* # programs that were started in the meantime
     fi
     tries=0
     while [ "$tries" -lt 60 ] && awaited; do # each takes 20 ms and a fork
@@ -30,13 +30,13 @@ halt_motion() { # in the name of $1, those of folder $2 alone if it is given
     done
     case $tries$(motion_states $halted) in
         0*) ;;
-        *" land"* | *" return"*) nap 0.05 ;; # a drone on the ground has landed by then
+        *" land"* | *" return"*) nap 0.05 ;; # a drone on the ground reports `landed` within this time
     esac
     motion_states $halted
     for name in $halted; do
         meta=$base/${name#*/}
         moves "$meta" && motion_state "$meta"
-        # It does not go on, whatever keeps it. A drone's program is not killed: another one may bring the drone down.
+        # A driving program that does not react is killed. A program of a drone is not: it may still land the drone.
         [ "$state:$program" != silent:drive ] || { alive "$meta" && signal KILL; }
     done
     [ -z "${full-}" ] || unwritten "$base/lock"
@@ -44,7 +44,7 @@ halt_motion() { # in the name of $1, those of folder $2 alone if it is given
 
 brake() { # signal each such program in folders $@, and add it to halted: TRIAL/ATTEMPT/.jobs/NAME below the home
     for dir do
-        # Who starts a program looks for this behind its record, and is seen here or sees it.
+        # A starting program writes its pid and then checks for this file: it is found here, or finds the file.
         [ -d "$dir/.jobs" ] && { printf '%s\n' "$by" >"$dir/.ended"; } 2>/dev/null
         for meta in "$dir"/.jobs/*; do
             name=${meta#"${base%/*}"/}
@@ -52,14 +52,14 @@ brake() { # signal each such program in folders $@, and add it to halted: TRIAL/
             moves "$meta" && alive "$meta" || continue
             halted="$halted $name"
             ask
-            # A suspended one gets the first signal with the second.
+            # A suspended process handles SIGINT after SIGCONT.
             signal INT
             signal CONT
         done
     done
 }
 
-stray_movers() { # the same for those whose folder was removed: they have no record, and are listed as ended
+stray_movers() { # signal such programs whose folder was deleted; they have no record, and are listed as ended
     home=$(cd "$base" 2>/dev/null && pwd -P) || return 0
     ls -ld /proc/[0-9]*/cwd 2>/dev/null | while read -r line; do
         case $line in *"/cwd -> $home/"*" (deleted)") ;; *) continue ;; esac
@@ -75,7 +75,7 @@ stray_movers() { # the same for those whose folder was removed: they have no rec
     done
 }
 
-awaited() { # whether one of halted has not said yet what becomes of its robot
+awaited() { # true if a program of halted has not reported the state of its robot yet
     for name in $halted; do
         moves "$base/${name#*/}" && motion_state "$base/${name#*/}"
         [ "$state" != silent ] || return 0
@@ -83,7 +83,7 @@ awaited() { # whether one of halted has not said yet what becomes of its robot
     return 1
 }
 
-motion_state() { # set state of the program in $1, whose kind is in program
+motion_state() { # set state to that of the program in $1; program must be set
     state=silent
     if [ "$program" = drive ]; then
         [ ! -e "$1/stationary" ] || state=stationary
@@ -100,7 +100,7 @@ motion_state() { # set state of the program in $1, whose kind is in program
     case $state in silent | land | return) alive "$1" || state=ended ;; esac
 }
 
-landing() { # list the programs that still bring a drone down, of any trial: DIR/.jobs/NAME STATE
+landing() { # list the programs of all trials that still land a drone: DIR/.jobs/NAME STATE
     for meta in "$base"/*/*/.jobs/*; do
         [ -e "$meta/unhurried" ] && alive "$meta" && moves "$meta" && motion_state "$meta" &&
             echo "lands ${meta#"${base%/*}"/} $state"
@@ -112,7 +112,7 @@ life_signs() { # print file $1, which the pilot and the guard of a drone share, 
     cat "$1" /proc/uptime
 }
 
-motion_states() { # of programs $@
+motion_states() { # print the states of programs $@
     for name do
         moves "$base/${name#*/}" && motion_state "$base/${name#*/}" && echo "$name $state"
     done

@@ -1,4 +1,4 @@
-"""Passwords, from a person at the terminal or the system's keyring; never in a file. The only user of keyring."""
+"""Passwords from the terminal or the system's keyring, never from a file. Only this module imports keyring."""
 
 import getpass
 import shutil
@@ -11,31 +11,31 @@ from fieldkit.core.errors import ConfigurationError, typed
 SERVICE: Final = "fieldkit"
 
 Ask = Callable[[str, str, str], str]
-"""Returns the password of a user on a host, which is a robot's."""
+"""Returns a password; the arguments are the user, the host, and the name of the robot."""
 
 
 def at_terminal(user: str, host: str, robot: str) -> str:
-    """Return the password that a person types, unseen.
+    """Return the password that the operator types, without echo.
 
     Raises:
-        ConfigurationError: There is no terminal to ask at.
+        ConfigurationError: Standard input is not a terminal.
     """
     if not sys.stdin.isatty():
         raise ConfigurationError(
             f"the password of {user}@{host} must be typed, and there is no terminal to ask at",
             where=robot,
-            remedy=f"{_store(user, host)}, and write `password: keyring`; or use a key",
+            remedy=f"{_store_command(user, host)}, and write `password: keyring`; or use a key",
         )
     return getpass.getpass(f"password of {user}@{host} ({robot}): ")
 
 
 def in_keyring(user: str, host: str, robot: str) -> str:
-    """Return the password that the keyring has.
+    """Return the password from the keyring.
 
     Raises:
-        ConfigurationError: It has none, or there is no keyring.
+        ConfigurationError: The keyring has no such password, or there is no keyring.
     """
-    import keyring  # noqa: PLC0415 (50 ms, which `fieldkit stop` has no time for)
+    import keyring  # noqa: PLC0415 (takes 50 ms, which would delay `fieldkit stop`)
     import keyring.errors  # noqa: PLC0415
 
     try:
@@ -46,12 +46,12 @@ def in_keyring(user: str, host: str, robot: str) -> str:
         ) from error
     if password is None:
         raise ConfigurationError(
-            f"the keyring has no password of {user}@{host}", where=robot, remedy=_store(user, host)
+            f"the keyring has no password of {user}@{host}", where=robot, remedy=_store_command(user, host)
         )
     return password
 
 
-def _store(user: str, host: str) -> str:
-    """Return what stores a password; an environment of its own, as pipx makes them, is on no path."""
+def _store_command(user: str, host: str) -> str:
+    """Return the command that stores a password; in an environment of pipx, `keyring` is not on the PATH."""
     program = ("keyring",) if shutil.which("keyring") else (sys.executable, "-m", "keyring")
     return typed(*program, "set", SERVICE, f"{user}@{host}")

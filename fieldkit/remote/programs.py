@@ -1,17 +1,17 @@
-"""Programs of the lab on a robot: copied into the folder of an attempt, and deleted with it."""
+"""Copy programs from this computer to a robot, into the folder of an attempt; they are deleted with it."""
 
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.remote.script import HOME, REPLY_S, demand
+from fieldkit.remote.script import HOME, REPLY_S, require_success
 from fieldkit.remote.shell import Shell
 
-_SLOWEST_BYTES_PER_S: Final = 14_000.0
-"""As for evidence: a link that carries less is of no use."""
+_MIN_BYTES_PER_S: Final = 14_000.0
+"""Minimum rate of a usable link, as for evidence."""
 
-# $1 folder of the program, $2 its name, $3 its mode, $4 its SHA-256. A name that begins with a dot is not evidence,
-# so that it is not fetched.
-_PLACE: Final = (
+# $1 folder of the program, $2 its name, $3 its mode, $4 its SHA-256. Folders whose name begins with a dot are not
+# evidence, so that the program is not fetched.
+_COPY_SCRIPT: Final = (
     'umask 077 && mkdir -p "$1" && cat >"$1/$2.$$" && said=$(sha256sum <"$1/$2.$$") && '
     '{ [ "${said%% *}" = "$4" ] || { echo "the copy is not whole: $1/$2" >&2; exit 1; }; } && '
     'chmod "$3" "$1/$2.$$" && mv -f "$1/$2.$$" "$1/$2"'
@@ -19,22 +19,22 @@ _PLACE: Final = (
 
 
 def path(job: str, name: str) -> str:
-    """Return where a program is for a job, seen from the folder of its attempt.
+    """Return the path of a program for a job, relative to the folder of the attempt.
 
     Args:
-        job: Name of the job that runs it; each has a folder of its own.
+        job: Name of the job that runs it; each job has a separate folder.
         name: Name of the file.
     """
     return f".put/{job}/{name}"
 
 
 def place(shell: Shell, folder: str, at: str, content: bytes, sha256: str, *, executable: bool) -> None:
-    """Copy a program into the folder of an attempt; repeated, it changes nothing.
+    """Copy a program into the folder of an attempt; idempotent.
 
     Args:
         shell: The robot.
         folder: The attempt's folder on the robot.
-        at: From `path`.
+        at: The path of the program, from `path`.
         content: The program.
         sha256: Its SHA-256, which the robot checks.
         executable: Whether the copy may be executed.
@@ -43,8 +43,17 @@ def place(shell: Shell, folder: str, at: str, content: bytes, sha256: str, *, ex
         LinkError: The robot did not answer.
         RobotError: It cannot be written there.
     """
-    inside, _, name = at.rpartition("/")
-    argv = ("sh", "-c", _PLACE, "sh", f"{folder}/{inside}", name, "700" if executable else "600", sha256)
-    deadline = Deadline.after(2 * REPLY_S + len(content) / _SLOWEST_BYTES_PER_S)
-    placed = shell.run(argv, stdin=content, deadline=deadline, check=False)
-    demand(shell, placed, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")
+    program_folder, _, name = at.rpartition("/")
+    argv = (
+        "sh",
+        "-c",
+        _COPY_SCRIPT,
+        "sh",
+        f"{folder}/{program_folder}",
+        name,
+        "700" if executable else "600",
+        sha256,
+    )
+    deadline = Deadline.after(2 * REPLY_S + len(content) / _MIN_BYTES_PER_S)
+    copied = shell.run(argv, stdin=content, deadline=deadline, check=False)
+    require_success(shell, copied, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")

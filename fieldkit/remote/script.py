@@ -1,4 +1,4 @@
-"""The job script on a robot: put there once per version, called for everything that must survive a connection."""
+"""The job script on a robot: installed once per version, and called for all tasks that must survive a connection."""
 
 import hashlib
 import re
@@ -13,10 +13,10 @@ from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Completed, Shell
 
 HOME: Final = ".fieldkit"
-"""Folder of everything that fieldkit keeps on a robot, below the user's home."""
+"""Folder of all files of fieldkit on a robot, below the user's home."""
 
 REPLY_S: Final = 10.0
-"""How long the robot may take for its part of a command besides the command itself."""
+"""Timeout for the answer of a robot, in addition to the duration of the command."""
 
 _PARTS: Final = ("common.sh", "leader.sh", "lock.sh", "evidence.sh", "telemetry.sh", "motion.sh", "job.sh")
 _FOLDER: Final = Path(__file__).parent
@@ -25,34 +25,34 @@ SCRIPT: Final = b"\n".join(_FOLDER.joinpath(name).read_bytes() for name in _PART
 _SHA256: Final = hashlib.sha256(SCRIPT).hexdigest()
 SCRIPT_PATH: Final = f"{HOME}/job-{_SHA256[:12]}.sh"
 CALL: Final = ("sh", SCRIPT_PATH)
-"""How the script is called, before its verb."""
+"""The command that calls the script, without its verb."""
 
-# Nobody else may write there, whoever made it: a capture by sudo runs the script as root. Where somebody could, a
-# script that is not ours, or not whole, is replaced.
-_LOOK: Final = (
+# Other users must not be able to write to the folder, because sudo runs the script as root for captures. A script
+# that has another owner or other content is replaced.
+_CHECK_SCRIPT: Final = (
     'umask 077 && mkdir -p "$1" && chmod go-rwx "$1" && [ -O "$2" ] && [ ! -L "$2" ] && '
     'said=$(sha256sum <"$2") && [ "${said%% *}" = "$3" ] && exec sh "$2" needs'
 )
-_PLACE: Final = (
+_COPY_SCRIPT: Final = (
     'umask 077 && mkdir -p "$1" && chmod go-rwx "$1" && cat >"$2.$$" && mv "$2.$$" "$2" && exec sh "$2" needs'
 )
 
-_LACKS: Final = b"it lacks "
+_MISSING_PROGRAM: Final = b"it lacks "
 _INSTALL: Final = "install it: apt-get install util-linux coreutils gawk grep tar, or a whole busybox"
 _GREETING_BYTES: Final = 60
-_MOUNTED: Final = "on the robot: dmesg | tail; a card that fails turns read-only, so save what it has"
+_READ_ONLY_REMEDY: Final = "on the robot: dmesg | tail; a failing SD card becomes read-only, so save its data"
 
-HELD_REMEDY: Final = "wait, go on with it if it is yours, or end it: fieldkit abort"
-"""What to do about a robot that somebody holds; one's own trial holds it too, when its laptop died."""
+HELD_REMEDY: Final = "wait, resume that trial if it is yours, or end it: fieldkit abort"
+"""Remedy for a locked robot. The holder may be the operator's own trial, if its laptop failed."""
 
-_SAYS: Final = b"job.sh: "
+_MESSAGE_PREFIX: Final = b"job.sh: "
 _HELD: Final = re.compile(
     r"held (?P<age>-?\d{1,11}) (?P<rest>-?\d{1,11}) (?P<since>\d{1,11}) (?P<who>\S+) (?P<what>.+)", re.ASCII
 )
 _LOST: Final = re.compile(
     r"(?P<kind>aborted|stopped|held|gone) (?P<since>\d{1,11}) (?P<who>\S+) (?P<what>.+)", re.ASCII
 )
-_WHY_LOST: Final = {
+_LOSS_MESSAGES: Final = {
     "aborted": "the trial was aborted by {who} at {at}",
     "stopped": "{who} stopped the robots at {at} (fieldkit stop)",
     "held": "{who} took the robot at {at} for {what}, after this trial's lock had expired",
@@ -61,72 +61,80 @@ _WHY_LOST: Final = {
 
 
 def install(shell: Shell, deadline: Deadline) -> None:
-    """Put the job script on the robot where it is not there yet, and see that the robot can run it.
+    """Install the job script on the robot if it is missing there, and check that the robot can run it.
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: Its home cannot be written, it lacks a program, or its login shell greets commands.
+        RobotError: Its home cannot be written, a program is missing, or its login shell prints a greeting.
     """
-    looked = shell.run(("sh", "-c", _LOOK, "sh", HOME, SCRIPT_PATH, _SHA256), deadline=deadline, check=False)
-    if looked.stdout:  # it would be taken for what a job says, and for evidence
+    checked = shell.run(("sh", "-c", _CHECK_SCRIPT, "sh", HOME, SCRIPT_PATH, _SHA256), deadline=deadline, check=False)
+    if checked.stdout:  # it would be mixed with the output of jobs, and with evidence
         raise RobotError(
-            f"its login shell answers every command with {printable(looked.stdout[:_GREETING_BYTES])!r}",
+            f"its login shell answers every command with {printable(checked.stdout[:_GREETING_BYTES])!r}",
             where=shell.robot,
             remedy="first line of ~/.bashrc (or its like) on the robot: case $- in *i*) ;; *) return ;; esac",
         )
-    if looked.exit_code == 0:
+    if checked.exit_code == 0:
         return
-    placed = shell.run(("sh", "-c", _PLACE, "sh", HOME, SCRIPT_PATH), stdin=SCRIPT, deadline=deadline, check=False)
-    demand(shell, placed, remedy=_INSTALL if _LACKS in placed.stderr else f"on the robot: touch ~/{HOME}/x; df -h ~")
+    copied = shell.run(
+        ("sh", "-c", _COPY_SCRIPT, "sh", HOME, SCRIPT_PATH), stdin=SCRIPT, deadline=deadline, check=False
+    )
+    require_success(
+        shell,
+        copied,
+        remedy=_INSTALL if _MISSING_PROGRAM in copied.stderr else f"on the robot: touch ~/{HOME}/x; df -h ~",
+    )
 
 
 def call(shell: Shell, verb: str, *words: str, deadline: Deadline) -> bytes:
-    """Run a verb of the script that starts and waits for no job; return what it printed.
+    """Run a verb of the script that neither starts a job nor waits for one; return its standard output.
 
     Raises:
         LinkError: The robot did not answer.
-        LockLostError: The lock of this trial is not ours any more.
+        LockLostError: This trial has lost its lock.
         RobotError: The script failed.
     """
     done = shell.run((*CALL, verb, *words), deadline=deadline, check=False)
-    demand(shell, done)
+    require_success(shell, done)
     return done.stdout
 
 
-def demand(shell: Shell, done: Completed, *, remedy: str = "") -> None:
-    """Raise what a failed call of the script means: as `call`."""
+def require_success(shell: Shell, done: Completed, *, remedy: str = "") -> None:
+    """Check that a call of the script succeeded; raises as `call` otherwise."""
     if done.exit_code == 0:
         return
-    # A login shell that lets nobody in says so on either stream.
-    said = printable(done.stderr or done.stdout) or "no message"
-    what = complaint(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {said}"
+    # A login shell that refuses the login (nologin) prints its message to either stream.
+    output = printable(done.stderr or done.stdout) or "no message"
+    what = error_message(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {output}"
     match done.exit_code:
-        case 75 if held := _HELD.match(what):  # codes of the script's own, see common.sh
-            age, rest = (format_duration(float(held[name])) for name in ("age", "rest"))
-            what = f"{held['who']} holds it since {_moment(held)}, {age} ago, for {held['what']}; expires in {rest}"
+        case 75 if held := _HELD.match(what):  # exit codes of the script, see common.sh
+            age, remaining = (format_duration(float(held[name])) for name in ("age", "rest"))
+            what = (
+                f"{held['who']} holds it since {_since(held)}, {age} ago, for {held['what']}; expires in {remaining}"
+            )
             remedy = HELD_REMEDY
         case 76 if lost := _LOST.match(what):
             raise LockLostError(
-                _WHY_LOST[lost["kind"]].format(at=_moment(lost), **lost.groupdict()), where=shell.robot
+                _LOSS_MESSAGES[lost["kind"]].format(at=_since(lost), **lost.groupdict()), where=shell.robot
             )
         case 77:
-            remedy = "see to its battery and supply; on the robot: uptime -s"
+            remedy = "check its battery and power supply; on the robot: uptime -s"
         case 28:
             remedy = f"see what fills its disk: df -h; du -sh ~/{HOME}/*; then remove old trials and bags"
-    by_hand = _MOUNTED if "Read-only file system" in what else "run the command on the robot by hand"
-    raise RobotError(what, where=shell.robot, remedy=remedy or by_hand)
+    default_remedy = _READ_ONLY_REMEDY if "Read-only file system" in what else "run the command on the robot by hand"
+    raise RobotError(what, where=shell.robot, remedy=remedy or default_remedy)
 
 
 def word(text: str) -> str:
-    """Return `text` as one word that a lock's record can hold."""
+    """Return `text` as one word for the record of a lock; other characters are replaced by `_`."""
     return re.sub(r"[^A-Za-z0-9._@-]", "_", text)[:80] or "-"
 
 
-def complaint(stderr: bytes) -> str:
-    """Return what the script says about its own failure as one line; empty where only a job spoke, or nothing."""
-    reason, _, log = stderr.partition(_SAYS)[2].partition(b"\n")
+def error_message(stderr: bytes) -> str:
+    """Return the error message of the script as one line; empty if standard error contains none."""
+    reason, _, log = stderr.partition(_MESSAGE_PREFIX)[2].partition(b"\n")
     return ": ".join(text for text in (printable(reason), printable(log)) if text)
 
 
-def _moment(record: re.Match[str]) -> str:
+def _since(record: re.Match[str]) -> str:
     return f"{datetime.fromtimestamp(int(record['since']), UTC):%H:%M:%S UTC}"

@@ -1,4 +1,4 @@
-"""The Shell protocol: how everything else runs commands on a robot and moves files."""
+"""The Shell protocol: runs commands on a robot, and fetches files."""
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -11,13 +11,13 @@ from fieldkit.core.deadline import Deadline
 
 @dataclass(frozen=True)
 class Completed:
-    """A remote command that ended.
+    """The result of a remote command.
 
     Attributes:
         argv: The command.
         exit_code: Its exit code.
-        stdout: All of its standard output.
-        stderr: All of its standard error.
+        stdout: Its complete standard output.
+        stderr: Its complete standard error.
     """
 
     argv: tuple[str, ...]
@@ -27,19 +27,19 @@ class Completed:
 
 
 class Session(Protocol):
-    """A remote command that runs; nothing crosses the connection until `end`, or until it writes something."""
+    """A running remote command. The connection is silent until `end` is called or the command writes output."""
 
     @property
     def told(self) -> bool:
-        """Whether the command wrote what `Shell.begin` waited for; false if it ended without."""
+        """Whether the command wrote the output for which `Shell.begin` waited; False if it ended before."""
         ...
 
     def end(self, *, deadline: Deadline, check: bool = True) -> Completed:
-        """Close the command's standard input, if it is open, and wait for its end; both streams are drained.
+        """Close the command's standard input, if it is open, and wait for its end; both streams are read.
 
         Args:
             deadline: When to give up.
-            check: Raise when the exit code is not 0.
+            check: Whether to raise if the exit code is not 0.
 
         Raises:
             LinkError: The connection broke, or the deadline passed.
@@ -49,11 +49,11 @@ class Session(Protocol):
 
 
 class Shell(Protocol):
-    """A connection to one robot, which it makes again by itself when it was lost.
+    """A connection to one robot, which is reopened automatically after a loss.
 
-    Every command must be one that may be sent twice with the effect of once. When the link is lost nobody knows how
-    far a command got, so a Shell may connect again and send the same words again, also in the middle of
-    `Session.end`. A command that merely takes too long is not sent again.
+    Every command must be idempotent. After a loss of the link the progress of a command is unknown, so a Shell may
+    reconnect and send the same command again, also during `Session.end`. A command that only takes too long is not
+    sent again.
     """
 
     @property
@@ -63,17 +63,17 @@ class Shell(Protocol):
 
     @property
     def by_hand(self) -> str:
-        """What a person types after `ssh` to get there."""
+        """The arguments for `ssh` to this robot."""
         ...
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> Session:
-        """Start a command and return when the robot has accepted it, which tells its end when `end` asks for it.
+        """Start a command and return when the robot has accepted it.
 
         Args:
-            argv: Argument list; quoting is the Shell's work.
+            argv: Argument list; the Shell quotes it.
             deadline: When to give up.
-            until: Return when the command has written this, or has ended; its end is told at once then, and asking
-                for it sends nothing.
+            until: Return when the command has written this output, or has ended. The robot then reports the end of
+                the command without a request. If it is None, the end is reported only when `Session.end` requests it.
 
         Raises:
             LinkError: The robot could not be reached, or the deadline passed.
@@ -81,13 +81,13 @@ class Shell(Protocol):
         ...
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        """Run a command and wait for its end; both streams are drained.
+        """Run a command and wait for its end; both streams are read.
 
         Args:
-            argv: Argument list; quoting is the Shell's work.
+            argv: Argument list; the Shell quotes it.
             deadline: When to give up.
-            stdin: Fed to the command, then closed.
-            check: Raise when the exit code is not 0.
+            stdin: Standard input of the command.
+            check: Whether to raise if the exit code is not 0.
 
         Raises:
             LinkError: The robot could not be reached, the connection broke, or the deadline passed.
@@ -105,13 +105,13 @@ class Shell(Protocol):
         ...
 
     def silence(self, seconds: float) -> AbstractContextManager[None]:
-        """Keep the connection silent while the body measures, where it crosses the radio under test.
+        """Keep the connection silent during the body, if it crosses the radio under test.
 
-        A connection that is lost meanwhile is made again after the body, or after `seconds` where the body waits for
-        it: so long it is also awaited, and patience begins then. What the connection carries is not touched.
+        A connection that is lost during the body is reopened after it, or after `seconds` if the body waits for the
+        connection. The time limit for reopening starts then. Data of running commands are not affected.
         """
         ...
 
     def close(self) -> None:
-        """End the connection, and all waiting for it in other threads; what runs on the robot goes on."""
+        """Close the connection, and end all waits for it in other threads; commands on the robot continue."""
         ...

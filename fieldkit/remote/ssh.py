@@ -1,4 +1,4 @@
-"""Shell over SSH: pinned host key, a deadline on everything, a command sent again when the link was lost."""
+"""Shell over SSH: pinned host key, deadlines for all operations, commands repeated after a loss of the link."""
 
 import contextlib
 import errno
@@ -11,39 +11,39 @@ from fieldkit.core.deadline import Deadline, ExpiredError
 from fieldkit.core.errors import LinkError, LinkLostError, RobotError
 from fieldkit.remote.command import printable, quote
 from fieldkit.remote.connection import Connection
-from fieldkit.remote.drain import drain, hear
+from fieldkit.remote.drain import drain, wait_for_output
 from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.link import BROKEN, Connect, FloodError, Link, NoSessionError, Timing
 from fieldkit.remote.script import CALL
 from fieldkit.remote.shell import Completed
-from fieldkit.remote.standing import Running, Turn
+from fieldkit.remote.standing import Execution, RunningCommand
 
 CONNECT_S: Final = Timing.connect_s
 PATIENCE_S: Final = 60.0
 
-_KEEP_OUTPUT_BYTES: Final = 16 << 20
-_NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_MAX_OUTPUT_BYTES: Final = 16 << 20
+_DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class SshShell:
-    """A Shell over one SSH connection, made when first used and again after it was lost.
+    """A Shell over one SSH connection, which is opened at its first use, and reopened after a loss.
 
     Args:
         robot: Name of the robot, for messages.
-        connect: Opens the stream; a backend decides by which way.
+        connect: Opens the stream; provided by a backend.
         user: Login name.
         host_key: Pinned host key as in `known_hosts`: `ssh-ed25519 AAAA...`.
-        private_key: OpenSSH private key text; None asks the SSH agent, unless there is a password.
-        password: Tried alone where it is given.
-        host: Where the robot is, for messages; its name where left out.
-        port: Its SSH port, for messages.
-        patience_s: How long a lost connection is awaited.
-        notice: Told in one line when the connection is lost, and when it is back.
-        on_air: Whether it crosses the radio under test.
-        timing: How long it waits.
+        private_key: OpenSSH private key text; None uses the keys of the SSH agent, unless there is a password.
+        password: The password, which is then the only method; None to use keys.
+        host: Host name or address, for messages; empty for the name of the robot.
+        port: SSH port, for messages.
+        patience_s: Time for which a lost connection is reopened.
+        notice: Called with one line when the connection is lost, and when it is restored.
+        on_air: Whether the connection crosses the radio under test.
+        timing: Timeouts of the connection.
 
     Raises:
-        ConfigurationError: `host_key` is none.
+        ConfigurationError: `host_key` is not a host key.
     """
 
     def __init__(
@@ -79,20 +79,20 @@ class SshShell:
 
     @property
     def by_hand(self) -> str:
-        """See `Shell.by_hand`."""
+        """The arguments for `ssh` to this robot."""
         return self._connection.address.by_hand
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> "SshSession":
-        """See `Shell.begin`."""
-        return self._begin(argv, deadline, asks=until is None, until=until or b"")
+        """Start a command and return when the robot has accepted it, or has written `until`; as `Shell.begin`."""
+        return self._begin(argv, deadline, ends_on_request=until is None, until=until or b"")
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        """See `Shell.run`."""
-        session = self._begin(argv, deadline, feeds=bool(stdin))
+        """Run a command and wait for its end; as `Shell.run`."""
+        session = self._begin(argv, deadline, has_input=bool(stdin))
         return session.end(deadline=deadline, stdin=stdin, check=check)
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
-        """See `Shell.fetch`."""
+        """Run a command and write its standard output to a file; as `Shell.fetch`."""
         session = self._begin(argv, deadline)
         with to.open("wb") as out:
             return session.end(deadline=deadline, out=out, limit_bytes=limit_bytes)
@@ -102,58 +102,67 @@ class SshShell:
         argv: Sequence[str],
         deadline: Deadline,
         *,
-        asks: bool = False,
-        feeds: bool = False,
+        ends_on_request: bool = False,
+        has_input: bool = False,
         until: bytes = b"",
     ) -> "SshSession":
         def attempt(within: Deadline) -> SshSession:
-            link, channel = _start(self._connection, argv, within, asks=asks, feeds=feeds)
-            with _explained(self._connection.address, link, argv), contextlib.ExitStack() as opened:
-                opened.enter_context(contextlib.closing(channel))
-                told = not until or hear(channel, until, deadline=within, robot=self.robot)
+            link, channel = _start(
+                self._connection, argv, within, ends_on_request=ends_on_request, has_input=has_input
+            )
+            with _converting_errors(self._connection.address, link, argv), contextlib.ExitStack() as stack:
+                stack.enter_context(contextlib.closing(channel))
+                told = not until or wait_for_output(channel, until, deadline=within, robot=self.robot)
                 link.acknowledge()
-                opened.pop_all()
-            return SshSession(self._connection, argv, (link, channel), asks=asks, feeds=feeds, told=told)
+                stack.pop_all()
+            return SshSession(
+                self._connection,
+                argv,
+                (link, channel),
+                ends_on_request=ends_on_request,
+                has_input=has_input,
+                told=told,
+            )
 
-        return self._connection.persist(attempt, deadline)
+        return self._connection.run_with_retries(attempt, deadline)
 
     def silence(self, seconds: float) -> contextlib.AbstractContextManager[None]:
-        """See `Shell.silence`."""
+        """Keep the connection silent during the body, if it crosses the radio under test; as `Shell.silence`."""
         return self._connection.silence(seconds)
 
     def close(self) -> None:
-        """See `Shell.close`."""
+        """Close the connection, and end all waits for it in other threads."""
         self._connection.close()
 
 
 class SshSession:
-    """See `Session`; made by `SshShell.begin`.
+    """A running command, created by `SshShell.begin`.
 
     Args:
-        connection: Carries it.
+        connection: The connection.
         argv: The command.
-        running: Its channel, and the link of that.
-        asks: Whether the robot tells its end when asked.
-        feeds: Whether it gets standard input.
-        told: See `Session.told`.
+        running: The link, and the channel of the command on it.
+        ends_on_request: Whether the robot reports the end of the command only on request.
+        has_input: Whether the command has standard input.
+        told: Whether the command wrote the expected output, see `Session.told`.
     """
 
     def __init__(
         self,
         connection: Connection,
         argv: Sequence[str],
-        running: tuple[Link, Running],
+        running: tuple[Link, Execution],
         *,
-        asks: bool,
-        feeds: bool,
+        ends_on_request: bool,
+        has_input: bool,
         told: bool,
     ) -> None:
         self.told = told
         self._connection = connection
         self._argv = tuple(argv)
-        self._running: tuple[Link, Running] | None = running
-        self._asks = asks
-        self._feeds = feeds
+        self._running: tuple[Link, Execution] | None = running
+        self._ends_on_request = ends_on_request
+        self._has_input = has_input
 
     def end(
         self,
@@ -162,39 +171,49 @@ class SshSession:
         check: bool = True,
         stdin: bytes = b"",
         out: IO[bytes] | None = None,
-        limit_bytes: int = _KEEP_OUTPUT_BYTES,
+        limit_bytes: int = _MAX_OUTPUT_BYTES,
     ) -> Completed:
-        """See `Session.end`, `Shell.run` and `Shell.fetch`; output goes to `out` where it is given."""
-        kept = io.BytesIO()
-        into = out or kept
+        """Wait for the end of the command; as `Session.end`, `Shell.run` and `Shell.fetch`.
+
+        Args:
+            deadline: When to give up.
+            check: Whether to raise if the exit code is not 0.
+            stdin: Standard input of the command.
+            out: File for standard output; None to return it in the result.
+            limit_bytes: Maximum size of standard output.
+        """
+        buffer = io.BytesIO()
+        output = out or buffer
 
         def attempt(within: Deadline) -> tuple[int, bytes]:
             link, channel = self._running or _start(
-                self._connection, self._argv, within, asks=self._asks, feeds=self._feeds
+                self._connection, self._argv, within, ends_on_request=self._ends_on_request, has_input=self._has_input
             )
             self._running = None
-            into.seek(0)
-            into.truncate()
-            with _explained(self._connection.address, link, self._argv), contextlib.closing(channel):
-                given = stdin if self._asks or self._feeds else None
-                if isinstance(channel, Turn):  # which has no input to be closed
-                    given = None
-                    if self._asks:
-                        channel.ask()
-                done = drain(channel, into, stdin=given, deadline=within, limit_bytes=limit_bytes, robot=self._robot)
-                standing = f"exec {quote((*CALL, 'stand'))}" if _is_call(self._argv) else None
-                self._connection.replenish(link, standing)
+            output.seek(0)
+            output.truncate()
+            with _converting_errors(self._connection.address, link, self._argv), contextlib.closing(channel):
+                pending_input = stdin if self._ends_on_request or self._has_input else None
+                if isinstance(channel, RunningCommand):  # it has no standard input that could be closed
+                    pending_input = None
+                    if self._ends_on_request:
+                        channel.request_end()
+                done = drain(
+                    channel, output, stdin=pending_input, deadline=within, limit_bytes=limit_bytes, robot=self._robot
+                )
+                shell_command = f"exec {quote((*CALL, 'stand'))}" if _is_call(self._argv) else None
+                self._connection.open_spares(link, shell_command)
                 return done
 
-        exit_code, stderr = self._connection.persist(attempt, deadline)
+        exit_code, stderr = self._connection.run_with_retries(attempt, deadline)
         if check and exit_code != 0:
             raise RobotError(
                 f"`{quote(self._argv)}` ended with exit code {exit_code}: "
-                f"{printable(stderr or kept.getvalue()) or 'no message'}",
+                f"{printable(stderr or buffer.getvalue()) or 'no message'}",
                 where=self._robot,
                 remedy="run the command on the robot by hand",
             )
-        return Completed(self._argv, exit_code, kept.getvalue(), stderr)
+        return Completed(self._argv, exit_code, buffer.getvalue(), stderr)
 
     @property
     def _robot(self) -> str:
@@ -202,37 +221,39 @@ class SshSession:
 
 
 def _start(
-    connection: Connection, argv: Sequence[str], deadline: Deadline, *, asks: bool, feeds: bool
-) -> tuple[Link, Running]:
-    """Return a command that the robot has accepted, and the link that carries it.
+    connection: Connection, argv: Sequence[str], deadline: Deadline, *, ends_on_request: bool, has_input: bool
+) -> tuple[Link, Execution]:
+    """Start a command; return it and its link when the robot has accepted it.
 
-    Whose end is told at once finds standard input empty without a word from us, which would cross what it sends.
-    Whose end is asked for has it open, in a session of its own. A call of the job script that gets no input goes to
-    a standing shell, if one has nothing else to do.
+    The standard input of a command whose end is reported without a request is /dev/null, so that no packet to close
+    it is sent while the command sends data. If its end is reported on request, its standard input stays open in a
+    separate session. A call of the job script without standard input runs in a persistent shell, if one is free.
     """
-    # A shell that is told where to read from may stand between us and the command's end, unless it is replaced.
-    words = quote(argv) if asks or feeds else f"exec {quote(argv)} </dev/null"
+    # Without `exec`, the login shell would wait for the command and delay the report of its end.
+    command_line = quote(argv) if ends_on_request or has_input else f"exec {quote(argv)} </dev/null"
     ended = connection.ended
     link = connection.link(deadline)
     try:
-        with _explained(connection.address, link, argv):
-            turn = None
-            if _is_call(argv) and not feeds:
-                turn = connection.standing.begin(link, quote(argv[len(CALL) :]), deadline, ended, held=asks)
-            return link, turn or link.begin(words, deadline, ended)
+        with _converting_errors(connection.address, link, argv):
+            running = None
+            if _is_call(argv) and not has_input:
+                running = connection.shells.begin(
+                    link, quote(argv[len(CALL) :]), deadline, ended, held=ends_on_request
+                )
+            return link, running or link.begin(command_line, deadline, ended)
     except LinkError:
-        link.close()  # a server that does not answer this will not answer the next
+        link.close()  # a server that does not answer this command will not answer the next one
         raise
 
 
 def _is_call(argv: Sequence[str]) -> bool:
-    """Whether a command is one that fits a line of the job script's standing shell."""
+    """Return True if a command is a call of the job script that fits on one line of a persistent shell."""
     return tuple(argv[: len(CALL)]) == CALL and not any("\n" in word for word in argv)
 
 
 @contextlib.contextmanager
-def _explained(address: Address, link: Link, argv: Sequence[str]) -> Iterator[None]:
-    """Turn what paramiko, the socket and the deadline raise into errors with robot, command and remedy."""
+def _converting_errors(address: Address, link: Link, argv: Sequence[str]) -> Iterator[None]:
+    """Convert exceptions of paramiko, the socket and the deadline to errors with robot, command and remedy."""
     command, robot = quote(argv), address.robot
     try:
         yield
@@ -243,14 +264,14 @@ def _explained(address: Address, link: Link, argv: Sequence[str]) -> Iterator[No
     except FloodError as error:
         link.close()
         raise RobotError(
-            f"its SSH server did not keep to SSH during `{command}`: {error}",
+            f"its SSH server violated the SSH protocol during `{command}`: {error}",
             where=robot,
-            remedy=f"ssh -v {address.by_hand} true; is it the robot that answers, and its SSH server up to date?",
+            remedy=f"ssh -v {address.by_hand} true; does the robot answer, and is its SSH server up to date?",
         ) from error
     except BROKEN as error:
         link.close()
-        if isinstance(error, OSError) and error.errno in _NO_ROOM:
-            raise  # this machine's own disk: connecting again would not help
+        if isinstance(error, OSError) and error.errno in _DISK_FULL:
+            raise  # the disk of this machine is full: reconnecting would not help
         if isinstance(error, NoSessionError):
             raise LinkLostError(
                 f"its SSH server opens no session: {error}",

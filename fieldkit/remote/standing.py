@@ -1,10 +1,10 @@
-"""Shells that stay open on a robot: commands go down their channels, and no session is opened for each.
+"""Persistent shells on a robot: they run commands without a new SSH session for each command.
 
-A command is a line, `NONCE VERB WORD...`, quoted as everything remote is. The shell answers on either stream with the
-nonce, what the command writes, and the nonce again with the exit code: this when another line asks for it, where
-`held` stands before the verb. The nonce is drawn for each command, and no program on the robot is told it. So output
-of any kind, whether it ends a line or not, is not taken for the end of an answer, and what a process left behind
-writes between two commands is dropped.
+A command is a line `NONCE VERB WORD...`, quoted as all remote commands. On both streams the shell writes the nonce,
+the output of the command, and the nonce again with the exit code. If `held` precedes the verb, it writes the end only
+after it has received another line. The nonce is random for each command, and programs on the robot do not receive it.
+Therefore no output, with or without a newline at its end, can be mistaken for the end of an answer, and output of
+processes that were left behind is dropped between two commands.
 """
 
 import re
@@ -20,30 +20,30 @@ _READY: Final = b"ready\n"
 _CHUNK: Final = 1 << 15
 _NONCE_BYTES: Final = 16
 _END: Final = re.compile(rb" [0-9]{1,3}\n")
-_END_BYTES: Final = 5
-_SHELLS: Final = 2
-"""How many a robot gets: a capture and a listener begin on it at the same time."""
+_MIN_END_BYTES: Final = 5
+_SHELL_COUNT: Final = 2
+"""Number of shells per robot: a capture and a listener start at the same time."""
 
 
-class Standing:
-    """The standing shells of one robot, opened anew on each link, each for one command at a time.
+class ShellPool:
+    """The persistent shells of one robot, which are opened again on each link. Each runs one command at a time.
 
-    What finds none that is free is carried as always, by a channel of its own.
+    If no shell is free, the caller must open a separate channel for its command.
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()  # of what follows
+        self._lock = threading.Lock()  # of the attributes below
         self._link: Link | None = None
-        self._shells: list[StandingShell] = []
+        self._shells: list[PersistentShell] = []
         self._opening = False
         self._opener: threading.Thread | None = None
 
     def begin(
-        self, link: Link, words: str, deadline: Deadline, ended: threading.Event, *, held: bool = False
-    ) -> "Turn | None":
-        """Return a command that a shell on `link` has begun; None if none is free, or it has ended.
+        self, link: Link, command_line: str, deadline: Deadline, ended: threading.Event, *, held: bool = False
+    ) -> "RunningCommand | None":
+        """Start a command in a shell on `link`; return None if no shell is free, or if the shell has ended.
 
-        With `held`, the shell tells its end when `Turn.ask` asks for it.
+        With `held`, the shell reports the end of the command only after `RunningCommand.request_end`.
 
         Raises:
             ExpiredError: The deadline passed, or `ended` was set.
@@ -51,28 +51,28 @@ class Standing:
         """
         with self._lock:
             shells = list(self._shells) if self._link is link else []
-        shell = next((one for one in shells if one.take()), None)
+        shell = next((candidate for candidate in shells if candidate.reserve()), None)
         if shell is None:
             return None
-        line = f"held {words}" if held else words
-        turn = bounded(lambda: shell.start(line), deadline, ended, what="start")
+        full_line = f"held {command_line}" if held else command_line
+        command = bounded(lambda: shell.start(full_line), deadline, ended, what="start")
         link.acknowledge()
-        return turn
+        return command
 
     def restore(self, link: Link, command: str) -> None:
-        """Begin to open a shell by `command` where `link` has too few, unless that failed on it before."""
+        """Start to open a shell by `command` if `link` has too few, unless that failed on this link before."""
         with self._lock:
             if self._link is not link:
                 self._link, self._shells, self._opening = link, [], False
             self._shells = [shell for shell in self._shells if shell.alive]
-            if self._opening or len(self._shells) == _SHELLS:
+            if self._opening or len(self._shells) == _SHELL_COUNT:
                 return
             self._opening = True
             self._opener = threading.Thread(target=self._open, args=(link, command), daemon=True)
             self._opener.start()
 
-    def settle(self, deadline: Deadline) -> None:
-        """Wait until no shell is being opened, or the deadline has passed."""
+    def wait_until_opened(self, deadline: Deadline) -> None:
+        """Wait until no shell is being opened any more, or the deadline has passed."""
         with self._lock:
             opener = self._opener
         if opener is not None:
@@ -80,91 +80,91 @@ class Standing:
 
     def _open(self, link: Link, command: str) -> None:
         with suppress(*BROKEN):
-            channel = link.another()
-            shell = None if channel is None else StandingShell.open(channel, command)
+            channel = link.open_additional()
+            shell = None if channel is None else PersistentShell.open(channel, command)
             with self._lock:
                 if shell is not None and self._link is link:
                     self._shells, self._opening = [*self._shells, shell], False
 
 
-class StandingShell:
-    """One command at a time: who has taken it starts a command, and closing that gives it back.
+class PersistentShell:
+    """A shell for one command at a time: `reserve` reserves it, and `RunningCommand.close` releases it.
 
     Args:
-        channel: Carries it; it has said that it is ready.
+        channel: The channel of the shell, which has reported that it is ready.
     """
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
-        self._taken = threading.Lock()
+        self._reservation = threading.Lock()
 
     @classmethod
     def open(cls, channel: Channel, command: str) -> Self:
-        """Return the shell that `command` starts on `channel`, once it is ready.
+        """Start a shell by `command` on `channel`, and return it when it is ready.
 
         Raises:
-            EOFError: It is none, or a login shell greets first.
+            EOFError: The shell did not start, or a login shell printed a greeting before.
             OSError, SSHException: The connection broke.
         """
         channel.exec_command(command)
-        said = b""
-        while len(said) < len(_READY) and (piece := channel.recv(len(_READY) - len(said))):
-            said += piece
-        if said != _READY:
+        output = b""
+        while len(output) < len(_READY) and (piece := channel.recv(len(_READY) - len(output))):
+            output += piece
+        if output != _READY:
             channel.close()
-            raise EOFError("no shell that stays")
+            raise EOFError("the persistent shell did not start")
         return cls(channel)
 
     @property
     def alive(self) -> bool:
-        """Whether it is not known to have ended."""
+        """Whether the shell is open, as far as is known."""
         return not (self._channel.closed or self._channel.eof_received)
 
-    def take(self) -> bool:
-        """Return whether it lives and has no command, and is the caller's now."""
-        return self.alive and self._taken.acquire(blocking=False)
+    def reserve(self) -> bool:
+        """Reserve the shell for the caller; return False if it has ended or runs a command."""
+        return self.alive and self._reservation.acquire(blocking=False)
 
-    def start(self, words: str) -> "Turn | None":
-        """Return a command that the shell has begun; None if it has ended instead. It must have been taken.
+    def start(self, command_line: str) -> "RunningCommand | None":
+        """Start a command in a reserved shell; return None if the shell has ended.
 
         Raises:
             SSHException: The connection broke.
         """
         nonce = secrets.token_hex(_NONCE_BYTES).encode()
-        turn = Turn(self._channel, nonce, self._taken)
-        turn.settimeout(None)
-        with suppress(OSError):  # it has ended; if the connection has, whoever asks for a session is told
-            self._channel.sendall(nonce + b" " + words.encode() + b"\n")
-        return turn if turn.has_begun() else None
+        command = RunningCommand(self._channel, nonce, self._reservation)
+        command.settimeout(None)
+        with suppress(OSError):  # the shell has ended; a lost connection is reported by the next session
+            self._channel.sendall(nonce + b" " + command_line.encode() + b"\n")
+        return command if command.wait_for_start() else None
 
 
-class Turn:
-    """A command in a standing shell, read as a channel of its own is by `drain`.
+class RunningCommand:
+    """A command in a persistent shell, with the part of a channel's interface that `drain` uses.
 
     Args:
-        channel: The shell's.
-        nonce: The command's.
-        taken: Held as long as the shell has the command.
+        channel: The channel of the shell.
+        nonce: The nonce of the command.
+        reservation: The lock that reserves the shell; it is released by `close`.
     """
 
-    def __init__(self, channel: Channel, nonce: bytes, taken: threading.Lock) -> None:
+    def __init__(self, channel: Channel, nonce: bytes, reservation: threading.Lock) -> None:
         self._channel = channel
-        self._taken: threading.Lock | None = taken
-        self._over = threading.Event()
+        self._reservation: threading.Lock | None = reservation
+        self._end_event = threading.Event()
         self._out, self._err = _Stream(nonce), _Stream(nonce)
 
     def __del__(self) -> None:
-        """Close it where nobody did, as a channel does."""
+        """Close the command if it was not closed, as a channel does."""
         self.close()
 
-    def has_begun(self) -> bool:
-        """Wait until the shell has begun the command; return whether it has, and not ended instead."""
-        while not self._out.begun and (piece := self._channel.recv(_CHUNK)):
+    def wait_for_start(self) -> bool:
+        """Wait until the shell has started the command; return False if the shell has ended."""
+        while not self._out.has_started and (piece := self._channel.recv(_CHUNK)):
             self._out.feed(piece)
-        return self._out.begun
+        return self._out.has_started
 
-    def ask(self) -> None:
-        """Ask for the end of a command that is held.
+    def request_end(self) -> None:
+        """Request the end of a command that was started with `held`.
 
         Raises:
             OSError, SSHException: The connection broke.
@@ -173,64 +173,64 @@ class Turn:
 
     @property
     def eof_received(self) -> bool:
-        """Whether all that the command writes is here; takes in what has come since the last look."""
+        """Whether all output of the command has arrived; reads the available data of both streams."""
         if self._channel.recv_ready():
             self._out.feed(self._channel.recv(_CHUNK))
         if self._channel.recv_stderr_ready():
             self._err.feed(self._channel.recv_stderr(_CHUNK))
-        return self._ended or self._cut
+        return self._ended or self._is_cut_off
 
     @property
     def closed(self) -> bool:
-        """Whether nothing can come any more."""
-        return self._cut
+        """Whether no more output can arrive because the channel has ended."""
+        return self._is_cut_off
 
     @property
     def status_event(self) -> threading.Event:
-        """Set when there is an exit code, or will be none."""
-        return self._over if self._ended else self._channel.status_event
+        """An event that is set when the exit code is known, or cannot become known."""
+        return self._end_event if self._ended else self._channel.status_event
 
     def fileno(self) -> int:
-        """Return a descriptor to read from when something came that `eof_received` has not taken in."""
+        """Return a descriptor that is readable when data have arrived that `eof_received` has not read."""
         return self._channel.fileno()
 
     def get_transport(self) -> Transport:
-        """Return what carries the shell's channel."""
+        """Return the transport of the shell's channel."""
         return self._channel.get_transport()
 
     def settimeout(self, seconds: float | None) -> None:
-        """Bound each wait of `recv`."""
+        """Set the timeout of `recv`."""
         self._channel.settimeout(seconds)
 
     def recv_ready(self) -> bool:
-        """Return whether standard output of the command is here."""
-        return bool(self._out.said)
+        """Return True if standard output of the command is available."""
+        return bool(self._out.output)
 
     def recv_stderr_ready(self) -> bool:
-        """Return whether standard error of the command is here."""
-        return bool(self._err.said)
+        """Return True if standard error of the command is available."""
+        return bool(self._err.output)
 
     def recv(self, size_bytes: int) -> bytes:
-        """Return up to so much standard output, nothing at its end.
+        """Wait for standard output and return at most `size_bytes` of it; empty at its end.
 
         Raises:
-            TimeoutError: Nothing came in time.
+            TimeoutError: Nothing arrived in time.
         """
-        while self._out.lacks and (piece := self._channel.recv(_CHUNK)):
+        while self._out.is_waiting and (piece := self._channel.recv(_CHUNK)):
             self._out.feed(piece)
-        while not self._out.said and self._err.code is None and (piece := self._channel.recv_stderr(_CHUNK)):
+        while not self._out.output and self._err.code is None and (piece := self._channel.recv_stderr(_CHUNK)):
             self._err.feed(piece)
-        return self._out.take(size_bytes)
+        return self._out.read(size_bytes)
 
     def recv_stderr(self, size_bytes: int) -> bytes:
-        """Return up to so much standard error of what is here."""
-        return self._err.take(size_bytes)
+        """Return at most `size_bytes` of the available standard error."""
+        return self._err.read(size_bytes)
 
     def recv_exit_status(self) -> int:
-        """Return the exit code, -1 if the shell was ended by a signal or the connection broke.
+        """Return the exit code, or -1 if a signal terminated the shell or the connection broke.
 
         Raises:
-            EOFError: The shell ended by itself, and left the command.
+            EOFError: The shell has exited before the command.
         """
         if self._out.code is not None:
             return self._out.code
@@ -239,83 +239,83 @@ class Turn:
         return -1
 
     def close(self) -> None:
-        """Give the shell back where the command has ended, else end it."""
-        taken, self._taken = self._taken, None
+        """Release the shell if the command has ended; otherwise close the shell."""
+        reservation, self._reservation = self._reservation, None
         if not self._ended:
             self._channel.close()
-        elif taken is not None:
-            taken.release()
+        elif reservation is not None:
+            reservation.release()
 
     @property
     def _ended(self) -> bool:
         if self._out.code is not None and self._err.code is not None:
-            self._over.set()
-        return self._over.is_set()
+            self._end_event.set()
+        return self._end_event.is_set()
 
     @property
-    def _cut(self) -> bool:
-        """Whether the channel has ended, and all that came has been taken in."""
+    def _is_cut_off(self) -> bool:
+        """Whether the channel has ended, and all received data have been read."""
         ended = self._channel.closed or self._channel.eof_received
         return bool(ended) and not (self._channel.recv_ready() or self._channel.recv_stderr_ready())
 
 
-Running = Channel | Turn
-"""A command that runs: in a session of its own, or in a standing shell, without standard input."""
+Execution = Channel | RunningCommand
+"""A running command: in a separate session, or in a persistent shell, which provides no standard input."""
 
 
 class _Stream:
-    """What a command writes to one stream, told from what came before and from the end of the answer.
+    """Extracts the output of a command from one stream, between the marks at its start and at its end.
 
     Args:
-        nonce: Tells both.
+        nonce: The text of both marks.
 
     Attributes:
-        begun: Whether the answer has begun.
-        said: What the command has written and nobody has taken.
-        code: Its exit code, once the end is here.
+        has_started: Whether the start mark has arrived.
+        output: Unread output of the command.
+        code: Its exit code; None before the end mark has arrived.
     """
 
     def __init__(self, nonce: bytes) -> None:
-        self.begun = False
-        self.said = b""
+        self.has_started = False
+        self.output = b""
         self.code: int | None = None
         self._nonce = nonce
-        self._held = b""
+        self._incomplete = b""
 
     @property
-    def lacks(self) -> bool:
-        """Whether there is neither something to take nor the end."""
-        return not self.said and self.code is None
+    def is_waiting(self) -> bool:
+        """Whether there is no unread output, and the end mark has not arrived."""
+        return not self.output and self.code is None
 
-    def take(self, size_bytes: int) -> bytes:
-        """Return up to so much of what was written."""
-        taken, self.said = self.said[:size_bytes], self.said[size_bytes:]
-        return taken
+    def read(self, size_bytes: int) -> bytes:
+        """Remove and return at most `size_bytes` of the unread output."""
+        chunk, self.output = self.output[:size_bytes], self.output[size_bytes:]
+        return chunk
 
     def feed(self, piece: bytes) -> None:
-        """Take in what came; what comes before the answer and behind it is dropped.
+        """Process received data; data before the start mark and after the end mark are dropped.
 
         Raises:
-            UnfitServerError: The end has no exit code.
+            UnfitServerError: The end mark has no exit code.
         """
         if self.code is not None:
             return
-        came, self._held = self._held + piece, b""
-        if not self.begun:
-            stray, mark, came = came.partition(self._nonce + b"\n")
-            self.begun = bool(mark)
-            if not mark:
-                self._held = stray[-len(self._nonce) :]
+        data, self._incomplete = self._incomplete + piece, b""
+        if not self.has_started:
+            before_start, start_mark, data = data.partition(self._nonce + b"\n")
+            self.has_started = bool(start_mark)
+            if not start_mark:
+                self._incomplete = before_start[-len(self._nonce) :]
                 return
-        said, nonce, rest = came.partition(self._nonce)
+        output, nonce, rest = data.partition(self._nonce)
         if nonce:
-            self._held = nonce + rest
+            self._incomplete = nonce + rest
             if _END.match(rest):
                 self.code = int(rest.partition(b"\n")[0])
-            elif len(rest) >= _END_BYTES:
-                raise UnfitServerError("a command's exit code is none")
+            elif len(rest) >= _MIN_END_BYTES:
+                raise UnfitServerError("the answer to a command has no valid exit code")
         else:
-            # Only what the nonce may begin with is held back: somebody may wait for what the command said.
-            held = next((n for n in range(len(self._nonce) - 1, 0, -1) if said.endswith(self._nonce[:n])), 0)
-            said, self._held = said[: len(said) - held], said[len(said) - held :]
-        self.said += said
+            # Only a possible start of the nonce is held back, because a caller may wait for the other output.
+            held = next((n for n in range(len(self._nonce) - 1, 0, -1) if output.endswith(self._nonce[:n])), 0)
+            output, self._incomplete = output[: len(output) - held], output[len(output) - held :]
+        self.output += output

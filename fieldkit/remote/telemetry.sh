@@ -1,29 +1,29 @@
-# What a robot's Wi-Fi says of its link while an attempt lasts, as iw and the kernel print it.
+# Sample the state of a robot's Wi-Fi link during an attempt, from the output of iw and the kernel.
 #
-# A tick forks nothing where the shell can wait by itself, and iw is called on it only as long as all of this has used
-# less than its share of a core: on a small computer a process costs milliseconds. Nothing of it meets the air.
+# An iteration needs no fork if the shell has a `read` with a timeout. iw is called only while this job has used less than
+# its share of a core, because a process takes milliseconds on a small computer. Nothing is sent over the radio.
 
 TICK=0.2
-SEEN=500 # so many hundredths of a second pass between looks at the channel, the cell and the lock
-SHARE=12 AHEAD=3000 # thousandths of a core, and as many thousandths of a hundredth of a second ahead of that
-BLOCKS=8192 # of 512 or 1,024 bytes: no file of it gets longer
+SEEN=500 # interval of checks of the channel, the cell and the lock, in 10 ms
+SHARE=12 AHEAD=3000 # CPU budget in thousandths of a core, and advance on it in 10 us
+BLOCKS=8192 # limit of the file size, in blocks of 512 or 1,024 bytes
 
-watch() { # $1 role, $2 interface: begin to sample in this folder; nothing without iw, or where it was begun before
+watch() { # $1 role, $2 interface: start to sample in this folder; does nothing without iw, or if it was started before
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     command -v iw >/dev/null && mkdir "$PWD/.jobs/link" 2>/dev/null || return 0
     meta=$PWD/.jobs/link shell=sh
-    ! command -v bash >/dev/null || shell=bash # which can wait by itself
+    ! command -v bash >/dev/null || shell=bash # its `read` has a timeout
     read -r token _ <.began
     echo "sample the link of $2" >"$meta/command"
     detach "$meta" 86400 - 0 /dev/null "$1-link.txt" "$meta/log" "$shell" "$self" sample "$2" "$token"
 }
 
-unwatch() { # $1 role: end it
+unwatch() { # $1 role: stop it
     meta=.jobs/link
     [ -d "$meta" ] || return 0
     clock
     until_s=$((now + 2))
-    # What was begun a moment ago has yet to say who it is.
+    # A job that was just started may not have written its pid yet.
     while [ ! -s "$meta/pid" ] && clock && [ "$now" -le "$until_s" ]; do nap 0.002; done
     if alive "$meta"; then
         ask
@@ -34,10 +34,10 @@ unwatch() { # $1 role: end it
     [ ! -e "$1-link.txt" ] || gzip -nf "$1-link.txt" 2>/dev/null || :
 }
 
-sample() { # $1 interface, $2 token of the lock, or -: until it is ended, the folder goes, or the lock is another's
+sample() { # $1 interface, $2 token of the lock, or -: until it is stopped, the folder is deleted, or the lock is lost
     interface=$1 token=$2 look=0 again=0 wifi=
     ulimit -f "$BLOCKS"
-    exec 8<>.jobs/link/end # into which nobody writes
+    exec 8<>.jobs/link/end # no process writes to it: only used to wait
     [ -z "$({ read -r -t 0.01 _ <&8; } 2>&1)" ] && waits=1 || waits=
     moment_of first
     spending
@@ -50,13 +50,13 @@ sample() { # $1 interface, $2 token of the lock, or -: until it is ended, the fo
                 look=$((at + SEEN))
                 [ "$token" = - ] || ours || return 0
                 section link
-                # It fails where there is no Wi-Fi, and also while a station is being lost.
+                # It fails if the interface is not Wi-Fi, and also while a station is being lost.
                 said=$(iw dev "$interface" link) || [ -n "$wifi" ] || return 0
                 wifi=1
                 echo "$said"
                 section survey
                 iw dev "$interface" survey dump
-                # Of its own cell a station may know more than it has in a list: brcmfmac, Realtek's drivers.
+                # With some drivers (brcmfmac, Realtek) `station get` of the own cell reports more than `station dump`.
                 cell=${said#Connected to }
                 [ "$cell" = "$said" ] && set -- station dump || set -- station get "${cell%% *}"
             fi
@@ -71,12 +71,12 @@ sample() { # $1 interface, $2 token of the lock, or -: until it is ended, the fo
     return 0
 }
 
-moment_of() { # set up to the seconds since boot, and $1 to the hundredths
+moment_of() { # set up to the seconds since boot, and variable $1 to hundredths of a second
     read -r up _ </proc/uptime
     eval "$1=\${up%.*}\${up#*.}"
 }
 
-spending() { # set used to what this shell and its children have used, in hundredths of a second
+spending() { # set used to the CPU time of this shell and its children, in hundredths of a second
     read -r stat <"/proc/$$/stat"
     set -- ${stat##*) }
     used=$((${12} + ${13} + ${14} + ${15})) # fields 14 to 17
@@ -86,7 +86,7 @@ section() {
     echo "==> $up $1 <=="
 }
 
-quality() { # what a driver tells without iw, of a station; set told to whether it does
+quality() { # print the link quality from /proc/net/wireless, which is available for stations; set told if there is any
     told=
     [ -r /proc/net/wireless ] || return 0
     while read -r name line; do
@@ -94,7 +94,7 @@ quality() { # what a driver tells without iw, of a station; set told to whether 
     done </proc/net/wireless
 }
 
-ours() { # whether the lock is still $token's
+ours() { # true if $token still holds the lock
     newest
     [ "$kind:$holder" = "held:$token" ] && age
 }

@@ -1,1 +1,1 @@
-"""ROS on the laptop's side: message types, names on the wire, qualities of service, bridges."""
+"""ROS on the laptop: message types, names for DDS and Zenoh, qualities of service, bridges."""

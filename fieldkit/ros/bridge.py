@@ -1,8 +1,8 @@
-"""Carry topics from one middleware to another, as bytes: ROS 1 to DDS or Zenoh and back.
+"""Bridge topics between two middlewares as serialized messages: ROS 1, DDS and Zenoh.
 
-Between the two generations of ROS rosbags converts them, without making messages of them; `seq` of a header, which
-ROS 2 does not have, is lost on the way there and 0 on the way back. No sample goes in circles: each end passes over
-what it published itself, told by caller id (ROS 1), participant (DDS) or session (Zenoh).
+Between ROS 1 and ROS 2 rosbags converts the bytes without deserializing them. `seq` of a header, which ROS 2 does not
+have, is dropped towards ROS 2, and 0 towards ROS 1. Samples do not loop: each side ignores the samples that it has
+published, identified by caller id (ROS 1), participant (DDS) or session (Zenoh).
 """
 
 import os
@@ -29,7 +29,7 @@ Convert = Callable[[bytes], bytes]
 
 _PACKAGES: Final = "python3 -m pip install 'fieldkit[ros2]', and give an address of this machine"
 _REMEDIES: Final = {
-    "ros1": "start roscore or say where it is; what it takes here: apt-get install python3-rospy",
+    "ros1": "start roscore, or give its address; if rospy is missing here: apt-get install python3-rospy",
     "dds": _PACKAGES,
     "zenoh": _PACKAGES,
 }
@@ -37,11 +37,11 @@ _REMEDIES: Final = {
 
 @dataclass(frozen=True)
 class Side:
-    """A middleware that a bridge stands in.
+    """One side of a bridge.
 
     Attributes:
-        over: One of `middleware.ADAPTERS`.
-        network: How it takes part there.
+        over: Name of the middleware, one of `middleware.ADAPTERS`.
+        network: Its network settings.
     """
 
     over: str
@@ -49,18 +49,23 @@ class Side:
 
 
 class Carrier:
-    """Carries a topic one way.
+    """Forwards a topic in one direction.
 
     Args:
-        crossing: Which.
-        source: Where it comes from, started.
-        target: Where it goes to, started.
-        described: It by all its names, for either end.
-        convert: Makes a message of the target's of one of the source's; raises `SerdeError` of what is none.
+        crossing: The topic and its direction.
+        source: The side that it comes from.
+        target: The side that it is forwarded to.
+        described: The topic as described for the source, and for the target.
+        convert: Converts a message of the source to one of the target; raises `SerdeError` for an invalid message.
     """
 
     def __init__(
-        self, crossing: Crossing, source: "_End", target: "_End", described: tuple[Topic, Topic], convert: Convert
+        self,
+        crossing: Crossing,
+        source: "_RunningSide",
+        target: "_RunningSide",
+        described: tuple[Topic, Topic],
+        convert: Convert,
     ) -> None:
         self._crossing, self._source, self._target, self._described = crossing, source, target, described
         self._convert = convert
@@ -71,7 +76,7 @@ class Carrier:
         source.running.subscribe(described[0], self._carry)
 
     def _carry(self, data: bytes, arrived_ns: int) -> None:
-        """Take a sample, and hand it on: in threads of the source, one sample at a time, in their order."""
+        """Forward a sample. Called in threads of the source; samples are forwarded in sequence."""
         with self._lock:
             if self._ended:
                 return
@@ -81,36 +86,36 @@ class Carrier:
                 self._tally.unreadable += 1
                 return
             if self._publisher.write(converted):
-                self._tally.carried(len(data), arrived_ns, time.time_ns())
+                self._tally.count(len(data), arrived_ns, time.time_ns())
             else:
                 self._tally.refused += 1
 
     def end(self) -> None:
-        """Carry nothing any more; a sample on its way is first handed on."""
+        """Stop to forward samples; a sample that is being forwarded is finished first."""
         with self._lock:
             self._ended = True
 
     def other_types(self) -> Sequence[str]:
-        """Return sentences about others that have the topic with another type, in which nothing is carried."""
-        ends = zip((self._source, self._target), self._described, strict=True)
-        return [sentence for end, topic in ends for sentence in end.other_types(topic)]
+        """Return a sentence for each different type of the topic on either side, which is not forwarded."""
+        sides = zip((self._source, self._target), self._described, strict=True)
+        return [sentence for end, topic in sides for sentence in end.other_types(topic)]
 
     def told(self) -> Crossed:
-        """Return what was carried so far."""
+        """Return the counters of the forwarded samples."""
         with self._lock:
-            return self._tally.told(self._crossing, self._source.over, self._target.over)
+            return self._tally.counts(self._crossing, self._source.over, self._target.over)
 
 
 @dataclass(frozen=True)
-class _End:
-    """A side whose middleware runs."""
+class _RunningSide:
+    """A side of a bridge with its running middleware."""
 
     over: str
     network: Network
     running: Middleware
 
     def other_types(self, topic: Topic) -> Sequence[str]:
-        """Return a sentence about each other type that the topic has there."""
+        """Return a sentence for each different type of the topic on this side."""
         others = sorted(self.running.other_types(topic))
         return [f"{topic.name} is of type {other} in {self.over}, not {topic.type}" for other in others]
 
@@ -120,72 +125,77 @@ def bridged(near: Side, far: Side, crossings: Sequence[Crossing], types: Message
     """Bridge two sides while the body runs.
 
     Args:
-        near: What topics come from; those that go back go there.
-        far: The other.
-        crossings: What is carried.
-        types: Where the types are known.
+        near: The source of topics, and the target of those with `Crossing.back`.
+        far: The other side.
+        crossings: The topics.
+        types: The message types.
 
     Yields:
-        What carries each of them.
+        A carrier for each crossing.
 
     Raises:
-        ConfigurationError: A topic cannot be carried so, or has another type there.
+        ConfigurationError: A topic cannot be bridged, or has a different type on one side.
         LinkError: A middleware does not start: no ROS master answers, or it is not installed.
     """
     check(near, far, crossings, types)
     with ExitStack() as stack:
-        ends = [stack.enter_context(_started(side)) for side in (near, far)]
-        made: list[Carrier] = []
+        sides = [stack.enter_context(_running_side(side)) for side in (near, far)]
+        carriers: list[Carrier] = []
         for number, crossing in enumerate(crossings, 1):
-            source, target = reversed(ends) if crossing.back else ends
-            made.append(_carrier(crossing, source, target, types, number))
-            stack.callback(made[-1].end)
-        yield made
+            source, target = reversed(sides) if crossing.back else sides
+            carriers.append(_create_carrier(crossing, source, target, types, number))
+            stack.callback(carriers[-1].end)
+        yield carriers
 
 
 def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTypes) -> None:
-    """See that everything can be carried, before anything starts.
+    """Check that all topics can be bridged, before anything starts.
 
     Raises:
-        ConfigurationError: It cannot.
+        ConfigurationError: A topic cannot be bridged.
     """
     if near.over == far.over:
-        # Nobody could tell what came by the bridge: both ends are the same node or share a network.
-        raise ConfigurationError(f"a bridge from {near.over} to {far.over} is none", remedy="name two middlewares")
-    ways = [(crossing.topic, crossing.back) for crossing in crossings]
-    for one in crossings:
-        if ways.count((one.topic, one.back)) > 1:
-            raise ConfigurationError(f"{one.topic} is named twice for the same way", remedy="name it once")
-        same = counterparts.of_type(types, one.type_name) if _is_ros1(near, far) else types.get(one.type_name).rihs01
-        if not same:
+        # Forwarded samples could not be recognized: both sides are the same node, or share a network.
+        raise ConfigurationError(
+            f"a bridge cannot connect {near.over} with {far.over}", remedy="name two different middlewares"
+        )
+    directions = [(crossing.topic, crossing.back) for crossing in crossings]
+    for crossing in crossings:
+        topic, type_name = crossing.topic, crossing.type_name
+        if directions.count((topic, crossing.back)) > 1:
+            raise ConfigurationError(f"{topic} is named twice for the same direction", remedy="name it once")
+        is_same = counterparts.of_type(types, type_name) if _is_ros1(near, far) else types.get(type_name).rihs01
+        if not is_same:
             raise ConfigurationError(
-                f"{one.topic}: {one.type_name} is not the same in ROS 1 and ROS 2, or there in one of them alone",
-                remedy="carry a topic of another type",
+                f"{topic}: {type_name} differs between ROS 1 and ROS 2, or exists in one of them only",
+                remedy="bridge a topic of another type",
             )
 
 
-def _is_ros1(*sides: "Side | _End") -> bool:
+def _is_ros1(*sides: "Side | _RunningSide") -> bool:
     return any(side.over == "ros1" for side in sides)
 
 
 @contextmanager
-def _started(side: Side) -> Iterator[_End]:
-    """Run a side's middleware while the body runs."""
+def _running_side(side: Side) -> Iterator[_RunningSide]:
+    """Start the middleware of a side, and stop it after the body."""
     with ExitStack() as stack:
         if _is_ros1(side):
-            # Where rospy writes its log, which nobody reads.
+            # rospy writes a log, which is not needed.
             os.environ["ROS_LOG_DIR"] = stack.enter_context(tempfile.TemporaryDirectory(prefix="fieldkit-"))
         try:
             running = middleware.adapter(side.over)(side.network)
         except MiddlewareError as error:
             raise LinkError(f"the bridge does not start: {error}", remedy=_REMEDIES[side.over]) from error
         stack.callback(running.close)
-        yield _End(side.over, side.network, running)
+        yield _RunningSide(side.over, side.network, running)
 
 
-def _carrier(crossing: Crossing, source: _End, target: _End, types: MessageTypes, number: int) -> Carrier:
-    ends = (source, target)
-    pair = counterparts.of_type(types, crossing.type_name) if _is_ros1(*ends) else None
+def _create_carrier(
+    crossing: Crossing, source: _RunningSide, target: _RunningSide, types: MessageTypes, number: int
+) -> Carrier:
+    sides = (source, target)
+    pair = counterparts.of_type(types, crossing.type_name) if _is_ros1(*sides) else None
     described = [
         Topic.from_json(
             topics.describe(
@@ -198,18 +208,18 @@ def _carrier(crossing: Crossing, source: _End, target: _End, types: MessageTypes
                 number=number,
             )
         )
-        for end in ends
+        for end in sides
     ]
-    for end, topic in zip(ends, described, strict=True):
-        # Where ends are found by and by, it is not known yet.
+    for end, topic in zip(sides, described, strict=True):
+        # With gradual discovery, endpoints with another type may be discovered only later.
         for sentence in end.other_types(topic):
-            raise ConfigurationError(sentence, remedy="name the topic with its own type")
+            raise ConfigurationError(sentence, remedy="name the topic with that type")
     convert = _conversion(_is_ros1(source), pair, types)
     return Carrier(crossing, source, target, (described[0], described[1]), convert)
 
 
-def _type_at(end: _End, crossing: Crossing, pair: Counterparts | None) -> str:
-    """Return the name that the type of a crossing has at one of its ends."""
+def _type_at(end: _RunningSide, crossing: Crossing, pair: Counterparts | None) -> str:
+    """Return the name of a crossing's type on one side."""
     if pair is None:
         return crossing.type_name
     return pair.ros1 if _is_ros1(end) else pair.ros2

@@ -1,4 +1,4 @@
-"""Settings of a middleware by their path, as the step `topics` takes them, in the files that the middleware reads.
+"""Write the settings of a middleware, as the step `topics` has them, in the middleware's configuration format.
 
 Formats: CycloneDDS, docs/manual/config/config_file_reference.rst (`CYCLONEDDS_URI`); Fast DDS, "XML profiles"
 (`FASTDDS_DEFAULT_PROFILES_FILE`); Zenoh, DEFAULT_CONFIG.json5 (`ZENOH_SESSION_CONFIG_URI` of rmw_zenoh).
@@ -12,47 +12,47 @@ from xml.etree import ElementTree as ET
 from fieldkit.core.errors import ConfigurationError
 
 FILES: Final[Mapping[str, str]] = {"dds": "cyclonedds.xml", "ros2": "fastdds.xml", "zenoh": "zenoh.json5"}
-"""Name of the file by the middleware, as the key `over` names it."""
+"""File name by middleware, a value of the key `over`."""
 VARIABLES: Final[Mapping[str, str]] = {
     "dds": "CYCLONEDDS_URI",
     "ros2": "FASTDDS_DEFAULT_PROFILES_FILE",
     "zenoh": "ZENOH_SESSION_CONFIG_URI",
 }
-"""The variable of the environment that names the file."""
+"""Environment variable with the path of the file, by middleware."""
 _TRANSPORTS: Final = "FASTDDS_BUILTIN_TRANSPORTS"
 _NAMESPACE: Final = "http://www.eprosima.com"
 
 
 def written(over: str, transport: str, settings: Mapping[str, str], comment: Sequence[str]) -> str:
-    """Return the text of the file that sets what was measured, its evidence in a comment.
+    """Return the text of a configuration file with the measured settings, and the evidence in a comment.
 
     Args:
         over: The middleware: `dds`, `zenoh` or `ros2` for Fast DDS.
-        transport: What carries Zenoh.
+        transport: Transport of Zenoh.
         settings: The middleware's settings by their path.
         comment: Lines of the comment.
 
     Raises:
-        ConfigurationError: The middleware has no such file, or it cannot hold one of the settings.
+        ConfigurationError: The middleware has no such file, or the file cannot contain one of the settings.
     """
     if over == "dds":
         return _xml(_cyclonedds(settings), comment)
     if over == "ros2":
         return _xml(_fastdds(settings), comment)
     if over == "zenoh":
-        lines = "".join(f"// {line}\n" for line in _flat(comment))
+        lines = "".join(f"// {line}\n" for line in _printable(comment))
         return lines + json.dumps(_zenoh(transport, settings), indent=2) + "\n"
-    raise ConfigurationError(f"{over} has no configuration file", remedy="set what was measured in your nodes")
+    raise ConfigurationError(f"{over} has no configuration file", remedy="apply the measured settings in your nodes")
 
 
-def _flat(comment: Sequence[str]) -> list[str]:
-    """Return lines that stay within the comment whatever names of trials contain."""
+def _printable(comment: Sequence[str]) -> list[str]:
+    """Return lines without control characters, so that names of trials cannot end the comment."""
     return ["".join(letter if letter.isprintable() else "?" for letter in line) for line in comment]
 
 
 def _xml(root: ET.Element, comment: Sequence[str]) -> str:
     # `--` ends a comment in XML (section 2.5).
-    text = "\n".join(f"  {line.replace('--', '- -')}" for line in _flat(comment))
+    text = "\n".join(f"  {line.replace('--', '- -')}" for line in _printable(comment))
     ET.indent(root)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n<!--\n{text}\n-->\n{ET.tostring(root, encoding="unicode")}\n'
 
@@ -65,8 +65,8 @@ def _cyclonedds(settings: Mapping[str, str]) -> ET.Element:
         element = domain
         for name in names:
             element = _child(element, name)
-        own, _, attribute = last.partition("@")
-        element = _child(element, own)
+        element_name, _, attribute = last.partition("@")
+        element = _child(element, element_name)
         if attribute:
             element.set(attribute, value)
         else:
@@ -85,7 +85,7 @@ def _fastdds(settings: Mapping[str, str]) -> ET.Element:
     if others or not rmw.startswith("rmw_fastrtps"):
         raise ConfigurationError(
             f"profiles of Fast DDS cannot hold {', '.join(sorted(others)) or rmw}",
-            remedy="set the same variables of the environment on your robots",
+            remedy="set the same environment variables on your robots",
         )
     root = ET.Element("profiles", xmlns=_NAMESPACE)
     participant = ET.SubElement(root, "participant", profile_name="measured", is_default_profile="true")
@@ -95,7 +95,7 @@ def _fastdds(settings: Mapping[str, str]) -> ET.Element:
 
 
 def _zenoh(transport: str, settings: Mapping[str, str]) -> dict[str, Any]:
-    """Return nested settings: those that were measured, and the transport of the listener."""
+    """Return nested settings: the measured ones, and the transport of the listener."""
     tree: dict[str, Any] = {"mode": "peer", "listen": {"endpoints": [f"{transport}/0.0.0.0:0"]}}
     for path, text in settings.items():
         *names, last = path.split("/")

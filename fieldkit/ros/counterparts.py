@@ -1,8 +1,8 @@
-"""Message types of ROS 1 and the types of ROS 2 with the same content, and how the bytes of one become the other's.
+"""Pairs of message types of ROS 1 and ROS 2 with the same content, and the conversion of serialized messages.
 
-Most types have one name and the same members in both. A time and a duration are messages of `std_msgs` in ROS 1 and
-of `builtin_interfaces` in ROS 2, with the same two numbers (ros1_bridge maps them likewise). From Iron on
-`sensor_msgs/Range` has one member more, at its end: it is 0 for a message from ROS 1, and is lost on the way there.
+Most types have the same name and members in both. Time and duration are messages of `std_msgs` in ROS 1 and of
+`builtin_interfaces` in ROS 2, with the same two numbers (ros1_bridge maps them in the same way). Since Iron,
+`sensor_msgs/Range` has an additional last member: it is 0 in messages from ROS 1, and is dropped towards ROS 1.
 """
 
 import struct
@@ -22,24 +22,24 @@ ROS2_NAMES: Final[Mapping[str, str]] = MappingProxyType(
         "std_msgs/msg/Duration": "builtin_interfaces/msg/Duration",
     }
 )
-"""Types whose name in ROS 2 is another, by that in ROS 1."""
+"""Names in ROS 2 of types with different names, by the name in ROS 1."""
 
 _ROS1_NAMES: Final = {ros2: ros1 for ros1, ros2 in ROS2_NAMES.items()}
 
 ADDED: Final[Mapping[str, Mapping[str, bytes]]] = MappingProxyType(
     {"sensor_msgs/msg/Range": {"variance": bytes(4)}}  # float32, of which 0 is "unknown" (Range.msg)
 )
-"""Members that ROS 2 adds at the end of a type, with the bytes that they get in a message from ROS 1."""
+"""Members that ROS 2 adds at the end of a type, with their bytes in messages from ROS 1."""
 
 
 @dataclass(frozen=True)
 class Counterparts:
-    """A type in both generations of ROS.
+    """A type in ROS 1 and in ROS 2.
 
     Attributes:
-        ros1: Its name in ROS 1, `std_msgs/msg/Time`.
-        ros2: Its name in ROS 2, `builtin_interfaces/msg/Time`.
-        added: What a message from ROS 1 gets at its end, as ROS 1 serializes it.
+        ros1: Its name in ROS 1, for example `std_msgs/msg/Time`.
+        ros2: Its name in ROS 2, for example `builtin_interfaces/msg/Time`.
+        added: Bytes that are appended to a message from ROS 1, in the serialization of ROS 1.
     """
 
     ros1: str
@@ -47,19 +47,19 @@ class Counterparts:
     added: bytes = b""
 
     def to_ros2(self, types: MessageTypes, data: bytes) -> bytes:
-        """Return a message of ROS 1 as CDR.
+        """Return a message of ROS 1 in CDR.
 
         Raises:
-            SerdeError: It is not of the type.
+            SerdeError: The data are not a message of this type.
         """
         with _any_error_as_serde_error(self.ros1):
             return bytes(types.ros2.ros1_to_cdr(data + self.added, self.ros2))
 
     def to_ros1(self, types: MessageTypes, data: bytes) -> bytes:
-        """Return a message in CDR as ROS 1 serializes it.
+        """Return a message in CDR in the serialization of ROS 1.
 
         Raises:
-            SerdeError: It is not of the type.
+            SerdeError: The data are not a message of this type.
         """
         with _any_error_as_serde_error(self.ros2):
             converted = bytes(types.ros2.cdr_to_ros1(data, self.ros2))
@@ -70,7 +70,7 @@ class Counterparts:
 
 @contextmanager
 def _any_error_as_serde_error(kind: str) -> Iterator[None]:
-    """Raise what rosbags raises of a message that is cut off as `SerdeError`, as it does of most others."""
+    """Convert the exceptions of rosbags for truncated messages to `SerdeError`, which it raises for most others."""
     try:
         yield
     except (ValueError, IndexError, AssertionError, struct.error) as error:
@@ -78,7 +78,7 @@ def _any_error_as_serde_error(kind: str) -> Iterator[None]:
 
 
 def of_type(types: MessageTypes, name: str) -> Counterparts | None:
-    """Return a type in both generations by its name in either; None where their contents differ.
+    """Return a type of ROS 1 and ROS 2 by either name, or None if the contents differ.
 
     Raises:
         ConfigurationError: Neither has such a type.

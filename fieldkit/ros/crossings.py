@@ -1,4 +1,4 @@
-"""Topics that a bridge carries: how they are written, and what is counted of each."""
+"""Topics that a bridge forwards: their notation, and the counters of each."""
 
 import math
 import re
@@ -18,21 +18,22 @@ _POLICIES: Final[dict[str, dict[str, Policy]]] = {
 }
 _DEPTH: Final = re.compile(r"depth=([1-9]\d{0,5})", re.ASCII)
 _NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
-"""A name that both ROS take (wiki.ros.org/Names; design.ros2.org, "Topic and Service name mapping to DDS")."""
+"""A name that is valid in ROS 1 and ROS 2 (wiki.ros.org/Names; design.ros2.org, "Topic and Service name mapping to
+DDS")."""
 
 _BUCKET: Final = math.log(1.01)
-"""Delays are counted in classes that are 1 % wide, so that a bridge may run for months."""
+"""Logarithmic width of the histogram classes of delays, 1 %: memory stays constant if a bridge runs for months."""
 
 
 @dataclass(frozen=True)
 class Crossing:
-    """A topic that is carried one way.
+    """A topic that a bridge forwards in one direction.
 
     Attributes:
-        topic: `/scan`.
-        type_name: `sensor_msgs/msg/LaserScan`.
+        topic: Name, for example `/scan`.
+        type_name: Type, for example `sensor_msgs/msg/LaserScan`.
         qos: Its quality of service on both sides.
-        back: Whether it goes from the second side to the first.
+        back: Whether it is forwarded from the second side to the first.
     """
 
     topic: str
@@ -42,59 +43,59 @@ class Crossing:
 
     @classmethod
     def parse(cls, text: str, *, back: bool = False) -> "Crossing":
-        """Return what `/scan:sensor_msgs/LaserScan:sensor_data,depth=1` says.
+        """Parse a text such as `/scan:sensor_msgs/LaserScan:sensor_data,depth=1`.
 
         Raises:
-            ConfigurationError: It is not written so, or there is no such quality of service.
+            ConfigurationError: It has another syntax, or the quality of service does not exist.
         """
         topic, _, rest = text.partition(":")
         type_name, _, quality = rest.partition(":")
         if not _NAME.fullmatch(topic) or not type_name:
             raise ConfigurationError(
-                f"{text!r} is no topic and its type", remedy="write it as /scan:sensor_msgs/LaserScan"
+                f"{text!r} is not a topic with its type", remedy="write it as /scan:sensor_msgs/LaserScan"
             )
         return cls(topic, full_name(type_name), parse_qos(quality), back)
 
 
 def parse_qos(text: str) -> QosProfile:
-    """Return the quality of service that a profile's name and policies say, with commas between; empty: default.
+    """Parse a quality of service: the name of a profile, then policies, separated by commas; empty for the default.
 
     Raises:
-        ConfigurationError: There is no such profile or policy.
+        ConfigurationError: A profile or policy does not exist.
     """
     words = text.split(",") if text else []
-    found = PROFILES[words.pop(0)] if words and words[0] in PROFILES else PROFILES["default"]
+    profile = PROFILES[words.pop(0)] if words and words[0] in PROFILES else PROFILES["default"]
     for word in words:
         if depth := _DEPTH.fullmatch(word):
-            found = replace(found, history=History.KEEP_LAST, depth=int(depth[1]))
+            profile = replace(profile, history=History.KEEP_LAST, depth=int(depth[1]))
         elif word in _POLICIES:
-            found = replace(found, **_POLICIES[word])  # type: ignore[arg-type] # each by its own field
+            profile = replace(profile, **_POLICIES[word])  # type: ignore[arg-type] # each value has the type of its field
         else:
-            known = (*PROFILES, *_POLICIES, "depth=N")
+            choices = (*PROFILES, *_POLICIES, "depth=N")
             raise ConfigurationError(
-                f"{word!r} is no quality of service; there are {', '.join(known)}",
-                remedy=nearest(word, known, "leave it out for the default of ROS 2"),
+                f"{word!r} is not a quality of service; choose from {', '.join(choices)}",
+                remedy=nearest(word, choices, "leave it out for the default of ROS 2"),
             )
-    return found
+    return profile
 
 
 @dataclass(frozen=True)
 class Crossed:
-    """What a bridge did for a topic one way.
+    """Counters of a topic that a bridge forwards in one direction.
 
     Attributes:
         topic: Its name.
         type: Its type in the spelling of ROS 2.
-        source: Middleware that it came from.
-        target: Middleware that it went to.
-        messages: Handed to that.
-        bytes: Of them, serialized, as they came.
-        refused: Messages that the target did not take in time.
-        unreadable: Messages that are none of the type, and were dropped.
-        per_s: Messages a second between the first and the last; None of fewer than two.
-        bytes_per_s: The same of their bytes, without the first.
-        delay_median_s: Median time from a message's arrival in this process until the target took it, to 1 %.
-        delay_p99_s: The time that 99 % of them took at most, to 1 %.
+        source: Middleware of the source.
+        target: Middleware of the target.
+        messages: Number of messages that were forwarded to the target.
+        bytes: Their total size as received.
+        refused: Number of messages that the target did not accept in time.
+        unreadable: Number of dropped messages that are not valid for the type.
+        per_s: Messages per second between the first and the last; None for fewer than two.
+        bytes_per_s: Bytes per second in the same time, without the first message.
+        delay_median_s: Median time from the arrival of a message here until the target accepted it, to 1 %.
+        delay_p99_s: 99th percentile of this time, to 1 %.
     """
 
     topic: str
@@ -112,7 +113,7 @@ class Crossed:
 
 
 class CrossingTally:
-    """Counts what is carried. One thread at a time."""
+    """Counts forwarded messages. It is not thread-safe."""
 
     def __init__(self) -> None:
         self.refused = self.unreadable = 0
@@ -120,20 +121,20 @@ class CrossingTally:
         self._first_ns = self._last_ns = 0
         self._classes: Counter[int] = Counter()
 
-    def carried(self, size_bytes: int, arrived_ns: int, left_ns: int) -> None:
-        """Count a message."""
+    def count(self, size_bytes: int, arrived_ns: int, left_ns: int) -> None:
+        """Count a forwarded message."""
         if not self._messages:
             self._first_ns, self._first_bytes = left_ns, size_bytes
         self._messages += 1
         self._bytes += size_bytes
         self._last_ns = left_ns
-        # A clock that is set back makes a delay of no time.
+        # If the clock was set back, the delay counts as 0.
         self._classes[round(math.log(max(1, left_ns - arrived_ns)) / _BUCKET)] += 1
 
-    def told(self, crossing: Crossing, source: str, target: str) -> Crossed:
-        """Return what was counted."""
-        lasted_s = (self._last_ns - self._first_ns) / 1e9
-        steady = lasted_s > 0
+    def counts(self, crossing: Crossing, source: str, target: str) -> Crossed:
+        """Return the counters."""
+        duration_s = (self._last_ns - self._first_ns) / 1e9
+        has_rate = duration_s > 0
         return Crossed(
             crossing.topic,
             crossing.type_name,
@@ -143,17 +144,17 @@ class CrossingTally:
             self._bytes,
             self.refused,
             self.unreadable,
-            (self._messages - 1) / lasted_s if steady else None,
-            (self._bytes - self._first_bytes) / lasted_s if steady else None,
+            (self._messages - 1) / duration_s if has_rate else None,
+            (self._bytes - self._first_bytes) / duration_s if has_rate else None,
             self._delay_s(0.5),
             self._delay_s(0.99),
         )
 
-    def _delay_s(self, share: float) -> float | None:
-        """Return the least delay that this share of messages do not exceed."""
-        missing = math.ceil(share * self._messages)
+    def _delay_s(self, fraction: float) -> float | None:
+        """Return the smallest delay that this fraction of the messages does not exceed; None without messages."""
+        remaining = math.ceil(fraction * self._messages)
         for number in sorted(self._classes):
-            missing -= self._classes[number]
-            if missing <= 0:
+            remaining -= self._classes[number]
+            if remaining <= 0:
                 return math.exp(number * _BUCKET) / 1e9
         return None

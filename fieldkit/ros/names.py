@@ -1,4 +1,4 @@
-"""Names of topics, types and nodes on the wire: of ROS 2 over DDS, and of rmw_zenoh.
+"""Names of topics, types and nodes in ROS 2 over DDS, and in rmw_zenoh.
 
 DDS: "Topic and Service name mapping to DDS" and the mapping of interfaces to IDL, of design.ros2.org.
 Zenoh: docs/design.md of github.com/ros2/rmw_zenoh, sections Publishers and Graph Cache, from its version 0.3 on.
@@ -12,27 +12,27 @@ from fieldkit.ros import qos
 from fieldkit.ros.qos import QosProfile
 
 ADMIN_SPACE: Final = "@ros2_lv"
-"""With which every liveliness token of rmw_zenoh begins."""
+"""Prefix of all liveliness tokens of rmw_zenoh."""
 
 NO_HASH: Final = "TypeHashNotSupported"
-"""Stands for the hash of a type where ROS 2 has none: in rmw_zenoh of Humble."""
+"""Placeholder for the hash of a type in rmw_zenoh of Humble, where ROS 2 has no type hashes."""
 
 _TOPIC_PREFIX: Final = "rt"
 
 
 def dds_type(name: str) -> str:
-    """Return the DDS name of a message type: `sensor_msgs::msg::dds_::LaserScan_`."""
+    """Return the DDS name of a message type, for example `sensor_msgs::msg::dds_::LaserScan_`."""
     package, kind, short = name.split("/")
     return f"{package}::{kind}::dds_::{short}_"
 
 
 def dds_topic(topic: str) -> str:
-    """Return the DDS name of a topic: `rt/scan` of `/scan`."""
+    """Return the DDS name of a topic, for example `rt/scan` for `/scan`."""
     return f"{_TOPIC_PREFIX}/{topic.lstrip('/')}"
 
 
 def user_data(rihs01: str) -> str:
-    """Return what a DDS endpoint tells of its type in its user data since ROS 2 Iron (rmw_dds_common, qos.cpp)."""
+    """Return the user data of a DDS endpoint with the type hash, used since ROS 2 Iron (rmw_dds_common, qos.cpp)."""
     return f"typehash={rihs01};" if rihs01 else ""
 
 
@@ -42,7 +42,7 @@ def zenoh_key(domain: int, topic: str, type_name: str, rihs01: str) -> str:
 
 
 class Entity(StrEnum):
-    """What a liveliness token stands for."""
+    """Kind of entity in a liveliness token."""
 
     NODE = "NN"
     PUBLISHER = "MP"
@@ -54,9 +54,9 @@ class Endpoint:
     """A publisher or a subscription.
 
     Attributes:
-        topic: `/scan`.
-        type_name: `sensor_msgs/msg/LaserScan`.
-        rihs01: Its hash.
+        topic: Name of the topic, for example `/scan`.
+        type_name: Its type, for example `sensor_msgs/msg/LaserScan`.
+        rihs01: Hash of the type.
         qos: Its quality of service.
     """
 
@@ -68,18 +68,18 @@ class Endpoint:
 
 @dataclass(frozen=True)
 class Token:
-    """A liveliness token: that a node, or an endpoint of one, is there.
+    """A liveliness token, which announces a node or an endpoint.
 
     Attributes:
         domain: Its ROS domain.
         session: Identifier of its Zenoh session, hexadecimal.
         node_id: Number of the node in its session.
-        entity_id: Number of the entity there; of a node, the same.
-        entity: What it is.
+        entity_id: Number of the entity in the session; for a node equal to `node_id`.
+        entity: Kind of entity.
         node: Name of the node.
-        namespace: Of the node.
-        enclave: Of the node.
-        endpoint: What it is the end of; None of a node.
+        namespace: Namespace of the node.
+        enclave: Enclave of the node.
+        endpoint: The endpoint; None for a node.
     """
 
     domain: int
@@ -106,9 +106,16 @@ class Token:
         node = (_mangled(self.enclave), _mangled(self.namespace), _mangled(self.node))
         if self.endpoint is None:
             return "/".join((*head, *node))
-        end = self.endpoint
+        endpoint = self.endpoint
         return "/".join(
-            (*head, *node, _mangled(end.topic), dds_type(end.type_name), end.rihs01, qos.to_zenoh(end.qos))
+            (
+                *head,
+                *node,
+                _mangled(endpoint.topic),
+                dds_type(endpoint.type_name),
+                endpoint.rihs01,
+                qos.to_zenoh(endpoint.qos),
+            )
         )
 
 

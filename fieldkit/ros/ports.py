@@ -1,8 +1,8 @@
-"""Ports and multicast groups by which a capture knows a middleware's packets.
+"""Ports and multicast groups of middlewares, by which captures identify their packets.
 
-DDS: RTPS 2.5, section 9.6.2 (PB 7400, DG 250, PG 2, d0 0, d1 10, d2 1, d3 11). Zenoh and ROS 1: others than their
-usual ones, so that fieldkit's routers, masters and nodes run beside a robot's own, and others in every domain, so
-that several run on one robot; only Zenoh's scouting has its own.
+DDS: RTPS 2.5, section 9.6.2 (PB 7400, DG 250, PG 2, d0 0, d1 10, d2 1, d3 11). Zenoh and ROS 1: not the default
+ports, so that fieldkit's routers, masters and nodes can run beside those of a robot, and different ports in each
+domain, so that several can run on one robot. Only the scouting of Zenoh uses its default port.
 """
 
 from dataclasses import dataclass
@@ -11,23 +11,23 @@ from typing import Final
 _ZENOH_SCOUTING: Final = 7446
 _ZENOH_FIRST: Final = 7500
 _ROS1_FIRST: Final = 11500
-_ROS1_EACH: Final = 3
+_ROS1_PORTS: Final = 3
 
 _PARTICIPANTS: Final = 4
-"""Of one domain on one robot: more than one of fieldkit's and some of the robot's own."""
+"""Maximum number of participants of a domain on a robot: one of fieldkit, and some of the robot."""
 
 MOST_DOMAIN: Final = 101
-"""Above it ports of DDS are those that Linux gives to anybody."""
+"""Maximum domain: the DDS ports of higher domains are in the ephemeral port range of Linux."""
 
 
 @dataclass(frozen=True)
 class MiddlewarePorts:
-    """Ports of a middleware on every robot.
+    """Ports of a middleware on each robot.
 
     Attributes:
-        data: Of samples and their acknowledgements.
-        discovery: By which ends look for each other.
-        group: Multicast group that is asked; None where nobody is.
+        data: Ports of samples and their acknowledgements.
+        discovery: Ports of the discovery.
+        group: Multicast group of the discovery; None without multicast.
     """
 
     data: frozenset[int]
@@ -52,7 +52,7 @@ def zenoh_listener(domain: int) -> int:
 
 
 def zenoh(domain: int, *, multicast: bool) -> MiddlewarePorts:
-    """Return Zenoh's ports in a domain; what a session declares goes the way of its data."""
+    """Return Zenoh's ports in a domain; declarations of a session use the port of its data."""
     data = frozenset({zenoh_listener(domain)})
     if not multicast:
         return MiddlewarePorts(data=data, discovery=frozenset())
@@ -61,11 +61,11 @@ def zenoh(domain: int, *, multicast: bool) -> MiddlewarePorts:
 
 def ros1_master(domain: int) -> int:
     """Return the port of ROS 1's master in a domain."""
-    return _ROS1_FIRST + _ROS1_EACH * domain
+    return _ROS1_FIRST + _ROS1_PORTS * domain
 
 
 def ros1_node(domain: int) -> dict[str, int]:
-    """Return the ports of a node of ROS 1, by the settings of the agent that give it them."""
+    """Return the ports of a node of ROS 1, by the names of the agent's settings."""
     return {"xmlrpc_port": ros1_master(domain) + 1, "tcpros_port": ros1_master(domain) + 2}
 
 

@@ -1,4 +1,4 @@
-"""Qualities of service as ROS 2 names them, and as rmw_zenoh writes them into liveliness tokens.
+"""Qualities of service of ROS 2, and their encoding in liveliness tokens of rmw_zenoh.
 
 Names and values: rmw/qos_profiles.h and rmw/types.h of ROS 2 (the same from Foxy to Jazzy).
 """
@@ -15,7 +15,7 @@ class Policy(Enum):
 
 
 class Reliability(Policy):
-    """Whether what is lost is sent again."""
+    """Whether lost samples are sent again."""
 
     SYSTEM_DEFAULT = 0
     RELIABLE = 1
@@ -23,7 +23,7 @@ class Reliability(Policy):
 
 
 class History(Policy):
-    """How many samples are kept for who has not got them."""
+    """Number of samples that are kept for readers that have not received them."""
 
     SYSTEM_DEFAULT = 0
     KEEP_LAST = 1
@@ -31,7 +31,7 @@ class History(Policy):
 
 
 class Durability(Policy):
-    """Whether who comes late gets what was sent before."""
+    """Whether late readers receive earlier samples."""
 
     SYSTEM_DEFAULT = 0
     TRANSIENT_LOCAL = 1
@@ -39,7 +39,7 @@ class Durability(Policy):
 
 
 class Liveliness(Policy):
-    """Who says that a publisher is alive."""
+    """Method by which a publisher asserts that it is alive."""
 
     SYSTEM_DEFAULT = 0
     AUTOMATIC = 1
@@ -51,14 +51,14 @@ class QosProfile:
     """A quality of service.
 
     Attributes:
-        reliability: Whether what is lost is sent again.
-        history: How many samples are kept.
-        depth: That number, with `KEEP_LAST`; 0 leaves it to the middleware.
-        durability: Whether who comes late gets what was sent before.
-        deadline_ns: A sample is expected at least so often; None for never.
-        lifespan_ns: A sample is worth nothing after this time; None for always.
-        liveliness: Who says that a publisher is alive.
-        lease_ns: How often it must; None for never.
+        reliability: Whether lost samples are sent again.
+        history: Whether the last samples or all samples are kept.
+        depth: Number of kept samples with `KEEP_LAST`; 0 leaves it to the middleware.
+        durability: Whether late readers receive earlier samples.
+        deadline_ns: Maximum expected time between two samples; None for no deadline.
+        lifespan_ns: Time after which a sample expires; None for no limit.
+        liveliness: Method by which a publisher asserts that it is alive.
+        lease_ns: Maximum time between two assertions; None for no limit.
     """
 
     reliability: Reliability = Reliability.RELIABLE
@@ -83,10 +83,10 @@ PROFILES: Final[Mapping[str, QosProfile]] = MappingProxyType(
         ),
     }
 )
-"""The profiles that ROS 2 names, `rmw_qos_profile_NAME`."""
+"""The profiles of ROS 2 by name: `rmw_qos_profile_NAME`."""
 
 _ZENOH: Final = QosProfile(depth=42, liveliness=Liveliness.AUTOMATIC)
-"""What rmw_zenoh takes where nothing is said (its qos.cpp); a token leaves out what equals it."""
+"""Default profile of rmw_zenoh (its qos.cpp); a token omits values that equal it."""
 
 _SECOND_NS: Final = 10**9
 _INFINITE_NS: Final = 2**63 - 1  # RMW_DURATION_INFINITE
@@ -95,39 +95,41 @@ Kind = TypeVar("Kind", bound=Policy)
 
 
 def to_zenoh(profile: QosProfile) -> str:
-    """Return a profile as the last part of a liveliness token: `2::,5:,:,:,,` of sensor data."""
-    own = _adapted(profile)
-    kinds = (own.reliability, own.durability, own.history, own.liveliness)
-    usual = (_ZENOH.reliability, _ZENOH.durability, _ZENOH.history, _ZENOH.liveliness)
+    """Return a profile as the last part of a liveliness token, for example `2::,5:,:,:,,` for sensor data."""
+    adapted = _with_zenoh_defaults(profile)
+    kinds = (adapted.reliability, adapted.durability, adapted.history, adapted.liveliness)
+    defaults = (_ZENOH.reliability, _ZENOH.durability, _ZENOH.history, _ZENOH.liveliness)
     reliability, durability, history, liveliness = (
-        "" if kind is other else str(kind.value) for kind, other in zip(kinds, usual, strict=True)
+        "" if kind is default else str(kind.value) for kind, default in zip(kinds, defaults, strict=True)
     )
-    depth = "" if own.depth == _ZENOH.depth else str(own.depth)
-    deadline, lifespan, lease = (_duration(time_ns) for time_ns in (own.deadline_ns, own.lifespan_ns, own.lease_ns))
+    depth = "" if adapted.depth == _ZENOH.depth else str(adapted.depth)
+    deadline, lifespan, lease = (
+        _duration(time_ns) for time_ns in (adapted.deadline_ns, adapted.lifespan_ns, adapted.lease_ns)
+    )
     return f"{reliability}:{durability}:{history},{depth}:{deadline}:{lifespan}:{liveliness},{lease}"
 
 
-def _adapted(profile: QosProfile) -> QosProfile:
-    """Return what rmw_zenoh makes of a profile: what is left to the middleware has its values."""
+def _with_zenoh_defaults(profile: QosProfile) -> QosProfile:
+    """Return a profile in which system defaults are replaced by the defaults of rmw_zenoh."""
     return replace(
         profile,
-        reliability=_chosen(profile.reliability, _ZENOH.reliability),
-        history=_chosen(profile.history, _ZENOH.history),
+        reliability=_resolve(profile.reliability, _ZENOH.reliability),
+        history=_resolve(profile.history, _ZENOH.history),
         depth=profile.depth or _ZENOH.depth,
-        durability=_chosen(profile.durability, _ZENOH.durability),
-        liveliness=_chosen(profile.liveliness, _ZENOH.liveliness),
+        durability=_resolve(profile.durability, _ZENOH.durability),
+        liveliness=_resolve(profile.liveliness, _ZENOH.liveliness),
     )
 
 
-def _chosen(policy: Kind, otherwise: Kind) -> Kind:
-    return policy if policy.value else otherwise
+def _resolve(policy: Kind, default: Kind) -> Kind:
+    return policy if policy.value else default
 
 
 def _duration(time_ns: int | None) -> str:
     if time_ns is None:
         return ","
-    # Each half is left out where it equals that of the usual duration.
+    # Seconds and nanoseconds are each omitted if they equal those of the default duration.
     return ",".join(
-        "" if own == usual else str(own)
-        for own, usual in zip(divmod(time_ns, _SECOND_NS), divmod(_INFINITE_NS, _SECOND_NS), strict=True)
+        "" if part == default else str(part)
+        for part, default in zip(divmod(time_ns, _SECOND_NS), divmod(_INFINITE_NS, _SECOND_NS), strict=True)
     )

@@ -1,4 +1,4 @@
-"""A topic of the laptop's words as the agent on a robot is told it (`fieldkit.agent.middleware.Topic`)."""
+"""Describe topics for the agent on a robot (`fieldkit.agent.middleware.Topic`)."""
 
 from typing import Any
 
@@ -8,38 +8,38 @@ from fieldkit.ros.qos import QosProfile
 from fieldkit.ros.types import MessageTypes
 
 SESSION = "{zid}"
-"""Stands in a token for the session, which only the robot knows."""
+"""Placeholder in a token for the id of the session, which is known on the robot only."""
 
 
 def describe(
     types: MessageTypes, topic: str, type_name: str, qos: QosProfile, *, domain: int, node: str, number: int = 1
 ) -> dict[str, Any]:
-    """Return a topic by all the names that it has on the wire, for JSON.
+    """Return a topic with its names and types for all middlewares, as the JSON form of the agent's `Topic`.
 
     Args:
-        types: Where its type is known.
-        topic: `/scan`.
-        type_name: `sensor_msgs/msg/LaserScan`.
+        types: The message types.
+        topic: Name of the topic, for example `/scan`.
+        type_name: Its type, for example `sensor_msgs/msg/LaserScan`.
         qos: Its quality of service.
         domain: ROS domain.
-        node: Name of the node that has it.
-        number: Of its end among those of the node.
+        node: Name of the node.
+        number: Number of its endpoint in the node.
 
     Raises:
         ConfigurationError: There is no such type.
     """
-    found = types.get(type_name)
-    members = types.fields(found.name) if found.rihs01 else {}
-    rihs01 = found.rihs01 if types.distribution.tells_hashes else ""
-    endpoint = Endpoint(topic, found.name, rihs01 or names.NO_HASH, qos)
-    of_node = Token(domain, SESSION, 0, 0, Entity.NODE, node).key
-    ends = {
-        end: (of_node, Token(domain, SESSION, 0, number, entity, node, endpoint=endpoint).key)
-        for end, entity in (("publisher", Entity.PUBLISHER), ("subscription", Entity.SUBSCRIPTION))
+    message_type = types.get(type_name)
+    members = types.fields(message_type.name) if message_type.rihs01 else {}
+    rihs01 = message_type.rihs01 if types.distribution.has_type_hashes else ""
+    endpoint = Endpoint(topic, message_type.name, rihs01 or names.NO_HASH, qos)
+    node_token = Token(domain, SESSION, 0, 0, Entity.NODE, node).key
+    tokens = {
+        role: (node_token, Token(domain, SESSION, 0, number, entity, node, endpoint=endpoint).key)
+        for role, entity in (("publisher", Entity.PUBLISHER), ("subscription", Entity.SUBSCRIPTION))
     }
     return {
         "name": topic,
-        "type": found.name,
+        "type": message_type.name,
         "quality": {
             "reliability": qos.reliability.name.lower(),
             "history": qos.history.name.lower(),
@@ -49,13 +49,13 @@ def describe(
             "lifespan_ns": qos.lifespan_ns,
         },
         "members": {
-            name: [(member.name, member.type, member.count) for member in of] for name, of in members.items()
+            name: [(member.name, member.type, member.count) for member in fields] for name, fields in members.items()
         },
         "dds_topic": names.dds_topic(topic),
         "dds_types": {name: names.dds_type(name) for name in members},
         "user_data": names.user_data(rihs01),
-        "key": names.zenoh_key(domain, topic, found.name, rihs01 or names.NO_HASH),
-        "tokens": ends,
-        "md5": found.md5,
-        "definition": found.definition,
+        "key": names.zenoh_key(domain, topic, message_type.name, rihs01 or names.NO_HASH),
+        "tokens": tokens,
+        "md5": message_type.md5,
+        "definition": message_type.definition,
     }

@@ -1,8 +1,8 @@
-"""ROS message types by name: definitions, the MD5 sum of ROS 1, the type hash of ROS 2, and their fields.
+"""ROS message types by name: definitions, MD5 sums of ROS 1, type hashes of ROS 2, and fields.
 
-Types that ROS ships come with rosbags; tf2_msgs, which it lacks, and types of a lab's own are made from the text of
-their definition. The MD5 sum is that of gentools (wiki.ros.org/ROS/Technical Overview), the type hash RIHS01 that of
-REP-2016: SHA-256 over the type's description as JSON.
+rosbags contains the standard types of ROS except tf2_msgs; this and the custom types of a lab are parsed from their
+definitions. The MD5 sum is that of gentools (wiki.ros.org/ROS/Technical Overview), the type hash is RIHS01 of
+REP-2016: SHA-256 of the type's description as JSON.
 """
 
 from collections.abc import Mapping
@@ -21,14 +21,14 @@ from fieldkit.core.errors import ConfigurationError, nearest
 LACKING: Final[Mapping[str, str]] = MappingProxyType(
     {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
 )
-"""Types of every robot that rosbags does not know."""
+"""Definitions of standard types that rosbags lacks."""
 
 
 _HEADER: Final = "std_msgs/msg/Header"
 
 
 class Distribution(StrEnum):
-    """A distribution of ROS 2, whose types are spoken over DDS and Zenoh."""
+    """A distribution of ROS 2, whose types are used over DDS and Zenoh."""
 
     FOXY = "foxy"
     GALACTIC = "galactic"
@@ -39,31 +39,32 @@ class Distribution(StrEnum):
 
     @classmethod
     def of(cls, name: str) -> "Distribution":
-        """Return the distribution of a name; the newest for one that is not known, such as `rolling`."""
+        """Return the distribution with a name, or the newest one for an unknown name such as `rolling`."""
         return cls(name) if name in list(cls) else list(cls)[-1]
 
     @property
-    def tells_hashes(self) -> bool:
-        """Whether its nodes tell others the hashes of types, which came with Iron (REP-2016)."""
+    def has_type_hashes(self) -> bool:
+        """Whether its nodes announce type hashes, which were introduced in Iron (REP-2016)."""
         return self not in {Distribution.FOXY, Distribution.GALACTIC, Distribution.HUMBLE}
 
     @property
     def gid_bytes(self) -> int:
-        """How long the name of an endpoint is in its rmw_dds_common."""
-        return 16 if self.tells_hashes else 24
+        """Length of a GID in its rmw_dds_common."""
+        return 16 if self.has_type_hashes else 24
 
 
-_STORES: Final = MappingProxyType({one: Stores(f"ros2_{one}") for one in Distribution})
+_STORES: Final = MappingProxyType({distribution: Stores(f"ros2_{distribution}") for distribution in Distribution})
 
 
 @dataclass(frozen=True)
 class MessageField:
-    """One member of a message.
+    """A member of a message.
 
     Attributes:
         name: Its name.
-        type: A type of the language (`float32`, `string`), or the name of a message type, `std_msgs/msg/Header`.
-        count: None for one, 0 for a sequence, else the length of an array; less than 0, the bound of a sequence.
+        type: A primitive type (`float32`, `string`), or the name of a message type (`std_msgs/msg/Header`).
+        count: None for a single value, 0 for an unbounded sequence, the length of an array, or the negative bound of
+            a sequence.
     """
 
     name: str
@@ -73,13 +74,13 @@ class MessageField:
 
 @dataclass(frozen=True)
 class MessageType:
-    """A message type in both generations of ROS.
+    """A message type in ROS 1 and ROS 2.
 
     Attributes:
-        name: `sensor_msgs/msg/LaserScan`.
-        definition: Its text as nodes of ROS 1 tell it, with the types that it is made of; empty where ROS 1 has none.
-        md5: Its sum there; empty where ROS 1 has none.
-        rihs01: Its hash in ROS 2, `RIHS01_` and 64 hexadecimal digits; empty where ROS 2 has none.
+        name: Its name, for example `sensor_msgs/msg/LaserScan`.
+        definition: Its definition with all nested types, in the format of ROS 1; empty if ROS 1 has no such type.
+        md5: Its MD5 sum in ROS 1; empty if ROS 1 has no such type.
+        rihs01: Its hash in ROS 2, `RIHS01_` and 64 hexadecimal digits; empty if ROS 2 has no such type.
     """
 
     name: str
@@ -89,19 +90,19 @@ class MessageType:
 
 
 class MessageTypes:
-    """The message types that a lab knows.
+    """The standard message types, and the custom types of a lab.
 
     Args:
-        distribution: Of ROS 2.
-        definitions: Text of each type of the lab's own by name, `lab_msgs/msg/Radio` or `lab_msgs/Radio`.
+        distribution: Distribution of ROS 2.
+        definitions: Definitions of the custom types by name, `lab_msgs/msg/Radio` or `lab_msgs/Radio`.
 
     Attributes:
-        ros1: The types in ROS 1, Noetic.
+        ros1: The types in ROS 1 Noetic.
         ros2: The types in ROS 2.
-        distribution: Of that.
+        distribution: Distribution of ROS 2.
 
     Raises:
-        ConfigurationError: A definition is none, or names a type that there is not.
+        ConfigurationError: A definition is invalid, or contains an unknown type.
     """
 
     def __init__(
@@ -110,74 +111,77 @@ class MessageTypes:
         self.distribution = distribution
         self.ros1 = get_typestore(Stores.ROS1_NOETIC)
         self.ros2 = get_typestore(_STORES[distribution])
-        own = {full_name(name): text for name, text in definitions.items()}
+        custom = {full_name(name): text for name, text in definitions.items()}
         for store in (self.ros1, self.ros2):
-            _add(store, {**LACKING, **own})
-        # In a .msg file of ROS 2 `char` is another name of uint8, which rosbags' hash does not know.
+            _add(store, {**LACKING, **custom})
+        # In .msg files of ROS 2 `char` is an alias of uint8, which the hash function of rosbags ignores.
         for name, (constants, members) in list(self.ros2.fielddefs.items()):
             self.ros2.fielddefs[name] = (constants, _char_as_uint8(members))
 
     def get(self, name: str) -> MessageType:
-        """Return a type by its name, in the spelling of either generation.
+        """Return a type by its name, in the spelling of ROS 1 or ROS 2.
 
         Raises:
-            ConfigurationError: There is none.
+            ConfigurationError: There is no such type.
         """
         full = full_name(name)
-        of_ros1, of_ros2 = full in self.ros1.fielddefs, full in self.ros2.fielddefs
-        if not of_ros1 and not of_ros2:
+        in_ros1, in_ros2 = full in self.ros1.fielddefs, full in self.ros2.fielddefs
+        if not in_ros1 and not in_ros2:
             raise self._unknown(full)
-        definition, md5 = self.ros1.generate_msgdef(full, ros_version=1) if of_ros1 else ("", "")
-        return MessageType(full, definition, md5, self.ros2.hash_rihs01(full) if of_ros2 else "")
+        definition, md5 = self.ros1.generate_msgdef(full, ros_version=1) if in_ros1 else ("", "")
+        return MessageType(full, definition, md5, self.ros2.hash_rihs01(full) if in_ros2 else "")
 
     def fields(self, name: str) -> Mapping[str, tuple[MessageField, ...]]:
-        """Return the members of a type in ROS 2, and of every type that it is made of, by name; itself first.
+        """Return the members of a type in ROS 2, which is the first key, and of all nested types, by type name.
 
         Raises:
             ConfigurationError: ROS 2 has no such type.
         """
-        found: dict[str, tuple[MessageField, ...]] = {}
-        waiting = [full_name(name)]
-        while waiting:
-            kind = waiting.pop(0)
-            if kind in found:
+        types: dict[str, tuple[MessageField, ...]] = {}
+        pending = [full_name(name)]
+        while pending:
+            kind = pending.pop(0)
+            if kind in types:
                 continue
             if kind not in self.ros2.fielddefs:
                 raise self._unknown(kind)
-            found[kind] = tuple(_field(*member) for member in self.ros2.fielddefs[kind][1])
-            waiting += [member.type for member in found[kind] if "/" in member.type]
-        return found
+            types[kind] = tuple(_field(*member) for member in self.ros2.fielddefs[kind][1])
+            pending += [member.type for member in types[kind] if "/" in member.type]
+        return types
 
     def translatable(self, type_name: str) -> bool:
-        """Return whether a message of this type in one ROS is one of the other, but for `seq` of headers."""
+        """Return True if the type is the same in ROS 1 and ROS 2, except for `seq` of headers."""
         return all(
             name == _HEADER
-            or (name in self.ros1.fielddefs and _char_as_uint8(_kinds(self.ros1, name)) == _kinds(self.ros2, name))
+            or (
+                name in self.ros1.fielddefs
+                and _char_as_uint8(_member_types(self.ros1, name)) == _member_types(self.ros2, name)
+            )
             for name in self.fields(type_name)
         )
 
     def adds_at_end(self, type_name: str, names: tuple[str, ...]) -> bool:
-        """Return whether a type of ROS 2 has the members of ROS 1's, and after them just those of these names."""
+        """Return True if a type of ROS 2 has the members of ROS 1, followed by members with exactly these names."""
         full = full_name(type_name)
-        of_ros1 = _char_as_uint8(self.ros1.fielddefs[full][1])
+        ros1_members = _char_as_uint8(self.ros1.fielddefs[full][1])
         common, added = self.ros2.fielddefs[full][1][: -len(names)], self.ros2.fielddefs[full][1][-len(names) :]
-        return common == of_ros1 and tuple(name for name, _ in added) == names
+        return common == ros1_members and tuple(name for name, _ in added) == names
 
     def _unknown(self, name: str) -> ConfigurationError:
-        known = self.ros1.fielddefs.keys() | self.ros2.fielddefs.keys()
-        last = {full.rpartition("/")[2]: full for full in known}
-        remedy = nearest(name, last.values(), "give its definition")
+        type_names = self.ros1.fielddefs.keys() | self.ros2.fielddefs.keys()
+        full_names = {full.rpartition("/")[2]: full for full in type_names}
+        remedy = nearest(name, full_names.values(), "give its definition")
         return ConfigurationError(f"there is no message type {name}", remedy=remedy)
 
 
 @cache
 def shipped(distribution: Distribution = Distribution.JAZZY) -> MessageTypes:
-    """Return the types that ROS ships."""
+    """Return the standard types of ROS, without custom types."""
     return MessageTypes(distribution)
 
 
 def full_name(name: str) -> str:
-    """Return `sensor_msgs/msg/LaserScan` for either spelling of it."""
+    """Return a type name in the spelling of ROS 2, for example `sensor_msgs/msg/LaserScan`."""
     package, _, rest = name.partition("/")
     return f"{package}/msg/{rest}" if rest and "/" not in rest else name
 
@@ -185,27 +189,27 @@ def full_name(name: str) -> str:
 def _add(store: Typestore, definitions: Mapping[str, str]) -> None:
     for name, text in definitions.items():
         try:
-            found = get_types_from_msg(text, name)
-            store.register({kind: found[kind] for kind in found if kind not in store.fielddefs})
+            types = get_types_from_msg(text, name)
+            store.register({kind: types[kind] for kind in types if kind not in store.fielddefs})
         except (TypesysError, AssertionError, ValueError, KeyError) as error:
             raise ConfigurationError(
-                f"the definition of {name} is none: {error}", remedy="write it as in a .msg file of ROS"
+                f"the definition of {name} is not valid: {error}", remedy="write it as in a .msg file of ROS"
             ) from error
     for name in definitions:
         for _, description in store.fielddefs[name][1]:
             if (member := _field("", description)).type not in store.fielddefs and "/" in member.type:
                 raise ConfigurationError(
-                    f"the definition of {name} names {member.type}, which there is not", remedy="define it, too"
+                    f"the definition of {name} contains the unknown type {member.type}", remedy="define it, too"
                 )
 
 
-def _kinds(store: Typestore, name: str) -> list[Any]:
-    """Return the descriptions of a type's members, without their names."""
+def _member_types(store: Typestore, name: str) -> list[Any]:
+    """Return the descriptions of the members of a type, without names."""
     return [description for _, description in store.fielddefs[name][1]]
 
 
 def _char_as_uint8(node: Any) -> Any:  # noqa: ANN401 (of rosbags, whose own type is recursive)
-    """Return a description of members, tuples in lists, with one type of the language for another."""
+    """Return a description of members (nested lists and tuples) in which `char` is replaced by `uint8`."""
     if isinstance(node, list):
         return [_char_as_uint8(part) for part in node]
     if not isinstance(node, tuple):
@@ -214,12 +218,12 @@ def _char_as_uint8(node: Any) -> Any:  # noqa: ANN401 (of rosbags, whose own typ
 
 
 def _field(name: str, description: Any) -> MessageField:  # noqa: ANN401 (of rosbags, whose own type is recursive)
-    """Return a member as rosbags describes it: a kind of node, and what it is of."""
-    kind, of = description
+    """Convert a description of rosbags, a node type with its content, to a member."""
+    kind, content = description
     if kind == Nodetype.BASE:
-        return MessageField(name, of[0], None)
+        return MessageField(name, content[0], None)
     if kind == Nodetype.NAME:
-        return MessageField(name, of, None)
-    (inner, what), count = of
-    element = what[0] if inner == Nodetype.BASE else what
+        return MessageField(name, content, None)
+    (inner, element_type), count = content
+    element = element_type[0] if inner == Nodetype.BASE else element_type
     return MessageField(name, element, count if kind == Nodetype.ARRAY else -count)

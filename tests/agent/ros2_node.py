@@ -1,6 +1,6 @@
-"""A node of a real ROS 2, by a Python that has rclpy: hears `/stream`, says it again as `/again`, tells what it saw.
+"""A ROS 2 node for a Python with rclpy: it republishes messages of `/stream` on `/again`, and prints a report.
 
-Usage: python ros2_node.py COUNT TYPE; it ends after so many messages, and prints one object of JSON.
+Usage: python ros2_node.py COUNT TYPE. It exits after COUNT messages, and prints one JSON object.
 """
 
 import importlib
@@ -16,36 +16,36 @@ LIMIT_S = 60.0
 
 
 def main(count: int, kind: str) -> None:
-    """Hear so many messages of a type, and print what they were."""
+    """Receive so many messages of a type, and print a report."""
     package, _, name = kind.split("/")
     message_type = getattr(importlib.import_module(f"{package}.msg"), name)
     rclpy.init()
     node = rclpy.create_node("real")
     publisher = node.create_publisher(message_type, "/again", 10)
-    heard = []
+    messages = []
 
-    def take(data: bytes) -> None:
-        heard.append(data)
+    def on_message(data: bytes) -> None:
+        messages.append(data)
         publisher.publish(deserialize_message(data, message_type))
 
-    node.create_subscription(message_type, "/stream", take, qos_profile_sensor_data, raw=True)
+    node.create_subscription(message_type, "/stream", on_message, qos_profile_sensor_data, raw=True)
     deadline_s = time.monotonic() + LIMIT_S
-    while len(heard) < count and time.monotonic() < deadline_s:
+    while len(messages) < count and time.monotonic() < deadline_s:
         rclpy.spin_once(node, timeout_sec=0.1)
-    (seen,) = node.get_publishers_info_by_topic("/stream")
-    quality = seen.qos_profile
-    told = {
-        "heard": [data.hex() for data in heard],
-        "again": [serialize_message(deserialize_message(data, message_type)).hex() for data in heard],
-        "type": seen.topic_type,
-        "hash": str(seen.topic_type_hash),
+    (publisher,) = node.get_publishers_info_by_topic("/stream")
+    quality = publisher.qos_profile
+    report = {
+        "heard": [data.hex() for data in messages],
+        "again": [serialize_message(deserialize_message(data, message_type)).hex() for data in messages],
+        "type": publisher.topic_type,
+        "hash": str(publisher.topic_type_hash),
         "reliability": quality.reliability.name,
         "depth": quality.depth,
-        "subscribers": [one.topic_type for one in node.get_subscriptions_info_by_topic("/again")],
+        "subscribers": [subscription.topic_type for subscription in node.get_subscriptions_info_by_topic("/again")],
     }
-    sys.stdout.write(json.dumps(told) + "\n")
+    sys.stdout.write(json.dumps(report) + "\n")
     sys.stdout.flush()
-    # What was said again last is still on the way.
+    # The last republished message may not have been sent yet.
     rclpy.spin_once(node, timeout_sec=1.0)
     node.destroy_node()
     rclpy.shutdown()

@@ -1,4 +1,4 @@
-"""The agent as a robot runs it: one file, on two hosts on one cable, over each middleware."""
+"""The agent as it runs on robots: one file, on two hosts with one cable, over each middleware."""
 
 import ast
 import json
@@ -32,10 +32,10 @@ MODULES = sorted((ROOT / "fieldkit" / "agent").glob("*.py"))
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.name)
-def test_the_agent_needs_nothing_but_python_3_8_and_its_middleware(path: Path) -> None:
+def test_agent_needs_only_python_3_8_and_its_middleware(path: Path) -> None:
     tree = ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 8))
-    names = {one.module or "" for one in ast.walk(tree) if isinstance(one, ast.ImportFrom)}
-    names |= {alias.name for one in ast.walk(tree) if isinstance(one, ast.Import) for alias in one.names}
+    names = {row.module or "" for row in ast.walk(tree) if isinstance(row, ast.ImportFrom)}
+    names |= {alias.name for row in ast.walk(tree) if isinstance(row, ast.Import) for alias in row.names}
     of = {
         "dds.py": {"cyclonedds"},
         "zenoh.py": {"zenoh"},
@@ -48,7 +48,7 @@ def test_the_agent_needs_nothing_but_python_3_8_and_its_middleware(path: Path) -
         assert name.startswith("fieldkit.agent") or root in sys.stdlib_module_names | own, name
 
 
-def test_the_same_modules_make_the_same_file() -> None:
+def test_same_modules_give_the_same_file() -> None:
     first = agent.content()
     agent.content.cache_clear()
     assert agent.content() == first
@@ -56,12 +56,12 @@ def test_the_same_modules_make_the_same_file() -> None:
 
 @dataclass(frozen=True)
 class Cable:
-    """Two hosts, and the agent's file."""
+    """Two hosts, and the file of the agent."""
 
     hosts: tuple[TestHost, TestHost]
     program: Path
 
-    def told(self, over: str, host: TestHost, **network: object) -> dict[str, Any]:
+    def arguments(self, over: str, host: TestHost, **network: object) -> dict[str, Any]:
         node = f"fieldkit_{host.pid}"
         topic = topics.describe(shipped(), "/stream", TYPE, PROFILES["default"], domain=3, node=node)
         taking_part = {"address": host.address, "domain": 3, "node": node, **network}
@@ -69,10 +69,10 @@ class Cable:
 
     @contextmanager
     def running(
-        self, host: TestHost, verb: str, told: dict[str, Any], *words: str
+        self, host: TestHost, verb: str, arguments: dict[str, Any], *words: str
     ) -> Iterator[subprocess.Popen[bytes]]:
-        """Run the agent on a host while the body runs; it is up when the body begins."""
-        with host.start((sys.executable, str(self.program), verb, json.dumps(told), *words)) as process:
+        """Run the agent on a host; it is ready when the body starts, and is stopped after it."""
+        with host.start((sys.executable, str(self.program), verb, json.dumps(arguments), *words)) as process:
             assert process.stderr is not None
             said = process.stderr.readline()
             assert said.startswith(b"up, "), said + process.stderr.read()
@@ -92,21 +92,21 @@ def cable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cable]:
 
 
 def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> None:
-    """Stream from one host to the other, and see that all came as it was sent."""
+    """Stream from one host to the other, and check that all samples arrive unchanged."""
     near, far = cable.hosts
     sent, came = tmp_path / "sent", tmp_path / "came"
-    hears = cable.told(over, far, peers=(near.address,), **network)
+    hears = cable.arguments(over, far, peers=(near.address,), **network)
     with cable.running(far, "subscribe", hears, str(came)) as subscriber:
-        speaks = cable.told(over, near, peers=(far.address,), **network)
+        speaks = cable.arguments(over, near, peers=(far.address,), **network)
         with cable.running(near, "publish", speaks, str(sent)) as publisher:
             assert publisher.wait(timeout=60) == 0
     assert subscriber.returncode == 0
     left, arrived = topic_logs.rows(sent), topic_logs.rows(came)
     kinds = [row[0] for row in left if row[0] != records.SKIPPED]
     assert kinds[:3] == [records.ORIGIN, records.BEGUN, records.MATCHED]
-    wanted = [one[2:5] for one in left if one[0] == records.SAMPLE]
+    wanted = [row[2:5] for row in left if row[0] == records.SAMPLE]
     assert wanted
-    assert [one[2:5] for one in arrived if one[0] == records.SAMPLE] == wanted
+    assert [row[2:5] for row in arrived if row[0] == records.SAMPLE] == wanted
     kind, _, _, count, checked, _ = arrived[-1]
     assert (kind, count, checked) == (records.END, len(wanted), records.CHECKED)
 
@@ -114,17 +114,17 @@ def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> Non
 @pytest.mark.emulated
 @pytest.mark.parametrize("discovery", ["multicast", "peers"])
 @pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_samples_cross_without_a_master(cable: Cable, tmp_path: Path, over: str, discovery: str) -> None:
+def test_samples_arrive_without_a_master(cable: Cable, tmp_path: Path, over: str, discovery: str) -> None:
     exchanged(cable, tmp_path, over, discovery=discovery)
 
 
 @pytest.mark.emulated
-def test_samples_cross_by_udp(cable: Cable, tmp_path: Path) -> None:
+def test_samples_arrive_over_udp(cable: Cable, tmp_path: Path) -> None:
     exchanged(cable, tmp_path, "zenoh", discovery="peers", transport="udp")
 
 
 @pytest.mark.emulated
-def test_samples_cross_by_a_router(cable: Cable, tmp_path: Path) -> None:
+def test_samples_arrive_through_a_router(cable: Cable, tmp_path: Path) -> None:
     near, _ = cable.hosts
     routes = {"network": {"address": near.address, "discovery": "router", "server": near.address}}
     with cable.running(near, "route", routes):
@@ -132,7 +132,7 @@ def test_samples_cross_by_a_router(cable: Cable, tmp_path: Path) -> None:
 
 
 @pytest.mark.emulated
-def test_samples_cross_by_a_master_of_ros_1(cable: Cable, tmp_path: Path) -> None:
+def test_samples_arrive_with_a_ros_1_master(cable: Cable, tmp_path: Path) -> None:
     near, _ = cable.hosts
     with ExitStack() as stack:
         master = stack.enter_context(near.start(("rosmaster", "--core", "-p", "11311")))
@@ -141,27 +141,27 @@ def test_samples_cross_by_a_master_of_ros_1(cable: Cable, tmp_path: Path) -> Non
 
 
 @pytest.mark.emulated
-def test_a_subscriber_that_is_killed_leaves_what_it_had(cable: Cable, tmp_path: Path) -> None:
+def test_killed_subscriber_leaves_received_samples(cable: Cable, tmp_path: Path) -> None:
     near, far = cable.hosts
     sent, came = tmp_path / "sent", tmp_path / "came"
-    with cable.running(far, "subscribe", cable.told("dds", far), str(came)) as subscriber:
-        with cable.running(near, "publish", cable.told("dds", near), str(sent)) as publisher:
+    with cable.running(far, "subscribe", cable.arguments("dds", far), str(came)) as subscriber:
+        with cable.running(near, "publish", cable.arguments("dds", near), str(sent)) as publisher:
             assert publisher.wait(timeout=60) == 0
         subscriber.kill()
-    arrived = [one[3] for one in topic_logs.rows(came) if one[0] == records.SAMPLE]
-    assert arrived == [one[3] for one in topic_logs.rows(sent) if one[0] == records.SAMPLE]
+    arrived = [row[3] for row in topic_logs.rows(came) if row[0] == records.SAMPLE]
+    assert arrived == [row[3] for row in topic_logs.rows(sent) if row[0] == records.SAMPLE]
     assert topic_logs.rows(came)[-1][0] == records.SAMPLE
 
 
 @pytest.mark.emulated
-def test_a_publisher_ends_where_nobody_acknowledges_any_more(cable: Cable, tmp_path: Path) -> None:
+def test_publisher_stops_without_acknowledgements(cable: Cable, tmp_path: Path) -> None:
     near, far = cable.hosts
     sent, came = tmp_path / "sent", tmp_path / "came"
-    with cable.running(far, "subscribe", cable.told("dds", far), str(came)) as subscriber:
-        speaks = cable.told("dds", near)
-        speaks["stream"]["duration_s"] = 3.0  # so that it is stopped before it has all
+    with cable.running(far, "subscribe", cable.arguments("dds", far), str(came)) as subscriber:
+        speaks = cable.arguments("dds", near)
+        speaks["stream"]["duration_s"] = 3.0  # stopped before it has received all samples
         with cable.running(near, "publish", speaks, str(sent)) as publisher:
-            wait_until(lambda: any(one[0] == records.SAMPLE for one in topic_logs.rows(sent)), Deadline.after(60))
+            wait_until(lambda: any(row[0] == records.SAMPLE for row in topic_logs.rows(sent)), Deadline.after(60))
             subscriber.send_signal(signal.SIGSTOP)
             try:
                 _, said = publisher.communicate(timeout=60)
@@ -172,11 +172,11 @@ def test_a_publisher_ends_where_nobody_acknowledges_any_more(cable: Cable, tmp_p
 
 
 @pytest.mark.emulated
-def test_no_master_is_told(cable: Cable, tmp_path: Path) -> None:
+def test_missing_master_is_reported(cable: Cable, tmp_path: Path) -> None:
     near, _ = cable.hosts
-    told = cable.told("ros1", near, discovery="master", server="127.0.0.1", settings={"patience_s": "0.1"})
+    arguments = cable.arguments("ros1", near, discovery="master", server="127.0.0.1", settings={"patience_s": "0.1"})
     with near.start(
-        (sys.executable, str(cable.program), "publish", json.dumps(told), str(tmp_path / "log"))
+        (sys.executable, str(cable.program), "publish", json.dumps(arguments), str(tmp_path / "log"))
     ) as process:
         _, said = process.communicate(timeout=60)
     assert process.returncode == 3
@@ -184,36 +184,36 @@ def test_no_master_is_told(cable: Cable, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("argv", [[], ["publish"], ["route", "{}", "log"], ["other", "{}"]])
-def test_a_wrong_command_line_is_refused(argv: list[str], tmp_path: Path) -> None:
+def test_invalid_command_line_is_rejected(argv: list[str], tmp_path: Path) -> None:
     program = tmp_path / "agent.pyz"
     program.write_bytes(agent.content())
     done = subprocess.run((sys.executable, program, *argv), capture_output=True, check=False)
     assert (done.returncode, done.stderr[:6]) == (2, b"usage:")
 
 
-def test_a_log_without_room_is_told(tmp_path: Path) -> None:
+def test_log_without_disk_space_is_reported(tmp_path: Path) -> None:
     program = tmp_path / "agent.pyz"
     program.write_bytes(agent.content())
-    told = json.dumps({"stream": {"over": "dds", **STREAM}})
-    argv = ("prlimit", "--fsize=1000", sys.executable, program, "subscribe", told, tmp_path / "log")
+    arguments = json.dumps({"stream": {"over": "dds", **STREAM}})
+    argv = ("prlimit", "--fsize=1000", sys.executable, program, "subscribe", arguments, tmp_path / "log")
     done = subprocess.run(argv, capture_output=True, text=True, check=False)
     assert done.returncode == 3
     assert done.stderr == f"error: the log {tmp_path / 'log'} cannot be written: File too large\n"
 
 
-def test_a_middleware_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_missing_middleware_is_reported(tmp_path: Path) -> None:
     program = tmp_path / "agent.pyz"
     program.write_bytes(agent.content())
-    told = json.dumps({"stream": {"over": "zenoh", **STREAM}})
-    # Isolated and without site-packages, Python has nothing but its own library.
-    argv = (sys.executable, "-I", "-S", program, "publish", told, tmp_path / "log")
+    arguments = json.dumps({"stream": {"over": "zenoh", **STREAM}})
+    # Isolated and without site-packages, Python has only its standard library.
+    argv = (sys.executable, "-I", "-S", program, "publish", arguments, tmp_path / "log")
     done = subprocess.run(argv, capture_output=True, check=False)
     assert done.returncode == 3
     assert done.stderr.startswith(b"error: zenoh is not installed here: ")
 
 
 def attacked(host: TestHost, *words: str) -> None:
-    """Let a host say what ends who trusts it, and wait until it has."""
+    """Let a host send hostile packets, and wait until it has finished."""
     argv = ("env", f"PYTHONPATH={ROOT}", sys.executable, "-m", "tests.helpers.hostile_wire", *words)
     with host.start(argv) as process:
         _, said = process.communicate(timeout=120)
@@ -222,14 +222,14 @@ def attacked(host: TestHost, *words: str) -> None:
 
 @contextmanager
 def unharmed(cable: Cable, tmp_path: Path, over: str, **network: object) -> Iterator[Path]:
-    """Stream from one host to the other while the body runs; both are up behind it, and end well.
+    """Stream from one host to the other while the body runs; both programs must survive and stop cleanly after it.
 
-    Gives the log of what came.
+    Yields the log of the received samples.
     """
     near, far = cable.hosts
     came, sent = tmp_path / "came", tmp_path / "sent"
-    hears = cable.told(over, near, peers=(far.address,), **network)
-    speaks = cable.told(over, far, peers=(near.address,), **network)
+    hears = cable.arguments(over, near, peers=(far.address,), **network)
+    speaks = cable.arguments(over, far, peers=(near.address,), **network)
     endless = {**speaks, "stream": {**speaks["stream"], "duration_s": 600.0}}
     with cable.running(near, "subscribe", hears, str(came)) as subscriber:
         with cable.running(far, "publish", endless, str(sent)) as publisher:
@@ -238,20 +238,20 @@ def unharmed(cable: Cable, tmp_path: Path, over: str, **network: object) -> Iter
         assert subscriber.poll() is None
     assert (subscriber.returncode, publisher.returncode) == (0, 0)
     for log in (sent, came):
-        assert records.SAMPLE in {one[0] for one in topic_logs.rows(log)}
+        assert records.SAMPLE in {row[0] for row in topic_logs.rows(log)}
         assert topic_logs.rows(log)[-1][0] == records.END
 
 
 @pytest.mark.emulated
-def test_changed_rtps_messages_end_neither_end_of_a_topic(cable: Cable, tmp_path: Path) -> None:
-    """What they say to each other may be lost for good: whoever speaks in another's name is believed."""
+def test_changed_rtps_messages_stop_neither_program(cable: Cable, tmp_path: Path) -> None:
+    """Their messages may be lost permanently, because RTPS trusts packets in the name of another participant."""
     with unharmed(cable, tmp_path, "dds"):
         attacked(cable.hosts[1], "rtps", "1000")
 
 
 @pytest.mark.emulated
-def test_one_heartbeat_in_a_writers_name_silences_a_subscription(cable: Cable, tmp_path: Path) -> None:
-    """CycloneDDS does as RTPS says: what is before its oldest sample is gone. docs/studies/hostile.md tells it."""
+def test_forged_heartbeat_silences_a_subscription(cable: Cable, tmp_path: Path) -> None:
+    """CycloneDDS follows RTPS: samples before the oldest available one are lost; see docs/studies/hostile.md."""
     with unharmed(cable, tmp_path, "dds") as came:
         attacked(cable.hosts[1], "heartbeat")
         said = newest(tmp_path / "sent") + 1  # sent, and perhaps not yet in the log
@@ -260,12 +260,12 @@ def test_one_heartbeat_in_a_writers_name_silences_a_subscription(cable: Cable, t
 
 
 def newest(log: Path) -> int:
-    """Return the highest number of a sample in a log, -1 of none."""
-    return max((one[3] for one in topic_logs.rows(log) if one[0] == records.SAMPLE), default=-1)
+    """Return the highest sequence number of the samples in a log, -1 if there are none."""
+    return max((row[3] for row in topic_logs.rows(log) if row[0] == records.SAMPLE), default=-1)
 
 
 @pytest.mark.emulated
-def test_what_is_no_tcpros_ends_neither_end_of_a_topic(cable: Cable, tmp_path: Path) -> None:
+def test_invalid_tcpros_data_stop_neither_program(cable: Cable, tmp_path: Path) -> None:
     near, far = cable.hosts
     network = {"discovery": "master", "server": near.address, "settings": {"tcpros_port": "40001"}}
     with ExitStack() as stack:
@@ -273,7 +273,7 @@ def test_what_is_no_tcpros_ends_neither_end_of_a_topic(cable: Cable, tmp_path: P
         stack.callback(process.terminate)
         with unharmed(cable, tmp_path, "ros1", **network) as came:
             attacked(far, "tcpros", f"http://{near.address}:11311", f"{near.address}:40001", f"{far.address}:40001")
-            heard = {one[3] for one in topic_logs.rows(came) if one[0] == records.SAMPLE}
+            sequences = {row[3] for row in topic_logs.rows(came) if row[0] == records.SAMPLE}
             deadline_s = time.monotonic() + 60
-            while {one[3] for one in topic_logs.rows(came) if one[0] == records.SAMPLE} <= heard:
+            while {row[3] for row in topic_logs.rows(came) if row[0] == records.SAMPLE} <= sequences:
                 assert time.monotonic() < deadline_s, "nothing comes any more"

@@ -1,4 +1,4 @@
-"""The program that flies a drone: its messages against pymavlink, its way, its orders, and bytes that are none."""
+"""The program that flies a drone: its messages compared with pymavlink, its path, its orders, and invalid bytes."""
 
 import math
 from collections.abc import Iterator
@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as d
 from fieldkit.agent import dialect, mavlink_frames
 from fieldkit.agent.arming import ArmingCheck
 from fieldkit.agent.autopilot import AutopilotState
-from fieldkit.agent.flight_plan import FlightNeeds, FlightPlan, along
+from fieldkit.agent.flight_plan import FlightNeeds, FlightPlan, point_on_path
 from fieldkit.agent.flying.origin import FlightOrigin
 from fieldkit.agent.links.client import MessageRate
 
@@ -23,7 +23,7 @@ legs = st.lists(st.tuples(metres, metres, metres), max_size=5)
 
 
 class MemoryLink:
-    """A way to nowhere: what is sent stays, what is to come is put there."""
+    """A link without a connection: it stores sent frames, and delivers frames that a test has set."""
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []
@@ -45,7 +45,7 @@ class MemoryLink:
 
 
 def talk(*messages: d.MAVLink_message, system: int = 7) -> tuple[AutopilotState, MemoryLink]:
-    """Return what is known of an autopilot that said this after its heartbeat."""
+    """Return the state of an autopilot that has sent these messages after its heartbeat."""
     link, writer = MemoryLink(), d.MAVLink(None, srcSystem=system, srcComponent=1)
     beat = d.MAVLink_heartbeat_message(2, PX4, ARMED, 6 << 16, 4, 3)
     link.coming = [message.pack(writer) for message in (beat, *messages)]
@@ -54,7 +54,7 @@ def talk(*messages: d.MAVLink_message, system: int = 7) -> tuple[AutopilotState,
     return state, link
 
 
-def test_what_an_autopilot_says_is_known() -> None:
+def test_state_from_messages_of_an_autopilot() -> None:
     state, _ = talk(
         d.MAVLink_local_position_ned_message(1, 1.0, -2.0, -3.0, 0.3, 0.4, 0.0),
         d.MAVLink_attitude_message(1, 0.1, 0.2, 1.5, 0, 0, 0),
@@ -66,16 +66,16 @@ def test_what_an_autopilot_says_is_known() -> None:
     assert state.guided
     assert state.dialect is not None
     assert state.dialect.name == "PX4"
-    assert state.place_m == (1.0, -2.0, -3.0)
+    assert state.position_m == (1.0, -2.0, -3.0)
     assert state.speed_m_s == pytest.approx(0.5)
     assert state.yaw_rad == pytest.approx(1.5)
-    assert state.answers == {400: 4}
-    assert state.said == "mode OFFBOARD, its last text: Arming denied: it falls"
+    assert state.command_results == {400: 4}
+    assert state.messages == "mode OFFBOARD, its last text: Arming denied: it falls"
     assert state.texts.new() == ["Arming denied: it falls"]
     assert state.texts.new() == []
 
 
-def test_a_stranger_and_a_damaged_frame_count_for_nothing() -> None:
+def test_other_systems_and_damaged_frames_are_ignored() -> None:
     state, link = talk(d.MAVLink_local_position_ned_message(1, 1.0, 2.0, 3.0, 0, 0, 0))
     stranger = d.MAVLink(None, srcSystem=9, srcComponent=1)
     elsewhere = d.MAVLink_local_position_ned_message(2, 99.0, 99.0, 99.0, 0, 0, 0)
@@ -88,11 +88,11 @@ def test_a_stranger_and_a_damaged_frame_count_for_nothing() -> None:
         nowhere.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)),
     ]
     state.receive()
-    assert state.place_m == (1.0, 2.0, 3.0)
+    assert state.position_m == (1.0, 2.0, 3.0)
 
 
 @given(st.lists(st.tuples(st.sampled_from([*mavlink_frames.EXTRA]), st.binary(max_size=60)), max_size=5))
-def test_no_payload_ends_it(payloads: list[tuple[int, bytes]]) -> None:
+def test_any_payload_is_tolerated(payloads: list[tuple[int, bytes]]) -> None:
     state, link = talk()
     check = ArmingCheck(state, FlightNeeds(3.0, 5.0, 30.0, 0.2, returns=True))
     for kind, payload in payloads:
@@ -100,29 +100,29 @@ def test_no_payload_ends_it(payloads: list[tuple[int, bytes]]) -> None:
         total = mavlink_frames.checksum(body + bytes((mavlink_frames.EXTRA[kind],)))
         link.coming.append(b"\xfd" + body + total.to_bytes(2, "little"))
     state.receive()
-    numbers = (*(state.place_m or ()), state.yaw_rad or 0.0, *state.parameters.values())
+    numbers = (*(state.position_m or ()), state.yaw_rad or 0.0, *state.parameters.values())
     assert all(map(math.isfinite, numbers))
     assert all(fault.what and fault.remedy for fault in check.faults())
 
 
-def test_what_it_says_is_what_pymavlink_reads() -> None:
+def test_sent_messages_are_those_of_pymavlink() -> None:
     state, link = talk()
-    state.beat()
+    state.send_heartbeat()
     assert state.dialect is not None
-    state.command(*state.dialect.guide())
+    state.command(*state.dialect.guided_command())
     state.command(dialect.ARM, 1)
-    state.command(*state.dialect.bring_down("land"))
-    state.lead((1.5, -2.5, -3.0), -2.0)
+    state.command(*state.dialect.bring_down_command("land"))
+    state.send_set_point((1.5, -2.5, -3.0), -2.0)
     state.request_stream(mavlink_frames.ATTITUDE, 10.0)
     reader = d.MAVLink(None)
-    said = [message for frame in link.sent for message in reader.parse_buffer(frame)]
-    beat, mode, arm, land, lead, ask = said
+    messages = [message for frame in link.sent for message in reader.parse_buffer(frame)]
+    beat, mode, arm, land, lead, ask = messages
     assert (beat.type, beat.autopilot) == (d.MAV_TYPE_ONBOARD_CONTROLLER, d.MAV_AUTOPILOT_INVALID)
-    assert {(one.target_system, one.target_component) for one in (mode, arm, land, lead, ask)} == {(7, 1)}
+    assert {(message.target_system, message.target_component) for message in (mode, arm, land, lead, ask)} == {(7, 1)}
     assert (mode.command, mode.param1, mode.param2) == (d.MAV_CMD_DO_SET_MODE, 1, 6)
     assert (arm.command, arm.param1, arm.param2) == (d.MAV_CMD_COMPONENT_ARM_DISARM, 1, 0)
     assert land.command == d.MAV_CMD_NAV_LAND
-    assert state.dialect.bring_down("return") == (d.MAV_CMD_NAV_RETURN_TO_LAUNCH,)
+    assert state.dialect.bring_down_command("return") == (d.MAV_CMD_NAV_RETURN_TO_LAUNCH,)
     assert (lead.x, lead.y, lead.z) == (1.5, -2.5, -3.0)
     assert lead.coordinate_frame == d.MAV_FRAME_LOCAL_NED
     assert lead.yaw == -2.0
@@ -139,7 +139,7 @@ def plan(way: list[tuple[float, float, float]]) -> FlightPlan:
     return FlightPlan("udpout:127.0.0.1:1", "orders", "land", 5.0, height_m=3.0, legs=way)
 
 
-def test_an_answer_to_another_station_and_one_that_is_not_final_are_ignored() -> None:
+def test_acknowledgements_for_others_and_in_progress_are_ignored() -> None:
     ours, other = (245, 191), (255, 190)
     state, _ = talk(
         d.MAVLink_command_ack_message(400, d.MAV_RESULT_DENIED, 0, 0, *other),
@@ -149,13 +149,13 @@ def test_an_answer_to_another_station_and_one_that_is_not_final_are_ignored() ->
         d.MAVLink_statustext_message(d.MAV_SEVERITY_NOTICE, b"Fence Breached"),
         d.MAVLink_statustext_message(d.MAV_SEVERITY_INFO, b"Arming motors"),
     )
-    assert state.answers == {176: d.MAV_RESULT_ACCEPTED, 21: d.MAV_RESULT_FAILED}
+    assert state.command_results == {176: d.MAV_RESULT_ACCEPTED, 21: d.MAV_RESULT_FAILED}
     assert state.texts.new() == ["Fence Breached"]
     assert state.texts.warnings == []
 
 
 @given(legs, st.floats(-math.pi, math.pi), st.tuples(metres, metres, metres))
-def test_its_way_is_as_long_as_its_legs_wherever_its_nose_points(
+def test_path_length_is_independent_of_position_and_heading(
     way: list[tuple[float, float, float]], yaw_rad: float, begin_m: tuple[float, float, float]
 ) -> None:
     corners_m = plan(way).corners_m(FlightOrigin("local", "", begin_m[0], begin_m[1], yaw_rad), begin_m[2])
@@ -166,7 +166,7 @@ def test_its_way_is_as_long_as_its_legs_wherever_its_nose_points(
     assert corners_m[-1][2] == pytest.approx(begin_m[2] - 3.0 - sum(up for _, _, up in way))
 
 
-def test_ahead_is_where_its_nose_points_and_left_is_left_of_that() -> None:
+def test_legs_ahead_and_left_follow_the_heading() -> None:
     _, ahead, left = plan([(4.0, 0.0, 0.0), (0.0, 2.0, 1.0)]).corners_m(
         FlightOrigin("local", "", 0.0, 0.0, math.pi / 2), 0.0
     )
@@ -175,9 +175,11 @@ def test_ahead_is_where_its_nose_points_and_left_is_left_of_that() -> None:
 
 
 @given(legs, st.floats(0, 400), st.floats(0, 400))
-def test_along_it_nobody_goes_faster_than_the_way(
+def test_points_on_a_path_do_not_exceed_the_speed(
     way: list[tuple[float, float, float]], one_m: float, other_m: float
 ) -> None:
     corners_m = plan(way).corners_m(FlightOrigin("local", "", 0.0, 0.0, 0.0), 0.0)
-    assert math.dist(along(corners_m, one_m), along(corners_m, other_m)) <= abs(one_m - other_m) + 1e-6
-    assert along(corners_m, 1e6) == corners_m[-1]
+    assert (
+        math.dist(point_on_path(corners_m, one_m), point_on_path(corners_m, other_m)) <= abs(one_m - other_m) + 1e-6
+    )
+    assert point_on_path(corners_m, 1e6) == corners_m[-1]

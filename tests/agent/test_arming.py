@@ -1,4 +1,4 @@
-"""What is asked before a drone rises, by messages of pymavlink and of the emulated autopilots."""
+"""Arming checks with messages of pymavlink, and of the emulated autopilots."""
 
 import json
 import threading
@@ -23,7 +23,7 @@ from tests.helpers.sshd import free_port
 NEEDS = FlightNeeds(highest_m=3.0, farthest_m=20.0, ceiling_m=10.0, least_charge=0.2, returns=True)
 ALL = d.MAV_SYS_STATUS_SENSOR_GPS | d.MAV_SYS_STATUS_PREARM_CHECK
 WELL = 831
-"""Flags of EKF_STATUS_REPORT of an ArduCopter that is ready, as its logs have them."""
+"""Flags of EKF_STATUS_REPORT of a ready ArduCopter, from its logs."""
 
 
 def beat(autopilot: int, mode: int = 0, base: int = 0) -> Any:  # noqa: ANN401 (of pymavlink)
@@ -38,7 +38,7 @@ def parameter(name: str, value: float) -> Any:  # noqa: ANN401
     return d.MAVLink_param_value_message(name.encode(), value, d.MAV_PARAM_TYPE_REAL32, 1, 0)
 
 
-WELL_SAID: Mapping[str, Any] = {
+WITHOUT_FAULT: Mapping[str, Any] = {
     "place": d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0),
     "estimate": d.MAVLink_ekf_status_report_message(WELL, 0.1, 0.1, 0.1, 0.1, 0.1),
     "status": status(),
@@ -51,53 +51,56 @@ WELL_SAID: Mapping[str, Any] = {
 }
 
 
-def faults(needs: FlightNeeds = NEEDS, first: Any = None, **said: Any) -> list[str]:  # noqa: ANN401
-    """Return what speaks against a flight where an autopilot says all is well, but for what is `said` otherwise."""
+def faults(needs: FlightNeeds = NEEDS, first: Any = None, **replaced: Any) -> list[str]:  # noqa: ANN401
+    """Return the faults if an autopilot sends messages without a fault, except for those replaced by `replaced`."""
     link, writer = MemoryLink(), d.MAVLink(None, srcSystem=7, srcComponent=1)
     drone = AutopilotState(link)
     link.coming = [(first or beat(d.MAV_AUTOPILOT_ARDUPILOTMEGA)).pack(writer)]
     drone.receive()
     check = ArmingCheck(drone, needs)
-    messages = [one for one in {**WELL_SAID, **said}.values() if one is not None]
-    link.coming = [one.pack(writer) for one in messages]
+    messages = [item for item in {**WITHOUT_FAULT, **replaced}.values() if item is not None]
+    link.coming = [item.pack(writer) for item in messages]
     drone.receive()
-    found = list(check.faults())
-    assert all(one.remedy for one in found)
-    return [one.what for one in found]
+    reported = list(check.faults())
+    assert all(item.remedy for item in reported)
+    return [item.what for item in reported]
 
 
-def test_where_all_is_well_nothing_speaks_against_it() -> None:
+def test_no_faults_for_a_ready_autopilot() -> None:
     assert faults() == []
-    assert faults(status=status(charge=-1)) == [], "it does not know its charge"
+    assert faults(status=status(charge=-1)) == [], "the charge is unknown"
     assert faults(replace(NEEDS, returns=False), home=None, back=None) == []
 
 
 @pytest.mark.parametrize(
-    ("said", "what"),
+    ("replaced", "what"),
     [
         ({"first": beat(d.MAV_AUTOPILOT_GENERIC)}, "its autopilot is neither PX4 nor ArduCopter (0, 2)"),
         ({"first": beat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)}, "its motors turn"),
-        ({"place": None}, "it does not say where it is"),
+        ({"place": None}, "it does not report its position"),
         (
             {"estimate": d.MAVLink_ekf_status_report_message(0xA7, 1, 1, 1, 1, 1)},
             "its estimate of where it is does not hold",
         ),
         ({"estimate": d.MAVLink_estimator_status_message(1, 0x400, *(1,) * 8)}, "flags 0x400"),
-        ({"status": None}, "it does not say how it is"),
-        ({"status": status(charge=19)}, "its battery has 19%, and 20% is the least"),
-        ({"status": status(healthy=0)}, "ArduCopter does not let itself be armed: GPS"),
+        ({"status": None}, "it does not report its status"),
+        ({"status": status(charge=19)}, "its battery has 19%, and 20% is the minimum"),
+        ({"status": status(healthy=0)}, "ArduCopter refuses to be armed: GPS"),
         ({"text": d.MAVLink_statustext_message(2, b"PreArm: Gyros inconsistent")}, "be armed: Gyros inconsistent"),
-        ({"home": None}, "it knows no home"),
-        ({"top": parameter("FENCE_ALT_MAX", 2.5)}, "its own fence ends 2.5 m high, and it is to fly 3 m"),
-        ({"radius": parameter("FENCE_RADIUS", 15)}, "its own fence ends 15 m far from home, and it is to fly 20 m"),
-        ({"back": parameter("RTL_ALT", 1500)}, "it returns 15 m high, and may fly 10 m"),
+        ({"home": None}, "it has no home position"),
+        ({"top": parameter("FENCE_ALT_MAX", 2.5)}, "its own fence ends 2.5 m high, but the flight needs 3 m"),
+        (
+            {"radius": parameter("FENCE_RADIUS", 15)},
+            "its own fence ends 15 m far from home, but the flight needs 20 m",
+        ),
+        ({"back": parameter("RTL_ALT", 1500)}, "it returns at a height of 15 m, but only 10 m are allowed"),
     ],
 )
-def test_what_speaks_against_a_flight_is_said(said: dict[str, Any], what: str) -> None:
-    assert any(what in one for one in faults(**said)), faults(**said)
+def test_each_fault_is_reported(replaced: dict[str, Any], what: str) -> None:
+    assert any(what in item for item in faults(**replaced)), faults(**replaced)
 
 
-def test_a_text_in_pieces_is_one() -> None:
+def test_text_in_pieces_is_joined() -> None:
     long = b"PreArm: Battery 1 below minimum arming voltage, which stands in BATT_ARM_VOLT"
     pieces = {f"text{n}": d.MAVLink_statustext_message(2, long[50 * n :][:50], 5, n) for n in range(2)}
     (what,) = faults(**pieces)
@@ -105,20 +108,23 @@ def test_a_text_in_pieces_is_one() -> None:
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])
-def test_an_emulated_autopilot_is_asked(firmware: Firmware, capsys: pytest.CaptureFixture[str]) -> None:
+def test_emulated_autopilots(firmware: Firmware, capsys: pytest.CaptureFixture[str]) -> None:
     unfit: list[str] = []
     with drones.at_udp(firmware=replace(firmware, arming_errors=lambda _parameters, _battery: unfit)) as port:
         for reasons in ([], ["Gyros inconsistent"]):
             unfit[:] = reasons
-            assert arming.look(f"udpout:127.0.0.1:{port}", replace(NEEDS, ceiling_m=30.0), threading.Event()) == 0
-            *found, told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-            assert told["charge"] == 1.0
-            assert [one["what"].rpartition(": ")[2] for one in found] == unfit
-            # What PX4 says is of the mode that it is in now, which is not the one in which it is flown.
-            assert [one["grave"] for one in found] == [told["autopilot"] == "ArduCopter"] * len(unfit)
+            assert (
+                arming.check_arming(f"udpout:127.0.0.1:{port}", replace(NEEDS, ceiling_m=30.0), threading.Event())
+                == 0
+            )
+            *reported, summary = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+            assert summary["charge"] == 1.0
+            assert [item["what"].rpartition(": ")[2] for item in reported] == unfit
+            # The checks of PX4 apply to its present mode, which is not the item of the flight.
+            assert [item["grave"] for item in reported] == [summary["autopilot"] == "ArduCopter"] * len(unfit)
 
 
-def test_where_nobody_answers_it_says_so(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_heartbeat_is_reported(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arming, "_HEARTBEAT_S", 0.3)
-    assert arming.look(f"udpin:127.0.0.1:{free_port()}", NEEDS, threading.Event()) == 1
+    assert arming.check_arming(f"udpin:127.0.0.1:{free_port()}", NEEDS, threading.Event()) == 1
     assert "no heartbeat" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The adapter of CycloneDDS: what it says to the library, and types that serialize as rosbags does."""
+"""The adapter of CycloneDDS: its configuration, QoS policies, and types with the serialization of rosbags."""
 
 import xml.etree.ElementTree as ET
 
@@ -17,11 +17,11 @@ OWN = "float32[4] level\nstring name\nuint8[] raw\nint16[<=3] few\nbool good\nby
 
 
 def topic(name: str, types: MessageTypes | None = None) -> Topic:
-    known = types or shipped()
-    return Topic.from_json(topics.describe(known, "/t", name, PROFILES["default"], domain=0, node="n"))
+    message_types = types or shipped()
+    return Topic.from_json(topics.describe(message_types, "/t", name, PROFILES["default"], domain=0, node="n"))
 
 
-def test_a_scan_has_the_bytes_that_rosbags_writes() -> None:
+def test_serialized_scan_is_that_of_rosbags() -> None:
     store = shipped().ros2
     kinds = {name: store.types[f"{name}"] for name in topic("sensor_msgs/LaserScan").members}
     time, header = kinds["builtin_interfaces/msg/Time"](5, 6), kinds["std_msgs/msg/Header"]
@@ -39,8 +39,8 @@ def test_a_scan_has_the_bytes_that_rosbags_writes() -> None:
     "name",
     ["nav_msgs/Odometry", "sensor_msgs/Imu", "sensor_msgs/BatteryState", "geometry_msgs/Twist", "tf2_msgs/TFMessage"],
 )
-def test_every_type_of_a_robot_is_made_member_by_member(name: str) -> None:
-    """An all-zero message of rosbags' size is what the binding reads and writes again."""
+def test_all_types_of_robots_can_be_built(name: str) -> None:
+    """The binding reads and writes an all-zero message with the size from rosbags."""
     described = topic(name)
     struct = dds.struct_type(described)
     empty = bytes((0, 1, 0, 0)) + bytes(2000)
@@ -51,12 +51,12 @@ def test_every_type_of_a_robot_is_made_member_by_member(name: str) -> None:
     assert bytes(again) == written
 
 
-def test_a_definition_of_ones_own_is_made_too() -> None:
+def test_custom_type_can_be_built() -> None:
     types = MessageTypes(definitions={"lab_msgs/Radio": OWN})
     kind = types.ros2.types["lab_msgs/msg/Radio"]
     level, raw = np.array([1, 2, 3, 4], np.float32), np.array([9, 8], np.uint8)
     message = kind(
-        level, "x", raw, np.array([1], np.int16), good=True, one=7, wide=0.5, big=np.array([1, 2], np.int64)
+        level, "x", raw, np.array([1], np.int16), good=True, element=7, wide=0.5, big=np.array([1, 2], np.int64)
     )
     written = bytes(types.ros2.serialize_cdr(message, "lab_msgs/msg/Radio"))
     read = dds.struct_type(topic("lab_msgs/Radio", types)).deserialize(written)  # type: ignore[attr-defined]
@@ -64,51 +64,51 @@ def test_a_definition_of_ones_own_is_made_too() -> None:
     assert read.serialize(use_version_2=False) == written
 
 
-def test_types_tell_the_names_that_ros_2_gives_them() -> None:
+def test_types_have_the_dds_names_of_ros_2() -> None:
     struct = dds.struct_type(topic("sensor_msgs/LaserScan"))
     assert struct.__idl__.idl_transformed_typename == "sensor_msgs::msg::dds_::LaserScan_"  # type: ignore[attr-defined]
 
 
 @given(st.binary(min_size=4, max_size=64))
-def test_samples_come_back_as_they_were(data: bytes) -> None:
+def test_padding_is_reversible(data: bytes) -> None:
     sample = data[:3] + bytes([data[3] & ~3]) + data[4:]
     assert len(dds.padded(sample)) % 4 == 0
     assert dds.unpadded(dds.padded(sample)) == sample
 
 
-def test_the_configuration_names_one_interface_and_the_peers() -> None:
+def test_configuration_contains_one_interface_and_the_peers() -> None:
     network = Network(
         "10.0.0.1", discovery="peers", peers=("10.0.0.2",), settings={"Discovery/SPDPInterval": "500 ms"}
     )
     (domain,) = ET.fromstring(dds.configuration(network))
-    assert [one.get("address") for one in domain.iter("NetworkInterface")] == ["10.0.0.1"]
-    assert [one.get("address") for one in domain.iter("Peer")] == ["10.0.0.2"]
+    assert [element.get("address") for element in domain.iter("NetworkInterface")] == ["10.0.0.1"]
+    assert [element.get("address") for element in domain.iter("Peer")] == ["10.0.0.2"]
     assert domain.findtext("General/AllowMulticast") == "false"
     assert domain.findtext("Discovery/SPDPInterval") == "500 ms"
     assert domain.findtext("Discovery/ParticipantIndex") == "auto"
 
 
-def test_a_setting_may_be_an_attribute() -> None:
+def test_setting_may_be_an_attribute() -> None:
     network = Network("10.0.0.1", settings={"Internal/SocketReceiveBufferSize@min": '10"MB'})
-    (found,) = ET.fromstring(dds.configuration(network)).iter("SocketReceiveBufferSize")
-    assert found.attrib == {"min": '10"MB'}
+    (element,) = ET.fromstring(dds.configuration(network)).iter("SocketReceiveBufferSize")
+    assert element.attrib == {"min": '10"MB'}
 
 
-def test_the_library_knows_what_is_tuned() -> None:
-    """It does not start with an element that it does not know."""
+def test_library_accepts_the_recommended_settings() -> None:
+    """It does not start if it does not know an element."""
     settings = dict(tuning.tuned("dds", "tcp"))
     dds.start(Network("127.0.0.1", discovery="peers", domain=97, settings=settings)).close()
     with pytest.raises(MiddlewareError, match="does not start"):
         dds.start(Network("127.0.0.1", discovery="peers", domain=97, settings={**settings, "General/Mox": "1"}))
 
 
-def test_settings_cannot_leave_their_element() -> None:
+def test_settings_are_escaped() -> None:
     network = Network("10.0.0.1", settings={"Discovery/Tag": "<x/>&"})
     assert ET.fromstring(dds.configuration(network)).findtext("Domain/Discovery/Tag") == "<x/>&"
 
 
 @pytest.mark.parametrize(
-    ("wanted", "policies"),
+    ("quality", "policies"),
     [
         (Quality(), ["Policy.Reliability.Reliable", "Policy.History.KeepLast", "Policy.Durability.Volatile"]),
         (
@@ -126,8 +126,8 @@ def test_settings_cannot_leave_their_element() -> None:
         (Quality("system_default", "system_default", 0, "system_default"), []),
     ],
 )
-def test_qualities_are_policies_of_dds(wanted: Quality, policies: list[str]) -> None:
-    said = repr(dds.quality(wanted, "typehash=x;", writes=True))
+def test_quality_of_service_as_dds_policies(quality: Quality, policies: list[str]) -> None:
+    qos_text = repr(dds.quality(quality, "typehash=x;", writes=True))
     for policy in (*policies, "Policy.Userdata"):
-        assert policy in said
-    assert said.count("Policy.") == len(policies) + 2
+        assert policy in qos_text
+    assert qos_text.count("Policy.") == len(policies) + 2

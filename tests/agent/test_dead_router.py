@@ -1,4 +1,4 @@
-"""A router that ends in flight and stays away: all programs of the flight end in a stated time, with an alarm."""
+"""A router that stops in flight and does not restart: all programs of the flight stop in time, with an alarm."""
 
 import json
 import signal
@@ -23,7 +23,7 @@ from tests.helpers.mavlink_router import MavlinkRouter
 from tests.helpers.sshd import wait_until
 
 UNHEARD_S: Final = 5.0
-"""Instead of `landing.UNHEARD_S`, to be faster; longer than the 4 s after which there is an alarm."""
+"""Replaces `landing.UNHEARD_S` by a shorter time, which is longer than the 4 s before an alarm."""
 PROGRAM: Final = f"""\
 import sys
 from fieldkit.agent import landing
@@ -50,7 +50,7 @@ def lines(log: Path) -> list[str]:
     return [line.partition(" ")[2] for line in log.read_text(encoding="utf-8").splitlines()]
 
 
-def test_all_programs_end_in_time_after_the_order_to_end(tmp_path: Path) -> None:
+def test_all_programs_stop_in_time_after_a_signal(tmp_path: Path) -> None:
     (tmp_path / "orders").write_text(f"1 {CLIMB} 600\n", encoding="ascii")
     with (
         drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot),
@@ -75,7 +75,7 @@ def test_all_programs_end_in_time_after_the_order_to_end(tmp_path: Path) -> None
                 ended_s = time.monotonic() - began_s
                 wait_until(lambda: not alive(server), Deadline.after(60))
         assert ended_s >= UNHEARD_S
-        assert autopilot.vehicle.armed, "nothing reached it"
+        assert autopilot.vehicle.armed, "it received no command"
     for log in logs:
         texts = lines(log)
         assert texts[-1] == f"error: no heartbeat of the autopilot for {UNHEARD_S:g} s"
@@ -85,7 +85,7 @@ def test_all_programs_end_in_time_after_the_order_to_end(tmp_path: Path) -> None
 
 
 def server_pid(connection: str) -> int:
-    """Return the process of the link server."""
+    """Return the process id of the link server."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client, places.address(connection) as address:
         client.connect(address)
-        return places.peer(client)[0]
+        return places.peer_credentials(client)[0]

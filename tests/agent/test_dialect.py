@@ -1,4 +1,4 @@
-"""PX4 and ArduCopter as the program that flies them knows them, against pymavlink's own tables."""
+"""The dialects of PX4 and ArduCopter compared with the tables of pymavlink."""
 
 import pytest
 from pymavlink import mavutil
@@ -13,7 +13,7 @@ COPTER, PX4 = ArduCopter(), Px4()
 ACM = {name: number for number, name in mavutil.mode_mapping_acm.items()}
 
 
-def test_every_message_ends_as_its_definition_says() -> None:
+def test_crc_extra_is_that_of_the_definitions() -> None:
     assert {kind: d.mavlink_map[kind].crc_extra for kind in mavlink_frames.EXTRA} == mavlink_frames.EXTRA
 
 
@@ -31,31 +31,31 @@ def test_every_message_ends_as_its_definition_says() -> None:
         (dialect.REQUEST, "REQUEST_MESSAGE"),
     ],
 )
-def test_commands_are_those_of_the_dialect(number: int, name: str) -> None:
+def test_command_numbers_are_those_of_pymavlink(number: int, name: str) -> None:
     assert d.enums["MAV_CMD"][number].name == f"MAV_CMD_{name}"
 
 
-def test_modes_of_arducopter_are_those_of_its_table() -> None:
+def test_arducopter_modes_are_those_of_pymavlink() -> None:
     def mode(name: str) -> tuple[float, ...]:
         return (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, ACM[name])
 
-    assert COPTER.guide() == mode("GUIDED")
-    assert COPTER.bring_down("land") == mode("LAND")
-    assert COPTER.bring_down("return") == mode("RTL")
+    assert COPTER.guided_command() == mode("GUIDED")
+    assert COPTER.bring_down_command("land") == mode("LAND")
+    assert COPTER.bring_down_command("return") == mode("RTL")
     assert [name for name, number in ACM.items() if COPTER.is_guided(number)] == ["GUIDED"]
 
 
-def test_modes_of_px4_are_those_of_its_table() -> None:
+def test_px4_modes_are_those_of_pymavlink() -> None:
     base, main, _ = mavutil.px4_map["OFFBOARD"]
     assert base & d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-    assert PX4.guide() == (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main)
+    assert PX4.guided_command() == (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main)
     guided = [name for name, (_, main, sub) in mavutil.px4_map.items() if PX4.is_guided(main << 16 | sub << 24)]
     assert guided == ["OFFBOARD"]
 
 
-def test_names_of_modes_are_those_of_the_tables_of_pymavlink() -> None:
+def test_mode_names_are_those_of_pymavlink() -> None:
     px4 = {name: PX4.mode_name(main << 16 | sub << 24) for name, (_, main, sub) in mavutil.px4_map.items()}
-    del px4["RTGS"], px4["FOLLOWME"]  # not in px4_custom_mode.h any more; FOLLOW_TARGET there
+    del px4["RTGS"], px4["FOLLOWME"]  # not in px4_custom_mode.h any more, which has FOLLOW_TARGET
     assert {name: given.rpartition(".")[2] for name, given in px4.items()} == {name: name for name in px4}
     assert PX4.mode_name(4 << 16 | 6 << 24) == "AUTO.LAND"
     obsolete = {"POSITION", "OF_LOITER", "RATE_ACRO"}
@@ -64,34 +64,39 @@ def test_names_of_modes_are_those_of_the_tables_of_pymavlink() -> None:
     assert (COPTER.mode_name(99), PX4.mode_name(99 << 16)) == ("99", str(99 << 16))
 
 
-def test_a_guard_knows_the_modes_of_programs_and_those_in_which_a_drone_comes_down() -> None:
-    assert {name for name, number in ACM.items() if COPTER.is_led(number)} == {"AUTO", "GUIDED"}
-    assert {name for name, number in ACM.items() if COPTER.comes_down(number)} == {
+def test_program_controlled_and_landing_modes() -> None:
+    assert {name for name, number in ACM.items() if COPTER.is_program_controlled(number)} == {"AUTO", "GUIDED"}
+    assert {name for name, number in ACM.items() if COPTER.lands_or_returns(number)} == {
         *("RTL", "LAND", "SMART_RTL", "AUTO_RTL")
     }
     px4 = {name: main << 16 | sub << 24 for name, (_, main, sub) in mavutil.px4_map.items()}
-    assert {name for name in px4 if PX4.is_led(px4[name])} == {"OFFBOARD", "TAKEOFF", "LOITER", "MISSION"}
-    assert {name for name in px4 if PX4.comes_down(px4[name])} == {"RTL", "LAND"}
+    assert {name for name in px4 if PX4.is_program_controlled(px4[name])} == {
+        "OFFBOARD",
+        "TAKEOFF",
+        "LOITER",
+        "MISSION",
+    }
+    assert {name for name in px4 if PX4.lands_or_returns(px4[name])} == {"RTL", "LAND"}
 
 
-def test_who_speaks_which() -> None:
-    flown = {kind for kind in range(64) if COPTER.speaks(d.MAV_AUTOPILOT_ARDUPILOTMEGA, kind)}
+def test_dialect_for_an_autopilot() -> None:
+    flown = {kind for kind in range(64) if COPTER.matches(d.MAV_AUTOPILOT_ARDUPILOTMEGA, kind)}
     named = {kind for kind in range(64) if mavutil.mode_mapping_byname(kind) == ACM}
     assert flown == named
-    assert not COPTER.speaks(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
-    assert PX4.speaks(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
-    assert not PX4.speaks(d.MAV_AUTOPILOT_ARDUPILOTMEGA, d.MAV_TYPE_QUADROTOR)
+    assert not COPTER.matches(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
+    assert PX4.matches(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
+    assert not PX4.matches(d.MAV_AUTOPILOT_ARDUPILOTMEGA, d.MAV_TYPE_QUADROTOR)
 
 
-def test_arducopter_takes_off_by_command_and_is_told_how_fast() -> None:
-    speed, rise = COPTER.take_off(3.0, 0.5)
+def test_arducopter_takes_off_by_command_with_a_speed() -> None:
+    speed, rise = COPTER.take_off_commands(3.0, 0.5)
     assert speed == (d.MAV_CMD_DO_CHANGE_SPEED, d.SPEED_TYPE_CLIMB_SPEED, 0.5)
     assert rise == (d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 3.0)
-    assert PX4.take_off(3.0, 0.5) == ()
+    assert PX4.take_off_commands(3.0, 0.5) == ()
 
 
 @pytest.mark.parametrize(
-    ("one", "values", "bounds"),
+    ("dialect_under_test", "values", "bounds"),
     [
         (COPTER, {}, (None, None, None)),
         (COPTER, {"FENCE_ENABLE": 0, "FENCE_TYPE": 7, "FENCE_ALT_MAX": 5}, (None, None, None)),
@@ -102,8 +107,8 @@ def test_arducopter_takes_off_by_command_and_is_told_how_fast() -> None:
         (PX4, {"GF_MAX_VER_DIST": 0, "GF_MAX_HOR_DIST": 40, "RTL_RETURN_ALT": 30}, (None, 40, 30)),
     ],
 )
-def test_bounds_are_those_that_hold(
-    one: FlightDialect, values: dict[str, float], bounds: tuple[float | None, ...]
+def test_limits_from_parameters(
+    dialect_under_test: FlightDialect, values: dict[str, float], bounds: tuple[float | None, ...]
 ) -> None:
-    found = one.bounds(values)
-    assert (found.height_m, found.radius_m, found.return_m) == bounds
+    limits = dialect_under_test.limits(values)
+    assert (limits.height_m, limits.radius_m, limits.return_m) == bounds

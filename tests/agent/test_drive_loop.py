@@ -1,4 +1,4 @@
-"""The loop of the driver on a clock of its own: messages as other tools make them, a lease, and zeros at the end."""
+"""The loop of the driver on a simulated clock: messages compared with rosbags, the lease, zeros at the end."""
 
 import json
 import math
@@ -31,7 +31,7 @@ TASK = {
 
 
 def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child: str = "base_footprint") -> bytes:
-    """Serialize a message by rosbags."""
+    """Serialize a message with rosbags."""
     store = STORES[cdr]
     kinds = store.types
     numbers = (0, 0) if cdr else (0, 0, 0)
@@ -53,7 +53,7 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child: str =
 
 @pytest.mark.parametrize("cdr", [False, True])
 @pytest.mark.parametrize("names", [("odom", "base_footprint"), ("", ""), ("o", "abcdefghi")])
-def test_odometry_and_velocities_are_as_rosbags_has_them(names: tuple[str, str], cdr: bool) -> None:
+def test_messages_are_those_of_rosbags(names: tuple[str, str], cdr: bool) -> None:
     pose = OdometryPose(3.5, -2.25, 1.25)
     read = drive.read_odometry(odometry(pose, cdr=cdr, frame=names[0], child=names[1]), cdr=cdr)
     assert read == pytest.approx(pose)
@@ -61,26 +61,26 @@ def test_odometry_and_velocities_are_as_rosbags_has_them(names: tuple[str, str],
     vector = kinds["geometry_msgs/msg/Vector3"]
     wanted = kinds["geometry_msgs/msg/Twist"](vector(0.25, 0.0, 0.0), vector(0.0, 0.0, -0.5))
     serialize = STORES[cdr].serialize_cdr if cdr else STORES[cdr].serialize_ros1
-    made = drive.twist(DriveVelocity(0.25, -0.5), cdr=cdr)
-    assert made == bytes(serialize(wanted, "geometry_msgs/msg/Twist"))
+    twist = drive.twist(DriveVelocity(0.25, -0.5), cdr=cdr)
+    assert twist == bytes(serialize(wanted, "geometry_msgs/msg/Twist"))
 
 
 @given(st.binary(max_size=300), st.booleans())
-def test_what_is_no_odometry_is_none(data: bytes, cdr: bool) -> None:
-    found = drive.read_odometry(data, cdr=cdr)
-    assert found is None or all(map(math.isfinite, found))
+def test_invalid_odometry_is_none(data: bytes, cdr: bool) -> None:
+    pose = drive.read_odometry(data, cdr=cdr)
+    assert pose is None or all(map(math.isfinite, pose))
     whole = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=cdr)
     assert drive.read_odometry(whole[: min(len(data), 80)], cdr=cdr) is None
 
 
-def test_odometry_that_is_not_a_number_is_none() -> None:
+def test_odometry_with_nan_is_none() -> None:
     whole = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=False)
     at = whole.index(struct.pack("<d", 1.0))
     assert drive.read_odometry(whole[:at] + struct.pack("<d", math.nan) + whole[at + 8 :], cdr=False) is None
 
 
 class World:
-    """A middleware whose robot drives as it is told, on a clock that goes on while the driver waits."""
+    """A middleware whose robot drives as commanded, and a clock that advances while the driver waits."""
 
     version = "world 1"
 
@@ -93,7 +93,7 @@ class World:
         self.deliver: Deliver | None = None
         self.over = False
 
-    # A clock and an event.
+    # The methods of a clock and of an event.
     def monotonic(self) -> float:
         return self.now_s
 
@@ -101,7 +101,7 @@ class World:
         return round(1e9 * self.now_s)
 
     def sleep(self, for_s: float) -> None:
-        self.wait(for_s)  # the robot rolls on and reports it
+        self.wait(for_s)  # the robot moves on and reports its odometry
 
     def is_set(self) -> bool:
         return self.over
@@ -121,7 +121,7 @@ class World:
             self.orders.write_text(f"{round(1e3 * self.now_s)} {order} 2\n", encoding="ascii")
         return self.over
 
-    # A middleware.
+    # The methods of a middleware.
     def publisher(self, topic: Topic) -> Any:  # noqa: ANN401
         def write(data: bytes) -> bool:
             values = struct.unpack("<6d", data)
@@ -138,10 +138,10 @@ class World:
 def run(
     world: World, monkeypatch: pytest.MonkeyPatch, folder: Path
 ) -> tuple[str, list[dict[str, Any]], dict[str, Any]]:
-    """Drive; return why it ended, the log and the last status."""
+    """Drive; return the reason of the end, the log and the last status."""
     monkeypatch.setattr(drive, "time", world)
     monkeypatch.setattr(drive, "now_s", world.monotonic)
-    told: Mapping[str, Any] = {
+    arguments: Mapping[str, Any] = {
         "cdr": False,
         "command": {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist"},
         "odometry": {"name": "/odom", "type": "nav_msgs/msg/Odometry"},
@@ -149,12 +149,12 @@ def run(
         "orders": str(world.orders),
         "status": str(folder / "status"),
     }
-    ended = drive.drive(world, told, folder / "log", world)  # type: ignore[arg-type]
+    ended = drive.drive(world, arguments, folder / "log", world)  # type: ignore[arg-type]
     log = [json.loads(line) for line in (folder / "log").read_text(encoding="ascii").splitlines()]
     return ended, log, json.loads((folder / "status").read_text(encoding="ascii"))
 
 
-def test_it_drives_there_and_back_and_says_zero_at_the_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_drives_out_and_back_and_ends_with_zero_velocity(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders")
     ended, log, status = run(world, monkeypatch, tmp_path)
     assert (ended, status["ended"], status["phase"]) == ("", "home", "home")
@@ -166,7 +166,7 @@ def test_it_drives_there_and_back_and_says_zero_at_the_end(monkeypatch: pytest.M
     assert {line["phase"] for line in log} >= {"out", "there", "back", "home"}
 
 
-def test_a_laptop_that_leaves_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_lost_laptop_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders", leaves_s=100.9)
     ended, log, status = run(world, monkeypatch, tmp_path)
     assert ended == status["ended"] == "the laptop was silent for 2 s"
@@ -174,7 +174,7 @@ def test_a_laptop_that_leaves_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert world.sent[-8:] == [DriveVelocity()] * 8
 
 
-def test_a_signal_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_signal_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders")
     world.hears = lambda: setattr(world, "over", world.now_s > 100.5) or 1  # type: ignore[func-returns-value]
     monkeypatch.setattr(World, "is_set", lambda self: self.now_s > 101.0)
@@ -183,13 +183,13 @@ def test_a_signal_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     assert world.sent[-8:] == [DriveVelocity()] * 8
 
 
-def test_a_base_that_nobody_has_and_silence_are_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_subscription_and_odometry_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders")
     world.hears = lambda: 0
-    with pytest.raises(MiddlewareError, match="nobody hears /cmd_vel"):
+    with pytest.raises(MiddlewareError, match="/cmd_vel has no subscription"):
         run(world, monkeypatch, tmp_path)
     world = World(tmp_path / "orders")
     monkeypatch.setattr(World, "subscribe", lambda *_: lambda: 1)
-    with pytest.raises(MiddlewareError, match="nothing comes from /odom"):
+    with pytest.raises(MiddlewareError, match="no odometry arrives on /odom"):
         run(world, monkeypatch, tmp_path)
     assert not world.sent

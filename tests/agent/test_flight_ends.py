@@ -1,4 +1,4 @@
-"""A drone whose pilot can no longer write, or is no longer answered, comes down all the same."""
+"""A drone lands if its pilot can no longer write, or receives no answers."""
 
 import json
 import subprocess
@@ -45,8 +45,8 @@ def wait_until_down(autopilot: Autopilot) -> None:
 
 
 @contextmanager
-def agent(told: FlightPlan) -> Iterator["subprocess.Popen[bytes]"]:
-    words = (sys.executable, "-m", "fieldkit.agent", "fly", json.dumps(asdict(told)))
+def agent(flight_plan: FlightPlan) -> Iterator["subprocess.Popen[bytes]"]:
+    words = (sys.executable, "-m", "fieldkit.agent", "fly", json.dumps(asdict(flight_plan)))
     process = subprocess.Popen(words, stderr=subprocess.PIPE)
     try:
         yield process
@@ -55,8 +55,8 @@ def agent(told: FlightPlan) -> Iterator["subprocess.Popen[bytes]"]:
         process.wait(60)
 
 
-def test_who_cannot_write_its_log_lands(tmp_path: Path) -> None:
-    """As on a full disk: what it says from then on is lost, and the drone is not."""
+def test_pilot_without_disk_space_for_its_output_lands(tmp_path: Path) -> None:
+    """As on a full disk: further output is lost, but the drone lands."""
     order(tmp_path, 1, CLIMB)
     with drones.autopilot_at_udp() as (port, autopilot), agent(plan(tmp_path, port)) as process:
         wait_until_up(autopilot)
@@ -68,8 +68,8 @@ def test_who_cannot_write_its_log_lands(tmp_path: Path) -> None:
         assert process.wait(60) == 0
 
 
-def test_a_full_disk_does_not_end_a_flight(tmp_path: Path) -> None:
-    """The log of positions ends; the flight does not."""
+def test_full_disk_does_not_end_a_flight(tmp_path: Path) -> None:
+    """The log of positions ends, but the flight continues."""
     order(tmp_path, 1, CLIMB)
     with (
         drones.autopilot_at_udp() as (port, autopilot),
@@ -90,10 +90,10 @@ def test_a_full_disk_does_not_end_a_flight(tmp_path: Path) -> None:
     ],
     ids=["everything", "positions"],
 )
-def test_an_autopilot_that_does_not_report_is_told_to_land(
+def test_autopilot_without_reports_is_commanded_to_land(
     lost: int | None, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """It may hear what it cannot answer."""
+    """It may receive commands although its answers are lost."""
     monkeypatch.setattr(loop, "_BLIND_S" if lost else "_SILENT_S", 2.0)
     silent, codes = threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
@@ -102,8 +102,8 @@ def test_an_autopilot_that_does_not_report_is_told_to_land(
         return [] if silent.is_set() and lost in {None, head(frame).kind} else [frame]
 
     with drones.autopilot_at_udp(damage) as (port, autopilot):
-        told, over = plan(tmp_path, port), threading.Event()
-        pilot = threading.Thread(target=lambda: codes.append(flight.fly(told, over)))
+        flight_plan, over = plan(tmp_path, port), threading.Event()
+        pilot = threading.Thread(target=lambda: codes.append(flight.fly(flight_plan, over)))
         pilot.start()
         try:
             wait_until_up(autopilot)
@@ -118,17 +118,17 @@ def test_an_autopilot_that_does_not_report_is_told_to_land(
     assert reason in capfd.readouterr().err
 
 
-def test_an_autopilot_that_stays_silent_ends_the_flight_with_an_alarm(
+def test_silent_autopilot_ends_the_flight_with_an_alarm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """As behind a router that has ended: the alarm comes first, and the program ends some time later."""
+    """As behind a stopped router: the alarm is logged first, and the program exits some time later."""
     monkeypatch.setattr(loop, "_SILENT_S", 5.0)
     monkeypatch.setattr(landing, "UNHEARD_S", 1.0)
     silent, over, codes = threading.Event(), threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
     with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame]) as (port, autopilot):
-        told = plan(tmp_path, port)
-        pilot = threading.Thread(target=lambda: codes.append(flight.fly(told, over)))
+        flight_plan = plan(tmp_path, port)
+        pilot = threading.Thread(target=lambda: codes.append(flight.fly(flight_plan, over)))
         pilot.start()
         try:
             wait_until_up(autopilot)
@@ -138,20 +138,20 @@ def test_an_autopilot_that_stays_silent_ends_the_flight_with_an_alarm(
             over.set()
             pilot.join(60)
     assert codes == [landing.REFUSED]
-    said = capfd.readouterr().err.splitlines()
-    texts = [line.partition(" ")[2] for line in said]
+    lines = capfd.readouterr().err.splitlines()
+    texts = [line.partition(" ")[2] for line in lines]
     alarms = [number for number, text in enumerate(texts) if text.startswith("ALARM: THE DRONE MAY STILL BE")]
     assert texts[alarms[0] - 1] == "land: no heartbeat of the autopilot for 5 s"
     assert all(text.endswith(landing.MANUAL_ACTION) for text in (texts[number] for number in alarms))
     assert texts[-1] == "error: no heartbeat of the autopilot for 1 s"
 
 
-def test_a_drone_whose_motors_stop_is_not_led_any_more(tmp_path: Path) -> None:
-    """As by a crash, or a kill switch; an ArduCopter stays in its mode."""
+def test_drone_with_stopped_motors_is_released(tmp_path: Path) -> None:
+    """As after a crash, or by a kill switch; an ArduCopter keeps its mode."""
     order(tmp_path, 1, CLIMB)
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), agent(plan(tmp_path, port)) as process:
         wait_until_up(autopilot)
         autopilot.vehicle.disarm(force=True)
-        assert process.wait(60) == landing.TAKEN
+        assert process.wait(60) == landing.TAKEN_OVER
         assert process.stderr is not None
         assert b"its motors have stopped" in process.stderr.read()

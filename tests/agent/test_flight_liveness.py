@@ -1,4 +1,4 @@
-"""Pilot and guard see of each other whether they run."""
+"""Pilot and guard detect whether the other program runs."""
 
 import os
 import signal
@@ -36,33 +36,33 @@ def pilot(path: Path, beats: int) -> Iterator["subprocess.Popen[bytes]"]:
         process.wait(60)
 
 
-def test_an_end_a_suspension_and_a_hang_are_seen(tmp_path: Path) -> None:
+def test_exit_suspension_and_hang_are_detected(tmp_path: Path) -> None:
     own = LivenessFile(str(tmp_path / "file"), GUARD)
-    assert own.look() == "has ended", "it has not begun"
+    assert own.poll() == "has ended", "it has not started"
     with pilot(tmp_path / "file", 10**9) as process:
-        wait_until(lambda: own.look() == "", Deadline.after(60))
+        wait_until(lambda: own.poll() == "", Deadline.after(60))
         assert own.other_state == liveness.FLYING
         process.send_signal(signal.SIGSTOP)
-        wait_until(lambda: own.look() == "is suspended", Deadline.after(60))
-        own.end_other()
+        wait_until(lambda: own.poll() == "is suspended", Deadline.after(60))
+        own.kill_other()
         assert process.wait(60) == -signal.SIGKILL
-        assert own.look() == "has ended"
+        assert own.poll() == "has ended"
     with pilot(tmp_path / "file", 5):
-        wait_until(lambda: own.look().startswith("has not run for"), Deadline.after(60))
+        wait_until(lambda: own.poll().startswith("has not run for"), Deadline.after(60))
 
 
-def test_another_process_with_its_number_is_not_ended(tmp_path: Path) -> None:
-    """A number is given again later; the time of the start is not."""
+def test_other_process_with_the_same_pid_is_not_killed(tmp_path: Path) -> None:
+    """A pid is reused, but the start time differs."""
     guard = LivenessFile(str(tmp_path / "file"), GUARD)
-    LivenessFile(str(tmp_path / "file"), PILOT).beat(liveness.FLYING)
+    LivenessFile(str(tmp_path / "file"), PILOT).update(liveness.FLYING)
     raw = bytearray((tmp_path / "file").read_bytes())
     raw[8:16] = (1).to_bytes(8, "little")
     (tmp_path / "file").write_bytes(raw)
-    assert guard.look() == "has ended"
-    guard.end_other()
+    assert guard.poll() == "has ended"
+    guard.kill_other()
     assert os.getpid()
 
 
-def test_without_room_there_is_no_flight() -> None:
+def test_full_disk_prevents_the_flight() -> None:
     with pytest.raises(FileNotFoundError):
         LivenessFile("/nowhere/liveness", PILOT)

@@ -15,42 +15,42 @@ from fieldkit.agent.flying.origin import (
     OriginError,
     frame_id,
     is_same_frame,
-    settled,
+    resolve_origin,
 )
 
 FIRST = FlightOrigin("local", frame_id("boot", 100.0), 3.0, -4.0, 0.7, 48.0, 11.0)
 metres = st.floats(-200, 200)
 
 
-def test_the_first_start_is_the_origin() -> None:
-    assert settled(None, FIRST) == FIRST
+def test_first_start_is_the_origin() -> None:
+    assert resolve_origin(None, FIRST) == FIRST
 
 
-def test_a_later_start_keeps_heading_and_place_of_the_first() -> None:
+def test_later_start_keeps_heading_and_position_of_the_first() -> None:
     start = replace(FIRST, x_m=4.0, heading_rad=0.7 + math.pi, latitude_deg=None, longitude_deg=None)
-    origin = settled(FIRST, start)
+    origin = resolve_origin(FIRST, start)
     assert (origin.x_m, origin.y_m, origin.heading_rad) == (3.0, -4.0, 0.7)
 
 
-def test_after_a_reboot_latitude_and_longitude_give_the_place() -> None:
-    """A degree of latitude has 111.2 km on a sphere; one of longitude at 48 degrees cos(48 degrees) of that."""
+def test_after_a_reboot_latitude_and_longitude_give_the_position() -> None:
+    """A degree of latitude is 111.2 km on a sphere; one of longitude at 48 degrees is cos(48 degrees) times that."""
     rebooted = frame_id("boot", 500.0)
     start = replace(FIRST, frame_id=rebooted, x_m=0.0, y_m=0.0, latitude_deg=48.0 + 1.0 / 111_200)
-    origin = settled(FIRST, start)
+    origin = resolve_origin(FIRST, start)
     assert (origin.x_m, origin.y_m) == pytest.approx((-1.0, 0.0), abs=0.01)
     east = replace(start, latitude_deg=48.0, longitude_deg=11.0 + 1.0 / (111_200 * math.cos(math.radians(48))))
-    assert settled(FIRST, east).y_m == pytest.approx(-1.0, abs=0.01)
+    assert resolve_origin(FIRST, east).y_m == pytest.approx(-1.0, abs=0.01)
 
 
-def test_a_start_elsewhere_and_one_after_a_reboot_without_gps_are_refused() -> None:
+def test_distant_start_and_reboot_without_gps_are_rejected() -> None:
     unknown = {"latitude_deg": None, "longitude_deg": None}
     with pytest.raises(OriginError, match=r"2\.5 m from the place .* bearing of 90 degrees"):
-        settled(FIRST, replace(FIRST, y_m=FIRST.y_m + START_M + 0.5, **unknown))  # type: ignore[arg-type]
+        resolve_origin(FIRST, replace(FIRST, y_m=FIRST.y_m + START_M + 0.5, **unknown))  # type: ignore[arg-type]
     with pytest.raises(OriginError, match="has rebooted"):
-        settled(FIRST, replace(FIRST, frame_id=frame_id("boot", 500.0), **unknown))  # type: ignore[arg-type]
+        resolve_origin(FIRST, replace(FIRST, frame_id=frame_id("boot", 500.0), **unknown))  # type: ignore[arg-type]
 
 
-def test_frames_of_one_life_are_the_same() -> None:
+def test_same_frame_until_a_reboot() -> None:
     assert is_same_frame(frame_id("boot", 100.0), frame_id("boot", 103.0))
     assert not is_same_frame(frame_id("boot", 100.0), frame_id("other", 100.0))
     assert not is_same_frame(frame_id("boot", 100.0), frame_id("boot", 160.0))
@@ -58,7 +58,7 @@ def test_frames_of_one_life_are_the_same() -> None:
 
 
 @given(metres, metres, metres)
-def test_each_set_point_is_inside_the_fence(north_m: float, east_m: float, down_m: float) -> None:
+def test_set_points_are_clamped_to_the_fence(north_m: float, east_m: float, down_m: float) -> None:
     fence = FlightFence(FIRST, -1.0, radius_m=20.0, ceiling_m=5.0)
     north, east, down = fence.clamped((north_m, east_m, down_m))
     assert math.hypot(north - FIRST.x_m, east - FIRST.y_m) <= 20.0 + 1e-6
@@ -67,7 +67,7 @@ def test_each_set_point_is_inside_the_fence(north_m: float, east_m: float, down_
         assert (north, east, down) == pytest.approx((north_m, east_m, down_m))
 
 
-def test_a_position_beyond_the_fence_and_its_margin_is_a_breach() -> None:
+def test_position_beyond_fence_and_margin_is_a_breach() -> None:
     fence = FlightFence(FIRST, 0.0, radius_m=20.0, ceiling_m=5.0)
     out_m = 20.0 + FENCE_MARGIN_M
     assert not fence.breach((FIRST.x_m + out_m - 0.1, FIRST.y_m, -4.0))
@@ -76,5 +76,5 @@ def test_a_position_beyond_the_fence_and_its_margin_is_a_breach() -> None:
 
 
 @given(metres, metres)
-def test_points_are_seen_from_the_origin_as_they_were_given(ahead_m: float, left_m: float) -> None:
-    assert FIRST.seen(FIRST.at(ahead_m, left_m, 0.0)) == pytest.approx((ahead_m, left_m), abs=1e-6)
+def test_relative_position_is_the_inverse_of_position_at(ahead_m: float, left_m: float) -> None:
+    assert FIRST.relative_m(FIRST.position_at(ahead_m, left_m, 0.0)) == pytest.approx((ahead_m, left_m), abs=1e-6)

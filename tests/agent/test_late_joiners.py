@@ -1,4 +1,4 @@
-"""Durability `transient_local`: a subscription that comes late gets the last samples, as many as the depth says."""
+"""Durability `transient_local`: a late subscription receives the last samples, as many as the depth."""
 
 import json
 import subprocess
@@ -23,7 +23,7 @@ LIMIT_S = "90"
 
 @contextmanager
 def end(host: TestHost, verb: str, over: str, file: Path) -> Iterator[subprocess.Popen[str]]:
-    """Run an end of a topic while the body runs."""
+    """Run a publisher or subscription while the body runs."""
     quality = parse_qos(f"transient_local,depth={DEPTH}")
     topic = topics.describe(shipped(), "/map", TYPE, quality, domain=0, node=verb)
     network = {"address": host.address, "node": verb}
@@ -40,20 +40,20 @@ def end(host: TestHost, verb: str, over: str, file: Path) -> Iterator[subprocess
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_who_comes_late_gets_the_last_samples(over: str, tmp_path: Path) -> None:
+def test_late_subscription_receives_the_last_samples(over: str, tmp_path: Path) -> None:
     store = shipped().ros2
-    said = [bytes(store.serialize_cdr(store.types[TYPE](text), TYPE)).hex() for text in ("one", "two", "three")]
+    published = [bytes(store.serialize_cdr(store.types[TYPE](text), TYPE)).hex() for text in ("one", "two", "three")]
     file = tmp_path / "samples"
-    file.write_text("\n".join(said), encoding="ascii")
+    file.write_text("\n".join(published), encoding="ascii")
     with cabled() as (near, far), end(near, "say", over, file) as publisher:
         with end(far, "hear", over, file) as ears:
             assert ears.stdout is not None
             for line in ears.stdout:
-                if line.strip() == said[-1]:
+                if line.strip() == published[-1]:
                     break
             assert publisher.stdout is not None
             assert publisher.stdout.readline() == "matched\n"
-        # All has been said by now.
+        # All samples were published before.
         with end(far, "hear", over, file) as late:
             assert late.stdout is not None
-            assert [late.stdout.readline().strip() for _ in range(DEPTH)] == said[-DEPTH:]
+            assert [late.stdout.readline().strip() for _ in range(DEPTH)] == published[-DEPTH:]

@@ -1,4 +1,4 @@
-"""The recorder of MAVLink: frames against pymavlink, and the program against a drone at each kind of connection."""
+"""The MAVLink recorder: frames compared with pymavlink, and the program with a drone at each kind of connection."""
 
 import json
 import select
@@ -31,9 +31,9 @@ from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from tests.helpers import drones
 from tests.helpers.drones import Sender
 
-Way = Callable[[], AbstractContextManager[str]]
+ConnectionKind = Callable[[], AbstractContextManager[str]]
 WANTED = {"32": 20_000, "30": -1}
-"""LOCAL_POSITION_NED at 50 Hz, no ATTITUDE: the recorder itself asks for whatever it is told to."""
+"""LOCAL_POSITION_NED at 50 Hz, no ATTITUDE; requested by the recorder."""
 
 
 def real_frames() -> list[bytes]:
@@ -53,7 +53,7 @@ FRAMES = real_frames()
 
 
 @given(st.lists(st.sampled_from(FRAMES), max_size=8), st.lists(st.integers(0, 400), max_size=5))
-def test_frames_come_out_as_they_went_in_wherever_the_stream_was_cut(sent: list[bytes], cuts: list[int]) -> None:
+def test_frames_are_complete_for_any_cut_of_the_stream(sent: list[bytes], cuts: list[int]) -> None:
     stream = b"".join(sent)
     edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
     buffer, came = bytearray(), list[bytes]()
@@ -65,7 +65,7 @@ def test_frames_come_out_as_they_went_in_wherever_the_stream_was_cut(sent: list[
 
 
 @given(st.binary(max_size=700))
-def test_whatever_bytes_come_the_frames_are_pieces_of_them_in_their_order(noise: bytes) -> None:
+def test_frames_of_any_bytes_are_parts_of_them_in_order(noise: bytes) -> None:
     at = 0
     for frame in mavlink_frames.frames(bytearray(noise)):
         assert mavlink_frames.frame_bytes(frame) == len(frame)
@@ -73,12 +73,12 @@ def test_whatever_bytes_come_the_frames_are_pieces_of_them_in_their_order(noise:
         at = noise.index(frame, at) + len(frame)
 
 
-def test_who_listens_from_the_middle_of_a_frame_on_soon_has_whole_ones() -> None:
+def test_reception_from_the_middle_of_a_frame_recovers() -> None:
     rest = FRAMES[1][7:] + b"".join(FRAMES)
     assert list(mavlink_frames.frames(bytearray(rest)))[-len(FRAMES) :] == FRAMES
 
 
-def test_its_own_frames_are_what_pymavlink_reads() -> None:
+def test_created_frames_are_read_by_pymavlink() -> None:
     writer, reader = mavlink_frames.FrameWriter(), d.MAVLink(None)
     reader.robust_parsing = False
     beat, command, other = reader.parse_buffer(
@@ -95,7 +95,7 @@ def test_its_own_frames_are_what_pymavlink_reads() -> None:
 
 
 @pytest.mark.parametrize("old", [False, True])
-def test_what_it_reads_is_intact_by_pymavlinks_own_sums(old: bool) -> None:
+def test_checksums_are_those_of_pymavlink(old: bool) -> None:
     link = d.MAVLink(None, srcSystem=7)
     for message in (drones.beat(), d.MAVLink_command_ack_message(511, 2)):
         frame = bytes(message.pack(link, force_mavlink1=old))
@@ -104,12 +104,12 @@ def test_what_it_reads_is_intact_by_pymavlinks_own_sums(old: bool) -> None:
             changed = bytes((*frame[:at], frame[at] ^ 1, *frame[at + 1 :]))
             assert not mavlink_frames.is_intact(changed)
     other = bytes(d.MAVLink_system_time_message(1, 2).pack(link, force_mavlink1=old))
-    assert not mavlink_frames.is_intact(other), "of another message it knows no sum"
+    assert not mavlink_frames.is_intact(other), "the CRC_EXTRA of another message is unknown"
 
 
 @dataclass
 class Ended:
-    """What a recorder left."""
+    """The result of a recorder."""
 
     code: int
     said: dict[str, Any]
@@ -124,10 +124,10 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def recording(program: Path, log: Path, connection: str, **told: object) -> Iterator[Ended]:
-    """Record while the body runs, from when the recorder is up; then end it as a job is ended."""
-    asked = json.dumps({"connection": connection, "intervals_us": {}, **told})
-    argv = (sys.executable, str(program), "mavlink", asked, str(log))
+def recording(program: Path, log: Path, connection: str, **arguments: object) -> Iterator[Ended]:
+    """Record while the body runs, after the recorder is ready; then stop it as a job is stopped."""
+    request = json.dumps({"connection": connection, "intervals_us": {}, **arguments})
+    argv = (sys.executable, str(program), "mavlink", request, str(log))
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stderr is not None
         assert process.stderr.readline().startswith(b"waiting for the heartbeat")
@@ -143,8 +143,8 @@ def recording(program: Path, log: Path, connection: str, **told: object) -> Iter
             process.kill()
 
 
-def until(log: Path, size_bytes: int) -> None:
-    """Wait until a log has grown so large."""
+def wait_until_size(log: Path, size_bytes: int) -> None:
+    """Wait until a log has reached a size."""
     for _ in range(600):
         if log.stat().st_size >= size_bytes:
             return
@@ -153,12 +153,12 @@ def until(log: Path, size_bytes: int) -> None:
 
 
 def kinds(path: Path) -> list[str]:
-    """Return the messages of a log as pymavlink's own reader of logs has them."""
+    """Return the message types of a log, read by pymavlink."""
     reader = mavutil.mavlink_connection(str(path))
-    found = []
+    types = []
     while (message := reader.recv_msg()) is not None:
-        found.append(message.get_type())
-    return found
+        types.append(message.get_type())
+    return types
 
 
 @contextmanager
@@ -178,7 +178,7 @@ def over_tcp() -> Iterator[str]:
 
 @contextmanager
 def _late(stream: Callable[[], socket.socket]) -> Iterator[None]:
-    """Let a drone answer at a stream once that is there."""
+    """Let a drone answer on a stream when it is open."""
     over, ready = threading.Event(), threading.Event()
 
     def fly() -> None:
@@ -220,32 +220,37 @@ def over_a_serial_line() -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    "way", [over_udp, over_udp_that_speaks_first, over_tcp, over_a_serial_line], ids=lambda way: way.__name__
+    "connection_kind",
+    [over_udp, over_udp_that_speaks_first, over_tcp, over_a_serial_line],
+    ids=lambda connection_kind: connection_kind.__name__,
 )
-def test_a_log_holds_what_pymavlinks_own_reader_finds_in_it(way: Way, program: Path, tmp_path: Path) -> None:
-    with way() as connection, recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended:
-        until(ended.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
+def test_log_is_read_by_pymavlink(connection_kind: ConnectionKind, program: Path, tmp_path: Path) -> None:
+    with (
+        connection_kind() as connection,
+        recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended,
+    ):
+        wait_until_size(ended.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
     assert ended.code == 0
-    found = kinds(ended.log)
+    types = kinds(ended.log)
     read = tlog.read(ended.log, 0, ended.said["ended_us"])
-    assert ended.said["frames"] == read.frames == len(found)
+    assert ended.said["frames"] == read.frames == len(types)
     assert (ended.said["refused"], ended.said["left_out"]) == ({}, 0)
-    assert read.kinds == {kind: found.count(kind) for kind in set(found) - {"BAD_DATA"}}
+    assert read.kinds == {kind: types.count(kind) for kind in set(types) - {"BAD_DATA"}}
     assert read.values["mavlink_loss"] == 0
-    assert found.count("LOCAL_POSITION_NED") > 3 * found.count("ATTITUDE")
+    assert types.count("LOCAL_POSITION_NED") > 3 * types.count("ATTITUDE")
 
 
-def test_who_begins_anew_at_another_port_is_spoken_to(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_peer_that_restarts_at_another_port_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    device = devices.opened(f"udpin:127.0.0.1:{port}")
+    device = devices.open_device(f"udpin:127.0.0.1:{port}")
     with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
         first.settimeout(60)
         second.settimeout(60)
         for sends, heard_by in ((first, first), (second, first), (second, second)):
             if heard_by is second:
-                monkeypatch.setattr(devices, "_GONE_S", 0.0)
+                monkeypatch.setattr(devices, "_PEER_TIMEOUT_S", 0.0)
             sends.sendto(Sender().frame(drones.beat()), ("127.0.0.1", port))
             select.select([device], [], [], 60)
             assert device.read()
@@ -254,7 +259,7 @@ def test_who_begins_anew_at_another_port_is_spoken_to(monkeypatch: pytest.Monkey
     device.close()
 
 
-def test_an_autopilot_that_refuses_a_rate_is_told(program: Path, tmp_path: Path) -> None:
+def test_refused_rate_is_reported(program: Path, tmp_path: Path) -> None:
     with (
         over_udp() as connection,
         recording(program, tmp_path / "x.tlog", connection, intervals_us={"12345": 1, "1": 500_000}) as ended,
@@ -263,13 +268,13 @@ def test_an_autopilot_that_refuses_a_rate_is_told(program: Path, tmp_path: Path)
     assert ended.said["refused"] == {"12345": d.MAV_RESULT_FAILED}
 
 
-def test_it_waits_for_the_system_that_is_named_and_says_where(program: Path, tmp_path: Path) -> None:
+def test_waits_for_the_given_system_and_reports_it(program: Path, tmp_path: Path) -> None:
     with over_udp() as connection:
-        told = json.dumps({"connection": connection, "intervals_us": {}, "system": 9})
-        argv = (sys.executable, str(program), "mavlink", told, str(tmp_path / "x.tlog"))
+        arguments = json.dumps({"connection": connection, "intervals_us": {}, "system": 9})
+        argv = (sys.executable, str(program), "mavlink", arguments, str(tmp_path / "x.tlog"))
         with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             until_there(tmp_path / "x.tlog")
-            until(tmp_path / "x.tlog", 500)
+            wait_until_size(tmp_path / "x.tlog", 500)
             process.send_signal(signal.SIGTERM)
             _, errors = process.communicate(timeout=60)
     assert errors.decode() == f"waiting for the heartbeat of an autopilot at {connection}\n"
@@ -288,8 +293,8 @@ class FakeClock:
         return round(self.now_s * 1e9)
 
 
-class Arriving:
-    """A link whose messages a test puts there; it is also what says that they are there."""
+class FakeLink:
+    """A link with messages from a test; it is also the selector that reports them."""
 
     def __init__(self) -> None:
         self.frames: list[bytes] = []
@@ -307,31 +312,31 @@ class Arriving:
         assert frame
 
 
-@pytest.mark.parametrize(("comes", "denied"), [(False, False), (True, False), (False, True)])
-def test_a_requested_message_has_sixty_seconds_from_the_first_heartbeat(
-    comes: bool, denied: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(("comes", "is_refused"), [(False, False), (True, False), (False, True)])
+def test_requested_message_must_arrive_60_s_after_the_first_heartbeat(
+    comes: bool, is_refused: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    clock, link, sender = FakeClock(), Arriving(), Sender()
+    clock, link, sender = FakeClock(), FakeLink(), Sender()
     monkeypatch.setattr(mavlink, "time", clock)
-    told = mavlink.FlightRecording("udpout:127.0.0.1:1", {"30": 100_000, "32": 100_000})
-    recorder = mavlink.FlightRecorder(told, link, str(tmp_path / "x.tlog"))  # type: ignore[arg-type]
+    arguments = mavlink.FlightRecording("udpout:127.0.0.1:1", {"30": 100_000, "32": 100_000})
+    recorder = mavlink.FlightRecorder(arguments, link, str(tmp_path / "x.tlog"))  # type: ignore[arg-type]
 
     def turn(at_s: float, *messages: d.MAVLink_message) -> None:
         clock.now_s = 100.0 + at_s
         link.frames = [sender.frame(message) for message in messages]
-        recorder.speak()
-        recorder.take(0.1, link)  # type: ignore[arg-type]
+        recorder.send()
+        recorder.receive(0.1, link)  # type: ignore[arg-type]
         recorder.check()
 
-    turn(500.0)  # an autopilot that is switched on late
+    turn(500.0)  # the autopilot is switched on late
     turn(500.0, drones.beat(), d.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0))
     turn(559.9, drones.beat())
     assert not recorder.ready
     if comes:
         turn(559.95, d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0))
-    if denied:
+    if is_refused:
         link.messages = {32: MessageRate(100_000, d.MAV_RESULT_DENIED, 0.0)}
-    if comes or denied:
+    if comes or is_refused:
         turn(560.1, drones.beat())
         assert recorder.ready
         turn(2000.0)
@@ -341,15 +346,13 @@ def test_a_requested_message_has_sixty_seconds_from_the_first_heartbeat(
     recorder.end()
 
 
-def test_the_recorder_ends_when_the_time_for_first_messages_is_over(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """An autopilot whose boot takes longer has no position until then."""
-    monkeypatch.setattr(mavlink, "_LATEST_S", 2.0)
+def test_recorder_stops_after_the_timeout_of_first_messages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An autopilot whose boot takes longer has no position before."""
+    monkeypatch.setattr(mavlink, "_TIMEOUT_S", 2.0)
     with drones.autopilot_at_udp(firmware=ARDUCOPTER, boot_s=3600.0) as (port, _):
-        told = mavlink.FlightRecording(f"udpout:127.0.0.1:{port}", {"32": 100_000})
+        arguments = mavlink.FlightRecording(f"udpout:127.0.0.1:{port}", {"32": 100_000})
         with pytest.raises(mavlink.MissingMessageError, match="no message 32 in 2 s"):
-            mavlink.record(told, str(tmp_path / "x.tlog"), threading.Event())
+            mavlink.record(arguments, str(tmp_path / "x.tlog"), threading.Event())
 
 
 def until_there(path: Path) -> None:
@@ -370,23 +373,27 @@ def until_there(path: Path) -> None:
         ("usb:1:2", "is not a connection: udpout:"),
     ],
 )
-def test_what_cannot_be_opened_is_told(connection: str, complaint: str, program: Path, tmp_path: Path) -> None:
-    told = json.dumps({"connection": connection, "intervals_us": {}})
-    argv = (sys.executable, str(program), "mavlink", told, str(tmp_path / "x.tlog"))
+def test_connection_that_cannot_be_opened_is_reported(
+    connection: str, complaint: str, program: Path, tmp_path: Path
+) -> None:
+    arguments = json.dumps({"connection": connection, "intervals_us": {}})
+    argv = (sys.executable, str(program), "mavlink", arguments, str(tmp_path / "x.tlog"))
     done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 3
-    assert f"error: MAVLink by {connection}: " in done.stderr
+    assert f"error: MAVLink over {connection}: " in done.stderr
     assert complaint in done.stderr
 
 
 @pytest.mark.parametrize("serial", [False, True], ids=["udp", "serial"])
-def test_hostile_bytes_end_no_recorder_and_spoil_no_log(serial: bool, program: Path, tmp_path: Path) -> None:
+def test_hostile_bytes_neither_stop_the_recorder_nor_damage_the_log(
+    serial: bool, program: Path, tmp_path: Path
+) -> None:
     damage = drones.hostile(1)
     drone = drones.at_terminal(damage) if serial else drones.at_udp(damage)
     with drone as where:
         connection = f"{where}:115200" if serial else f"udpout:127.0.0.1:{where}"
         with recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended:
-            until(ended.log, 12_000)
+            wait_until_size(ended.log, 12_000)
     assert ended.code == 0
     read = tlog.read(ended.log, drones.SYSTEM, ended.said["ended_us"])
     assert read.frames == ended.said["frames"]

@@ -1,4 +1,4 @@
-"""The loss of MAVLink behind a router against the counters of the kernel that dropped the messages."""
+"""The loss of MAVLink behind a router, compared with the counters of the kernel that dropped the messages."""
 
 import json
 import subprocess
@@ -21,7 +21,7 @@ REQUESTED = (("ATTITUDE", 50_000), ("LOCAL_POSITION_NED", 50_000))
 
 @pytest.mark.quiet
 @pytest.mark.parametrize("percent", [0, 20])
-def test_the_loss_behind_a_router_is_what_the_kernel_dropped(percent: int, tmp_path: Path) -> None:
+def test_loss_behind_a_router_is_that_of_the_kernel(percent: int, tmp_path: Path) -> None:
     log = tmp_path / "mavlink.tlog"
     words = ("unshare", "--net", "--", sys.executable, "-m", "tests.helpers.mavlink_loss")
     done = subprocess.run(
@@ -35,7 +35,7 @@ def test_the_loss_behind_a_router_is_what_the_kernel_dropped(percent: int, tmp_p
     assert done.returncode == 0, done.stderr
     counted = json.loads(done.stdout)
     assert counted["periodic"] > 200
-    assert counted["withheld"] > 10, "numbers have gaps that are no loss"
+    assert counted["withheld"] > 10, "numbers have gaps that are not losses"
     values = tlog.measure(tlog.read(log, drones.SYSTEM, counted["ended_us"], REQUESTED), 0.0).values
     came, sent = int(values["mavlink_periodic"]), int(values["mavlink_periodic_sent"])
     assert abs(sent - came - counted["dropped"]) <= EDGE

@@ -1,4 +1,4 @@
-"""Orders of the laptop: taken once, in order, for as long as they hold, from whatever lies in the file."""
+"""Orders of the laptop: each is read once and in sequence, expires, and invalid files are ignored."""
 
 from pathlib import Path
 
@@ -11,10 +11,10 @@ from fieldkit.agent.orders import Orders
 KNOWN = ("stay", "climb", "go", "home")
 
 
-def test_orders_are_taken_once_in_order_and_lapse(tmp_path: Path) -> None:
+def test_orders_are_read_once_in_sequence_and_expire(tmp_path: Path) -> None:
     path = tmp_path / "orders"
     orders = Orders(str(path), KNOWN, 60.0)
-    assert not orders.look(), "there is no file"
+    assert not orders.poll(), "there is no file"
     for text, order, new in (
         ("", "stay", False),
         ("1 climb 30\n", "climb", True),
@@ -29,23 +29,23 @@ def test_orders_are_taken_once_in_order_and_lapse(tmp_path: Path) -> None:
         ("8 home 30", "home", True),
     ):
         path.write_text(text, encoding="ascii")
-        assert orders.look() is new, text
+        assert orders.poll() is new, text
         assert orders.order == order, text
-        assert not orders.lapsed
+        assert not orders.expired
     path.write_text("9 home -1", encoding="ascii")
-    assert orders.look()
-    assert orders.lapsed
+    assert orders.poll()
+    assert orders.expired
 
 
-def test_nobody_who_never_said_anything_is_waited_for(tmp_path: Path) -> None:
-    assert Orders(str(tmp_path / "orders"), KNOWN, 0.0).lapsed
-    assert not Orders(str(tmp_path / "orders"), KNOWN, 60.0).lapsed
+def test_first_order_has_a_timeout(tmp_path: Path) -> None:
+    assert Orders(str(tmp_path / "orders"), KNOWN, 0.0).expired
+    assert not Orders(str(tmp_path / "orders"), KNOWN, 60.0).expired
 
 
 @given(st.binary(max_size=120))
-def test_no_file_ends_it(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
+def test_any_file_content_is_tolerated(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "orders"
     path.write_bytes(data)
     orders = Orders(str(path), KNOWN, 60.0)
-    orders.look()
+    orders.poll()
     assert orders.order in KNOWN

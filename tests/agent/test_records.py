@@ -1,4 +1,4 @@
-"""The log of an end of a topic, whose writer is killed, or whose disk is full."""
+"""The log of a publisher or subscriber whose process is killed, or whose disk is full."""
 
 import errno
 import os
@@ -36,8 +36,8 @@ except records.LogError as error:
 """
 
 
-def test_a_writer_that_is_killed_leaves_all_that_was_noted(tmp_path: Path) -> None:
-    """Each number comes through a pipe once its record is there; the kill meets the writer at any instruction."""
+def test_killed_writer_leaves_all_noted_records(tmp_path: Path) -> None:
+    """Each number is sent through a pipe after its record was stored; the kill may occur at any instruction."""
     with subprocess.Popen((sys.executable, "-c", ENDLESS, tmp_path / "log"), stdout=-1, cwd=ROOT) as process:
         assert process.stdout is not None
         process.stdout.read(8 * SEVERAL_PIECES)
@@ -45,30 +45,28 @@ def test_a_writer_that_is_killed_leaves_all_that_was_noted(tmp_path: Path) -> No
         rest = process.stdout.read()
     noted = SEVERAL_PIECES + len(rest) // 8
 
-    found = topic_log.read(tmp_path / "log")
-    assert not found.whole
-    samples = found.samples
-    assert len(samples) - noted in {0, 1}, "the last was noted, or noted and told"
+    log = topic_log.read(tmp_path / "log")
+    assert not log.whole
+    samples = log.samples
+    assert len(samples) - noted in {0, 1}, "the last record was stored, and perhaps not yet sent"
     assert samples.sequence.tolist() == list(range(len(samples)))
     assert (samples.at_ns - samples.sequence == 2).all()
     assert (samples.sent_ns - samples.sequence == 1).all()
 
 
-def test_a_log_that_is_ended_has_its_records_alone(tmp_path: Path) -> None:
+def test_closed_log_contains_only_its_records(tmp_path: Path) -> None:
     log = Log(str(tmp_path / "log"))
     for number in range(SEVERAL_PIECES):
         log.note(records.SAMPLE, 5, sequence=number)
     log.end(6)
     size = (tmp_path / "log").stat().st_size
     assert size == len(records.MAGIC) + (SEVERAL_PIECES + 1) * records.RECORD.size
-    found = topic_log.read(tmp_path / "log")
-    assert found.whole
-    assert found.samples.sequence.tolist() == list(range(SEVERAL_PIECES))
+    log = topic_log.read(tmp_path / "log")
+    assert log.whole
+    assert log.samples.sequence.tolist() == list(range(SEVERAL_PIECES))
 
 
-def test_a_disk_that_becomes_full_is_told_and_keeps_what_was_noted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_is_reported_and_keeps_noted_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = Log(str(tmp_path / "log"))
 
     def full(*_: int) -> None:
@@ -78,29 +76,29 @@ def test_a_disk_that_becomes_full_is_told_and_keeps_what_was_noted(
     room = (records.PIECE_BYTES - len(records.MAGIC)) // records.RECORD.size
     for number in range(room):
         log.note(records.SAMPLE, 5, sequence=number)
-    for _ in range(2):  # it is not forgotten
+    for _ in range(2):  # the error persists
         with pytest.raises(LogError, match=r"log .*/log cannot be written: No space left on device"):
             log.note(records.SAMPLE, 5, sequence=room)
     with pytest.raises(LogError):
         log.end(6)
-    found = topic_log.read(tmp_path / "log")
-    assert (len(found.samples), found.whole) == (room, False)
+    log = topic_log.read(tmp_path / "log")
+    assert (len(log.samples), log.whole) == (room, False)
 
 
 @pytest.mark.emulated
-def test_a_full_file_system_ends_nobody_by_a_signal(tmp_path: Path) -> None:
-    """The last piece is reserved on disk before anything is stored to it."""
+def test_full_file_system_raises_no_signal(tmp_path: Path) -> None:
+    """The last piece is allocated on disk before data are stored in it."""
     (tmp_path / "disk").mkdir()
     script = 'mount -t tmpfs -o size=200k none disk && "$@" disk/log; code=$?; cp disk/log .; exit $code'
     program = ("env", f"PYTHONPATH={ROOT}", sys.executable, "-c", UNTIL_FULL)
     argv = ("unshare", "--mount", "sh", "-c", script, "sh", *program)
     done = subprocess.run(argv, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done
-    noted, _, said = done.stdout.partition(" ")
-    assert said == "the log disk/log cannot be written: No space left on device\n"
+    noted, _, output = done.stdout.partition(" ")
+    assert output == "the log disk/log cannot be written: No space left on device\n"
     assert topic_log.read(tmp_path / "log").samples.sequence.tolist() == list(range(int(noted)))
 
 
-def test_a_log_that_cannot_be_begun_is_told(tmp_path: Path) -> None:
+def test_log_that_cannot_be_created_is_reported(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="No such file"):
         Log(str(tmp_path / "nowhere" / "log"))

@@ -1,4 +1,4 @@
-"""The rescue program: it ends the pilot and the guard, and lands a drone that their flight still leads."""
+"""The rescue program: it kills the pilot and the guard, and lands a drone that their flight still controls."""
 
 import signal
 import subprocess
@@ -51,16 +51,16 @@ def programs(folder: Path) -> Iterator[list["subprocess.Popen[bytes]"]]:
         for process in pair:
             stack.callback(process.wait, 60)
             stack.callback(process.kill)
-        wait_until(lambda: have_begun(path), Deadline.after(60))
+        wait_until(lambda: have_started(path), Deadline.after(60))
         for process in pair:
             process.send_signal(signal.SIGSTOP)
         yield pair
 
 
-def have_begun(path: Path) -> bool:
-    """Return whether both programs are in the file."""
-    found = entries(path) if path.exists() else ()
-    return bool(found) and all(entry.turns for entry in found)
+def have_started(path: Path) -> bool:
+    """Return True if both programs are in the file."""
+    life_entries = entries(path) if path.exists() else ()
+    return bool(life_entries) and all(entry.turns for entry in life_entries)
 
 
 def entries(path: Path) -> tuple[liveness.LifeEntry, ...]:
@@ -69,7 +69,7 @@ def entries(path: Path) -> tuple[liveness.LifeEntry, ...]:
 
 
 def fly_up(autopilot: Autopilot, firmware: Firmware) -> None:
-    """Let it hover in the guided mode; a PX4 follows one set-point and then misses the next."""
+    """Let the drone hover in the guided mode; a PX4 follows one set-point and then misses the next one."""
     vehicle = autopilot.vehicle
     wait_until(lambda: not vehicle.arming_errors, Deadline.after(60))
     if firmware is PX4:
@@ -77,13 +77,13 @@ def fly_up(autopilot: Autopilot, firmware: Firmware) -> None:
     vehicle.change_mode(Mode.OFFBOARD)
     vehicle.arm()
     if firmware is PX4:
-        wait_until(lambda: lead(autopilot) > 0.8 * HEIGHT_M, Deadline.after(60))
+        wait_until(lambda: send_set_point(autopilot) > 0.8 * HEIGHT_M, Deadline.after(60))
     else:
         vehicle.take_off(HEIGHT_M)
         wait_until(lambda: vehicle.mode is Mode.OFFBOARD and up_m(autopilot) > 0.8 * HEIGHT_M, Deadline.after(60))
 
 
-def lead(autopilot: Autopilot) -> float:
+def send_set_point(autopilot: Autopilot) -> float:
     autopilot.vehicle.accept_set_point(SetPoint((0.0, 0.0, HEIGHT_M), is_place=True))
     return up_m(autopilot)
 
@@ -93,7 +93,7 @@ def up_m(autopilot: Autopilot) -> float:
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
-def test_both_are_ended_before_the_drone_lands(tmp_path: Path, firmware: Firmware) -> None:
+def test_pilot_and_guard_are_killed_before_the_drone_lands(tmp_path: Path, firmware: Firmware) -> None:
     with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot), programs(tmp_path) as pair:
         fly_up(autopilot, firmware)
         if firmware is PX4:
@@ -105,7 +105,7 @@ def test_both_are_ended_before_the_drone_lands(tmp_path: Path, firmware: Firmwar
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
-def test_a_drone_that_a_person_has_taken_over_is_left_alone(
+def test_drone_that_a_person_has_taken_over_is_not_commanded(
     tmp_path: Path, firmware: Firmware, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot), programs(tmp_path):
@@ -113,13 +113,13 @@ def test_a_drone_that_a_person_has_taken_over_is_left_alone(
         if firmware is PX4:
             wait_until(lambda: autopilot.vehicle.mode is Mode.LOITER, Deadline.after(60))
         autopilot.vehicle.change_mode(Mode.LOITER if firmware is PX4 else Mode.POSHOLD)
-        assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.TAKEN
+        assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.TAKEN_OVER
         assert autopilot.vehicle.armed
         assert up_m(autopilot) > 0.5 * HEIGHT_M
     assert "nothing more is sent" in capfd.readouterr().err
 
 
-def test_an_order_to_end_does_not_stop_the_rescue(tmp_path: Path) -> None:
+def test_stop_signal_does_not_stop_the_rescue(tmp_path: Path) -> None:
     over = threading.Event()
     over.set()
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), programs(tmp_path):
@@ -128,20 +128,20 @@ def test_an_order_to_end_does_not_stop_the_rescue(tmp_path: Path) -> None:
         assert autopilot.vehicle.body.on_ground
 
 
-def test_an_autopilot_that_is_not_heard_ends_it_with_an_alarm(
+def test_missing_heartbeat_ends_with_an_alarm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(rescue, "UNHEARD_S", 1.0)
     (tmp_path / "liveness").touch()
     with drones.autopilot_at_udp(damage=lambda _: []) as (port, _):
         assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.REFUSED
-    said = capfd.readouterr().err
-    assert "ALARM: THE DRONE MAY STILL BE IN THE AIR" in said
-    assert landing.MANUAL_ACTION in said
-    assert "no heartbeat of the autopilot" in said
+    errors = capfd.readouterr().err
+    assert "ALARM: THE DRONE MAY STILL BE IN THE AIR" in errors
+    assert landing.MANUAL_ACTION in errors
+    assert "no heartbeat of the autopilot" in errors
 
 
-def test_a_connection_that_cannot_be_opened_ends_it_with_an_alarm(
+def test_connection_that_cannot_be_opened_ends_with_an_alarm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(rescue, "UNHEARD_S", 1.0)

@@ -1,4 +1,4 @@
-"""The agent over a real ROS 2: rclpy of Kilted and Fast DDS, from packages of its own (`.ci/install --dev`)."""
+"""The agent over a real ROS 2: rclpy of Kilted and Fast DDS, from separate packages (`.ci/install --dev`)."""
 
 import json
 import signal
@@ -24,13 +24,13 @@ ROS2: Final = str(ROOT / ".ros2" / "bin" / "python")
 PYTHONS: Final = {"ros2": ROS2, "dds": sys.executable}
 TYPE: Final = "std_msgs/msg/UInt8MultiArray"
 DOMAIN: Final = 5
-# A large one is in many datagrams over either, and no length is a multiple of 4.
+# A large sample needs many datagrams over both, and no length is a multiple of 4.
 SIZES: Final = {"there": 100_001, "back": 1_001}
 LONG_S: Final = 120
 TRIES: Final = 5
 
 
-def told(over: str, host: TestHost, topic: str, size: int, **quality: object) -> dict[str, Any]:
+def arguments(over: str, host: TestHost, topic: str, size: int, **quality: object) -> dict[str, Any]:
     node = f"fieldkit_{over}_{topic}"
     described = topics.describe(shipped(), f"/{topic}", TYPE, PROFILES["default"], domain=DOMAIN, node=node)
     described["quality"] |= quality
@@ -51,73 +51,73 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def running(
     host: TestHost, program: Path, verb: str, what: dict[str, Any], log: Path
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run an end while the body runs, in the folder of its log."""
+    """Run a publisher or subscriber while the body runs, in the folder of its log."""
     python = PYTHONS[what["stream"]["over"]]
     inside = ("env", "-C", str(log.parent), python, str(program), verb, json.dumps(what), str(log))
     with host.start(inside) as process:
         assert process.stderr is not None
-        # Fast DDS may complain of CycloneDDS' types first.
-        said = list(takewhile(lambda line: not line.startswith(b"up, "), process.stderr))
-        assert process.poll() is None, said
+        # Fast DDS may print warnings about types of CycloneDDS before.
+        output = list(takewhile(lambda line: not line.startswith(b"up, "), process.stderr))
+        assert process.poll() is None, output
         yield process
 
 
 def read(path: Path, kind: int) -> list[tuple[int, ...]]:
-    found = records.RECORD.iter_unpack(path.read_bytes()[len(records.MAGIC) :])
-    return [one[2:5] for one in found if one[0] == kind]
+    rows = records.RECORD.iter_unpack(path.read_bytes()[len(records.MAGIC) :])
+    return [row[2:5] for row in rows if row[0] == kind]
 
 
 def exchange(program: Path, folder: Path) -> bool:
-    """Stream both ways at once; return whether both ends of both streams found each other."""
+    """Stream in both directions at the same time; return True if all endpoints matched."""
     with cabled() as (near, far), ExitStack() as stack:
 
         def start(host: TestHost, over: str, verb: str, topic: str) -> subprocess.Popen[bytes]:
-            what = told(over, host, topic, SIZES[topic], durability="transient_local", depth=100)
+            what = arguments(over, host, topic, SIZES[topic], durability="transient_local", depth=100)
             return stack.enter_context(running(host, program, verb, what, folder / f"{topic}.{verb}"))
 
-        ears = [start(far, "dds", "subscribe", "there"), start(near, "ros2", "subscribe", "back")]
-        mouths = [start(far, "dds", "publish", "back"), start(near, "ros2", "publish", "there")]
-        said = [mouth.communicate(timeout=LONG_S)[1] for mouth in mouths]
-        for ear in ears:
-            ear.send_signal(signal.SIGINT)
-        said += [ear.communicate(timeout=LONG_S)[1] for ear in ears]
-    assert [one.returncode for one in (*mouths, *ears)] == [0] * 4, said
+        subscribers = [start(far, "dds", "subscribe", "there"), start(near, "ros2", "subscribe", "back")]
+        publishers = [start(far, "dds", "publish", "back"), start(near, "ros2", "publish", "there")]
+        output = [publisher.communicate(timeout=LONG_S)[1] for publisher in publishers]
+        for subscriber in subscribers:
+            subscriber.send_signal(signal.SIGINT)
+        output += [subscriber.communicate(timeout=LONG_S)[1] for subscriber in subscribers]
+    assert [row.returncode for row in (*publishers, *subscribers)] == [0] * 4, output
     return all(
         read(folder / f"{topic}.{verb}", records.MATCHED) for topic in SIZES for verb in ("publish", "subscribe")
     )
 
 
 @pytest.mark.emulated
-def test_fast_dds_and_cyclonedds_hear_each_other_through_the_agent(program: Path, tmp_path: Path) -> None:
-    """Samples of one stack arrive as they were sent at the other."""
-    # On a busy machine CycloneDDS sometimes never learns of an end of Fast DDS that knows it.
+def test_fast_dds_and_cyclonedds_exchange_samples_through_the_agent(program: Path, tmp_path: Path) -> None:
+    """Samples of one implementation arrive unchanged at the other."""
+    # On a busy machine CycloneDDS sometimes does not discover an endpoint of Fast DDS that has discovered it.
     assert any(exchange(program, tmp_path) for _ in range(TRIES))
     for topic in SIZES:
         sent, came = (read(tmp_path / f"{topic}.{verb}", records.SAMPLE) for verb in ("publish", "subscribe"))
         assert sent
-        assert [one[1:] for one in came] == [one[1:] for one in sent]
+        assert [row[1:] for row in came] == [row[1:] for row in sent]
 
 
 @pytest.mark.emulated
-def test_a_node_of_ros_2_leaves_nothing_in_the_home_of_its_robot(program: Path, tmp_path: Path) -> None:
-    """And what its RMW cannot do is told in a sentence."""
+def test_ros_2_node_leaves_no_file_in_the_home_of_its_robot(program: Path, tmp_path: Path) -> None:
+    """An unknown RMW is reported in a sentence."""
     home, job = tmp_path / "home", tmp_path / "job"
     home.mkdir()
     job.mkdir()
     with cabled() as (near, _):
         for more, what, code in (
             ((), {"patience_s": 0.0}, 0),
-            # rcl itself ends the process.
+            # rcl exits the process.
             (("RMW_IMPLEMENTATION=rmw_none_cpp",), {}, 102),
         ):
-            asked = told("ros2", near, "none", 100)
-            asked["stream"] |= what
-            words = ("env", "-C", str(job), f"HOME={home}", *more, ROS2, str(program), "publish", json.dumps(asked))
+            request = arguments("ros2", near, "none", 100)
+            request["stream"] |= what
+            words = ("env", "-C", str(job), f"HOME={home}", *more, ROS2, str(program), "publish", json.dumps(request))
             with near.start((*words, str(job / "log"))) as process:
-                _, said = process.communicate(timeout=LONG_S)
-            assert process.returncode == code, said
-            assert (b"rmw_none_cpp" in said) == bool(code)
-            assert (b"up, rclpy 9.1.2, rmw_fastrtps_cpp\n" in said) == (not code)
+                _, output = process.communicate(timeout=LONG_S)
+            assert process.returncode == code, output
+            assert (b"rmw_none_cpp" in output) == bool(code)
+            assert (b"up, rclpy 9.1.2, rmw_fastrtps_cpp\n" in output) == (not code)
     assert not list(home.iterdir())
 
 
@@ -140,13 +140,13 @@ print(json.dumps([policies, made.deadline.nanoseconds, made.lifespan.nanoseconds
 
 
 @pytest.mark.emulated
-def test_what_is_asked_is_told_to_rclpy_in_its_own_words(program: Path) -> None:
+def test_network_settings_and_quality_in_rclpy(program: Path) -> None:
     done = subprocess.run((ROS2, "-c", SHOWN, str(program)), capture_output=True, check=False, timeout=LONG_S)
     assert done.returncode == 0, done.stderr
-    policies, deadline_ns, lifespan_ns, said, ways = json.loads(done.stdout)
+    policies, deadline_ns, lifespan_ns, output, ways = json.loads(done.stdout)
     assert policies == ["BEST_EFFORT", "KEEP_LAST", 7, "TRANSIENT_LOCAL"]
     assert (deadline_ns, lifespan_ns) == (100_000_000, 2_000_000_000)
-    assert "this ROS 2 has no lab_msgs/msg/Radio" in said
+    assert "this ROS 2 has no lab_msgs/msg/Radio" in output
     domain = {"ROS_DOMAIN_ID": "7"}
     assert ways == {
         "environment": domain,

@@ -1,4 +1,4 @@
-"""Detecting standstill from odometry, with exact paths."""
+"""Detection of standstill from odometry with exact paths."""
 
 import pytest
 
@@ -10,7 +10,7 @@ def after(speed_m_s: float, turn_rad_s: float, lasts_s: float, rate_hz: float = 
     standstill = Standstill()
     for number in range(round(lasts_s * rate_hz) + 1):
         at_s = number / rate_hz
-        standstill.odometry(100.0 + at_s, OdometryPose(speed_m_s * at_s, 1.0, turn_rad_s * at_s))
+        standstill.add_pose(100.0 + at_s, OdometryPose(speed_m_s * at_s, 1.0, turn_rad_s * at_s))
     return standstill
 
 
@@ -18,20 +18,20 @@ def after(speed_m_s: float, turn_rad_s: float, lasts_s: float, rate_hz: float = 
     ("speed_m_s", "turn_rad_s", "stationary"),
     [(0.0, 0.0, True), (0.02, 0.0, True), (0.03, 0.0, False), (0.0, 0.09, True), (0.0, 0.12, False)],
 )
-def test_motion_above_its_bounds_is_no_standstill(speed_m_s: float, turn_rad_s: float, *, stationary: bool) -> None:
+def test_motion_above_the_limits_is_detected(speed_m_s: float, turn_rad_s: float, *, stationary: bool) -> None:
     assert after(speed_m_s, turn_rad_s, 1.0).stationary is stationary
 
 
-def test_too_short_an_observation_confirms_nothing() -> None:
+def test_short_observation_confirms_nothing() -> None:
     assert not Standstill().stationary
     assert not after(0.0, 0.0, WITHIN_S - 0.05).stationary
     assert after(0.0, 0.0, WITHIN_S).stationary
 
 
-def test_a_robot_that_came_to_a_stop_is_stationary_once_its_motion_is_older_than_the_window() -> None:
+def test_stopped_robot_is_stationary_after_the_window() -> None:
     standstill = after(0.5, 0.0, 1.0)
     end = OdometryPose(0.5, 1.0, 0.0)
     for number in range(1, 5):
         assert not standstill.stationary
-        standstill.odometry(101.0 + number / 20, end)
+        standstill.add_pose(101.0 + number / 20, end)
     assert standstill.stationary

@@ -1,4 +1,4 @@
-"""The driver of a ground robot: within limits whatever happens, there and back on noisy odometry, stopped in time."""
+"""The driver of a ground robot: within limits for all inputs, out and back with noisy odometry, stopped in time."""
 
 import math
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.agent.drive_plan import BACK, END, OUT, DriveTask, way_s
-from fieldkit.agent.steering import STAND, Driver, DriveVelocity, OdometryPose
+from fieldkit.agent.steering import ZERO_VELOCITY, Driver, DriveVelocity, OdometryPose
 
 TICK_S = 0.05
 TASK = DriveTask(
@@ -29,7 +29,7 @@ LEGS = st.lists(st.tuples(METRES, METRES), min_size=1, max_size=3)
 
 
 class Robot:
-    """A base without inertia of its own, whose odometry is late by a tick and noisy."""
+    """A base without inertia, whose odometry is late by a tick and noisy."""
 
     def __init__(self, start: OdometryPose, noise_m: float = 0.0, seed: int = 0) -> None:
         self.pose = start
@@ -53,7 +53,7 @@ class Robot:
 def run(
     driver: Driver, robot: Robot, *, now_s: float = 0.0, order: str = OUT, ticks: int = 4000
 ) -> Iterator[DriveVelocity]:
-    """Yield each velocity of a drive until it is over or stands at its end; the laptop is there."""
+    """Yield each velocity until the drive ends or the robot stops at the end of its path; the lease is renewed."""
     for number in range(ticks):
         at_s = now_s + number * TICK_S
         driver.odometry(at_s, robot.odometry())
@@ -67,7 +67,8 @@ def run(
 
 def within_limits(task: DriveTask, driven: list[DriveVelocity]) -> bool:
     fast = all(
-        abs(one.forward_m_s) <= task.speed_m_s and abs(one.turn_rad_s) <= task.turn_rad_s + 1e-9 for one in driven
+        abs(velocity.forward_m_s) <= task.speed_m_s and abs(velocity.turn_rad_s) <= task.turn_rad_s + 1e-9
+        for velocity in driven
     )
     most = task.acceleration_m_s2 * TICK_S + 1e-9
     gentle = all(after.forward_m_s - before.forward_m_s <= most for before, after in pairwise(driven))
@@ -81,7 +82,7 @@ def within_limits(task: DriveTask, driven: list[DriveVelocity]) -> bool:
     st.floats(0, 0.005),
     st.integers(0, 99),
 )
-def test_it_gets_there_and_back_and_faces_as_before(
+def test_drives_out_and_back_to_its_pose(
     legs: list[tuple[float, float]], start: OdometryPose, noise_m: float, seed: int
 ) -> None:
     task = replace(TASK, legs=legs, fence_m=50.0, limit_s=500.0)
@@ -96,7 +97,7 @@ def test_it_gets_there_and_back_and_faces_as_before(
     assert (driver.phase, driver.stopped) == ("home", "")
     assert math.dist(robot.pose[:2], start[:2]) < 0.05 + 10 * noise_m
     assert abs(math.remainder(robot.pose.yaw_rad - start.yaw_rad, math.tau)) < 0.1 + 5 * noise_m
-    assert out[-1] == back[-1] == STAND
+    assert out[-1] == back[-1] == ZERO_VELOCITY
     assert within_limits(task, out)
     assert within_limits(task, back)
 
@@ -111,11 +112,11 @@ def test_it_gets_there_and_back_and_faces_as_before(
         max_size=60,
     )
 )
-def test_no_odometry_and_no_order_make_it_faster_than_it_may(
-    told: list[tuple[float, OdometryPose | None, str]],
+def test_any_odometry_and_order_keep_the_limits(
+    leg: list[tuple[float, OdometryPose | None, str]],
 ) -> None:
-    driver, now_s, last, stopped = Driver(TASK, 0.0), 0.0, STAND, ""
-    for for_s, pose, order in told:
+    driver, now_s, last, stopped = Driver(TASK, 0.0), 0.0, ZERO_VELOCITY, ""
+    for for_s, pose, order in leg:
         now_s += for_s
         if pose is not None:
             driver.odometry(now_s, pose)
@@ -125,12 +126,12 @@ def test_no_odometry_and_no_order_make_it_faster_than_it_may(
         assert 0 <= velocity.forward_m_s <= TASK.speed_m_s
         assert abs(velocity.turn_rad_s) <= TASK.turn_rad_s
         assert velocity.forward_m_s - last.forward_m_s <= TASK.acceleration_m_s2 * for_s + 1e-9
-        assert not stopped or (velocity == STAND and driver.stopped == stopped), "for good"
+        assert not stopped or (velocity == ZERO_VELOCITY and driver.stopped == stopped), "the stop is final"
         last, stopped = velocity, driver.stopped
 
 
 def moving(task: DriveTask = TASK) -> tuple[Driver, Robot, float]:
-    """A driver that is under way, its robot, and when that is."""
+    """Return a moving driver, its robot, and the present time."""
     driver, robot = Driver(task, 0.0), Robot(OdometryPose(7.0, 8.0, 1.0))
     driven = list(run(driver, robot, ticks=30))
     assert driven[-1].forward_m_s > 0.3
@@ -147,14 +148,14 @@ def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: boo
             driver.renewed(now_s, OUT)
         robot.drive(driver.tick(now_s), TICK_S)
         assert now_s < since_s + 100
-    assert driver.tick(now_s) == STAND
+    assert driver.tick(now_s) == ZERO_VELOCITY
     driver.renewed(now_s, BACK)
     driver.odometry(now_s, robot.odometry())
-    assert driver.tick(now_s + TICK_S) == STAND, "what stops it, stops it for good"
+    assert driver.tick(now_s + TICK_S) == ZERO_VELOCITY, "the stop is final"
     return now_s - since_s
 
 
-def test_a_laptop_that_is_gone_stops_it_within_its_lease() -> None:
+def test_lost_laptop_stops_it_within_its_lease() -> None:
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)]))
     assert stopped_after_s(driver, since_s, robot, renews=False, hears=True) <= TASK.lease_s + TICK_S
     assert driver.stopped == "the laptop was silent for 2 s"
@@ -166,7 +167,7 @@ def test_silent_odometry_stops_it() -> None:
     assert driver.stopped == "odometry was silent for 0.5 s"
 
 
-def test_it_stops_at_its_fence_and_after_its_time() -> None:
+def test_stops_at_its_fence_and_after_its_time_limit() -> None:
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], fence_m=2.0))
     stopped_after_s(driver, since_s, robot, renews=True, hears=True)
     assert driver.stopped == "beyond the fence, 2 m from its place"
@@ -176,38 +177,38 @@ def test_it_stops_at_its_fence_and_after_its_time() -> None:
     assert driver.stopped == "not there after 3 s"
 
 
-def test_odometry_that_jumps_and_an_order_to_end_stop_it() -> None:
+def test_jumping_odometry_and_an_order_stop_it() -> None:
     driver, robot, since_s = moving()
     robot.pose = robot.pose._replace(x_m=robot.pose.x_m + 1.0)
     driver.odometry(since_s + TICK_S, robot.odometry())
-    assert driver.tick(since_s + TICK_S) == STAND
+    assert driver.tick(since_s + TICK_S) == ZERO_VELOCITY
     assert driver.stopped.startswith("odometry jumped by 1")
     driver, _, since_s = moving()
     driver.renewed(since_s, END)
-    assert (driver.tick(since_s), driver.stopped) == (STAND, "ordered to stop")
+    assert (driver.tick(since_s), driver.stopped) == (ZERO_VELOCITY, "ordered to stop")
 
 
-def test_it_waits_for_its_laptop_and_turns_back_where_it_is() -> None:
+def test_waits_for_its_laptop_and_turns_back_at_its_position() -> None:
     driver = Driver(TASK, 0.0)
     driver.odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
-    assert [driver.tick(number * TICK_S) for number in range(20)] == [STAND] * 20
+    assert [driver.tick(number * TICK_S) for number in range(20)] == [ZERO_VELOCITY] * 20
     driver, robot, since_s = moving(replace(TASK, legs=[(2.0, 0.0), (0.0, 2.0)]))
     farthest = 0.0
     for _ in run(driver, robot, now_s=since_s, order=BACK):
         farthest = max(farthest, math.dist(robot.pose[:2], (7.0, 8.0)))
     assert driver.phase == "home"
-    assert farthest < 1.0, "by the shortest way"
+    assert farthest < 1.0, "on the shortest path"
 
 
 @pytest.mark.parametrize("data", [{"legs": [["x", 0]]}, {"legs": []}, {}])
-def test_a_task_that_lacks_something_is_none(data: dict[str, object]) -> None:
+def test_incomplete_task_is_rejected(data: dict[str, object]) -> None:
     with pytest.raises((TypeError, ValueError, KeyError)):
         DriveTask.from_json(data)
 
 
 @settings(max_examples=30)
 @given(LEGS, st.floats(0.1, 1.5), st.floats(0.3, 3.0), st.floats(0.2, 2.0))
-def test_its_way_takes_as_long_as_is_said(
+def test_duration_of_a_path_is_predicted(
     legs: list[tuple[float, float]], speed_m_s: float, turn_rad_s: float, acceleration_m_s2: float
 ) -> None:
     task = replace(TASK, legs=legs, speed_m_s=speed_m_s, turn_rad_s=turn_rad_s, fence_m=20.0, limit_s=1e3)
@@ -218,9 +219,9 @@ def test_its_way_takes_as_long_as_is_said(
     assert way_s(task) == pytest.approx(took_s, rel=0.1, abs=0.5 + 0.5 * len(legs))
 
 
-@pytest.mark.parametrize("told", [(1.0, 0.0), (0.0, 1.0)])
-def test_odometry_that_says_the_same_for_ever_stops_it(told: tuple[float, float]) -> None:
-    driver, pose = Driver(replace(TASK, legs=[told]), 0.0), OdometryPose(0.0, 0.0, math.atan2(*reversed(told)))
+@pytest.mark.parametrize("leg", [(1.0, 0.0), (0.0, 1.0)])
+def test_constant_odometry_stops_it(leg: tuple[float, float]) -> None:
+    driver, pose = Driver(replace(TASK, legs=[leg]), 0.0), OdometryPose(0.0, 0.0, math.atan2(*reversed(leg)))
     driver.odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
     way_m = 0.0
     for number in range(1, 1200):
@@ -230,7 +231,7 @@ def test_odometry_that_says_the_same_for_ever_stops_it(told: tuple[float, float]
         way_m += driver.tick(at_s).forward_m_s * TICK_S
         if driver.stopped:
             break
-    assert driver.stopped.startswith("told to drive 1.3 m, it came 0.0 m")
+    assert driver.stopped.startswith("1.3 m were commanded, but by its odometry the robot drove 0.0 m")
     assert way_m < 1.5, "of 5 m to its fence"
 
 
@@ -243,30 +244,30 @@ def test_odometry_that_says_the_same_for_ever_stops_it(told: tuple[float, float]
         ((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), "its odometry is 2.00 m and 0.00 rad from where its last motion ended"),
     ],
 )
-def test_a_robot_that_is_not_at_its_place_does_not_start(
+def test_robot_that_is_not_at_its_place_does_not_start(
     start: tuple[float, float, float], last: tuple[float, float, float] | None, why: str
 ) -> None:
     driver = Driver(replace(TASK, origin=(0.0, 0.0, 0.0), last=last), 0.0)
-    assert set(run(driver, Robot(OdometryPose(*start)))) == {STAND}
+    assert set(run(driver, Robot(OdometryPose(*start)))) == {ZERO_VELOCITY}
     assert (driver.stopped, driver.refused) == (why, True)
 
 
-def test_later_repeats_take_the_direction_of_the_origin() -> None:
+def test_later_repeats_use_the_heading_of_the_origin() -> None:
     driver = Driver(replace(TASK, legs=[(2.0, 0.0)], origin=(0.0, 0.0, 0.0)), 0.0)
     robot = Robot(OdometryPose(0.1, -0.1, 0.25))
     list(run(driver, robot))
     assert robot.pose[:2] == pytest.approx((2.0, 0.0), abs=0.05)
 
 
-def test_a_gap_between_two_turns_of_the_loop_stops_it_for_good() -> None:
+def test_gap_between_two_iterations_stops_it() -> None:
     driver, robot, since_s = moving()
     driver.renewed(since_s + 6.0, OUT)
     driver.odometry(since_s + 6.0, robot.odometry())
-    assert driver.tick(since_s + 6.0) == STAND
+    assert driver.tick(since_s + 6.0) == ZERO_VELOCITY
     assert driver.stopped == "its program was suspended for 6.0 s"
 
 
-def test_with_leave_it_first_returns_along_its_path() -> None:
+def test_first_returns_along_its_path_if_allowed() -> None:
     task = replace(TASK, legs=[(2.0, 0.0), (0.0, 1.5)], origin=(0.0, 0.0, 0.0), may_return=True)
     driver, robot = Driver(task, 0.0), Robot(OdometryPose(2.0, 1.0, 1.5))
     off_m = 0.0
@@ -274,8 +275,8 @@ def test_with_leave_it_first_returns_along_its_path() -> None:
         x_m, y_m, _ = robot.pose
         off_m = max(off_m, min(abs(y_m), abs(x_m - 2.0)))
     assert (driver.phase, driver.stopped) == ("there", "")
-    assert off_m < 0.2, "round the corner"
-    assert driver.driven_m == pytest.approx(3.5, abs=0.3), "the way back is not of the drive"
+    assert off_m < 0.2, "around the corner"
+    assert driver.driven_m == pytest.approx(3.5, abs=0.3), "without the path of the return"
     driver = Driver(task, 0.0)
-    assert set(run(driver, Robot(OdometryPose(0.5, 2.0, 0.0)))) == {STAND}
+    assert set(run(driver, Robot(OdometryPose(0.5, 2.0, 0.0)))) == {ZERO_VELOCITY}
     assert driver.stopped.endswith("more than 1 m off its path")

@@ -1,4 +1,4 @@
-"""The adapter of Zenoh: attachments as Zenoh's own serializer writes them, and what the library is told."""
+"""The adapter of Zenoh: attachments compared with Zenoh's serializer, and the configuration of the library."""
 
 import json
 
@@ -17,55 +17,57 @@ numbers = st.integers(-(2**63), 2**63 - 1)
 
 @given(numbers, numbers, st.binary(min_size=16, max_size=16))
 def test_attachments_are_those_of_zenohs_serializer(sequence: int, at_ns: int, gid: bytes) -> None:
-    """What `zenoh::ext::Serializer` makes of the three values that rmw_zenoh hands it."""
+    """`zenoh::ext::Serializer` with the three values that rmw_zenoh uses."""
     whole = (zenoh.ext.Int64(sequence), zenoh.ext.Int64(at_ns), gid)
     assert adapter.ATTACHMENT.pack(sequence, at_ns, len(gid), gid) == zenoh.ext.z_serialize(whole).to_bytes()
 
 
-def test_publishers_have_identifiers_of_their_own() -> None:
+def test_publishers_have_different_identifiers() -> None:
     assert len(adapter.gid("a")) == adapter.GID_BYTES
     assert adapter.gid("a") != adapter.gid("b")
 
 
-def test_a_peer_looks_for_others_by_scouting_alone() -> None:
-    found = adapter.configuration(Network("10.0.0.1"), "peer")
-    assert found["scouting/multicast/enabled"] is True
-    assert found["listen/endpoints"] == ["tcp/10.0.0.1:7447"]
-    assert found["connect/endpoints"] == []
+def test_peer_uses_scouting_only() -> None:
+    configuration = adapter.configuration(Network("10.0.0.1"), "peer")
+    assert configuration["scouting/multicast/enabled"] is True
+    assert configuration["listen/endpoints"] == ["tcp/10.0.0.1:7447"]
+    assert configuration["connect/endpoints"] == []
 
 
-def test_peers_are_asked_by_address() -> None:
+def test_peers_are_contacted_by_address() -> None:
     network = Network("10.0.0.1", discovery="peers", peers=("10.0.0.2",), transport="udp")
-    found = adapter.configuration(network, "peer")
-    assert found["scouting/multicast/enabled"] is False
-    assert found["connect/endpoints"] == ["udp/10.0.0.2:7447"]
+    configuration = adapter.configuration(network, "peer")
+    assert configuration["scouting/multicast/enabled"] is False
+    assert configuration["connect/endpoints"] == ["udp/10.0.0.2:7447"]
 
 
-def test_a_client_knows_its_router_alone() -> None:
-    found = adapter.configuration(Network("10.0.0.1", discovery="router", server="10.0.0.9", port=7555), "client")
-    assert found["connect/endpoints"] == ["tcp/10.0.0.9:7555"]
-    assert "listen/endpoints" not in found
+def test_client_contacts_its_router_only() -> None:
+    configuration = adapter.configuration(
+        Network("10.0.0.1", discovery="router", server="10.0.0.9", port=7555), "client"
+    )
+    assert configuration["connect/endpoints"] == ["tcp/10.0.0.9:7555"]
+    assert "listen/endpoints" not in configuration
 
 
-def test_a_router_asks_nobody() -> None:
-    found = adapter.configuration(Network("10.0.0.9", discovery="router", server="10.0.0.9"), "router")
-    assert found["listen/endpoints"] == ["tcp/10.0.0.9:7447"]
-    assert "connect/endpoints" not in found
+def test_router_contacts_no_peers() -> None:
+    configuration = adapter.configuration(Network("10.0.0.9", discovery="router", server="10.0.0.9"), "router")
+    assert configuration["listen/endpoints"] == ["tcp/10.0.0.9:7447"]
+    assert "connect/endpoints" not in configuration
 
 
-def test_settings_are_values_of_json_or_texts() -> None:
+def test_settings_are_json_values_or_texts() -> None:
     network = Network("10.0.0.1", settings={"transport/link/tx/batch_size": "1400", "mode": "client"})
-    found = adapter.configuration(network, "peer")
-    assert (found["transport/link/tx/batch_size"], found["mode"]) == (1400, "client")
+    configuration = adapter.configuration(network, "peer")
+    assert (configuration["transport/link/tx/batch_size"], configuration["mode"]) == (1400, "client")
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
-def test_the_library_knows_what_is_tuned(transport: str) -> None:
+def test_library_accepts_the_recommended_settings(transport: str) -> None:
     """It refuses a path, or a value, that it does not know."""
     tuned = tuning.tuned("zenoh", transport)
-    found = adapter.configuration(Network("10.0.0.1", transport=transport, settings=tuned), "peer")
+    configuration = adapter.configuration(Network("10.0.0.1", transport=transport, settings=tuned), "peer")
     config = zenoh.Config()
     for path in tuned:
-        config.insert_json5(path, json.dumps(found[path]))
+        config.insert_json5(path, json.dumps(configuration[path]))
     (publication,) = json.loads(config.get_json("qos/publication"))
     assert publication["config"]["congestion_control"] == "block_first"

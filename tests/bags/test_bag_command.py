@@ -1,4 +1,4 @@
-"""`fieldkit bag`: what people see of whole and damaged bags, of ROS's own and of cut ones."""
+"""`fieldkit bag`: its output for complete and damaged bags, of ROS's recorders and truncated ones."""
 
 import gzip
 import json
@@ -44,7 +44,7 @@ def expected(count: int) -> list[Message]:
 
 
 def written(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
-    """Return a bag that rosbags wrote; of ROS 1 compressed, with a chunk each 20 messages or so."""
+    """Return a bag written by rosbags; for ROS 1 compressed, with about 20 messages per chunk."""
     if form is BagFormat.ROS1:
         types = get_typestore(Stores.ROS1_NOETIC)
         path = folder / "all.bag"
@@ -72,7 +72,7 @@ def written(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
 
 
 def in_chunks(path: Path, messages: Sequence[Message], compression: CompressionType = CompressionType.ZSTD) -> Path:
-    """Return a file of MCAP whose chunks have 20 messages or so, as rosbags writes one for all."""
+    """Return an MCAP file with about 20 messages per chunk; rosbags writes one chunk."""
     path.mkdir()
     with (path / "all.mcap").open("wb") as opened:
         writer = McapWriter(opened, chunk_size=20_000, compression=compression)
@@ -103,11 +103,11 @@ def data_file(bag: Path) -> Path:
 def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: pytest.CaptureFixture[str]) -> None:
     bag = written(tmp_path, form, expected(31))
     assert main(["bag", "info", str(bag), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["format"], told["messages"], told["problems"]) == (form.value, 31, [])
-    assert told["started_utc_ns"] == BEGUN_NS
-    assert told["duration_s"] == pytest.approx(0.3)
-    assert [topic["messages"] for topic in told["topics"]] == [11, 10, 10]
+    report = json.loads(capsys.readouterr().out)
+    assert (report["format"], report["messages"], report["problems"]) == (form.value, 31, [])
+    assert report["started_utc_ns"] == BEGUN_NS
+    assert report["duration_s"] == pytest.approx(0.3)
+    assert [topic["messages"] for topic in report["topics"]] == [11, 10, 10]
     assert main(["bag", "info", str(bag)]) == 0
     assert "/t1" in capsys.readouterr().out
     assert main(["bag", "check", str(bag)]) == 0
@@ -116,7 +116,7 @@ def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: 
 
 @pytest.mark.parametrize("form", BagFormat)
 @pytest.mark.parametrize("share", [0.35, 0.8, 0.97])
-def test_of_a_cut_file_a_beginning_is_saved(tmp_path: Path, form: BagFormat, share: float) -> None:
+def test_start_of_a_truncated_file_is_recovered(tmp_path: Path, form: BagFormat, share: float) -> None:
     messages = expected(300)
     bag = written(tmp_path, form, messages)
     file = data_file(bag)
@@ -125,14 +125,14 @@ def test_of_a_cut_file_a_beginning_is_saved(tmp_path: Path, form: BagFormat, sha
     assert main(["bag", "check", str(bag)]) == EvidenceError.exit_code
     saved = tmp_path / ("saved.bag" if form is BagFormat.ROS1 else "saved")
     if form is BagFormat.SQLITE:
-        # Its pages are a tree: a database that was cut off may tell nothing of what is left.
+        # Its pages are a tree: a truncated database may contain no readable message.
         assert main(["bag", "repair", str(bag), str(saved)]) in {0, EvidenceError.exit_code}
     else:
         assert main(["bag", "repair", str(bag), str(saved)]) == 0
-    found = read(saved) if saved.exists() else []
-    assert found == messages[: len(found)]
+    recovered = read(saved) if saved.exists() else []
+    assert recovered == messages[: len(recovered)]
     if form is not BagFormat.SQLITE:
-        assert len(found) > (share - 0.25) * len(messages)
+        assert len(recovered) > (share - 0.25) * len(messages)
     assert {path.name for path in tmp_path.iterdir()} <= {bag.name, saved.name}
 
 
@@ -140,35 +140,35 @@ def test_of_a_cut_file_a_beginning_is_saved(tmp_path: Path, form: BagFormat, sha
     ("name", "least"),
     [("open.bag.active", 266), ("bz2.bag.active", 225), ("lz4.bag.active", 225)],
 )
-def test_no_less_is_saved_of_a_killed_recorder_than_by_ros(
+def test_as_many_messages_are_recovered_as_by_ros(
     tmp_path: Path, name: str, least: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`rosbag reindex` 1.15.15 saves 0, 225 and 225 messages of these."""
+    """`rosbag reindex` 1.15.15 recovers 0, 225 and 225 messages of these."""
     saved = tmp_path / "saved.bag"
     assert main(["bag", "check", str(KILLED / name)]) == EvidenceError.exit_code
     assert f"{least} messages can be saved: fieldkit bag repair" in capsys.readouterr().err
     assert main(["bag", "repair", str(KILLED / name), str(saved)]) == 0
-    found = read(saved)
-    assert len(found) == least
-    assert {(topic, text) for topic, _, text in found} == {("/chatter", "hello hello hello hello")}
-    gaps_ns = sorted(after_ns - before_ns for (_, before_ns, _), (_, after_ns, _) in pairwise(found))
+    recovered = read(saved)
+    assert len(recovered) == least
+    assert {(topic, text) for topic, _, text in recovered} == {("/chatter", "hello hello hello hello")}
+    gaps_ns = sorted(after_ns - before_ns for (_, before_ns, _), (_, after_ns, _) in pairwise(recovered))
     assert gaps_ns[len(gaps_ns) // 2] == pytest.approx(20e6, rel=0.05), "50 Hz"
 
 
 @pytest.mark.emulated
-def test_ros_itself_reads_what_was_saved(tmp_path: Path) -> None:
+def test_ros_reads_a_repaired_bag(tmp_path: Path) -> None:
     saved = tmp_path / "saved.bag"
     contents.repair(KILLED / "open.bag.active", saved)
-    told = subprocess.run(("rosbag", "info", "-y", str(saved)), check=True, capture_output=True, text=True).stdout
-    assert "messages: 266" in told
-    assert "indexed: True" in told
+    report = subprocess.run(("rosbag", "info", "-y", str(saved)), check=True, capture_output=True, text=True).stdout
+    assert "messages: 266" in report
+    assert "indexed: True" in report
 
 
-def test_what_a_killed_recorder_of_ros_2_left_beside_its_database_is_saved(tmp_path: Path) -> None:
+def test_write_ahead_log_of_a_killed_ros_2_recorder_is_recovered(tmp_path: Path) -> None:
     messages = expected(40)
     bag = written(tmp_path, BagFormat.SQLITE, messages)
-    file, left = data_file(bag), tmp_path / "left"
-    left.mkdir()
+    file, remaining = data_file(bag), tmp_path / "left"
+    remaining.mkdir()
     with closing(sqlite3.connect(file)) as database:
         database.execute("PRAGMA journal_mode=WAL")
         database.execute("PRAGMA wal_autocheckpoint=0")
@@ -178,21 +178,21 @@ def test_what_a_killed_recorder_of_ros_2_left_beside_its_database_is_saved(tmp_p
         )
         database.commit()
         for path in bag.glob("*.db3*"):
-            shutil.copyfile(path, left / path.name)
-    before = {path.name: path.read_bytes() for path in left.iterdir()}
-    told = contents.inspect(left)
-    assert told.problems == (
-        "there is no metadata.yaml: its recorder was ended before it could close it, or it was copied alone",
+            shutil.copyfile(path, remaining / path.name)
+    before = {path.name: path.read_bytes() for path in remaining.iterdir()}
+    report = contents.inspect(remaining)
+    assert report.problems == (
+        "there is no metadata.yaml: the recorder was stopped before it closed the bag, or it was not copied",
     )
-    assert told.savable == 41
-    contents.repair(left, tmp_path / "saved")
+    assert report.savable == 41
+    contents.repair(remaining, tmp_path / "saved")
     assert [text for _, _, text in read(tmp_path / "saved")] == [*(text for _, _, text in messages), "late"]
-    assert {path.name: path.read_bytes() for path in left.iterdir()} == before, "it is never changed"
+    assert {path.name: path.read_bytes() for path in remaining.iterdir()} == before, "it is not changed"
 
 
 @pytest.mark.parametrize("form", BagFormat)
 @pytest.mark.parametrize("to", BagFormat)
-def test_conversion_keeps_every_message(tmp_path: Path, form: BagFormat, to: BagFormat) -> None:
+def test_conversion_keeps_all_messages(tmp_path: Path, form: BagFormat, to: BagFormat) -> None:
     messages = expected(30)
     bag = written(tmp_path, form, messages)
     new = tmp_path / ("new.bag" if to is BagFormat.ROS1 else "new")
@@ -204,7 +204,7 @@ def test_conversion_keeps_every_message(tmp_path: Path, form: BagFormat, to: Bag
 
 
 def test_types_are_those_of_the_distribution(tmp_path: Path) -> None:
-    """CameraInfo's fields have other names in ROS 2: D, K, R, P became d, k, r, p."""
+    """The fields of CameraInfo have other names in ROS 2: D, K, R, P became d, k, r, p."""
     types = get_typestore(Stores.ROS1_NOETIC)
     bag = tmp_path / "camera.bag"
     with rosbag1.Writer(bag) as writer:
@@ -219,10 +219,10 @@ def test_types_are_those_of_the_distribution(tmp_path: Path) -> None:
         writer.write(connection, BEGUN_NS, types.serialize_ros1(info, "sensor_msgs/msg/CameraInfo"))
     contents.convert(bag, tmp_path / "camera", distribution="humble")
     with AnyReader([tmp_path / "camera"]) as reader:
-        ((one, _, data),) = reader.messages()
-        found = reader.deserialize(data, one.msgtype)
-        assert one.digest == get_typestore(Stores.ROS2_HUMBLE).hash_rihs01("sensor_msgs/msg/CameraInfo")
-    assert list(found.k) == list(numbers[:9])  # type: ignore[attr-defined]
+        ((connection, _, data),) = reader.messages()
+        recovered = reader.deserialize(data, connection.msgtype)
+        assert connection.digest == get_typestore(Stores.ROS2_HUMBLE).hash_rihs01("sensor_msgs/msg/CameraInfo")
+    assert list(recovered.k) == list(numbers[:9])  # type: ignore[attr-defined]
 
 
 @pytest.fixture
@@ -239,7 +239,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("info", "x" * 300), 2, "File name too long"),
         (("info", "none"), 2, "no bag is in this folder"),
         (("info", "pipe.bag"), 2, "this is neither a file nor a folder"),
-        (("info", "text.bag"), 2, "this is no bag of ROS 1, SQLite or MCAP"),
+        (("info", "text.bag"), 2, "this is not a bag of ROS 1, SQLite or MCAP"),
         (("info", "packed.bag.gz"), 2, "remedy: gunzip -k packed.bag.gz, then try again"),
         (("info", "all.db3"), 2, "remedy: mv all.db3 all.db3.bag"),
         (("info", "empty.bag"), 4, "the file is empty"),
@@ -251,15 +251,15 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("repair", "zeros.mcap", "new"), 4, "the file begins with zeros"),
         (("convert", "nowhere.bag", "new"), 2, "No such file"),
         (("convert", "none", "new"), 2, "no bag is in this folder"),
-        (("repair", "all.bag", "all.bag"), 2, "something is there already"),
-        (("repair", "all.bag", "new"), 2, "a saved bag keeps its format, ros1: the new one is NAME.bag"),
+        (("repair", "all.bag", "all.bag"), 2, "it exists already"),
+        (("repair", "all.bag", "new"), 2, "a repaired bag keeps its format, ros1: the new one must be NAME.bag"),
         (("convert", "all.bag", "no/new"), 2, "cannot write there"),
         (("convert", "all.bag", "new.bag", "--distribution", "humble"), 2, "humble is ROS 2"),
         (("convert", "killed.bag", "new"), 4, "remedy: fieldkit bag repair killed.bag NEW"),
     ],
-    ids=lambda one: " ".join(one) if isinstance(one, tuple) else "",
+    ids=lambda connection: " ".join(connection) if isinstance(connection, tuple) else "",
 )
-def test_what_cannot_be_is_told(
+def test_impossible_requests_are_reported(
     here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, said: str
 ) -> None:
     written(here, BagFormat.ROS1, expected(5))
@@ -275,14 +275,14 @@ def test_what_cannot_be_is_told(
     names = {path.name for path in here.iterdir()}
     assert main(["bag", *words]) == code
     assert said in capsys.readouterr().err
-    assert {path.name for path in here.iterdir()} == names, "nothing is left"
+    assert {path.name for path in here.iterdir()} == names, "no file remains"
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.NONE])
-def test_a_file_of_mcap_is_a_bag_by_itself(
+def test_single_mcap_file_is_a_bag(
     tmp_path: Path, compression: CompressionType, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its index is inside: nothing beside it is needed to know that it is whole, and what it holds."""
+    """Its index is in the file: no other file is needed to check it and to read its contents."""
     messages = expected(300)
     alone = data_file(in_chunks(tmp_path / "all", messages, compression))
     assert not (alone.parent / METADATA).exists()
@@ -301,9 +301,7 @@ def test_a_file_of_mcap_is_a_bag_by_itself(
     assert "messages can be saved: fieldkit bag repair" in said
 
 
-def test_of_a_database_that_is_cut_off_it_is_told_what_may_help(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = data_file(written(tmp_path, BagFormat.SQLITE, expected(300)))
     cut = tmp_path / "cut.db3"
     cut.write_bytes(whole.read_bytes()[:30_000])
@@ -316,7 +314,7 @@ def test_of_a_database_that_is_cut_off_it_is_told_what_may_help(
     assert "remedy: SQLite may read more of it" in capsys.readouterr().err
 
 
-def test_a_file_of_holes_is_told_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sparse_file_is_reported_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = data_file(in_chunks(tmp_path / "all", expected(300)))
     with whole.open("r+b") as opened:
         opened.truncate(1 << 42)
@@ -324,6 +322,6 @@ def test_a_file_of_holes_is_told_in_time(tmp_path: Path, capsys: pytest.CaptureF
     assert "can be saved" in capsys.readouterr().err
 
 
-def test_the_command_line_knows_what_the_library_can() -> None:
-    assert all("sensor_msgs/msg/LaserScan" in types_of(one).fielddefs for one in bag.DISTRIBUTIONS)
+def test_command_line_accepts_all_distributions_of_the_library() -> None:
+    assert all("sensor_msgs/msg/LaserScan" in types_of(connection).fielddefs for connection in bag.DISTRIBUTIONS)
     assert set(bag.STORAGES) == set(BagFormat) - {BagFormat.ROS1}

@@ -1,4 +1,4 @@
-"""Bags can be read at any path, whatever bytes it has, and written at any path of characters."""
+"""Bags can be read at any path, also with invalid characters, and written at any path with valid ones."""
 
 import os
 import shutil
@@ -34,32 +34,32 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[BagFormat, Path]:
 @example(b"caf\xe9")
 @example("日本 #?".encode())
 @example(b"two\nlines")
-def test_a_bag_is_read_at_any_path(
+def test_bag_is_read_at_any_path(
     bags: dict[BagFormat, Path], tmp_path_factory: pytest.TempPathFactory, form: BagFormat, name: bytes
 ) -> None:
     base = tmp_path_factory.mktemp("any")
     folder = base / os.fsdecode(name)
     folder.mkdir()
     try:
-        lies_at = folder / bags[form].name
+        bag_path = folder / bags[form].name
         if bags[form].is_dir():
-            shutil.copytree(bags[form], lies_at)
+            shutil.copytree(bags[form], bag_path)
         else:
-            shutil.copy(bags[form], lies_at)
-        found = contents.inspect(lies_at, read_all=True)
-        assert (found.problems, found.messages) == ((), COUNT)
-        assert bag.read(data_file(lies_at)).messages == COUNT, "as the evidence of a repeat"
+            shutil.copy(bags[form], bag_path)
+        contents_of_bag = contents.inspect(bag_path, read_all=True)
+        assert (contents_of_bag.problems, contents_of_bag.messages) == ((), COUNT)
+        assert bag.read(data_file(bag_path)).messages == COUNT, "as the evidence of a repeat"
     finally:
         shutil.rmtree(base)
 
 
 @pytest.mark.parametrize("name", ["#1", "what?", "100%", "%41", "a?mode=memory", "日本"])
-def test_a_bag_is_written_at_any_path(bags: dict[BagFormat, Path], tmp_path: Path, name: str) -> None:
+def test_bag_is_written_at_any_path(bags: dict[BagFormat, Path], tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()
     contents.convert(bags[BagFormat.MCAP], tmp_path / name / name, storage=BagFormat.SQLITE)
     contents.repair(tmp_path / name / name, tmp_path / name / "again")
-    for made in (name, "again"):
-        found = contents.inspect(tmp_path / name / made, read_all=True)
-        assert (found.problems, found.messages) == ((), COUNT)
-        assert data_file(tmp_path / name / made).name == f"{made}.db3"
+    for name_of_bag in (name, "again"):
+        contents_of_bag = contents.inspect(tmp_path / name / name_of_bag, read_all=True)
+        assert (contents_of_bag.problems, contents_of_bag.messages) == ((), COUNT)
+        assert data_file(tmp_path / name / name_of_bag).name == f"{name_of_bag}.db3"
     assert {path.name for path in tmp_path.iterdir()} == {name}

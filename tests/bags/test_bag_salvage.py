@@ -1,4 +1,4 @@
-"""Salvage of bags: of hostile bytes nothing but messages and `DamagedError` comes."""
+"""Recovery of bags: hostile bytes cause messages and `DamagedError` only."""
 
 import random
 from contextlib import suppress
@@ -40,7 +40,7 @@ def test_changed_bytes(
 
 
 @given(st.integers(13, len(WHOLE)))
-def test_a_longer_file_saves_no_less(tmp_path_factory: pytest.TempPathFactory, length: int) -> None:
+def test_longer_file_recovers_no_less(tmp_path_factory: pytest.TempPathFactory, length: int) -> None:
     def saved(data: bytes) -> int:
         file: Path = tmp_path_factory.getbasetemp() / "cut.bag"
         file.write_bytes(data)

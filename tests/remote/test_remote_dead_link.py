@@ -1,4 +1,4 @@
-"""A control link that is cut for real while a job runs in silence."""
+"""A control link that is cut while a job runs and nothing is sent."""
 
 import re
 import subprocess
@@ -33,7 +33,7 @@ SOON = 60.0
 
 
 class Robot:
-    """An emulated robot, its control link, and what the operator is told of it."""
+    """An emulated robot, its control link, and the notices for the operator."""
 
     def __init__(self, up: EmulatedTestbed, notices: list[str]) -> None:
         self.shell = up.shells[Role.SENDER]
@@ -45,12 +45,12 @@ class Robot:
         subprocess.run(("nsenter", f"--net={self.inside}/ns/net", "ip", "link", "set", "lo", state), check=True)
 
     def is_silent(self) -> bool:
-        """Return whether no byte of any connection waits for its acknowledgement."""
+        """Return True if no byte of any connection waits for its acknowledgement."""
         lines = Path(f"{self.inside}/net/tcp").read_text(encoding="ascii").splitlines()[1:]
         return all(line.split()[4].startswith("00000000:") for line in lines if line.split()[3] == ESTABLISHED)
 
     def runs(self, words: str) -> bool:
-        """Return whether a process of the robot has these words in its command line."""
+        """Return True if a process of the robot has these words in its command line."""
         for pid in descendants(self.pid):
             with suppress(FileNotFoundError, ProcessLookupError):
                 line = Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -75,10 +75,10 @@ def robot(patience_s: float) -> Iterator[Robot]:
         patience_s=patience_s,
         notice=notices.append,
     ) as up:
-        made = Robot(up, notices)
-        jobs.install(made.shell, Deadline.after(30))
-        evidence.begin(made.shell, FOLDER, "sender", "wlan0")
-        yield made
+        robot_under_test = Robot(up, notices)
+        jobs.install(robot_under_test.shell, Deadline.after(30))
+        evidence.begin(robot_under_test.shell, FOLDER, "sender", "wlan0")
+        yield robot_under_test
 
 
 def silent(script: str) -> Job:
@@ -86,45 +86,47 @@ def silent(script: str) -> Job:
 
 
 @pytest.mark.quiet
-def test_a_link_that_dies_in_silence_is_noticed_within_ten_seconds() -> None:
-    with robot(patience_s=0.0) as one, ThreadPoolExecutor(1) as pool:
-        # Input has ended and is acknowledged: from here on neither side has anything to send.
+def test_silent_link_that_dies_is_detected_within_10_s() -> None:
+    with robot(patience_s=0.0) as emulated, ThreadPoolExecutor(1) as pool:
+        # Standard input has ended and is acknowledged: neither side has anything to send from here on.
         argv = ("sh", "-c", f"cat; touch {FOLDER}/up; sleep 60")
-        done = pool.submit(one.shell.run, argv, deadline=Deadline.after(SOON))
-        wait_until(lambda: one.has("up") and one.is_silent(), Deadline.after(SOON))
-        one.set_link("down")
+        done = pool.submit(emulated.shell.run, argv, deadline=Deadline.after(SOON))
+        wait_until(lambda: emulated.has("up") and emulated.is_silent(), Deadline.after(SOON))
+        emulated.set_link("down")
         cut_s = time.monotonic()
         with pytest.raises(LinkLostError, match="the connection broke during"):
             done.result(SOON)
         assert time.monotonic() - cut_s < NOTICED_S
 
 
-def test_a_job_that_outlives_its_link_is_collected_once_when_the_link_is_back() -> None:
-    with robot(patience_s=SOON) as one, ThreadPoolExecutor(1) as pool:
+def test_result_of_a_job_that_outlives_its_link_is_collected_once() -> None:
+    with robot(patience_s=SOON) as emulated, ThreadPoolExecutor(1) as pool:
         done = pool.submit(
-            jobs.run, one.shell, silent("touch up; until [ -e go ]; do sleep 0.05; done; echo end >>ends; exit 7")
+            jobs.run,
+            emulated.shell,
+            silent("touch up; until [ -e go ]; do sleep 0.05; done; echo end >>ends; exit 7"),
         )
-        wait_until(lambda: one.has("up"), Deadline.after(SOON))
-        one.set_link("down")
-        wait_until(lambda: len(one.notices) == 1, Deadline.after(SOON))
-        Path(f"{one.inside}/root/root/{FOLDER}/go").touch()
-        wait_until(lambda: one.has("ends"), Deadline.after(SOON))
+        wait_until(lambda: emulated.has("up"), Deadline.after(SOON))
+        emulated.set_link("down")
+        wait_until(lambda: len(emulated.notices) == 1, Deadline.after(SOON))
+        Path(f"{emulated.inside}/root/root/{FOLDER}/go").touch()
+        wait_until(lambda: emulated.has("ends"), Deadline.after(SOON))
         assert not done.done()
-        one.set_link("up")
+        emulated.set_link("up")
         assert done.result(SOON) == 7
-        assert one.shell.run(("cat", f"{FOLDER}/ends"), deadline=Deadline.after(30)).stdout == b"end\n"
-        assert [re.split(";| after", notice)[0] for notice in one.notices] == [
+        assert emulated.shell.run(("cat", f"{FOLDER}/ends"), deadline=Deadline.after(30)).stdout == b"end\n"
+        assert [re.split(";| after", notice)[0] for notice in emulated.notices] == [
             "turtlebot-1: the link is lost",
             "turtlebot-1: the link is back",
         ]
 
 
-def test_what_waits_on_the_robot_for_a_link_that_was_cut_ends_by_itself() -> None:
-    """The SSH server does not notice, and keeps its input open for hours."""
-    with robot(patience_s=0.0) as one:
-        pending = jobs.begin(one.shell, replace(silent("touch up"), limit_s=1, ready_s=1))
-        wait_until(lambda: one.has("up"), Deadline.after(SOON))
-        one.set_link("down")
-        assert pending.session is not None, "held: a session that nobody holds is closed"
-        assert one.runs(f"run {FOLDER} silent")
-        wait_until(lambda: not one.runs(FOLDER), Deadline.after(SOON))
+def test_wait_on_the_robot_for_a_cut_link_ends() -> None:
+    """The SSH server does not detect the loss, and keeps standard input open for hours."""
+    with robot(patience_s=0.0) as emulated:
+        pending = jobs.begin(emulated.shell, replace(silent("touch up"), limit_s=1, ready_s=1))
+        wait_until(lambda: emulated.has("up"), Deadline.after(SOON))
+        emulated.set_link("down")
+        assert pending.session is not None, "kept: an unreferenced session would be closed"
+        assert emulated.runs(f"run {FOLDER} silent")
+        wait_until(lambda: not emulated.runs(FOLDER), Deadline.after(SOON))

@@ -1,4 +1,4 @@
-"""A robot's disk fills up: refused before, told clearly when it happens. The home is a small file system."""
+"""A full disk of a robot is detected before, and reported when it occurs. The home is a small file system."""
 
 import os
 import subprocess
@@ -27,7 +27,7 @@ _FEW_PAGES = 8
 
 
 class SmallShell(LocalShell):
-    """A robot whose home is mounted for it alone, in the namespace of the process `holder`."""
+    """A robot whose home is mounted in the mount namespace of the process `holder` only."""
 
     holder = 0
 
@@ -40,17 +40,17 @@ class SmallShell(LocalShell):
 def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SmallShell]:
     home = tmp_path / "home"
     home.mkdir()
-    made = SmallShell(home, path_of(request.param, tmp_path / "bin"))
+    small_shell = SmallShell(home, path_of(request.param, tmp_path / "bin"))
     script = 'mount -t tmpfs -o size=2m tmpfs "$1" && echo mounted && exec cat'
     argv = ("unshare", "--mount", "--propagation", "private", "sh", "-c", script, "sh", str(home))
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == b"mounted\n"
-        made.holder = holder.pid
-        jobs.install(made, Deadline.after(30))
-        yield made
-        made.run(("rm", "-f", ".fieldkit/fill"), deadline=Deadline.after(30))
-        assert jobs.abort(made, "test", Deadline.after(30)).jobs == ()
+        small_shell.holder = holder.pid
+        jobs.install(small_shell, Deadline.after(30))
+        yield small_shell
+        small_shell.run(("rm", "-f", ".fieldkit/fill"), deadline=Deadline.after(30))
+        assert jobs.abort(small_shell, "test", Deadline.after(30)).jobs == ()
 
 
 def fill(shell: SmallShell) -> None:
@@ -61,14 +61,14 @@ def job(*argv: str) -> Job:
     return Job(folder=FOLDER, name="job", argv=argv, limit_s=100, log="job.log")
 
 
-def test_a_disk_too_small_for_the_evidence_is_refused_before_anything_is_made(shell: SmallShell) -> None:
+def test_disk_too_small_for_the_evidence_is_rejected_first(shell: SmallShell) -> None:
     with pytest.raises(RobotError, match=r"\d{4} KiB of disk are free, 102400 KiB are needed") as caught:
         evidence.begin(shell, FOLDER, "sender", "lo")
     assert "remove old trials" in caught.value.remedy
     assert shell.run(("ls", ".fieldkit/trial"), deadline=Deadline.after(30), check=False).exit_code != 0
 
 
-def test_a_host_state_that_does_not_fit_is_told_and_can_be_repeated(shell: SmallShell) -> None:
+def test_host_state_that_does_not_fit_is_reported_and_can_be_repeated(shell: SmallShell) -> None:
     shell.run(("mkdir", "-p", f"{FOLDER}/.jobs"), deadline=Deadline.after(30))
     fill(shell)
     with pytest.raises(RobotError, match=NO_SPACE):
@@ -79,7 +79,7 @@ def test_a_host_state_that_does_not_fit_is_told_and_can_be_repeated(shell: Small
     assert b"==> /proc/net/snmp <==" in state
 
 
-def test_a_job_that_could_not_be_ended_again_does_not_start(shell: SmallShell) -> None:
+def test_job_whose_identity_cannot_be_recorded_does_not_start(shell: SmallShell) -> None:
     evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
     fill(shell)
     for call in (jobs.run, jobs.start):
@@ -88,7 +88,7 @@ def test_a_job_that_could_not_be_ended_again_does_not_start(shell: SmallShell) -
     assert shell.run(("ls", f"{FOLDER}/started"), deadline=Deadline.after(30), check=False).exit_code != 0
 
 
-def test_evidence_that_does_not_fit_is_told(shell: SmallShell, tmp_path: Path) -> None:
+def test_evidence_that_does_not_fit_is_reported(shell: SmallShell, tmp_path: Path) -> None:
     evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
     jobs.run(shell, replace(job("cat", "/dev/zero"), stdout="recv.bag"))
     into = tmp_path / "local"
@@ -98,13 +98,13 @@ def test_evidence_that_does_not_fit_is_told(shell: SmallShell, tmp_path: Path) -
     assert not list(into.iterdir())
 
 
-def test_a_lock_that_does_not_fit_is_told(shell: SmallShell) -> None:
+def test_lock_that_does_not_fit_is_reported(shell: SmallShell) -> None:
     fill(shell)
     with pytest.raises(RobotError, match=NO_SPACE), taken({Role.SENDER: shell}, Holder("a", "b", "c"), sink=print):
         raise AssertionError("taken")
 
 
-def test_a_lock_that_cannot_be_renewed_is_told_and_nobody_else_takes_it(shell: SmallShell) -> None:
+def test_lock_that_cannot_be_renewed_is_reported_and_kept(shell: SmallShell) -> None:
     anna, bert = Holder("a", "anna@one", "a"), Holder("b", "bert@two", "b")
     with taken({Role.SENDER: shell}, anna, sink=print):
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
@@ -118,18 +118,18 @@ def test_a_lock_that_cannot_be_renewed_is_told_and_nobody_else_takes_it(shell: S
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
 
 
-# Counted from the boot: the machine may have booted less than half the lock's time ago.
+# Computed from the boot: the machine may have booted less than half of the lock's time ago.
 HALF_OVER = """read -r kind token boot from to since until who what <.fieldkit/lock.1
 times="0 $((2 * from)) $since $until"
 echo "$kind $token $boot $times $who $what" >.fieldkit/lock.1"""
 
 
 def is_full(shell: SmallShell) -> bool:
-    """Return whether hardly a page is free, which writing one to find out might leave free for ever."""
+    """Return True if hardly a page is free; a test write might keep the last page allocated."""
     return os.statvfs(f"/proc/{shell.holder}/root{shell.home}").f_bavail < _FEW_PAGES
 
 
-def test_the_job_that_fills_the_disk_is_ended_by_abort_even_of_another_version(shell: SmallShell) -> None:
+def test_job_that_fills_the_disk_is_stopped_by_abort_of_any_version(shell: SmallShell) -> None:
     anna = Holder("a", "anna@one", "a")
     with taken({Role.SENDER: shell}, anna, sink=print):
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
@@ -150,11 +150,11 @@ def test_the_job_that_fills_the_disk_is_ended_by_abort_even_of_another_version(s
             evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
 
 
-def test_a_lock_that_cannot_be_given_back_is_told_and_nobody_waits_for_it(shell: SmallShell) -> None:
-    told: list[Event] = []
-    with taken({Role.SENDER: shell}, Holder("a", "anna@one", "a"), sink=told.append):
+def test_lock_that_cannot_be_released_is_reported_and_not_awaited(shell: SmallShell) -> None:
+    events: list[Event] = []
+    with taken({Role.SENDER: shell}, Holder("a", "anna@one", "a"), sink=events.append):
         fill(shell)
-    (note,) = told
+    (note,) = events
     assert isinstance(note, Note)
     assert NO_SPACE in note.text
     assert locks.holder(shell) is not None

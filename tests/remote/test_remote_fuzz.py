@@ -1,4 +1,4 @@
-"""Whatever a robot sends stays in its folder, raises fieldkit's errors alone, garbles no terminal and no table."""
+"""Any data from a robot stay in its folder, raise only errors of fieldkit, and damage no terminal and no table."""
 
 import csv
 import hashlib
@@ -52,7 +52,7 @@ FIELD = st.binary(min_size=12, max_size=12) | st.integers(0, 8**11 - 1).map(lamb
 
 
 class Sender(LocalShell):
-    """A robot that answers a fetch with these bytes, and every other call with that result."""
+    """A robot that answers a fetch with these bytes, and all other calls with this result."""
 
     def __init__(self, home: Path, content: bytes = b"", *, code: int = 0, stderr: bytes = b"") -> None:
         super().__init__(home)
@@ -69,7 +69,7 @@ class Sender(LocalShell):
 
 
 def header(name: bytes, size: bytes, kind: bytes, prefix: bytes = b"", *, magic: bytes = b"ustar\x0000") -> bytes:
-    """Return a tar header built field by field (POSIX.1-2017, ustar), with the right checksum."""
+    """Return a tar header, composed by fields (POSIX.1-2017, ustar), with a correct checksum."""
     block = bytearray(512)
     block[0:100] = name[:100].ljust(100, b"\0")
     block[100:124] = b"0000644\0" + b"0000000\0" * 2
@@ -103,7 +103,7 @@ def harmless(error: FieldkitError) -> bool:
 
 
 def fetched(content: bytes) -> dict[str, bytes] | None:
-    """Return the files that a fetch took for whole; nothing else may come of it, and no error but fieldkit's."""
+    """Return the files that a fetch accepted; it must have no other effect, and raise only errors of fieldkit."""
     with tempfile.TemporaryDirectory() as folder:
         into = Path(folder, "outer", "into")
         into.mkdir(parents=True)
@@ -123,13 +123,13 @@ def fetched(content: bytes) -> dict[str, bytes] | None:
 
 
 @given(st.lists(ENTRIES | WHOLE, max_size=5), st.binary(max_size=30))
-def test_no_archive_leaves_its_folder_or_breaks_the_reader(entries: list[bytes], tail: bytes) -> None:
+def test_any_archive_stays_in_its_folder(entries: list[bytes], tail: bytes) -> None:
     fetched(b"".join(entries) + tail)
     fetched(b"".join(entries) + bytes(1024))
 
 
 @given(st.dictionaries(st.sampled_from(["scan.bag", "scan/a.db3", "b"]), st.binary(max_size=3000)), st.data())
-def test_an_archive_arrives_whole_or_not_at_all(files: dict[str, bytes], data: st.DataObject) -> None:
+def test_archive_arrives_completely_or_not_at_all(files: dict[str, bytes], data: st.DataObject) -> None:
     sums = "".join(f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items())
     sent = [(".sums-1", sums.encode()), *files.items()]
     whole = b"".join(entry(name.encode(), content) for name, content in sent) + bytes(1024)
@@ -145,7 +145,7 @@ def test_an_archive_arrives_whole_or_not_at_all(files: dict[str, bytes], data: s
 
 
 @pytest.mark.parametrize("kind", [tarfile.GNU_FORMAT, tarfile.USTAR_FORMAT, tarfile.PAX_FORMAT])
-def test_a_second_writer_of_tars_agrees_on_what_a_plain_file_is(kind: int, tmp_path: Path) -> None:
+def test_archives_of_another_tar_writer(kind: int, tmp_path: Path) -> None:
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w", format=kind) as tar:
         for name, content in (("scan.bag", b"x" * 700), ("scan/a.db3", b"")):
@@ -172,21 +172,21 @@ def test_a_second_writer_of_tars_agrees_on_what_a_plain_file_is(kind: int, tmp_p
     ],
     ids=["spaces", "huge", "base-256", "negative", "many", "pax", "twice", "two sums", "long"],
 )
-def test_what_no_robot_of_ours_sends_is_refused(content: bytes, tmp_path: Path) -> None:
+def test_invalid_archives_are_rejected(content: bytes, tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
         fetching.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
 
 
-def test_what_the_other_robot_sent_is_not_overwritten(tmp_path: Path) -> None:
+def test_files_of_another_robot_are_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "scan.bag").write_bytes(b"x")
     sums = hashlib.sha256(b"y").hexdigest().encode() + b"  scan.bag\n"
     content = entry(b".sums-1", sums) + entry(b"scan.bag", b"y") + bytes(1024)
-    with pytest.raises(EvidenceError, match="which it or the other robot sent before"):
+    with pytest.raises(EvidenceError, match="which it or another robot sent before"):
         fetching.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
     assert (tmp_path / "scan.bag").read_bytes() == b"x"
 
 
-def test_a_damaged_header_is_told(tmp_path: Path) -> None:
+def test_damaged_header_is_reported(tmp_path: Path) -> None:
     content = bytearray(entry(b"scan.bag", b"y") + bytes(1024))
     content[0] ^= 1
     with pytest.raises(EvidenceError, match="arrived damaged: a header fails its checksum"):
@@ -194,14 +194,14 @@ def test_a_damaged_header_is_told(tmp_path: Path) -> None:
 
 
 @given(BYTES)
-def test_what_a_robot_says_is_one_line_of_printable_characters(data: bytes) -> None:
+def test_output_of_a_robot_is_one_printable_line(data: bytes) -> None:
     text = printable(data, limit=60)
     assert len(text) <= 60
     assert not [char for char in text if unicodedata.category(char) in {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}]
 
 
 @given(BYTES, st.integers(0, 255), st.sampled_from([b"", b"job.sh: ", b"job.sh: held ", b"job.sh: aborted 1 "]))
-def test_any_answer_of_the_script_is_one_of_fieldkits_errors(said: bytes, code: int, start: bytes) -> None:
+def test_any_answer_of_the_script_raises_an_error_of_fieldkit(said: bytes, code: int, start: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         shell = Sender(Path(folder), said, code=code, stderr=start + said)
         said_then: FieldkitError | None = None
@@ -224,9 +224,7 @@ def test_any_answer_of_the_script_is_one_of_fieldkits_errors(said: bytes, code: 
         (76, b"", RobotError),
     ],
 )
-def test_a_lock_that_a_robot_invents_is_told_all_the_same(
-    code: int, said: bytes, kind: type[RobotError], tmp_path: Path
-) -> None:
+def test_invented_lock_of_a_robot_is_reported(code: int, said: bytes, kind: type[RobotError], tmp_path: Path) -> None:
     with pytest.raises(kind) as caught:
         script.call(Sender(tmp_path, code=code, stderr=said), "begin", deadline=Deadline.after(1))
     assert caught.value.what.isprintable()
@@ -237,19 +235,19 @@ WORDS = st.lists(TEXT.filter(lambda text: "\0" not in text), max_size=5)
 
 @settings(max_examples=40)
 @given(WORDS, st.sampled_from(["sh", "bash", "busybox"]))
-def test_every_argument_arrives_through_every_shell(words: list[str], shell: str) -> None:
+def test_any_argument_arrives_through_any_shell(words: list[str], shell: str) -> None:
     argv = (shell, "sh", "-c") if shell == "busybox" else (shell, "-c")
     done = subprocess.run((*argv, quote(("printf", "%s\\0", *words))), stdout=subprocess.PIPE, check=True)
     assert done.stdout.decode("utf-8", "surrogateescape").split("\0")[:-1] == (words or [""])
 
 
 def is_visible(char: str) -> bool:
-    """Return whether a character is shown as it is: of Unicode's categories all but other and separator (C, Z)."""
+    """Return True if a character is visible: all Unicode categories except other and separator (C, Z)."""
     return char in {" ", "\N{NO-BREAK SPACE}"} or unicodedata.category(char)[0] not in "CZ"
 
 
 @given(TEXT)
-def test_a_reason_stays_one_cell_of_one_line(reason: str) -> None:
+def test_reason_is_one_cell_and_one_line(reason: str) -> None:
     table = rows.to_csv([RepeatRow(reason=reason or None)], trial_columns())
     assert len(table.splitlines()) == 2
     head, cells = csv.reader(io.StringIO(table, newline=""))
@@ -260,7 +258,7 @@ def test_a_reason_stays_one_cell_of_one_line(reason: str) -> None:
 
 
 @given(TEXT)
-def test_nothing_that_an_event_holds_reaches_the_terminal_but_characters(text: str) -> None:
+def test_events_write_only_printable_characters_to_the_terminal(text: str) -> None:
     events: list[Event] = [
         Note(text),
         RepeatEnded("udp-01", 1, Status.VOID, reason=text, summary=text, done=1, total=2, left_s=1),
@@ -272,7 +270,7 @@ def test_nothing_that_an_event_holds_reaches_the_terminal_but_characters(text: s
 
 
 @pytest.mark.parametrize("show", [display.show_error, lambda text: display.table(["x"], [[text]])])
-def test_errors_and_tables_show_markup_and_escapes_as_they_are(
+def test_errors_and_tables_show_markup_and_escapes_literally(
     show: Callable[[str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     show("[bold]a[/bold] \x1b]52;c;QQ==\x07 \u202e b")
@@ -288,7 +286,7 @@ class Endless:
     taken = 0
 
     def recv_ready(self) -> bool:
-        assert self.taken < 1 << 30, "nobody stops reading"
+        assert self.taken < 1 << 30, "reading does not stop"
         return True
 
     def recv(self, size: int) -> bytes:
@@ -305,14 +303,14 @@ class Endless:
         return sys.stderr.fileno()
 
 
-def test_output_without_end_or_pause_is_refused_at_its_limit() -> None:
+def test_output_without_end_or_pause_is_limited() -> None:
     channel, out = Endless(), io.BytesIO()
     with pytest.raises(RobotError, match="sent more than 1000000 bytes"):
         drain(channel, out, stdin=b"x", deadline=Deadline.after(30), limit_bytes=10**6, robot="r")  # type: ignore[arg-type]
     assert channel.taken < 1.1e6
 
 
-def test_sums_of_any_size_take_little_memory(tmp_path: Path) -> None:
+def test_list_of_hashes_of_any_size_needs_little_memory(tmp_path: Path) -> None:
     size = 100 << 20
 
     class Big(LocalShell):

@@ -1,4 +1,4 @@
-"""A link that dies while nobody uses it, as when the operator walks: noticed soon after it is used again."""
+"""A link that dies while it is not used, for example while the operator walks, is detected soon after."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +16,7 @@ SOON = 60.0
 
 
 @pytest.mark.quiet
-def test_a_link_that_died_in_idleness_is_noticed_within_ten_seconds_of_its_use(server: Server) -> None:
+def test_link_that_died_while_idle_is_detected_within_10_s(server: Server) -> None:
     notices: list[str] = []
     with Forwarder({"robot": server.connect}) as links, ThreadPoolExecutor(1) as pool:
         shell = server.shell(connect=lambda within_s: links.reach("robot", within_s), notice=notices.append)

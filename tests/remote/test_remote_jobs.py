@@ -1,4 +1,4 @@
-"""Detached jobs: the script that runs on robots, here run in a folder of this machine by a shell without SSH."""
+"""Detached jobs: the script for robots, run in a folder of this machine by a shell without SSH."""
 
 import os
 import re
@@ -39,17 +39,17 @@ FOLDER = jobs.work_folder("trial", "udp-01-1")
 def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell]:
     home = tmp_path / "home"
     home.mkdir()
-    made = LocalShell(home, path_of(request.param, tmp_path / "bin"))
-    jobs.install(made, Deadline.after(30))
-    evidence.begin(made, FOLDER, "sender", "lo")
-    yield made
-    evidence.end_jobs(made, FOLDER)
-    assert jobs.left(made, Deadline.after(30)) == ()
+    local_shell = LocalShell(home, path_of(request.param, tmp_path / "bin"))
+    jobs.install(local_shell, Deadline.after(30))
+    evidence.begin(local_shell, FOLDER, "sender", "lo")
+    yield local_shell
+    evidence.end_jobs(local_shell, FOLDER)
+    assert jobs.left(local_shell, Deadline.after(30)) == ()
 
 
-def stop(shell: LocalShell, one: Job, *, signal: str = "INT", settle: str | None = None) -> int:
-    """End a job that ends by itself, however long it takes on a busy machine."""
-    return jobs.stop(shell, one, signal=signal, grace_s=30, settle=settle)
+def stop(shell: LocalShell, job_spec: Job, *, signal: str = "INT", settle: str | None = None) -> int:
+    """Stop a job with a timeout that is sufficient on a busy machine."""
+    return jobs.stop(shell, job_spec, signal=signal, grace_s=30, settle=settle)
 
 
 def job(*argv: str, name: str = "job", limit_s: float = 30.0) -> Job:
@@ -57,7 +57,7 @@ def job(*argv: str, name: str = "job", limit_s: float = 30.0) -> Job:
 
 
 def replace_program(shell: LocalShell, name: str, body: str) -> None:
-    """Let a program of the robot be a script; `{program}` in its body is the command line of the real one."""
+    """Replace a program of the robot by a script; `{program}` in its body is the command line of the real program."""
     place = Path(shell.path.partition(":")[0]) / name
     real = f"busybox {name}" if place.exists() else shutil.which(name)
     place.unlink(missing_ok=True)
@@ -70,7 +70,7 @@ def leader(shell: LocalShell, name: str = "job") -> int:
 
 
 def group_is_gone(pid: int) -> bool:
-    """Return whether no process of the group runs."""
+    """Return True if no process of the group runs."""
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             state, _, group = path.read_text(encoding="utf-8").rpartition(")")[2].split()[:3]
@@ -81,23 +81,23 @@ def group_is_gone(pid: int) -> bool:
     return True
 
 
-def test_a_job_keeps_streams_command_and_exit_code(shell: LocalShell) -> None:
+def test_job_keeps_streams_command_and_exit_code(shell: LocalShell) -> None:
     (shell.home / FOLDER / "in.txt").write_text("data", encoding="utf-8")
-    one = replace(job("sh", "-c", "cat; echo note >&2; exit 7"), stdin="in.txt", stdout="out.txt")
-    assert jobs.run(shell, one) == 7
+    job_spec = replace(job("sh", "-c", "cat; echo note >&2; exit 7"), stdin="in.txt", stdout="out.txt")
+    assert jobs.run(shell, job_spec) == 7
     assert (shell.home / FOLDER / "out.txt").read_text(encoding="utf-8") == "data"
     assert (shell.home / FOLDER / "job.log").read_text(encoding="utf-8") == "note\n"
-    assert jobs.begin_wait(shell, one, 20).end(30) == 7
+    assert jobs.begin_wait(shell, job_spec, 20).end(30) == 7
 
 
-def test_start_returns_when_the_log_says_ready(shell: LocalShell) -> None:
-    one = replace(job("sh", "-c", "sleep 0.2; echo now listening on x >&2; sleep 60"), ready="log:listening on")
-    jobs.start(shell, one)
+def test_start_returns_when_the_log_contains_the_text(shell: LocalShell) -> None:
+    job_spec = replace(job("sh", "-c", "sleep 0.2; echo now listening on x >&2; sleep 60"), ready="log:listening on")
+    jobs.start(shell, job_spec)
     assert "listening on" in (shell.home / FOLDER / "job.log").read_text(encoding="utf-8")
-    assert stop(shell, one, signal="TERM") == 128 + signal.SIGTERM
+    assert stop(shell, job_spec, signal="TERM") == 128 + signal.SIGTERM
 
 
-def test_who_is_told_that_a_job_is_up_hears_nothing_else(shell: LocalShell) -> None:
+def test_start_has_no_output(shell: LocalShell) -> None:
     done = shell.run(jobs.command("start", job("sh", "-c", "exit 0")), deadline=Deadline.after(30))
     assert (done.stdout, done.stderr) == (b"", b"")
 
@@ -106,51 +106,51 @@ def test_who_is_told_that_a_job_is_up_hears_nothing_else(shell: LocalShell) -> N
 def test_start_returns_when_the_port_is_bound(shell: LocalShell, protocol: Protocol) -> None:
     port = free_port()
     udp = ("-u",) if protocol is Protocol.UDP else ()
-    one = replace(job("nc.traditional", *udp, "-l", "-p", str(port)), ready=jobs.bound(protocol, port))
-    jobs.start(shell, one)
+    job_spec = replace(job("nc.traditional", *udp, "-l", "-p", str(port)), ready=jobs.bound(protocol, port))
+    jobs.start(shell, job_spec)
     table = Path(f"/proc/net/{protocol}").read_text(encoding="ascii")
     assert f":{port:04X} " in table
-    jobs.stop(shell, one, signal="TERM")
+    jobs.stop(shell, job_spec, signal="TERM")
 
 
-def test_a_job_that_ends_before_it_is_ready_is_an_error_with_its_log(shell: LocalShell) -> None:
-    one = replace(job("sh", "-c", "echo no such device >&2; exit 1"), ready="log:listening on")
+def test_job_that_ends_before_it_is_ready_is_an_error_with_its_log(shell: LocalShell) -> None:
+    job_spec = replace(job("sh", "-c", "echo no such device >&2; exit 1"), ready="log:listening on")
     with pytest.raises(RobotError, match="no such device"):
-        jobs.start(shell, one)
+        jobs.start(shell, job_spec)
 
 
-def test_sigint_reaches_the_command_although_it_runs_detached(shell: LocalShell) -> None:
-    # A program started with & from a script would ignore SIGINT (field notes); rosbag needs it to close its bag.
+def test_sigint_reaches_a_detached_command(shell: LocalShell) -> None:
+    # A program that a script starts with & would ignore SIGINT (field notes); rosbag needs it to close its bag.
     script = "trap 'echo closed; exit 5' INT; echo up; while :; do sleep 0.05; done"
-    one = replace(job("sh", "-c", script), ready="log:up")
-    jobs.start(shell, one)
-    assert stop(shell, one, signal="INT") == 5
+    job_spec = replace(job("sh", "-c", script), ready="log:up")
+    jobs.start(shell, job_spec)
+    assert stop(shell, job_spec, signal="INT") == 5
     assert "closed" in (shell.home / FOLDER / "job.log").read_text(encoding="utf-8")
 
 
-def test_a_job_that_ignores_its_signal_is_killed_with_its_children(shell: LocalShell) -> None:
+def test_job_that_ignores_its_signal_is_killed_with_its_children(shell: LocalShell) -> None:
     script = "trap '' INT TERM; sleep 300 & echo up; while :; do sleep 0.05; done"
-    one = replace(job("sh", "-c", script), ready="log:up")
-    jobs.start(shell, one)
+    job_spec = replace(job("sh", "-c", script), ready="log:up")
+    jobs.start(shell, job_spec)
     pid = leader(shell)
-    assert jobs.stop(shell, one, signal="INT", grace_s=1) == jobs.KILLED
+    assert jobs.stop(shell, job_spec, signal="INT", grace_s=1) == jobs.KILLED
     wait_until(lambda: group_is_gone(pid), Deadline.after(30))
 
 
-def test_what_a_command_leaves_behind_ends_with_it(shell: LocalShell) -> None:
-    one = job("sh", "-c", "sleep 300 & exit 0")
-    assert jobs.run(shell, one) == 0
+def test_remaining_processes_of_a_command_are_terminated(shell: LocalShell) -> None:
+    job_spec = job("sh", "-c", "sleep 300 & exit 0")
+    assert jobs.run(shell, job_spec) == 0
     pid = leader(shell)
     wait_until(lambda: group_is_gone(pid), Deadline.after(30))
 
 
-def test_the_robot_itself_ends_a_job_at_its_limit(shell: LocalShell) -> None:
+def test_robot_stops_a_job_at_its_limit(shell: LocalShell) -> None:
     script = "trap 'exit 9' INT; echo up; while :; do sleep 0.02; done"
     assert jobs.run(shell, replace(job("sh", "-c", script, limit_s=0.3), ready="log:up")) == 9
 
 
-def test_a_limit_counts_from_when_the_job_is_up(shell: LocalShell) -> None:
-    # The file `go` comes when a job that counted from its start would have been ended for long.
+def test_limit_starts_when_the_job_is_ready(shell: LocalShell) -> None:
+    # The file `go` is created when a job whose limit started with the job would have been stopped long before.
     script = (
         "trap 'echo early; exit 1' INT; until [ -e go ]; do sleep 0.02; done; trap 'exit 9' INT; echo up; sleep 60"
     )
@@ -161,7 +161,7 @@ def test_a_limit_counts_from_when_the_job_is_up(shell: LocalShell) -> None:
     assert pending.end(30) == 9
 
 
-def test_a_begun_job_tells_its_end_only_when_it_is_asked(shell: LocalShell) -> None:
+def test_job_of_begin_reports_its_end_on_request_only(shell: LocalShell) -> None:
     pending = jobs.begin(shell, job("sh", "-c", "exit 3"))
     ended = shell.home / FOLDER / ".jobs" / "job" / "exit"
     wait_until(lambda: ended.exists() and ended.read_text(encoding="ascii") == "3\n", Deadline.after(30))
@@ -171,107 +171,107 @@ def test_a_begun_job_tells_its_end_only_when_it_is_asked(shell: LocalShell) -> N
     assert pending.end(30) == 3
 
 
-def test_wait_gives_up_after_its_time(shell: LocalShell) -> None:
-    one = job("sleep", "60")
-    jobs.start(shell, one)
-    assert jobs.begin_wait(shell, one, 1).end(30) == jobs.STILL_RUNNING
-    jobs.stop(shell, one, signal="TERM")
+def test_wait_has_a_timeout(shell: LocalShell) -> None:
+    job_spec = job("sleep", "60")
+    jobs.start(shell, job_spec)
+    assert jobs.begin_wait(shell, job_spec, 1).end(30) == jobs.STILL_RUNNING
+    jobs.stop(shell, job_spec, signal="TERM")
 
 
-def test_wait_ends_when_a_job_is_killed_from_outside(shell: LocalShell) -> None:
-    one = job("sleep", "60")
-    jobs.start(shell, one)
+def test_wait_returns_when_a_job_is_killed_externally(shell: LocalShell) -> None:
+    job_spec = job("sleep", "60")
+    jobs.start(shell, job_spec)
     killer = threading.Timer(0.2, lambda: os.killpg(leader(shell), signal.SIGKILL))
     killer.start()
-    assert jobs.begin_wait(shell, one, 20).end(30) == jobs.KILLED
+    assert jobs.begin_wait(shell, job_spec, 20).end(30) == jobs.KILLED
     killer.join()
 
 
-def test_an_ended_job_is_left_alone_by_stop(shell: LocalShell) -> None:
-    one = job("true")
-    assert jobs.run(shell, one) == 0
-    assert jobs.stop(shell, one) == 0
+def test_stop_ignores_an_ended_job(shell: LocalShell) -> None:
+    job_spec = job("true")
+    assert jobs.run(shell, job_spec) == 0
+    assert jobs.stop(shell, job_spec) == 0
 
 
-def test_a_recycled_pid_is_not_signalled(shell: LocalShell) -> None:
-    """A job is ended by identity: pid, start time and boot, never by number alone."""
-    one = job("sleep", "60")
-    jobs.start(shell, one)
+def test_reused_pid_is_not_signalled(shell: LocalShell) -> None:
+    """A job is identified by pid, start time and boot ID, never by its pid only."""
+    job_spec = job("sleep", "60")
+    jobs.start(shell, job_spec)
     with subprocess.Popen(("sleep", "60"), start_new_session=True) as stranger:
         record = shell.home / FOLDER / ".jobs" / "job" / "pid"
         true_record = record.read_text(encoding="ascii")
         _, ticks, boot = true_record.split()
         record.write_text(f"{stranger.pid} {int(ticks) - 1} {boot}\n", encoding="ascii")
-        assert jobs.stop(shell, one, signal="KILL") == jobs.KILLED
+        assert jobs.stop(shell, job_spec, signal="KILL") == jobs.KILLED
         assert stranger.poll() is None
         stranger.kill()
         record.write_text(true_record, encoding="ascii")
-    jobs.stop(shell, one, signal="TERM")
+    jobs.stop(shell, job_spec, signal="TERM")
 
 
-def test_a_repeated_run_joins_the_job_and_gives_its_exit_code(shell: LocalShell) -> None:
-    one = job("sh", "-c", "echo once >>out; sleep 0.3; exit 4")
-    first, second = jobs.begin(shell, one), jobs.begin(shell, one)
+def test_repeated_run_joins_the_job_and_returns_its_exit_code(shell: LocalShell) -> None:
+    job_spec = job("sh", "-c", "echo once >>out; sleep 0.3; exit 4")
+    first, second = jobs.begin(shell, job_spec), jobs.begin(shell, job_spec)
     assert (first.end(30), second.end(30)) == (4, 4)
-    assert jobs.run(shell, one) == 4
+    assert jobs.run(shell, job_spec) == 4
     assert (shell.home / FOLDER / "out").read_text(encoding="ascii") == "once\n"
 
 
-def test_a_repeated_start_waits_until_the_job_is_up(shell: LocalShell) -> None:
-    one = replace(job("sh", "-c", "echo once >>out; sleep 0.3; echo up; sleep 60"), ready="log:up")
+def test_repeated_start_waits_until_the_job_is_ready(shell: LocalShell) -> None:
+    job_spec = replace(job("sh", "-c", "echo once >>out; sleep 0.3; echo up; sleep 60"), ready="log:up")
     with ThreadPoolExecutor(2) as pool:
-        for done in [pool.submit(jobs.start, shell, one) for _ in range(2)]:
+        for done in [pool.submit(jobs.start, shell, job_spec) for _ in range(2)]:
             done.result()
             assert "up" in (shell.home / FOLDER / "job.log").read_text(encoding="ascii")
     assert (shell.home / FOLDER / "out").read_text(encoding="ascii") == "once\n"
-    jobs.stop(shell, one, signal="TERM")
-    jobs.start(shell, one)  # it was up: its log says so
-    assert jobs.stop(shell, one) == 128 + signal.SIGTERM
+    jobs.stop(shell, job_spec, signal="TERM")
+    jobs.start(shell, job_spec)  # its log shows that it was ready
+    assert jobs.stop(shell, job_spec) == 128 + signal.SIGTERM
 
 
-def test_a_repeated_start_says_that_the_job_ended_before_it_was_up(shell: LocalShell) -> None:
-    one = replace(job("sh", "-c", "echo no such device >&2; exit 1"), ready="log:listening on")
+def test_repeated_start_reports_that_the_job_ended_before_it_was_ready(shell: LocalShell) -> None:
+    job_spec = replace(job("sh", "-c", "echo no such device >&2; exit 1"), ready="log:listening on")
     for _ in range(2):
         with pytest.raises(RobotError, match="job job ended before it was ready: no such device"):
-            jobs.start(shell, one)
+            jobs.start(shell, job_spec)
 
 
-def test_a_job_that_does_not_get_up_is_killed_and_says_how_far_it_came(shell: LocalShell) -> None:
+def test_job_that_is_not_ready_in_time_is_killed_and_its_log_reported(shell: LocalShell) -> None:
     stays = job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done")
-    one = replace(stays, ready="log:up", ready_s=3)
+    job_spec = replace(stays, ready="log:up", ready_s=3)
     with pytest.raises(RobotError, match="job job was not up in 3 s: still looking") as caught:
-        jobs.start(shell, one)
+        jobs.start(shell, job_spec)
     assert FOLDER in caught.value.remedy
-    assert jobs.stop(shell, one) == jobs.KILLED
+    assert jobs.stop(shell, job_spec) == jobs.KILLED
     pid = leader(shell)
     wait_until(lambda: group_is_gone(pid), Deadline.after(30))
 
 
-def test_who_serves_is_told_when_the_job_is_up_and_how_it_ended(shell: LocalShell) -> None:
+def test_serve_reports_readiness_and_exit_code(shell: LocalShell) -> None:
     wait = "echo up; until [ -e go ]; do sleep 0.05; done; exit 6"
-    one = replace(job("sh", "-c", f"echo once >>out; {wait}"), ready="log:up")
-    first, second = jobs.serve(shell, one), jobs.serve(shell, one)
+    job_spec = replace(job("sh", "-c", f"echo once >>out; {wait}"), ready="log:up")
+    first, second = jobs.serve(shell, job_spec), jobs.serve(shell, job_spec)
     assert "up" in (shell.home / FOLDER / "job.log").read_text(encoding="ascii")
     (shell.home / FOLDER / "go").touch()
     assert (first.end(30), second.end(30)) == (6, 6)
     assert (shell.home / FOLDER / "out").read_text(encoding="ascii") == "once\n"
 
 
-def test_a_listener_that_ended_while_the_link_was_away_was_up(shell: LocalShell) -> None:
+def test_ended_listener_counts_as_ready_after_a_lost_link(shell: LocalShell) -> None:
     port = free_port()
     listen = 'nc.traditional -l -p "$0" & until [ -e go ]; do sleep 0.02; done; kill $!; exit 6'
-    one = replace(job("sh", "-c", listen, str(port)), ready=jobs.bound(Protocol.TCP, port))
-    first = jobs.serve(shell, one)
+    job_spec = replace(job("sh", "-c", listen, str(port)), ready=jobs.bound(Protocol.TCP, port))
+    first = jobs.serve(shell, job_spec)
     (shell.home / FOLDER / "go").touch()
     assert first.end(30) == 6
-    assert jobs.serve(shell, one).end(30) == 6, "though nothing listens any more"
+    assert jobs.serve(shell, job_spec).end(30) == 6, "although no process listens any more"
 
 
-def test_who_serves_is_told_that_the_job_did_not_get_up(shell: LocalShell) -> None:
-    one = replace(job("sh", "-c", "echo no such port >&2; exit 1"), ready="log:listening on")
+def test_serve_reports_a_job_that_was_not_ready(shell: LocalShell) -> None:
+    job_spec = replace(job("sh", "-c", "echo no such port >&2; exit 1"), ready="log:listening on")
     for _ in range(2):
         with pytest.raises(RobotError, match="job job ended before it was ready: no such port") as caught:
-            jobs.serve(shell, one)
+            jobs.serve(shell, job_spec)
         assert FOLDER in caught.value.remedy
 
 
@@ -279,15 +279,15 @@ PARTS = "trap 'echo counted; sleep 0.3; echo gone; exit {code}' INT; echo up; wh
 
 
 @pytest.mark.parametrize("code", [0, 3])
-def test_a_job_that_said_its_parting_word_ends_by_itself_until_the_evidence_is_fetched(
+def test_job_after_its_parting_text_may_run_until_the_evidence_is_fetched(
     shell: LocalShell, tmp_path: Path, code: int
 ) -> None:
-    one = replace(job("sh", "-c", PARTS.format(code=code)), ready="log:up")
+    job_spec = replace(job("sh", "-c", PARTS.format(code=code)), ready="log:up")
     into = tmp_path / "local"
     into.mkdir()
-    jobs.start(shell, one)
-    for _ in range(2):  # the answer of the first may have been lost
-        assert jobs.stop(shell, one, grace_s=30, parting="counted") == 0
+    jobs.start(shell, job_spec)
+    for _ in range(2):  # the first answer may have been lost
+        assert jobs.stop(shell, job_spec, grace_s=30, parting="counted") == 0
     if code:
         with pytest.raises(RobotError, match="job job ended with exit code 3"):
             fetching.fetch(shell, FOLDER, "sender", "lo", into)
@@ -297,32 +297,32 @@ def test_a_job_that_said_its_parting_word_ends_by_itself_until_the_evidence_is_f
     assert jobs.left(shell, Deadline.after(30)) == ()
 
 
-def test_a_job_that_does_not_end_after_its_parting_word_is_killed(shell: LocalShell, tmp_path: Path) -> None:
+def test_job_that_does_not_end_after_its_parting_text_is_killed(shell: LocalShell, tmp_path: Path) -> None:
     script = "trap 'echo counted; while :; do sleep 0.05; done' INT; echo up; while :; do sleep 0.05; done"
-    one = replace(job("sh", "-c", script), ready="log:up")
-    jobs.start(shell, one)
-    assert jobs.stop(shell, one, grace_s=30, parting="counted") == 0
+    job_spec = replace(job("sh", "-c", script), ready="log:up")
+    jobs.start(shell, job_spec)
+    assert jobs.stop(shell, job_spec, grace_s=30, parting="counted") == 0
     with pytest.raises(RobotError, match=f"job job ended with exit code {jobs.KILLED}"):
         fetching.fetch(shell, FOLDER, "sender", "lo", tmp_path)
     assert jobs.left(shell, Deadline.after(30)) == ()
 
 
-def test_a_job_that_ends_without_its_parting_word_gives_its_exit_code(shell: LocalShell) -> None:
-    one = replace(job("sh", "-c", "trap 'exit 9' INT; echo up; while :; do sleep 0.05; done"), ready="log:up")
-    jobs.start(shell, one)
-    assert jobs.stop(shell, one, grace_s=30, parting="counted") == 9
+def test_job_that_ends_without_its_parting_text_returns_its_exit_code(shell: LocalShell) -> None:
+    job_spec = replace(job("sh", "-c", "trap 'exit 9' INT; echo up; while :; do sleep 0.05; done"), ready="log:up")
+    jobs.start(shell, job_spec)
+    assert jobs.stop(shell, job_spec, grace_s=30, parting="counted") == 9
 
 
-def test_a_job_that_a_reboot_cut_says_so(shell: LocalShell) -> None:
-    one = job("sleep", "60")
-    jobs.start(shell, one)
+def test_job_that_a_reboot_interrupted_is_reported(shell: LocalShell) -> None:
+    job_spec = job("sleep", "60")
+    jobs.start(shell, job_spec)
     os.killpg(leader(shell), signal.SIGKILL)
     record = shell.home / FOLDER / ".jobs" / "job" / "pid"
     record.write_text(" ".join([*record.read_text(encoding="ascii").split()[:2], "another-boot"]), encoding="ascii")
     calls: list[Callable[[], int]] = [
-        lambda: jobs.stop(shell, one),
-        lambda: jobs.run(shell, one),
-        lambda: jobs.begin_wait(shell, one, 5).end(30),
+        lambda: jobs.stop(shell, job_spec),
+        lambda: jobs.run(shell, job_spec),
+        lambda: jobs.begin_wait(shell, job_spec, 5).end(30),
     ]
     for call in calls:
         with pytest.raises(RobotError, match="job job was cut: the robot rebooted"):
@@ -330,39 +330,39 @@ def test_a_job_that_a_reboot_cut_says_so(shell: LocalShell) -> None:
     assert jobs.left(shell, Deadline.after(30)) == ()
 
 
-def test_no_job_starts_in_a_folder_whose_jobs_were_ended(shell: LocalShell) -> None:
+def test_no_job_starts_in_a_folder_whose_jobs_were_stopped(shell: LocalShell) -> None:
     evidence.end_jobs(shell, FOLDER)
     with pytest.raises(RobotError, match="comes too late"):
         jobs.run(shell, job("true"))
 
 
 def held_up(shell: LocalShell, name: str) -> tuple[Path, Path]:
-    """Let the robot's program `name` say that it is called, by a file, and wait for another file."""
+    """Replace the robot's program `name`: it creates a file when it is called, and waits for another file."""
     called, go = shell.home / "called", shell.home / "go"
     replace_program(shell, name, f'touch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {{program}} "$@"')
     return called, go
 
 
 @pytest.mark.parametrize("call", [jobs.start, jobs.run])
-def test_a_job_that_is_being_started_while_somebody_aborts_does_not_run(
+def test_job_that_starts_during_an_abort_does_not_run(
     shell: LocalShell, call: Callable[[LocalShell, Job], object]
 ) -> None:
-    called, go = held_up(shell, "mkfifo")  # after the job's folder is made, before its identity is written
-    one = job("sh", "-c", "touch started; exec sleep 60")
+    called, go = held_up(shell, "mkfifo")  # after the job's folder is created, before its identity is written
+    job_spec = job("sh", "-c", "touch started; exec sleep 60")
     with ThreadPoolExecutor(1) as pool:
-        starting = pool.submit(call, shell, one)
+        starting = pool.submit(call, shell, job_spec)
         wait_until(called.exists, Deadline.after(30))
         assert jobs.abort(shell, "bert@two", Deadline.after(30)).jobs == ()
         go.touch()
         with pytest.raises(RobotError, match=f"comes too late: the jobs of {FOLDER} were ended by bert@two"):
             starting.result(30)
-    # Whoever started it is told as soon as its leader has an identity, which may then still be about to leave.
+    # `start` returns as soon as the leader has an identity; the leader may then still be about to exit.
     wait_until(lambda: jobs.left(shell, Deadline.after(30)) == (), Deadline.after(30))
     assert not (shell.home / FOLDER / "started").exists()
 
 
-def test_who_asked_for_a_jobs_end_and_is_never_heard_of_again_is_not_awaited_for_ever(shell: LocalShell) -> None:
-    """As a link that was cut while the job ran: the SSH server knows nothing of it, and keeps the input open."""
+def test_lost_caller_that_requested_the_end_is_not_awaited_forever(shell: LocalShell) -> None:
+    """The link was cut while the job ran: the SSH server has not detected it, and keeps standard input open."""
     asked = shell.home / "asked"
     replace_program(shell, "timeout", f'echo "$1" >>"{asked}"; shift; exec {{program}} 1 "$@"')
     pending = jobs.begin(shell, job("sh", "-c", "exit 3", limit_s=20))
@@ -372,7 +372,7 @@ def test_who_asked_for_a_jobs_end_and_is_never_heard_of_again_is_not_awaited_for
     assert 20 < int(seconds) <= 20 + jobs.READY_S + 10
 
 
-def test_a_process_whose_folder_was_removed_is_listed_and_ended(shell: LocalShell) -> None:
+def test_process_whose_folder_was_deleted_is_listed_and_stopped(shell: LocalShell) -> None:
     pending = jobs.begin(shell, job("sh", "-c", "touch up; exec sleep 60"))
     assert isinstance(pending.session, LocalSession)
     wait_until((shell.home / FOLDER / "up").exists, Deadline.after(30))
@@ -386,9 +386,9 @@ def test_a_process_whose_folder_was_removed_is_listed_and_ended(shell: LocalShel
 
 
 @pytest.mark.parametrize("lost", ["the identity", "the folder"])
-def test_records_that_the_end_of_power_took_are_no_mystery(shell: LocalShell, lost: str) -> None:
-    one = job("true")
-    jobs.run(shell, one)
+def test_records_lost_in_a_power_failure_are_reported(shell: LocalShell, lost: str) -> None:
+    job_spec = job("true")
+    jobs.run(shell, job_spec)
     began = shell.home / FOLDER / ".began"
     token, _ = began.read_text(encoding="ascii").split()
     began.write_text(f"{token} another-boot\n", encoding="ascii")
@@ -396,15 +396,15 @@ def test_records_that_the_end_of_power_took_are_no_mystery(shell: LocalShell, lo
     if lost == "the identity":
         (shell.home / FOLDER / ".jobs" / "job").mkdir()
     calls: list[Callable[[], int]] = [
-        lambda: jobs.stop(shell, one),
-        lambda: jobs.begin_wait(shell, one, 5).end(30),
+        lambda: jobs.stop(shell, job_spec),
+        lambda: jobs.begin_wait(shell, job_spec, 5).end(30),
     ]
     for call in calls:
         with pytest.raises(RobotError, match="job job was cut: the robot rebooted"):
             call()
 
 
-def test_what_root_made_can_be_removed_by_the_user(shell: LocalShell) -> None:
+def test_files_of_root_can_be_deleted_by_the_user(shell: LocalShell) -> None:
     for path in (shell.home, *shell.home.rglob("*")):
         os.chown(path, 65534, 65534, follow_symlinks=False)
     jobs.run(shell, job("true"))
@@ -413,12 +413,12 @@ def test_what_root_made_can_be_removed_by_the_user(shell: LocalShell) -> None:
     subprocess.run((*as_user, "rm", "-r", "udp-01-1"), cwd=(shell.home / FOLDER).parent, check=True)
 
 
-def test_an_exit_code_of_a_job_is_not_taken_for_the_scripts_own(shell: LocalShell) -> None:
+def test_exit_code_of_a_job_is_not_mistaken_for_one_of_the_script(shell: LocalShell) -> None:
     for code in (28, 75, 76, 124, 125):
         assert jobs.run(shell, job("sh", "-c", f"echo job.sh: lies >&2; exit {code}", name=f"exit-{code}")) == code
 
 
-def test_a_repeated_begin_keeps_the_first_state_and_what_runs(shell: LocalShell) -> None:
+def test_repeated_begin_keeps_the_first_state_and_running_jobs(shell: LocalShell) -> None:
     before = shell.home / FOLDER / "sender-before.txt"
     first = before.read_bytes()
     jobs.start(shell, job("sleep", "60"))
@@ -428,14 +428,14 @@ def test_a_repeated_begin_keeps_the_first_state_and_what_runs(shell: LocalShell)
     jobs.stop(shell, job("sleep", "60"), signal="TERM")
 
 
-def test_begin_refuses_when_the_disk_has_less_than_needed(shell: LocalShell) -> None:
+def test_begin_rejects_a_disk_with_less_space_than_needed(shell: LocalShell) -> None:
     with pytest.raises(RobotError, match=r"\d+ KiB of disk are free, 10{15} KiB are needed") as caught:
         evidence.begin(shell, jobs.work_folder("trial", "udp-02-1"), "sender", "lo", need_kib=10**15)
     assert "du -sh ~/.fieldkit/*" in caught.value.remedy
     assert not (shell.home / jobs.work_folder("trial", "udp-02-1")).exists()
 
 
-def test_a_robot_without_a_program_is_told_when_the_script_is_installed(tmp_path: Path) -> None:
+def test_missing_program_is_reported_at_the_installation(tmp_path: Path) -> None:
     folder = tmp_path / "bin"
     path = path_of("busybox", folder)
     (folder / "setsid").unlink()
@@ -446,12 +446,12 @@ def test_a_robot_without_a_program_is_told_when_the_script_is_installed(tmp_path
     assert path
 
 
-def test_an_unknown_job_is_an_error(shell: LocalShell) -> None:
+def test_unknown_job_is_an_error(shell: LocalShell) -> None:
     with pytest.raises(RobotError, match="no job in"):
         jobs.stop(shell, job("true", name="never"))
 
 
-def test_jobs_left_over_are_listed_and_ended(shell: LocalShell) -> None:
+def test_remaining_jobs_are_listed_and_stopped(shell: LocalShell) -> None:
     jobs.start(shell, job("sleep", "60"))
     (line,) = jobs.left(shell, Deadline.after(30))
     assert line.endswith("sleep 60")
@@ -460,23 +460,23 @@ def test_jobs_left_over_are_listed_and_ended(shell: LocalShell) -> None:
 
 
 def test_stop_waits_until_a_file_has_stopped_growing(shell: LocalShell) -> None:
-    # The file grows whenever the script naps between two looks at it, so that no load on this machine matters.
+    # The file grows whenever the script sleeps between two checks, so that the load of this machine has no effect.
     grow = 'case $1 in 0.02) [ "$(wc -l <out)" -ge 20 ] || echo >>out ;; esac'
     replace_program(shell, "sleep", f'cd "{shell.home / FOLDER}" && {grow}\nexec {{program}} "$@"')
     script = "trap 'wc -l <out >seen; exit 0' TERM; : >out; echo up; while :; do sleep 0.05; done"
-    one = replace(job("sh", "-c", script), ready="log:up")
-    jobs.start(shell, one)
-    assert stop(shell, one, signal="TERM", settle="out") == 0
+    job_spec = replace(job("sh", "-c", script), ready="log:up")
+    jobs.start(shell, job_spec)
+    assert stop(shell, job_spec, signal="TERM", settle="out") == 0
     assert (shell.home / FOLDER / "seen").read_text(encoding="ascii").split() == ["20"]
 
 
 @pytest.mark.parametrize(
     ("state", "runs"), [("R", True), ("S", True), ("D", True), ("T", True), ("Z", False), ("X", False)]
 )
-def test_a_process_that_has_ended_and_is_being_reaped_does_not_run(
+def test_zombie_and_dead_process_do_not_count_as_running(
     shell: LocalShell, tmp_path: Path, state: str, runs: bool
 ) -> None:
-    """Its entry says Z until its parent looks, and X for a moment afterwards."""
+    """Its state is Z until its parent waits for it, and X for a moment after that."""
     (tmp_path / "stat").write_text(f"7 (a) b) {state} {' '.join(map(str, range(4, 53)))}\n", encoding="ascii")
     common = Path(script.__file__).with_name("common.sh")
     argv = ("sh", "-c", '. "$1"; identify "../$2"; echo $? "$identity"', "sh", str(common), str(tmp_path))
@@ -484,7 +484,7 @@ def test_a_process_that_has_ended_and_is_being_reaped_does_not_run(
     assert (code == b"0", len(identity)) == ((True, 3) if runs else (False, 0))
 
 
-def test_a_folder_is_fetched_whole_with_the_hosts_state_before_and_after(shell: LocalShell, tmp_path: Path) -> None:
+def test_folder_is_fetched_completely_with_the_host_state_before_and_after(shell: LocalShell, tmp_path: Path) -> None:
     jobs.run(shell, replace(job("printf", "abc"), stdout="scan.bag"))
     into = tmp_path / "local"
     into.mkdir()
@@ -499,23 +499,21 @@ def test_a_folder_is_fetched_whole_with_the_hosts_state_before_and_after(shell: 
     assert "==> /proc/net/snmp <==\n" in (into / "sender-before.txt").read_text(encoding="utf-8")
 
 
-def test_who_ended_each_job_is_kept_with_which_boot_it_was_and_what_the_clock_said(
-    shell: LocalShell, tmp_path: Path
-) -> None:
+def test_end_of_each_job_is_recorded_with_boot_id_and_clock(shell: LocalShell, tmp_path: Path) -> None:
     waits = ("sh", "-c", "trap 'exit 0' INT; echo up; while :; do sleep 0.02; done")
     stopped, broken, lost, slow = (
         replace(job(*waits, name=name), ready="log:up") for name in ("stopped", "broken", "lost", "slow")
     )
-    for one in (stopped, broken, lost):
-        jobs.start(shell, one)
+    for job_spec in (stopped, broken, lost):
+        jobs.start(shell, job_spec)
     assert jobs.run(shell, job("sh", "-c", "sleep 0.3; exit 3")) == 3
     assert jobs.run(shell, replace(slow, limit_s=0.1)) == 0
     os.killpg(leader(shell, "broken"), signal.SIGINT)
     assert jobs.begin_wait(shell, broken, 20).end(30) == 0
     os.killpg(leader(shell, "lost"), signal.SIGKILL)
     assert jobs.begin_wait(shell, lost, 20).end(30) == jobs.KILLED
-    for one in (stopped, broken):
-        assert stop(shell, one) == 0, "as if nobody else had ended it"
+    for job_spec in (stopped, broken):
+        assert stop(shell, job_spec) == 0, "as if it had not been stopped"
     into = tmp_path / "local"
     into.mkdir()
     fetching.fetch(shell, FOLDER, "sender", "lo", into)
@@ -536,13 +534,13 @@ def test_who_ended_each_job_is_kept_with_which_boot_it_was_and_what_the_clock_sa
     assert before.clock is not None
     assert after.clock is not None
     assert clock.problem(before.clock, after.clock) is None
-    assert clock.moved(before.clock, after.clock).error_s < 1, "busybox tells fractions of a second, too"
+    assert clock.moved(before.clock, after.clock).error_s < 1, "busybox has fractions of a second, too"
 
 
-def test_the_state_of_the_radio_is_kept_before_and_after(shell: LocalShell, tmp_path: Path) -> None:
+def test_state_of_the_radio_is_recorded_before_and_after(shell: LocalShell, tmp_path: Path) -> None:
     into = tmp_path / "local"
     into.mkdir()
-    # There is no radio here: its answers are those of a real one.
+    # This machine has no radio: the outputs are those of a real one.
     answers = {"info": "info-station", "station": "stations-ap", "get": "power-save-on"}
     files = {verb: shlex.quote(str(DATA / "iw" / f"{name}.txt")) for verb, name in answers.items()}
     cases = "\n".join(f"{verb}) exec cat {file} ;;" for verb, file in files.items())
@@ -558,13 +556,13 @@ def test_the_state_of_the_radio_is_kept_before_and_after(shell: LocalShell, tmp_
         assert re.search(r"==> iw station dump <==\n[^=]*tx retries:.*\n[^=]*signal:", state)
 
 
-def test_files_in_one_level_of_folders_are_fetched_and_nothing_but_files(shell: LocalShell, tmp_path: Path) -> None:
+def test_regular_files_in_one_level_of_folders_are_fetched(shell: LocalShell, tmp_path: Path) -> None:
     script = """mkdir -p scan/deeper; echo a >scan/metadata.yaml; echo b >scan/scan_0.db3; echo c >scan/deeper/file
     ln -s /etc/passwd link; ln -s /etc/passwd scan/link; mkfifo fifo; echo d >.hidden"""
     assert jobs.run(shell, job("sh", "-c", script)) == 0
     into = tmp_path / "local"
     into.mkdir()
-    for _ in range(2):  # the answer of the first may have been lost
+    for _ in range(2):  # the first answer may have been lost
         shutil.rmtree(into)
         into.mkdir()
         fetching.fetch(shell, FOLDER, "sender", "lo", into)
@@ -578,24 +576,24 @@ def test_files_in_one_level_of_folders_are_fetched_and_nothing_but_files(shell: 
     assert (into / "scan" / "scan_0.db3").read_text(encoding="ascii") == "b\n"
 
 
-def test_a_userland_that_knows_whole_seconds_only_is_slower_and_no_worse(tmp_path: Path) -> None:
-    """As busybox was once, and still is where it was built small: no fractions in sleep, another timeout."""
+def test_userland_without_fractions_of_seconds(tmp_path: Path) -> None:
+    """As old and small versions of busybox: no fractions in sleep, and another timeout."""
     shell = LocalShell(tmp_path, path_of("busybox", tmp_path / "bin"))
     refusals = {"sleep": "case $1 in *.*) exit 1 ;; esac", "timeout": "case $1 in -t) shift ;; *) exit 127 ;; esac"}
     for name, refusal in refusals.items():
         replace_program(shell, name, f'{refusal}\nexec {{program}} "$@"')
     jobs.install(shell, Deadline.after(30))
     evidence.begin(shell, FOLDER, "sender", "lo")
-    one = replace(job("sh", "-c", "echo up; exec sleep 60"), ready="log:up")
-    jobs.start(shell, one)
-    assert jobs.begin_wait(shell, one, 1).end(30) == jobs.STILL_RUNNING
-    assert stop(shell, one, signal="TERM") == 128 + signal.SIGTERM
+    job_spec = replace(job("sh", "-c", "echo up; exec sleep 60"), ready="log:up")
+    jobs.start(shell, job_spec)
+    assert jobs.begin_wait(shell, job_spec, 1).end(30) == jobs.STILL_RUNNING
+    assert stop(shell, job_spec, signal="TERM") == 128 + signal.SIGTERM
     script = "trap 'exit 9' INT; echo up; while :; do sleep 1; done"
     assert jobs.run(shell, replace(job("sh", "-c", script, name="x", limit_s=0.3), ready="log:up")) == 9
     assert jobs.left(shell, Deadline.after(30)) == ()
 
 
-def test_a_job_that_another_version_of_the_script_started_is_found_and_ended(shell: LocalShell) -> None:
+def test_job_of_another_version_of_the_script_is_listed_and_stopped(shell: LocalShell) -> None:
     meta = shell.home / jobs.work_folder("older", "tcp-01-1") / ".jobs" / "capture"
     meta.mkdir(parents=True)
     (meta / "command").write_text("tcpdump -i wlan0\n", encoding="ascii")
@@ -609,15 +607,15 @@ def test_a_job_that_another_version_of_the_script_started_is_found_and_ended(she
         assert process.wait(30) == -signal.SIGINT
 
 
-def test_all_that_a_trial_left_on_a_robot_is_removed(shell: LocalShell) -> None:
+def test_all_files_of_a_trial_on_a_robot_are_deleted(shell: LocalShell) -> None:
     jobs.run(shell, replace(job("echo", "sent"), stdout="recv.bag"))
     assert (shell.home / FOLDER / "recv.bag").is_file()
     evidence.discard(shell, "trial")
     assert [path.name for path in (shell.home / jobs.HOME).iterdir()] == [Path(jobs.SCRIPT_PATH).name]
 
 
-class Liar(LocalShell):
-    """A robot that sends whatever archive it likes."""
+class HostileShell(LocalShell):
+    """A robot that sends any archive."""
 
     def __init__(self, home: Path, members: dict[str, bytes], *, link: str = "") -> None:
         super().__init__(home)
@@ -657,26 +655,26 @@ EMPTY_SUM = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
         ({}, "", "file missing"),
     ],
 )
-def test_what_a_robot_sends_cannot_leave_the_folder_or_pass_unchecked(
+def test_archive_cannot_leave_the_folder_or_skip_checks(
     tmp_path: Path, members: dict[str, bytes], link: str, said: str
 ) -> None:
     home, into = tmp_path / "home", tmp_path / "into"
     home.mkdir()
     into.mkdir()
     with pytest.raises(EvidenceError, match=said):
-        fetching.fetch(Liar(home, members, link=link), FOLDER, "sender", "lo", into)
+        fetching.fetch(HostileShell(home, members, link=link), FOLDER, "sender", "lo", into)
     assert {path.name for path in tmp_path.iterdir()} == {"home", "into"}
     assert not list(into.glob(".*"))
 
 
-def test_an_archive_cut_short_is_refused(tmp_path: Path) -> None:
-    liar = Liar(tmp_path, {"scan.bag": b"x" * 5000})
+def test_truncated_archive_is_rejected(tmp_path: Path) -> None:
+    liar = HostileShell(tmp_path, {"scan.bag": b"x" * 5000})
     liar.archive.write_bytes(liar.archive.read_bytes()[:2000])
     with pytest.raises(EvidenceError):
         fetching.fetch(liar, FOLDER, "sender", "lo", tmp_path)
 
 
-def test_nobody_else_can_write_where_the_script_is(shell: LocalShell) -> None:
+def test_other_users_cannot_write_to_the_folder_of_the_script(shell: LocalShell) -> None:
     folder = shell.home / jobs.HOME
     folder.chmod(0o777)
     jobs.install(shell, Deadline.after(30))
@@ -684,7 +682,7 @@ def test_nobody_else_can_write_where_the_script_is(shell: LocalShell) -> None:
 
 
 @pytest.mark.parametrize("damage", ["another's", "cut", "a link"])
-def test_a_script_that_is_not_ours_or_not_whole_is_replaced(shell: LocalShell, damage: str) -> None:
+def test_script_with_other_owner_or_content_is_replaced(shell: LocalShell, damage: str) -> None:
     path = shell.home / jobs.SCRIPT_PATH
     match damage:
         case "another's":
@@ -701,7 +699,7 @@ def test_a_script_that_is_not_ours_or_not_whole_is_replaced(shell: LocalShell, d
 
 
 class Greeting(LocalShell):
-    """A robot whose `.bashrc` prints something before every command."""
+    """A robot whose `.bashrc` prints a text before each command."""
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
         return super().begin(
@@ -709,13 +707,13 @@ class Greeting(LocalShell):
         )
 
 
-def test_a_login_shell_that_greets_commands_is_told_before_its_words_are_taken_for_a_jobs(tmp_path: Path) -> None:
+def test_login_shell_with_a_greeting_is_reported(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match="its login shell answers every command with 'ROS noetic'") as caught:
         jobs.install(Greeting(tmp_path), Deadline.after(30))
     assert "case $- in" in caught.value.remedy
 
 
-def test_a_robot_that_cannot_be_written_says_so_and_is_aborted_all_the_same(shell: LocalShell) -> None:
+def test_read_only_robot_is_reported_and_can_be_aborted(shell: LocalShell) -> None:
     jobs.start(shell, job("sleep", "60"))
     script_file = shell.home / jobs.SCRIPT_PATH
     script_file.unlink()
@@ -734,19 +732,19 @@ def test_a_robot_that_cannot_be_written_says_so_and_is_aborted_all_the_same(shel
     jobs.install(shell, Deadline.after(30))
     with pytest.raises(RobotError, match="Read-only file system") as caught:
         evidence.begin(robot, f"{FOLDER}-2", "sender", "lo", need_kib=0)
-    assert "a card that fails" in caught.value.remedy
+    assert "a failing SD card" in caught.value.remedy
     (ended,) = jobs.abort(robot, "anna@one", Deadline.after(30)).jobs
     assert ended.endswith("sleep 60")
     jobs.install(shell, Deadline.after(30))
 
 
-def test_a_script_that_is_there_is_not_sent_again(shell: LocalShell) -> None:
+def test_installed_script_is_not_sent_again(shell: LocalShell) -> None:
     before = (shell.home / jobs.SCRIPT_PATH).stat().st_ino
     jobs.install(shell, Deadline.after(30))
     assert (shell.home / jobs.SCRIPT_PATH).stat().st_ino == before
 
 
-def test_the_script_is_installed_under_the_hash_of_its_content(shell: LocalShell) -> None:
+def test_script_is_installed_under_the_hash_of_its_content(shell: LocalShell) -> None:
     before = time.time_ns()
     jobs.install(shell, Deadline.after(30))
     path = shell.home / jobs.SCRIPT_PATH

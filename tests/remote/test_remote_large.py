@@ -1,4 +1,4 @@
-"""Evidence that is too large for one archive: fetched piece by piece, goes on where it was cut, within bounds."""
+"""Evidence that is too large for one archive: fetched in pieces, continued after an interruption, limited in size."""
 
 import hashlib
 import os
@@ -24,7 +24,7 @@ SMALL = b"#ROSBAG V2.0\n" * 100
 
 
 class Flaky(LocalShell):
-    """A robot whose link is lost at some pieces, and which notes those that it is asked for."""
+    """A robot whose link is lost at some pieces, and which records the requested pieces."""
 
     def __init__(self, home: Path, path: str = os.environ["PATH"]) -> None:
         super().__init__(home, path)
@@ -44,15 +44,15 @@ class Flaky(LocalShell):
 def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Flaky]:
     home = tmp_path / "home"
     home.mkdir()
-    made = Flaky(home, path_of(request.param, tmp_path / "bin"))
-    jobs.install(made, Deadline.after(30))
-    evidence.begin(made, FOLDER, "sender", "lo", need_kib=0)
+    flaky_shell = Flaky(home, path_of(request.param, tmp_path / "bin"))
+    jobs.install(flaky_shell, Deadline.after(30))
+    evidence.begin(flaky_shell, FOLDER, "sender", "lo", need_kib=0)
     (home / FOLDER / "scan").mkdir()
     (home / FOLDER / "scan" / "scan_0.db3").write_bytes(LARGE)
     (home / FOLDER / "camera.bag").write_bytes(LARGE[::-1])
     (home / FOLDER / "small.bag").write_bytes(SMALL)
-    yield made
-    made.close()
+    yield flaky_shell
+    flaky_shell.close()
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def names(folder: Path) -> set[str]:
 WHOLE = {"camera.bag", "scan/scan_0.db3", "small.bag", "sender-before.txt", "sender-after.txt"}
 
 
-def test_large_files_come_in_pieces_and_small_ones_at_once(robot: Flaky, into: Path) -> None:
+def test_large_files_are_fetched_in_pieces_and_small_ones_in_an_archive(robot: Flaky, into: Path) -> None:
     said: list[tuple[str, float]] = []
     fetch(robot, into, progress=FetchProgress(lambda text, left_s: said.append((text, left_s))))
     assert names(into) == WHOLE
@@ -83,13 +83,11 @@ def test_large_files_come_in_pieces_and_small_ones_at_once(robot: Flaky, into: P
     assert robot.pieces == [0, 1, 2, 0, 1, 2]
 
 
-def test_no_other_robot_s_file_gets_the_name_of_one_that_has_come(
-    robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_robots_cannot_use_the_same_file_name(robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rename = Path.rename
 
     def late(self: Path, to: Path) -> Path:
-        with pytest.raises(FileExistsError):  # as it is written that the other robot sends
+        with pytest.raises(FileExistsError):  # as if the other robot sent its file at this time
             to.open("xb").close()
         return rename(self, to)
 
@@ -113,7 +111,7 @@ LIES = {
 
 
 @pytest.mark.parametrize(("tool", "lie"), [(tool, lie) for tool, lies in LIES.items() for lie in lies])
-def test_a_robot_whose_tools_lie_gives_nothing_that_is_taken_for_whole(tmp_path: Path, tool: str, lie: str) -> None:
+def test_wrong_output_of_tools_on_a_robot_is_detected(tmp_path: Path, tool: str, lie: str) -> None:
     home, into, tools = (tmp_path / name for name in ("home", "into", "bin"))
     for folder in (home, into, tools):
         folder.mkdir()
@@ -125,13 +123,13 @@ def test_a_robot_whose_tools_lie_gives_nothing_that_is_taken_for_whole(tmp_path:
     (tools / tool).chmod(0o755)
     with pytest.raises((EvidenceError, RobotError)):
         fetch(robot, into)
-    # What came of an archive that was cut is kept, as that of any void attempt.
+    # Files of a truncated archive are kept, as those of any void attempt.
     assert not (into / "camera.bag").exists() or (into / "camera.bag").stat().st_size < len(LARGE)
     assert not [name for name in names(into) if name.endswith((".tar", ".piece"))]
     robot.close()
 
 
-def test_a_fetch_that_was_cut_goes_on_where_it_was(robot: Flaky, into: Path) -> None:
+def test_interrupted_fetch_continues_from_its_last_piece(robot: Flaky, into: Path) -> None:
     robot.lost_at = lambda number: number == 2
     with pytest.raises(LinkError):
         fetch(robot, into)
@@ -145,7 +143,7 @@ def test_a_fetch_that_was_cut_goes_on_where_it_was(robot: Flaky, into: Path) -> 
     assert (into / "camera.bag").read_bytes() == LARGE[::-1]
 
 
-def test_what_an_earlier_fetch_left_wrong_is_noticed_and_fetched_anew(robot: Flaky, into: Path) -> None:
+def test_wrong_piece_of_an_earlier_fetch_is_detected_and_fetched_again(robot: Flaky, into: Path) -> None:
     (into / ".sender.camera.bag.part").write_bytes(bytes(PIECE_BYTES + 99))
     with pytest.raises(EvidenceError, match=r"hash differs: camera\.bag"):
         fetch(robot, into)
@@ -155,13 +153,14 @@ def test_what_an_earlier_fetch_left_wrong_is_noticed_and_fetched_anew(robot: Fla
     assert (into / "camera.bag").read_bytes() == LARGE[::-1]
 
 
-def test_more_than_is_expected_stays_on_the_robot_and_is_told(
+def test_more_than_expected_stays_on_the_robot_and_is_reported(
     robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fetching, "ALWAYS_BYTES", 1000)
     monkeypatch.setattr(fetching, "UNEXPECTED_SHARE", 0.0)
     with pytest.raises(
-        EvidenceError, match=r"17 MB wait there \(camera\.bag, scan/scan_0\.db3\), and at most 4\.0 MB are taken"
+        EvidenceError,
+        match=r"17 MB are to be fetched \(camera\.bag, scan/scan_0\.db3\), but at most 4\.0 MB are fetched",
     ):
         fetch(robot, into, expected_bytes=1_000_000)
     assert robot.pieces == []
@@ -172,34 +171,32 @@ def test_more_than_is_expected_stays_on_the_robot_and_is_told(
     assert names(fetch_again) == WHOLE
 
 
-def test_more_than_fits_here_stays_on_the_robot_and_is_told(
+def test_more_than_the_free_space_stays_on_the_robot_and_is_reported(
     robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(files, "free_bytes", lambda _: fetching.RESERVE_BYTES + 5_000_000)
-    with pytest.raises(EvidenceError, match=r"17 MB wait there .* and 5\.0 MB are free here"):
+    with pytest.raises(EvidenceError, match=r"17 MB are to be fetched .* but 5\.0 MB are free here"):
         fetch(robot, into)
 
 
-def test_a_file_that_shrank_meanwhile_is_told(robot: Flaky, into: Path) -> None:
+def test_file_that_became_smaller_is_reported(robot: Flaky, into: Path) -> None:
     def cut(number: int) -> bool:
         if number == 1:
             os.truncate(robot.home / FOLDER / "camera.bag", PIECE_BYTES + 10)
         return False
 
     robot.lost_at = cut
-    with pytest.raises(
-        EvidenceError, match=r"sent 10 bytes of camera\.bag from 4194304 on, where there were 4194304"
-    ):
+    with pytest.raises(EvidenceError, match=r"sent 10 bytes of camera\.bag from byte 4194304 on, instead of 4194304"):
         fetch(robot, into)
 
 
-def test_a_folder_that_is_gone_is_said_in_words(robot: Flaky, into: Path) -> None:
+def test_missing_folder_is_reported(robot: Flaky, into: Path) -> None:
     evidence.discard(robot, "trial")
     with pytest.raises(NoFolderError, match=rf"it no longer has folder {FOLDER}($|: the robot booted \d+ s ago)"):
         fetch(robot, into)
 
 
-def test_what_was_not_fetched_is_spared(robot: Flaky) -> None:
+def test_unfetched_folders_are_not_deleted(robot: Flaky) -> None:
     for number in (2, 3):
         evidence.begin(robot, jobs.work_folder("trial", f"udp-0{number}-1"), "sender", "lo", need_kib=0)
     evidence.discard(robot, "trial", but=[FOLDER, jobs.work_folder("trial", "udp-03-1")])
@@ -208,8 +205,8 @@ def test_what_was_not_fetched_is_spared(robot: Flaky) -> None:
     assert not (robot.home / ".fieldkit/trial").exists()
 
 
-class Liar(LocalShell):
-    """A robot that lists and tells whatever it likes."""
+class HostileShell(LocalShell):
+    """A robot that sends any list of large files, and any hashes."""
 
     def __init__(self, home: Path, large: str, told: bytes = b"") -> None:
         super().__init__(home)
@@ -241,18 +238,18 @@ class Liar(LocalShell):
         ("100 -rf\n", "no plain file"),
         ("-1 a.bag\n", "no plain file"),
         ("a.bag\n", "no plain file"),
-        (f"{10**14} a.bag\n", "wait there"),
+        (f"{10**14} a.bag\n", "are to be fetched"),
         ("".join(f"1 f{number}\n" for number in range(501)), "more than 500 files"),
         ("100 x\n", "sent before"),
         ("100 a.bag\n", "hash differs"),
     ],
 )
-def test_what_a_robot_lists_cannot_leave_the_folder_or_fill_the_disk(tmp_path: Path, large: str, said: str) -> None:
+def test_list_of_a_robot_cannot_leave_the_folder_or_fill_the_disk(tmp_path: Path, large: str, said: str) -> None:
     home, into = tmp_path / "home", tmp_path / "outer" / "into"
     home.mkdir()
     into.mkdir(parents=True)
     told = f"{hashlib.sha256(bytes(100)).hexdigest()}  {'x' if 'x' in large else 'y'}\n"
     with pytest.raises((EvidenceError, RobotError), match=said):
-        fetching.fetch(Liar(home, large, told.encode()), FOLDER, "sender", "lo", into)
+        fetching.fetch(HostileShell(home, large, told.encode()), FOLDER, "sender", "lo", into)
     assert [path.name for path in (tmp_path / "outer").iterdir()] == ["into"]
     assert names(into) <= {"x", ".sender.x.part"}

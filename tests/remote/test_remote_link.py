@@ -1,4 +1,4 @@
-"""A link that hangs, dies and comes back: each wait ends and says what hung, each command is done in the end."""
+"""A link that hangs, breaks and is restored: each wait has a timeout with a message, each command is completed."""
 
 import contextlib
 import errno
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.emulated
 SOON = 60.0
 QUICK = Timing(connect_s=SOON, probe_s=1, dead_s=1.0, reply_s=SOON, pause_s=0.02)
 HANGS_S = 1.5
-"""How long to wait for what does not come."""
+"""Timeout for an event that does not occur."""
 
 
 def soon() -> Deadline:
@@ -40,7 +40,7 @@ def soon() -> Deadline:
 
 
 class Clock:
-    """Stands still for every deadline until something hangs, so that what comes before may take its time."""
+    """A clock of deadlines that stands still until a test makes something hang: earlier steps have no timeout."""
 
     def __init__(self) -> None:
         self._made_s = time.monotonic()
@@ -62,8 +62,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return made
 
 
-class Halting(paramiko.ServerInterface):
-    """An SSH server that halts at one question and tells it, or refuses logins."""
+class HaltingServer(paramiko.ServerInterface):
+    """An SSH server that stops at one request and reports it, or refuses logins."""
 
     def __init__(self, at: str, told: Callable[[], None]) -> None:
         self.at = at
@@ -90,11 +90,11 @@ class Halting(paramiko.ServerInterface):
         self.halt("exec")
         if self.at == "command":
             self.told()
-        return True  # and nothing runs
+        return True  # but no command runs
 
 
-class Fake:
-    """Serves one connection after another on loopback."""
+class FakeServer:
+    """Serves connections on loopback in sequence."""
 
     def __init__(self, serve: Callable[[socket.socket], object]) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
@@ -117,7 +117,7 @@ def ssh_server(
 ) -> paramiko.Transport:
     transport = paramiko.Transport(stream)
     transport.add_server_key(key)
-    transport.start_server(event=threading.Event(), server=Halting(at, told))
+    transport.start_server(event=threading.Event(), server=HaltingServer(at, told))
     return transport
 
 
@@ -131,11 +131,11 @@ def pinned(key: paramiko.PKey) -> str:
 
 
 @pytest.fixture
-def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], Fake]]:
-    made: list[Fake] = []
+def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], FakeServer]]:
+    made: list[FakeServer] = []
 
-    def make(serve: Callable[[socket.socket], object]) -> Fake:
-        made.append(Fake(serve))
+    def make(serve: Callable[[socket.socket], object]) -> FakeServer:
+        made.append(FakeServer(serve))
         return made[-1]
 
     yield make
@@ -154,8 +154,8 @@ def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], Fake]]:
         ("command", "`true` did not end in time"),
     ],
 )
-def test_whatever_a_server_hangs_in_is_told(
-    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake], clock: Clock, *, at: str, said: str
+def test_any_hang_of_a_server_is_reported(
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., FakeServer], clock: Clock, *, at: str, said: str
 ) -> None:
     def serve(stream: socket.socket) -> object:
         if at in {"banner", "keys"}:
@@ -174,7 +174,7 @@ def test_whatever_a_server_hangs_in_is_told(
 
 
 def flooding(stream: socket.socket, key: paramiko.PKey, sent: list[int]) -> paramiko.Transport:
-    """Serve a channel that is sent data without end, whatever its window allows, once a command is asked for."""
+    """Serve a channel, and send data beyond its window without end after a command is requested."""
 
     def flood() -> None:
         message = paramiko.Message()
@@ -194,8 +194,8 @@ ENDLESS = 2000
 """Packets of a flood of 64 MB."""
 
 
-def test_a_server_that_floods_us_while_we_are_silent_fills_no_memory(
-    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake]
+def test_flooding_server_fills_no_memory_while_nothing_is_read(
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., FakeServer]
 ) -> None:
     sent: list[int] = []
     fake = fakes(lambda stream: flooding(stream, rsa, sent))
@@ -206,10 +206,12 @@ def test_a_server_that_floods_us_while_we_are_silent_fills_no_memory(
         wait_until(lambda: not is_up(shell), soon())
         session.end(deadline=soon())
 
-    with pytest.raises(RobotError, match="did not keep to SSH during `true`: it sent more than its window") as caught:
+    with pytest.raises(
+        RobotError, match="violated the SSH protocol during `true`: it sent more than its window"
+    ) as caught:
         run()
     assert "turtle.example" in caught.value.remedy
-    assert len(sent) < ENDLESS, "the connection ended"
+    assert len(sent) < ENDLESS, "the connection was closed"
     shell.close()
 
 
@@ -221,8 +223,8 @@ def test_a_server_that_floods_us_while_we_are_silent_fills_no_memory(
     ],
     ids=["banner", "packet"],
 )
-def test_a_server_that_floods_us_before_the_login_is_left(
-    server: Server, fakes: Callable[..., Fake], flood: bytes, said: str
+def test_flood_before_the_login_closes_the_connection(
+    server: Server, fakes: Callable[..., FakeServer], flood: bytes, said: str
 ) -> None:
     def serve(stream: socket.socket) -> object:
         def send() -> None:
@@ -245,10 +247,10 @@ def test_a_server_that_floods_us_before_the_login_is_left(
         ("digests", ("hmac-md5", "hmac-sha1-96"), "no acceptable macs"),
     ],
 )
-def test_a_server_with_nothing_but_broken_ciphers_gets_no_login(
+def test_server_with_weak_ciphers_only_gets_no_login(
     server: Server,
     rsa: paramiko.RSAKey,
-    fakes: Callable[..., Fake],
+    fakes: Callable[..., FakeServer],
     *,
     option: str,
     names: tuple[str, ...],
@@ -258,7 +260,7 @@ def test_a_server_with_nothing_but_broken_ciphers_gets_no_login(
         transport = paramiko.Transport(stream)
         setattr(transport.get_security_options(), option, names)
         transport.add_server_key(rsa)
-        transport.start_server(event=threading.Event(), server=Halting("never", lambda: None))
+        transport.start_server(event=threading.Event(), server=HaltingServer("never", lambda: None))
         return transport
 
     shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
@@ -267,7 +269,7 @@ def test_a_server_with_nothing_but_broken_ciphers_gets_no_login(
     assert caught.value.remedy.startswith("update it")
 
 
-def test_a_name_look_up_that_hangs_is_left_behind(server: Server) -> None:
+def test_hanging_name_resolution_has_a_timeout(server: Server) -> None:
     never = threading.Event()
 
     def connect(timeout_s: float) -> socket.socket:
@@ -281,7 +283,7 @@ def test_a_name_look_up_that_hangs_is_left_behind(server: Server) -> None:
     never.set()
 
 
-def test_an_agent_that_hangs_is_left_behind(
+def test_hanging_ssh_agent_has_a_timeout(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Clock
 ) -> None:
     with socket.socket(socket.AF_UNIX) as agent, ExitStack() as asked:
@@ -314,12 +316,12 @@ def raising(error: OSError) -> Callable[[float], socket.socket]:
             "getent hosts robot",
         ),
         (raising(ConnectionRefusedError()), "nothing listens on port 22", "sudo systemctl start ssh"),
-        (raising(OSError(errno.EHOSTUNREACH, "No route to host")), "there is no way to it", "ip route get robot"),
+        (raising(OSError(errno.EHOSTUNREACH, "No route to host")), "there is no route to it", "ip route get robot"),
         (raising(TimeoutError("timed out")), "did not accept the connection in time", "ping -c 3 robot"),
         (raising(OSError(errno.EPERM, "not permitted")), "cannot be reached for SSH: .*not permitted", "ping"),
     ],
 )
-def test_why_a_robot_is_not_reached_is_told_at_once(
+def test_reason_of_a_failed_connection_is_reported_immediately(
     server: Server, connect: Callable[[float], socket.socket], said: str, command: str
 ) -> None:
     tries: list[float] = []
@@ -331,11 +333,11 @@ def test_why_a_robot_is_not_reached_is_told_at_once(
     with pytest.raises(LinkLostError, match=said) as caught:
         server.shell(connect=counted).run(("true",), deadline=soon())
     assert caught.value.remedy.startswith(command) or command in caught.value.remedy
-    assert len(tries) == 1, "the first connection is not awaited"
+    assert len(tries) == 1, "the first connection is not retried"
 
 
-def test_a_robot_of_another_key_type_is_a_changed_one(
-    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake]
+def test_host_key_of_another_type_counts_as_changed(
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., FakeServer]
 ) -> None:
     shell = server.shell(connect=fakes(lambda stream: ssh_server(stream, rsa)).connect)
     with pytest.raises(RobotError, match=r"host key changed: pinned SHA256:\S+, offered SHA256:\S+") as caught:
@@ -343,9 +345,7 @@ def test_a_robot_of_another_key_type_is_a_changed_one(
     assert "fieldkit enroll robot --replace" in caught.value.remedy
 
 
-def test_more_keys_than_the_server_wants_to_see_are_a_refusal(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_many_keys_are_a_refused_login(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "agent"
     with subprocess.Popen(("ssh-agent", "-D", "-a", str(path)), stdout=subprocess.DEVNULL) as agent:
         try:
@@ -361,7 +361,7 @@ def test_more_keys_than_the_server_wants_to_see_are_a_refusal(
             agent.terminate()
 
 
-def test_a_key_file_with_a_passphrase_goes_to_the_agent(tmp_path: Path) -> None:
+def test_key_file_with_a_passphrase_is_for_the_agent(tmp_path: Path) -> None:
     path = tmp_path / "my key"
     subprocess.run(("ssh-keygen", "-q", "-t", "ed25519", "-N", "secret", "-f", str(path)), check=True)
     with pytest.raises(ConfigurationError, match="its private key has a passphrase") as caught:
@@ -376,14 +376,14 @@ def test_a_key_file_with_a_passphrase_goes_to_the_agent(tmp_path: Path) -> None:
         ("~nobody-of-that-name/id", "ls -l '~nobody-of-that-name/id'; "),
     ],
 )
-def test_a_key_file_that_is_not_there_is_looked_for_as_it_is_typed(path: str, typed: str) -> None:
+def test_missing_key_file_is_reported_with_its_path(path: str, typed: str) -> None:
     with pytest.raises(ConfigurationError, match="cannot be read") as caught:
         read_private_key(path, where="robot")
     assert caught.value.remedy.startswith(typed)
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff", b"ssh-ed25519 AAAA a public one"])
-def test_a_key_file_without_a_key_is_told(tmp_path: Path, content: bytes) -> None:
+def test_key_file_without_a_key_is_reported(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "key"
     path.write_bytes(content)
     with pytest.raises(ConfigurationError, match=r"cannot be (read|used)") as caught:
@@ -391,8 +391,8 @@ def test_a_key_file_without_a_key_is_told(tmp_path: Path, content: bytes) -> Non
     assert str(path) in caught.value.remedy
 
 
-class Line:
-    """The way to the server, which a test cuts, closes and leads elsewhere."""
+class CuttableLine:
+    """The connection to the server, which a test can cut, close and redirect."""
 
     def __init__(self, server: Server) -> None:
         self.connect_to = server.connect
@@ -412,8 +412,8 @@ class Line:
 
 
 @pytest.fixture
-def line(server: Server) -> Line:
-    return Line(server)
+def line(server: Server) -> CuttableLine:
+    return CuttableLine(server)
 
 
 @pytest.fixture
@@ -422,7 +422,7 @@ def notices() -> list[str]:
 
 
 @pytest.fixture
-def shell(server: Server, line: Line, notices: list[str]) -> Iterator[SshShell]:
+def shell(server: Server, line: CuttableLine, notices: list[str]) -> Iterator[SshShell]:
     made = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append)
     yield made
     made.close()
@@ -440,10 +440,10 @@ def pool() -> Iterator[ThreadPoolExecutor]:
         yield made
 
 
-class Waiting:
-    """A command that notes each start, says `part`, and ends with `whole` when it may: it may be sent twice.
+class WaitingCommand:
+    """A command that records each start, writes `part`, and ends with `whole` when allowed; it is idempotent.
 
-    It ends with the test's folder at the latest: sshd leaves a command alone whose client went away.
+    It ends when the test's folder is deleted: sshd does not terminate the command of a lost client.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -457,14 +457,14 @@ class Waiting:
 
 
 @pytest.fixture
-def waiting(tmp_path: Path) -> Iterator[Waiting]:
-    made = Waiting(tmp_path)
+def waiting(tmp_path: Path) -> Iterator[WaitingCommand]:
+    made = WaitingCommand(tmp_path)
     yield made
     made.go.touch()
 
 
-def test_a_command_whose_link_breaks_is_sent_again(
-    shell: SshShell, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor
+def test_command_whose_link_breaks_is_sent_again(
+    shell: SshShell, line: CuttableLine, waiting: WaitingCommand, notices: list[str], pool: ThreadPoolExecutor
 ) -> None:
     done = pool.submit(shell.run, waiting.argv, deadline=soon())
     waiting.wait_for_starts(1)
@@ -477,8 +477,8 @@ def test_a_command_whose_link_breaks_is_sent_again(
     assert notices[1].startswith("robot: the link is back after ")
 
 
-def test_a_link_that_breaks_before_a_command_has_said_so_is_no_end_of_it(
-    shell: SshShell, line: Line, waiting: Waiting, pool: ThreadPoolExecutor
+def test_link_that_breaks_before_the_expected_output_is_not_an_end(
+    shell: SshShell, line: CuttableLine, waiting: WaitingCommand, pool: ThreadPoolExecutor
 ) -> None:
     begun = pool.submit(shell.begin, waiting.argv, deadline=soon(), until=b"part\nwhole\n")
     waiting.wait_for_starts(1)
@@ -490,8 +490,8 @@ def test_a_link_that_breaks_before_a_command_has_said_so_is_no_end_of_it(
     assert session.end(deadline=soon()).exit_code == 0
 
 
-def test_a_link_that_is_away_for_a_while_is_awaited(
-    shell: SshShell, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor
+def test_link_that_is_interrupted_is_restored(
+    shell: SshShell, line: CuttableLine, waiting: WaitingCommand, notices: list[str], pool: ThreadPoolExecutor
 ) -> None:
     session = shell.begin(waiting.argv, deadline=soon())
     line.open = False
@@ -502,48 +502,48 @@ def test_a_link_that_is_away_for_a_while_is_awaited(
     wait_until(lambda: line.tries >= 4 and deadline.expired, soon())
     waiting.go.touch()
     line.open = True
-    assert done.result(SOON).stdout == b"part\nwhole\n", "a reply's time is left, though the deadline has passed"
+    assert done.result(SOON).stdout == b"part\nwhole\n", "time for the reply remains although the deadline has passed"
     assert [notice.split(";")[0] for notice in notices][:1] == ["robot: the link is lost"]
     assert len(notices) == 2
 
 
-def test_two_commands_that_lose_one_link_are_both_sent_again_and_told_once(
-    shell: SshShell, line: Line, notices: list[str], pool: ThreadPoolExecutor, tmp_path: Path
+def test_two_commands_that_lose_one_link_are_sent_again_with_one_notice(
+    shell: SshShell, line: CuttableLine, notices: list[str], pool: ThreadPoolExecutor, tmp_path: Path
 ) -> None:
-    both = [Waiting(tmp_path / name) for name in ("a", "b")]
-    for one in both:
-        one.go.parent.mkdir()
-    done = [pool.submit(shell.run, one.argv, deadline=soon()) for one in both]
-    for one in both:
-        one.wait_for_starts(1)
+    both = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
+    for command in both:
+        command.go.parent.mkdir()
+    done = [pool.submit(shell.run, command.argv, deadline=soon()) for command in both]
+    for command in both:
+        command.wait_for_starts(1)
     line.cut()
-    for one in both:
-        one.wait_for_starts(2)
-        one.go.touch()
-    assert [one.result(SOON).stdout for one in done] == [b"part\nwhole\n"] * 2
+    for command in both:
+        command.wait_for_starts(2)
+        command.go.touch()
+    assert [command.result(SOON).stdout for command in done] == [b"part\nwhole\n"] * 2
     assert len(notices) == 2
     assert len(line.links) == 2
 
 
-def test_who_notices_a_loss_late_finds_the_link_that_another_made(
-    shell: SshShell, line: Line, notices: list[str], tmp_path: Path
+def test_later_detection_of_a_loss_uses_the_restored_link(
+    shell: SshShell, line: CuttableLine, notices: list[str], tmp_path: Path
 ) -> None:
-    both = [Waiting(tmp_path / name) for name in ("a", "b")]
+    both = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
     sessions = []
-    for one in both:
-        one.go.parent.mkdir()
-        sessions.append(shell.begin(one.argv, deadline=soon()))
+    for command in both:
+        command.go.parent.mkdir()
+        sessions.append(shell.begin(command.argv, deadline=soon()))
     line.cut()
-    for one in both:
-        one.go.touch()
+    for command in both:
+        command.go.touch()
     for session in sessions:
         assert session.end(deadline=soon()).stdout == b"part\nwhole\n"
     assert len(notices) == 2
     assert len(line.links) == 2
 
 
-def test_a_robot_that_refuses_logins_while_it_boots_is_awaited(
-    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., Fake], notices: list[str]
+def test_robot_that_refuses_logins_while_it_boots_is_retried(
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., FakeServer], notices: list[str]
 ) -> None:
     logins: list[socket.socket] = []
 
@@ -565,8 +565,8 @@ def test_a_robot_that_refuses_logins_while_it_boots_is_awaited(
     shell.close()
 
 
-def test_fetch_starts_its_file_anew(
-    shell: SshShell, line: Line, waiting: Waiting, tmp_path: Path, pool: ThreadPoolExecutor
+def test_fetch_starts_its_file_again(
+    shell: SshShell, line: CuttableLine, waiting: WaitingCommand, tmp_path: Path, pool: ThreadPoolExecutor
 ) -> None:
     into = tmp_path / "into"
     done = pool.submit(shell.fetch, waiting.argv, into, deadline=soon(), limit_bytes=100)
@@ -579,10 +579,10 @@ def test_fetch_starts_its_file_anew(
 
 
 @pytest.mark.parametrize("ends_by", ["the body", "its time"])
-def test_a_link_over_the_radio_is_not_made_again_while_that_is_measured(
+def test_link_over_the_radio_is_not_reopened_during_a_measurement(
     server: Server,
-    line: Line,
-    waiting: Waiting,
+    line: CuttableLine,
+    waiting: WaitingCommand,
     notices: list[str],
     *,
     pool: ThreadPoolExecutor,
@@ -612,7 +612,7 @@ def test_a_link_over_the_radio_is_not_made_again_while_that_is_measured(
 
 
 @pytest.mark.parametrize("on_air", [True, False])
-def test_a_link_that_is_silent_for_the_radio_is_not_given_up_sooner(server: Server, *, on_air: bool) -> None:
+def test_timeout_of_a_link_over_the_radio_is_extended(server: Server, *, on_air: bool) -> None:
     shell = server.shell(timing=QUICK, on_air=on_air)
     shell.run(("true",), deadline=soon())
 
@@ -628,8 +628,8 @@ def test_a_link_that_is_silent_for_the_radio_is_not_given_up_sooner(server: Serv
     shell.close()
 
 
-def test_silence_lasts_as_long_as_the_last_who_wants_it(server: Server) -> None:
-    """Steps that run at the same time share a shell: the one that ends first ends only its own."""
+def test_silence_lasts_until_the_latest_end(server: Server) -> None:
+    """Steps that run at the same time share a shell: the end of one does not end the silence of another."""
     shell = server.shell(timing=QUICK, on_air=True)
     shell.run(("true",), deadline=soon())
     connection = shell._connection
@@ -652,7 +652,7 @@ def test_silence_lasts_as_long_as_the_last_who_wants_it(server: Server) -> None:
     shell.close()
 
 
-def test_patience_ends_and_is_not_spent_twice(shell: SshShell, line: Line, server: Server) -> None:
+def test_patience_ends_and_starts_only_once(shell: SshShell, line: CuttableLine, server: Server) -> None:
     impatient = server.shell(connect=line.connect, timing=QUICK, patience_s=2.0)
     assert impatient.run(("echo", "up"), deadline=soon()).stdout == b"up\n"
     line.open = False
@@ -663,13 +663,15 @@ def test_patience_ends_and_is_not_spent_twice(shell: SshShell, line: Line, serve
     assert tried > 2
     with pytest.raises(LinkLostError, match="nothing listens"):
         impatient.run(("true",), deadline=soon())
-    assert line.tries == tried + 1, "once more, without waiting"
+    assert line.tries == tried + 1, "one more attempt without a wait"
     line.open = True
     assert impatient.run(("echo", "back"), deadline=soon()).stdout == b"back\n"
     impatient.close()
 
 
-def test_a_command_that_takes_too_long_is_not_sent_again(shell: SshShell, line: Line, waiting: Waiting) -> None:
+def test_command_that_takes_too_long_is_not_sent_again(
+    shell: SshShell, line: CuttableLine, waiting: WaitingCommand
+) -> None:
     session = shell.begin(waiting.argv, deadline=soon())
     waiting.wait_for_starts(1)
     with pytest.raises(LinkError, match="did not end in time"):
@@ -678,7 +680,7 @@ def test_a_command_that_takes_too_long_is_not_sent_again(shell: SshShell, line: 
     assert line.tries == 1
 
 
-def test_a_server_that_is_stopped_meets_the_deadline(shell: SshShell, line: Line) -> None:
+def test_suspended_server_causes_a_timeout(shell: SshShell, line: CuttableLine) -> None:
     parent = int(shell.run(("sh", "-c", "echo $PPID"), deadline=soon()).stdout)
     os.kill(parent, signal.SIGSTOP)
     try:
@@ -689,15 +691,19 @@ def test_a_server_that_is_stopped_meets_the_deadline(shell: SshShell, line: Line
     assert line.tries == 1
 
 
-def test_another_host_key_after_a_break_stops_everything(
-    shell: SshShell, line: Line, waiting: Waiting, rsa: paramiko.RSAKey, fakes: Callable[..., Fake]
+def test_other_host_key_after_a_break_is_final(
+    shell: SshShell,
+    line: CuttableLine,
+    waiting: WaitingCommand,
+    rsa: paramiko.RSAKey,
+    fakes: Callable[..., FakeServer],
 ) -> None:
     session = shell.begin(waiting.argv, deadline=soon())
     line.connect_to = fakes(lambda stream: ssh_server(stream, rsa)).connect
     line.cut()
     with pytest.raises(RobotError, match=r"host key changed: pinned SHA256:\S+, offered SHA256:\S+"):
         session.end(deadline=soon())
-    assert line.tries == 2, "never tried again"
+    assert line.tries == 2, "no retry"
 
 
 def ends_soon(done: "Future[Completed]", shell: SshShell) -> FieldkitError:
@@ -705,18 +711,18 @@ def ends_soon(done: "Future[Completed]", shell: SshShell) -> FieldkitError:
     shell.close()
     with pytest.raises(LinkError) as caught:
         done.result(SOON)
-    assert time.monotonic() - began < SOON / 4, "and not by its deadline"
+    assert time.monotonic() - began < SOON / 4, "before its deadline"
     return caught.value
 
 
-def test_close_ends_a_command_that_waits(shell: SshShell, waiting: Waiting, pool: ThreadPoolExecutor) -> None:
+def test_close_ends_a_waiting_command(shell: SshShell, waiting: WaitingCommand, pool: ThreadPoolExecutor) -> None:
     done = pool.submit(shell.run, waiting.argv, deadline=soon())
     waiting.wait_for_starts(1)
     assert "fieldkit closed the connection" in str(ends_soon(done, shell))
 
 
 def test_close_ends_the_wait_for_a_lost_link(
-    server: Server, line: Line, waiting: Waiting, notices: list[str], pool: ThreadPoolExecutor
+    server: Server, line: CuttableLine, waiting: WaitingCommand, notices: list[str], pool: ThreadPoolExecutor
 ) -> None:
     shell = server.shell(connect=line.connect, patience_s=60.0, notice=notices.append)
     done = pool.submit(shell.run, waiting.argv, deadline=soon())
@@ -726,11 +732,13 @@ def test_close_ends_the_wait_for_a_lost_link(
     wait_until(lambda: len(notices) == 1, soon())
     assert "fieldkit closed the connection" in str(ends_soon(done, shell))
     line.open = True
-    assert shell.run(("echo", "new"), deadline=soon()).stdout == b"new\n", "a closed shell is as good as a new one"
+    assert shell.run(("echo", "new"), deadline=soon()).stdout == b"new\n", "a closed shell can be used again"
     shell.close()
 
 
-def test_close_ends_a_login_that_hangs(server: Server, fakes: Callable[..., Fake], pool: ThreadPoolExecutor) -> None:
+def test_close_ends_a_hanging_login(
+    server: Server, fakes: Callable[..., FakeServer], pool: ThreadPoolExecutor
+) -> None:
     mute = fakes(lambda stream: None)
     shell = server.shell(connect=mute.connect)
     done = pool.submit(shell.run, ("true",), deadline=soon())
@@ -739,7 +747,7 @@ def test_close_ends_a_login_that_hangs(server: Server, fakes: Callable[..., Fake
 
 
 @pytest.mark.quiet
-def test_close_is_prompt(shell: SshShell, waiting: Waiting, pool: ThreadPoolExecutor) -> None:
+def test_close_returns_quickly(shell: SshShell, waiting: WaitingCommand, pool: ThreadPoolExecutor) -> None:
     done = pool.submit(shell.run, waiting.argv, deadline=soon())
     waiting.wait_for_starts(1)
     began = time.monotonic()
@@ -750,7 +758,7 @@ def test_close_is_prompt(shell: SshShell, waiting: Waiting, pool: ThreadPoolExec
 
 
 class CountingSocket(socket.socket):
-    """Counts how often quick acknowledgement is requested."""
+    """Counts requests for quick acknowledgement."""
 
     requests = 0
 
@@ -759,8 +767,8 @@ class CountingSocket(socket.socket):
         super().setsockopt(*option)
 
 
-def test_the_handshake_is_acknowledged_immediately_and_later_commands_only_when_they_start(server: Server) -> None:
-    """A server with Nagle's algorithm waits 40 ms otherwise; a packet more crosses the radio under test later."""
+def test_quick_acknowledgement_in_handshakes_and_at_starts_of_commands_only(server: Server) -> None:
+    """A server with Nagle's algorithm waits 40 ms otherwise; later a packet more would cross the radio under test."""
     streams = []
 
     def connect(timeout_s: float) -> socket.socket:

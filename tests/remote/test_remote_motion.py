@@ -1,4 +1,4 @@
-"""Stopping programs that move robots: the robot's side, run in a folder of this machine in each userland."""
+"""Stopping programs that move robots: the script of the robot, run in a folder of this machine in each userland."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def robot(tmp_path: Path, request: pytest.FixtureRequest) -> LocalShell:
 
 
 def start(robot: LocalShell, name: str, verb: str, script: str) -> None:
-    """Start a program whose command line is that of the agent, and that does as a shell script says."""
+    """Start a program with the command line of the agent and the behaviour of a shell script."""
     argv = ("sh", "-c", script, "python3", "../../agent-0123456789ab.pyz", verb, '{"over": "ros1"}')
     jobs.start(robot, Job(FOLDER, name, argv, 60.0, f"{name}.log", ready="log:up"))
 
@@ -48,7 +48,7 @@ def runs(robot: LocalShell) -> list[str]:
     return [line.split()[0].rpartition("/")[2] for line in jobs.left(robot, Deadline.after(30))]
 
 
-def test_each_program_that_moves_is_stopped_and_says_what_becomes_of_its_robot(robot: LocalShell) -> None:
+def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShell) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo")
     start(robot, "drive", "drive", STANDS)
     start(robot, "fly", "fly", LANDS)
@@ -63,7 +63,7 @@ def test_each_program_that_moves_is_stopped_and_says_what_becomes_of_its_robot(r
     names = [name for name, _ in halted.programs]
     (robot.home / FOLDER / "ground").touch()
     wait_until(lambda: motion.look(robot, names, Deadline.after(30)).state is MotionState.LANDED, Deadline.after(60))
-    assert "record" in runs(robot), "it moves nothing"
+    assert "record" in runs(robot), "it does not move the robot"
     again = motion.halt(robot, "bert@two", Deadline.after(60))
     assert (again.programs, again.state) == ((), MotionState.NOTHING)
     with pytest.raises(RobotError, match=r"the jobs of .* were ended by bert@two"):
@@ -71,7 +71,7 @@ def test_each_program_that_moves_is_stopped_and_says_what_becomes_of_its_robot(r
     evidence.end_jobs(robot, FOLDER)
 
 
-def test_an_alarm_is_the_state_of_a_drone_that_does_not_come_down(robot: LocalShell) -> None:
+def test_alarm_is_the_state_of_a_drone_that_does_not_land(robot: LocalShell) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo")
     start(robot, "fly", "fly", WARNS)
     start(robot, "record", "mavlink", HANGS)
@@ -86,18 +86,18 @@ def test_an_alarm_is_the_state_of_a_drone_that_does_not_come_down(robot: LocalSh
     assert runs(robot) == []
 
 
-def test_life_signs_are_the_file_and_the_time_since_boot(robot: LocalShell) -> None:
+def test_liveness_file_and_time_since_boot(robot: LocalShell) -> None:
     content = bytes(range(64))
     (robot.home / FOLDER).mkdir(parents=True)
     (robot.home / FOLDER / "liveness").write_bytes(content)
-    told = motion.life_signs(robot, f"{FOLDER}/liveness", Deadline.after(60))
-    assert told[:64] == content
-    assert 0 < float(told[64:].split()[0]) <= float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
+    answer = motion.life_signs(robot, f"{FOLDER}/liveness", Deadline.after(60))
+    assert answer[:64] == content
+    assert 0 < float(answer[64:].split()[0]) <= float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
     with pytest.raises(RobotError):
         motion.life_signs(robot, f"{FOLDER}/missing", Deadline.after(60))
 
 
-def test_a_program_that_confirms_nothing_is_killed_and_reported(robot: LocalShell) -> None:
+def test_program_that_confirms_nothing_is_killed_and_reported(robot: LocalShell) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo")
     start(robot, "drive", "drive", HANGS)
     (halted,) = motion.halt_all({"turtlebot-1": robot}, "bert@two", 60.0).values()
@@ -105,14 +105,14 @@ def test_a_program_that_confirms_nothing_is_killed_and_reported(robot: LocalShel
     wait_until(lambda: not runs(robot), Deadline.after(60))
 
 
-def test_the_trial_that_holds_the_robot_learns_who_stopped_it_and_starts_nothing(robot: LocalShell) -> None:
+def test_trial_with_the_lock_is_informed_and_starts_nothing(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=lambda _: None):
         evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
         start(robot, "drive", "drive", STANDS)
         own = motion.halt_attempt(robot, FOLDER, "the-operator", Deadline.after(60))
         assert own.state is MotionState.STATIONARY
         other = jobs.work_folder("trial-a", "tcp-01-2")
-        evidence.begin(robot, other, "sender", "lo", token=ANNA.token)  # its own order leaves the lock
+        evidence.begin(robot, other, "sender", "lo", token=ANNA.token)  # an order for one attempt keeps the lock
         motion.halt(robot, "bert@two", Deadline.after(60))
         with pytest.raises(LockLostError, match=r"bert@two stopped the robots at \d\d:\d\d:\d\d UTC"):
             evidence.begin(robot, jobs.work_folder("trial-a", "tcp-01-3"), "sender", "lo", token=ANNA.token)
@@ -120,7 +120,7 @@ def test_the_trial_that_holds_the_robot_learns_who_stopped_it_and_starts_nothing
         evidence.begin(robot, jobs.work_folder("trial-a", "tcp-01-4"), "sender", "lo", token=ANNA.token)
 
 
-def test_one_out_of_reach_keeps_no_other_from_stopping(robot: LocalShell) -> None:
+def test_unreachable_robot_does_not_prevent_the_stop_of_others(robot: LocalShell) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo")
     start(robot, "drive", "drive", STANDS)
     gone = LinkError("no route", where="eve", remedy="")

@@ -1,4 +1,4 @@
-"""Logging in by password: a real sshd that takes one, a keyring, a person; and nowhere a trace of it."""
+"""Login by password: a real sshd with a password, a keyring, a person at a terminal; it is stored nowhere."""
 
 import logging
 import shlex
@@ -33,12 +33,12 @@ roles:
 
 
 def site(access: str) -> str:
-    """Return a site of two robots that one server plays, under the two names that it has."""
+    """Return a site of two robots, which are one server with two names."""
     return SITE.format(access=access, same=f"{access.replace('127.0.0.1', 'localhost')}, address: 127.0.0.1")
 
 
 class Memory(KeyringBackend):
-    """A keyring that holds what a test puts into it."""
+    """A keyring in memory."""
 
     priority = 1.0
 
@@ -62,8 +62,8 @@ def memory() -> Iterator[Memory]:
 
 
 @pytest.fixture(scope="module")
-def taking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server of which root's password is `SECRET`, in a mount namespace with a shadow file of its own."""
+def password_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server with the root password `SECRET`, in a mount namespace with a separate shadow file."""
     folder = tmp_path_factory.mktemp("passwords")
     crypt = subprocess.run(
         ("openssl", "passwd", "-6", "-stdin"), input=SECRET, capture_output=True, text=True, check=True
@@ -77,11 +77,11 @@ def taking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 @pytest.mark.emulated
-def test_a_password_logs_in_and_leaves_no_trace(
-    taking: Server, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+def test_password_logs_in_and_is_stored_nowhere(
+    password_server: Server, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     caplog.set_level(logging.DEBUG)
-    shell = taking.shell(private_key=None, password=SECRET)
+    shell = password_server.shell(private_key=None, password=SECRET)
     assert shell.run(("echo", "in"), deadline=Deadline.after(20)).stdout == b"in\n"
     shell.close()
     shown = capfd.readouterr()
@@ -89,8 +89,8 @@ def test_a_password_logs_in_and_leaves_no_trace(
 
 
 @pytest.mark.emulated
-def test_a_wrong_password_is_refused_and_not_told(taking: Server) -> None:
-    shell = taking.shell(private_key=None, password="wrong horse", host="10.1.2.3", port=2222)
+def test_wrong_password_is_refused_and_not_shown(password_server: Server) -> None:
+    shell = password_server.shell(private_key=None, password="wrong horse", host="10.1.2.3", port=2222)
     with pytest.raises(RobotError, match="refused the login of 'root' with the password") as caught:
         shell.run(("true",), deadline=Deadline.after(20))
     assert "ssh -p 2222 root@10.1.2.3" in caught.value.remedy
@@ -98,7 +98,7 @@ def test_a_wrong_password_is_refused_and_not_told(taking: Server) -> None:
 
 
 @pytest.mark.emulated
-def test_the_field_backend_asks_once_per_robot_and_run(taking: Server, tmp_path: Path) -> None:
+def test_field_backend_asks_once_per_robot_and_run(password_server: Server, tmp_path: Path) -> None:
     asked: list[tuple[str, str, str]] = []
 
     def answer(user: str, host: str, robot: str) -> str:
@@ -106,8 +106,8 @@ def test_the_field_backend_asks_once_per_robot_and_run(taking: Server, tmp_path:
         return SECRET
 
     path = tmp_path / "fieldkit.yaml"
-    host_key = " ".join(taking.host_key.split()[:2])
-    access = f"host: 127.0.0.1, port: {taking.port}, user: root, password: ask, host_key: {host_key}"
+    host_key = " ".join(password_server.host_key.split()[:2])
+    access = f"host: 127.0.0.1, port: {password_server.port}, user: root, password: ask, host_key: {host_key}"
     path.write_text(site(access), encoding="utf-8")
     field = FieldBackend(*load_site(path), answer)
     for _ in range(2):
@@ -116,13 +116,13 @@ def test_the_field_backend_asks_once_per_robot_and_run(taking: Server, tmp_path:
     assert asked == [("root", "localhost", "turtlebot-1"), ("root", "127.0.0.1", "duckiedrone-1")]
 
 
-def test_the_keyring_is_looked_up_under_user_and_host(memory: Memory) -> None:
+def test_keyring_entry_is_user_at_host(memory: Memory) -> None:
     memory.set_password("fieldkit", "duckie@192.168.4.1", SECRET)
     assert passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1") == SECRET
 
 
 @pytest.mark.parametrize("path", ["with", "without"])
-def test_what_the_keyring_does_not_have_is_a_command_to_type(
+def test_missing_keyring_entry_is_reported_with_a_command(
     memory: Memory, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = tmp_path / "keyring"
@@ -135,7 +135,7 @@ def test_what_the_keyring_does_not_have_is_a_command_to_type(
     assert caught.value.remedy == f"{keyring_of} set fieldkit duckie@192.168.4.1"
 
 
-def test_a_machine_without_a_keyring_says_so() -> None:
+def test_missing_keyring_is_reported() -> None:
     before = keyring.get_keyring()
     keyring.set_keyring(keyring.backends.fail.Keyring())  # type: ignore[no-untyped-call]
     try:
@@ -145,23 +145,23 @@ def test_a_machine_without_a_keyring_says_so() -> None:
         keyring.set_keyring(before)
 
 
-def test_without_a_terminal_nobody_can_be_asked() -> None:
+def test_missing_terminal_is_reported() -> None:
     with pytest.raises(ConfigurationError, match="there is no terminal to ask at") as caught:
         passwords.at_terminal("duckie", "192.168.4.1", "duckiedrone-1")
     assert "keyring set fieldkit duckie@192.168.4.1" in caught.value.remedy
 
 
 @pytest.mark.parametrize("written", [SECRET, "'ASK'", "71828182", "[s3same]"])
-def test_a_password_in_the_site_file_is_refused_and_not_repeated(tmp_path: Path, written: str) -> None:
+def test_password_in_the_site_file_is_rejected_and_not_shown(tmp_path: Path, written: str) -> None:
     path = tmp_path / "fieldkit.yaml"
     path.write_text(site(f"password: {written}"), encoding="utf-8")
     with pytest.raises(ConfigurationError, match="a password must not be in a file") as caught:
         load_site(path)
-    said = f"{caught.value} {caught.value.__cause__}".replace(str(tmp_path), "")
-    assert written.strip("'[]") not in said
+    message = f"{caught.value} {caught.value.__cause__}".replace(str(tmp_path), "")
+    assert written.strip("'[]") not in message
 
 
-def test_a_key_and_a_password_are_one_too_many(tmp_path: Path) -> None:
+def test_key_and_password_together_are_rejected(tmp_path: Path) -> None:
     path = tmp_path / "fieldkit.yaml"
     path.write_text(site("password: ask, key: ~/.ssh/lab"), encoding="utf-8")
     with pytest.raises(ConfigurationError, match="a key and a password; remove one of them"):

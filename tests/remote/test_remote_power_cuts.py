@@ -1,4 +1,4 @@
-"""A robot loses its power right after a command: what it was told to remember is on its disk."""
+"""A robot loses its power right after a command: its confirmed records are on the disk."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,17 +22,17 @@ FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
 
 @pytest.fixture
 def place(tmp_path: Path, untouched: Untouched) -> Iterator[Path]:
-    """A folder in memory, in mounts of the test's own."""
+    """A folder in memory, in separate mounts of the test."""
     with workplace(tmp_path) as folder:
         yield folder
 
 
 @pytest.mark.parametrize(
     ("file_system", "userland"),
-    [*((one, "debian") for one in FILE_SYSTEMS), (STRICTEST, "busybox"), (STRICTEST, "bash")],
-    ids=lambda one: one.name if isinstance(one, FileSystem) else one,
+    [*((file_system, "debian") for file_system in FILE_SYSTEMS), (STRICTEST, "busybox"), (STRICTEST, "bash")],
+    ids=lambda value: value.name if isinstance(value, FileSystem) else value,
 )
-def test_a_robot_that_loses_its_power_is_still_held(place: Path, file_system: FileSystem, userland: str) -> None:
+def test_robot_is_locked_after_a_power_failure(place: Path, file_system: FileSystem, userland: str) -> None:
     path = path_of(userland, place / "bin")
     disk = Disk.make(file_system, place / "disk.img")
     with disk.mounted(place / "disk") as mounted:

@@ -1,4 +1,4 @@
-"""Files that a robot may not provide: those that only the laptop, its testbed or another robot writes."""
+"""Files that a robot must not send: those that only the laptop, its testbed or another robot writes."""
 
 import hashlib
 from pathlib import Path
@@ -35,7 +35,7 @@ def fetch(data: bytes, into: Path, role: Role = Role.SENDER) -> None:
     fetching.fetch(shell, "x", role, "lo", into, foreign=lambda name: OWNERS.refusal(role, name))
 
 
-def test_a_robots_own_files_are_taken(tmp_path: Path) -> None:
+def test_files_of_the_robot_are_accepted(tmp_path: Path) -> None:
     fetch(archive("sender.pcap", "sender-after.txt", "ping.txt", "notes.txt", "scan.bag"), tmp_path)
     assert (tmp_path / "ping.txt").exists()
 
@@ -43,20 +43,20 @@ def test_a_robots_own_files_are_taken(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", OF_THE_LAPTOP)
 @pytest.mark.parametrize("form", ["{}", "up.{}", "scan/{}", "scan/up.{}"])
 @pytest.mark.parametrize("case", [str, str.upper, str.title])
-def test_what_only_the_laptop_writes_is_refused(name: str, form: str, case: type, tmp_path: Path) -> None:
+def test_files_of_the_laptop_are_rejected(name: str, form: str, case: type, tmp_path: Path) -> None:
     wrong = form.format(case(name))
     with pytest.raises(EvidenceError, match="only the laptop writes a file of this name"):
         fetch(archive("ping.txt", wrong), tmp_path)
     assert not (tmp_path / wrong).exists()
 
 
-def test_a_large_file_is_refused_by_its_name_too(tmp_path: Path) -> None:
+def test_large_file_of_the_laptop_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="only the laptop writes"):
         fetch(archive("ping.txt", large="99999999 track.csv\n"), tmp_path)
 
 
 @pytest.mark.parametrize("name", ["./medium.txt", "../track.csv", "/track.csv", "a//track.csv", ".track.csv"])
-def test_other_ways_to_write_a_name_are_refused(name: str, tmp_path: Path) -> None:
+def test_other_spellings_of_a_name_are_rejected(name: str, tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
         fetch(archive("ping.txt", name), tmp_path)
     assert not list(tmp_path.rglob("*track.csv")) + list(tmp_path.rglob("*medium.txt"))
@@ -74,13 +74,13 @@ def test_other_ways_to_write_a_name_are_refused(name: str, tmp_path: Path) -> No
         (Role.SENDER, "up.receiver-iperf3.json"),
     ],
 )
-def test_what_another_robot_writes_is_refused(role: Role, name: str, tmp_path: Path) -> None:
+def test_files_of_another_robot_are_rejected(role: Role, name: str, tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="only the robot in role"):
         fetch(archive(name), tmp_path, role)
 
 
 @given(st.sampled_from(OF_THE_LAPTOP), st.lists(st.booleans(), min_size=30, max_size=30))
-def test_a_name_is_reserved_in_any_case(name: str, upper: list[bool]) -> None:
+def test_name_is_reserved_in_any_case(name: str, upper: list[bool]) -> None:
     mixed = "".join(letter.upper() if up else letter for letter, up in zip(name, upper, strict=False))
     assert laptop_files.reserved(mixed)
 

@@ -1,4 +1,4 @@
-"""The SSH shell against a real OpenSSH server: what goes wrong in the field, and the rule for each."""
+"""The SSH shell with a real OpenSSH server: faults that occur in the field, and the required reaction to each."""
 
 import hashlib
 import resource
@@ -35,12 +35,12 @@ def soon() -> Deadline:
     return Deadline.after(SOON)
 
 
-def test_output_streams_and_exit_code_arrive(shell: SshShell) -> None:
+def test_output_streams_and_exit_code(shell: SshShell) -> None:
     done = shell.run(("sh", "-c", "echo out; echo err >&2; exit 3"), deadline=soon(), check=False)
     assert (done.exit_code, done.stdout, done.stderr) == (3, b"out\n", b"err\n")
 
 
-def test_begin_returns_when_the_command_has_said_so(shell: SshShell, tmp_path: Path) -> None:
+def test_begin_returns_after_the_expected_output(shell: SshShell, tmp_path: Path) -> None:
     go = tmp_path / "go"
     words = 'cat; sleep 0.2; echo up; until [ -e "$0" ]; do sleep 0.02; done; echo over; exit 4'
     session = shell.begin(("sh", "-c", words, str(go)), deadline=soon(), until=b"up\n")
@@ -50,14 +50,14 @@ def test_begin_returns_when_the_command_has_said_so(shell: SshShell, tmp_path: P
     assert (done.exit_code, done.stdout) == (4, b"over\n")
 
 
-def test_begin_returns_when_the_command_ended_without_saying_so(shell: SshShell) -> None:
+def test_begin_returns_when_the_command_ended_without_the_output(shell: SshShell) -> None:
     session = shell.begin(("sh", "-c", "echo u; echo why >&2; exit 4"), deadline=soon(), until=b"up\n")
     assert not session.told
     assert session.end(deadline=soon(), check=False).stderr == b"why\n"
 
 
-class Looks(Deadline):
-    """A deadline that counts how often somebody looks at it."""
+class CountingDeadline(Deadline):
+    """A deadline that counts how often it is checked."""
 
     count = 0
 
@@ -67,22 +67,22 @@ class Looks(Deadline):
         return super().expired
 
 
-def test_who_waits_to_be_told_is_not_kept_awake_by_standard_error(shell: SshShell, tmp_path: Path) -> None:
+def test_wait_for_output_does_not_poll_because_of_standard_error(shell: SshShell, tmp_path: Path) -> None:
     go = tmp_path / "go"
     words = 'echo why >&2; until [ -e "$0" ]; do sleep 0.02; done; echo up'
     threading.Timer(0.5, go.touch).start()
-    session = shell.begin(("sh", "-c", words, str(go)), deadline=Looks.after(SOON), until=b"up\n")
+    session = shell.begin(("sh", "-c", words, str(go)), deadline=CountingDeadline.after(SOON), until=b"up\n")
     assert session.end(deadline=soon()).stderr == b"why\n"
-    assert Looks.count < SOON
+    assert CountingDeadline.count < SOON
 
 
-def test_a_command_that_says_nothing_meets_the_deadline(shell: SshShell) -> None:
+def test_command_without_output_causes_a_timeout(shell: SshShell) -> None:
     with pytest.raises(LinkError, match="did not report in time"):
         shell.begin(("sleep", "5"), deadline=Deadline.after(1.0), until=b"up\n")
 
 
 @pytest.mark.parametrize("sessions", [1, 2])
-def test_a_server_that_allows_few_channels_is_served_one_by_one(tmp_path: Path, sessions: int) -> None:
+def test_server_with_few_channels_runs_commands_in_sequence(tmp_path: Path, sessions: int) -> None:
     with sshd(tmp_path, MaxSessions=str(sessions)) as few:
         shell = few.shell()
         for number in range(5):
@@ -90,7 +90,7 @@ def test_a_server_that_allows_few_channels_is_served_one_by_one(tmp_path: Path, 
         shell.close()
 
 
-def test_a_server_that_opens_no_session_is_told_so_and_not_asked_all_the_time(tmp_path: Path) -> None:
+def test_server_without_sessions_is_reported_and_not_polled(tmp_path: Path) -> None:
     notices: list[str] = []
     with sshd(tmp_path, MaxSessions="0") as closed:
         shell = closed.shell(patience_s=4.0, notice=notices.append)
@@ -101,38 +101,38 @@ def test_a_server_that_opens_no_session_is_told_so_and_not_asked_all_the_time(tm
     assert len(notices) < 12, "two for each link that lasted, which takes 2 s"
 
 
-def test_a_failing_command_says_what_it_said(shell: SshShell) -> None:
+def test_failed_command_is_reported_with_its_output(shell: SshShell) -> None:
     with pytest.raises(RobotError, match=r"ended with exit code 2: .*No such file"):
         shell.run(("ls", "/no/such/file"), deadline=soon())
     with pytest.raises(RobotError, match=r"ended with exit code 1: This account is not available"):
         shell.run(("sh", "-c", "echo This account is not available; exit 1"), deadline=soon())
 
 
-def test_both_streams_may_be_larger_than_every_window(shell: SshShell) -> None:
-    # Reading one stream while the other fills deadlocks paramiko (paramiko/paramiko#1778).
+def test_both_streams_may_exceed_all_windows(shell: SshShell) -> None:
+    # Reading one stream while the other one fills up deadlocks paramiko (paramiko/paramiko#1778).
     script = "head -c 6000000 /dev/zero >&2; head -c 6000000 /dev/zero"
     done = shell.run(("sh", "-c", script), deadline=soon())
     assert len(done.stdout) == 6_000_000
     assert done.stderr.strip(b"\0") == b""
 
 
-def test_standard_input_may_be_larger_than_every_window(shell: SshShell) -> None:
+def test_standard_input_may_exceed_all_windows(shell: SshShell) -> None:
     data = bytes(range(256)) * 40_000
     done = shell.run(("sha256sum",), stdin=data, deadline=soon())
     assert done.stdout.split()[0].decode() == hashlib.sha256(data).hexdigest()
 
 
-def test_a_command_that_never_ends_meets_the_deadline(shell: SshShell, tmp_path: Path) -> None:
+def test_endless_command_causes_a_timeout(shell: SshShell, tmp_path: Path) -> None:
     began = time.monotonic()
     with pytest.raises(LinkError, match="did not end in time"):
         shell.run(("sh", "-c", 'while [ -e "$0" ]; do sleep 0.1; done', str(tmp_path)), deadline=Deadline.after(0.5))
     assert time.monotonic() - began < SOON
-    tmp_path.rmdir()  # sshd leaves a command alone whose client went away
+    tmp_path.rmdir()  # sshd does not terminate the command of a lost client
     assert shell.run(("echo", "again"), deadline=soon()).stdout == b"again\n"
 
 
-def test_a_wait_in_which_this_process_was_stopped_goes_on(shell: SshShell, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock of its deadline goes on meanwhile, the robot too."""
+def test_wait_continues_after_this_process_was_suspended(shell: SshShell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of its deadline advances meanwhile, and the robot continues."""
     monotonic, wait = time.monotonic, select.select
     stopped_s: list[float] = []
 
@@ -149,7 +149,7 @@ def test_a_wait_in_which_this_process_was_stopped_goes_on(shell: SshShell, monke
     assert stopped_s
 
 
-def test_a_server_that_never_speaks_meets_the_deadline(server: Server) -> None:
+def test_silent_server_causes_a_timeout(server: Server) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         port = mute.getsockname()[1]
         shell = server.shell(connect=lambda timeout_s: socket.create_connection(("127.0.0.1", port), timeout_s))
@@ -157,7 +157,7 @@ def test_a_server_that_never_speaks_meets_the_deadline(server: Server) -> None:
             shell.run(("true",), deadline=Deadline.after(0.5))
 
 
-def test_a_closed_port_is_a_link_error_with_a_remedy(server: Server) -> None:
+def test_closed_port_is_a_link_error_with_a_remedy(server: Server) -> None:
     port = free_port()
     shell = server.shell(connect=lambda timeout_s: socket.create_connection(("127.0.0.1", port), timeout_s))
     with pytest.raises(LinkError, match="cannot be reached for SSH: nothing listens") as caught:
@@ -166,13 +166,13 @@ def test_a_closed_port_is_a_link_error_with_a_remedy(server: Server) -> None:
     assert caught.value.remedy
 
 
-def test_a_changed_host_key_stops_with_both_fingerprints(server: Server, tmp_path: Path) -> None:
+def test_changed_host_key_is_reported_with_both_fingerprints(server: Server, tmp_path: Path) -> None:
     shell = server.shell(host_key=make_key(tmp_path / "other"))
     with pytest.raises(RobotError, match=r"host key changed: pinned SHA256:\S+, offered SHA256:\S+"):
         shell.run(("true",), deadline=soon())
 
 
-def test_a_key_that_the_robot_does_not_know_is_refused(server: Server, tmp_path: Path) -> None:
+def test_unauthorized_key_is_refused(server: Server, tmp_path: Path) -> None:
     make_key(tmp_path / "stranger")
     shell = server.shell(private_key=(tmp_path / "stranger").read_text(encoding="ascii"))
     with pytest.raises(RobotError, match=r"refused the login of 'root' with 1 key") as caught:
@@ -181,24 +181,24 @@ def test_a_key_that_the_robot_does_not_know_is_refused(server: Server, tmp_path:
 
 
 @pytest.mark.parametrize("text", ["", "ssh-ed25519", "ssh-ed25519 !!!", "nonsense AAAA", "ssh-rsa AAAAC3NzaC1lZDI1"])
-def test_a_host_key_that_cannot_be_read_says_so(server: Server, text: str) -> None:
+def test_invalid_host_key_is_reported(server: Server, text: str) -> None:
     with pytest.raises(ConfigurationError, match="host key cannot be read"):
         server.shell(host_key=text)
 
 
-def test_a_private_key_that_cannot_be_used_says_so(server: Server) -> None:
+def test_unusable_private_key_is_reported(server: Server) -> None:
     shell = server.shell(private_key="-----BEGIN NOTHING-----")
     with pytest.raises(ConfigurationError, match="private key cannot be used"):
         shell.run(("true",), deadline=soon())
 
 
-def test_a_command_that_a_signal_ends_is_not_taken_for_a_dead_link(shell: SshShell) -> None:
+def test_command_terminated_by_a_signal_is_not_a_lost_link(shell: SshShell) -> None:
     with pytest.raises(RobotError, match="a signal ended the command: last words"):
         shell.run(("sh", "-c", "echo last words >&2; kill -KILL $$"), deadline=soon())
     assert shell.run(("echo", "again"), deadline=soon()).stdout == b"again\n"
 
 
-def test_a_full_disk_here_is_not_taken_for_a_dead_link(shell: SshShell, tmp_path: Path) -> None:
+def test_full_local_disk_is_not_a_lost_link(shell: SshShell, tmp_path: Path) -> None:
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, limit[1]))
     try:
@@ -210,7 +210,7 @@ def test_a_full_disk_here_is_not_taken_for_a_dead_link(shell: SshShell, tmp_path
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
 
 
-def test_fetch_writes_to_a_file_and_bounds_its_size(shell: SshShell, tmp_path: Path) -> None:
+def test_fetch_writes_to_a_file_and_limits_its_size(shell: SshShell, tmp_path: Path) -> None:
     shell.fetch(("printf", "abc"), tmp_path / "f", deadline=soon(), limit_bytes=10)
     assert (tmp_path / "f").read_bytes() == b"abc"
     with pytest.raises(RobotError, match="sent more than 100 bytes"):
@@ -219,7 +219,7 @@ def test_fetch_writes_to_a_file_and_bounds_its_size(shell: SshShell, tmp_path: P
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=20), min_size=1, max_size=5))
-def test_arguments_arrive_as_they_were_whatever_they_hold(shell: SshShell, words: list[str]) -> None:
+def test_any_argument_arrives_unchanged(shell: SshShell, words: list[str]) -> None:
     done = shell.run(("printf", "%s\\0", *words), deadline=soon())
     assert done.stdout.decode().split("\0")[:-1] == words
 
@@ -231,12 +231,12 @@ def test_setup_files_and_variables_reach_the_command(shell: SshShell, tmp_path: 
     assert shell.run(argv, deadline=soon()).stdout == b"noetic x a b\n"
 
 
-def test_quote_leaves_plain_words_alone() -> None:
+def test_quote_keeps_plain_words() -> None:
     assert quote(("nc.traditional", "-l", "-p", "1234")) == "nc.traditional -l -p 1234"
 
 
-def test_quote_keeps_backslashes_from_shells_that_read_them_between_single_quotes() -> None:
-    """fish does: there two are one, and one before the closing quote is none."""
+def test_quote_escapes_backslashes_for_fish() -> None:
+    """In single quotes of fish two backslashes are one, and one before the closing quote escapes it."""
     assert quote(("a\\b", "\\")) == """'a'"\\\\"'b' ''"\\\\"''"""
 
 
@@ -248,12 +248,12 @@ def test_quote_keeps_backslashes_from_shells_that_read_them_between_single_quote
         (b"all of it is here", "all of it is here"),
     ],
 )
-def test_what_a_robot_says_at_length_is_cut_between_words(said: bytes, text: str) -> None:
+def test_long_output_is_shortened_between_words(said: bytes, text: str) -> None:
     assert printable(said, limit=20) == text
 
 
 @given(st.binary(max_size=200))
-def test_what_a_robot_says_cannot_garble_a_terminal(data: bytes) -> None:
+def test_output_cannot_control_the_terminal(data: bytes) -> None:
     text = printable(data, limit=50)
     assert len(text) <= 50
     assert text.isprintable()

@@ -1,4 +1,4 @@
-"""The shell that stays open on a robot: real shells behind a real SSH server, and whatever commands do to them."""
+"""Persistent shells on a robot: real shells behind a real SSH server, with commands that disturb them."""
 
 import os
 import shlex
@@ -20,18 +20,18 @@ from hypothesis import strategies as st
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
-from fieldkit.remote.drain import drain, hear
+from fieldkit.remote.drain import drain, wait_for_output
 from fieldkit.remote.link import SPARES, Channel, Link, UnfitServerError
 from fieldkit.remote.script import CALL, SCRIPT, SCRIPT_PATH
 from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshSession, SshShell
-from fieldkit.remote.standing import StandingShell, Turn
+from fieldkit.remote.standing import PersistentShell, RunningCommand
 from tests.helpers.sshd import Server, sshd, wait_until
 from tests.helpers.userlands import USERLANDS, path_of
 
 SOON: Final = 60.0
 
-# The job script with a verb that does what a test wants.
+# The job script with a verb that runs the code of a test.
 OBEYS: Final = SCRIPT.replace(b'\nmain "$@"\n', b'\nleft() { eval "$1"; }\nmain "$@"\n')
 
 
@@ -41,10 +41,10 @@ def soon() -> Deadline:
 
 @dataclass
 class Robot:
-    """A robot behind a real SSH server, with a home of its own.
+    """A robot behind a real SSH server, with a separate home.
 
     Attributes:
-        shell: How fieldkit reaches it.
+        shell: The shell of fieldkit.
         server: Its SSH server.
         home: Its home.
     """
@@ -57,11 +57,11 @@ class Robot:
         return self.shell.run((*CALL, "left", code), deadline=soon(), check=check)
 
     def pid(self) -> int:
-        """Return the process that reads commands, in a session of a command's own this command."""
+        """Return the pid of the process that runs commands: a persistent shell, or a separate session."""
         return int(self.run("echo $$").stdout)
 
-    def stands(self) -> int:
-        """Return the process of the standing shell, once there is one."""
+    def shell_pid(self) -> int:
+        """Return the pid of the persistent shell when it is open."""
         found: list[int] = []
 
         def same() -> bool:
@@ -88,15 +88,15 @@ def robot(folder: Path, userland: str = "debian", *, script: bytes = OBEYS, **op
 
 
 @pytest.fixture(params=USERLANDS)
-def one(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Robot]:
-    with robot(tmp_path, request.param) as made:
-        yield made
+def userland_robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Robot]:
+    with robot(tmp_path, request.param) as started_robot:
+        yield started_robot
 
 
 @pytest.fixture
-def two(tmp_path: Path) -> Iterator[Robot]:
-    with robot(tmp_path) as made:
-        yield made
+def debian_robot(tmp_path: Path) -> Iterator[Robot]:
+    with robot(tmp_path) as started_robot:
+        yield started_robot
 
 
 COMMANDS: Final = [
@@ -111,154 +111,158 @@ COMMANDS: Final = [
     ("head -c 3000000 /dev/zero >&2; head -c 3000000 /dev/zero", 0, bytes(3_000_000), None),
     ('printf %s "$nonce" | wc -c; env | grep -c "$nonce"', 1, b"32\n0\n", b""),
 ]
-"""Code, exit code, standard output and standard error, None where the shell may say something of it."""
+"""Code, exit code, standard output and standard error; None if the shell may add a message to it."""
 
 
 @pytest.mark.emulated
-def test_streams_and_exit_code_are_a_commands_own(one: Robot) -> None:
-    pid = one.stands()
+def test_streams_and_exit_code_are_those_of_the_command(userland_robot: Robot) -> None:
+    pid = userland_robot.shell_pid()
     for code, exit_code, stdout, stderr in COMMANDS:
-        done = one.run(code, check=False)
+        done = userland_robot.run(code, check=False)
         assert (done.exit_code, done.stdout) == (exit_code, stdout), code
         assert stderr is None or done.stderr == stderr, code
-    assert one.pid() == pid, "the same shell goes on"
+    assert userland_robot.pid() == pid, "the same shell continues"
 
 
 @pytest.mark.emulated
-def test_what_a_process_left_behind_writes_later_is_dropped(one: Robot) -> None:
-    pid = one.stands()
-    one.run("{ until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done; echo stray; echo stray >&2; : >went; } & :")
-    (one.home / "go").touch()
-    wait_until((one.home / "went").exists, soon())
-    done = one.run("echo $$")
+def test_later_output_of_a_remaining_process_is_dropped(userland_robot: Robot) -> None:
+    pid = userland_robot.shell_pid()
+    userland_robot.run(
+        "{ until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done; echo stray; echo stray >&2; : >went; } & :"
+    )
+    (userland_robot.home / "go").touch()
+    wait_until((userland_robot.home / "went").exists, soon())
+    done = userland_robot.run("echo $$")
     assert (done.stdout, done.stderr) == (f"{pid}\n".encode(), b"")
 
 
 @pytest.mark.emulated
-def test_a_command_that_takes_its_time_keeps_no_other_waiting(two: Robot) -> None:
-    pid = two.stands()
+def test_long_command_does_not_block_others(debian_robot: Robot) -> None:
+    pid = debian_robot.shell_pid()
     code = "echo up; until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done; echo $$; exit 5"
-    session = two.shell.begin((*CALL, "left", code), deadline=soon(), until=b"up\n")
+    session = debian_robot.shell.begin((*CALL, "left", code), deadline=soon(), until=b"up\n")
     assert session.told
-    assert two.pid() != pid
-    (two.home / "go").touch()
+    assert debian_robot.pid() != pid
+    (debian_robot.home / "go").touch()
     done = session.end(deadline=soon(), check=False)
     assert (done.exit_code, done.stdout) == (5, f"{pid}\n".encode())
-    assert two.pid() == pid
+    assert debian_robot.pid() == pid
 
 
 @pytest.mark.emulated
-def test_a_command_that_is_held_tells_its_end_when_asked(one: Robot) -> None:
-    pid = one.stands()
-    session = one.shell.begin((*CALL, "left", ": >done; exit 5"), deadline=soon())
-    wait_until((one.home / "done").exists, soon())
+def test_held_command_reports_its_end_on_request(userland_robot: Robot) -> None:
+    pid = userland_robot.shell_pid()
+    session = userland_robot.shell.begin((*CALL, "left", ": >done; exit 5"), deadline=soon())
+    wait_until((userland_robot.home / "done").exists, soon())
     # It reads, or polls before it reads: proc_pid_syscall(5).
     wait_until(lambda: Path(f"/proc/{pid}/syscall").read_text().split()[0] in {"0", "7"}, soon())
     assert isinstance(session, SshSession)
     assert session._running is not None
-    assert not session._running[1].eof_received, "nothing was told"
-    assert one.pid() != pid
+    assert not session._running[1].eof_received, "no end was reported"
+    assert userland_robot.pid() != pid
     assert session.end(deadline=soon(), check=False).exit_code == 5
-    assert one.pid() == pid
+    assert userland_robot.pid() == pid
 
 
 @pytest.mark.emulated
-def test_a_command_that_nobody_asks_about_leaves_with_its_link(two: Robot) -> None:
-    pid = two.stands()
-    two.shell.begin((*CALL, "left", ": >done"), deadline=soon())
-    wait_until((two.home / "done").exists, soon())
-    two.shell.close()
+def test_unrequested_command_ends_with_its_link(debian_robot: Robot) -> None:
+    pid = debian_robot.shell_pid()
+    debian_robot.shell.begin((*CALL, "left", ": >done"), deadline=soon())
+    wait_until((debian_robot.home / "done").exists, soon())
+    debian_robot.shell.close()
     wait_until(lambda: not Path(f"/proc/{pid}").exists(), soon())
 
 
 @pytest.mark.emulated
-def test_who_waits_to_be_told_hears_that_a_command_ended(two: Robot) -> None:
-    two.stands()
-    session = two.shell.begin((*CALL, "left", "echo u; echo why >&2; exit 4"), deadline=soon(), until=b"up\n")
+def test_wait_for_output_ends_with_the_command(debian_robot: Robot) -> None:
+    debian_robot.shell_pid()
+    session = debian_robot.shell.begin(
+        (*CALL, "left", "echo u; echo why >&2; exit 4"), deadline=soon(), until=b"up\n"
+    )
     assert not session.told
     assert session.end(deadline=soon(), check=False).stderr == b"why\n"
 
 
 @pytest.mark.emulated
-def test_a_command_that_nobody_waits_for_any_more_holds_no_shell(two: Robot) -> None:
-    pid = two.stands()
-    session = two.shell.begin((*CALL, "left", "echo up; cat <>held"), deadline=soon(), until=b"up\n")
+def test_abandoned_command_releases_its_shell(debian_robot: Robot) -> None:
+    pid = debian_robot.shell_pid()
+    session = debian_robot.shell.begin((*CALL, "left", "echo up; cat <>held"), deadline=soon(), until=b"up\n")
     del session
-    assert two.stands() != pid
+    assert debian_robot.shell_pid() != pid
 
 
 @pytest.mark.emulated
-def test_a_shell_that_ended_is_none_and_another_is_opened(two: Robot) -> None:
-    pid = two.stands()
+def test_ended_shell_is_replaced(debian_robot: Robot) -> None:
+    pid = debian_robot.shell_pid()
     os.kill(pid, signal.SIGKILL)
-    assert two.stands() != pid
+    assert debian_robot.shell_pid() != pid
 
 
 @pytest.mark.emulated
-def test_a_command_that_ends_its_shell_is_no_lost_link(two: Robot) -> None:
-    pid = two.stands()
+def test_command_that_kills_its_shell_is_not_a_lost_link(debian_robot: Robot) -> None:
+    pid = debian_robot.shell_pid()
     with pytest.raises(RobotError, match="a signal ended the command"):
-        two.run("kill -KILL $$")
-    assert two.stands() != pid
+        debian_robot.run("kill -KILL $$")
+    assert debian_robot.shell_pid() != pid
 
 
 @pytest.mark.emulated
-def test_a_command_that_never_ends_meets_the_deadline(two: Robot) -> None:
-    pid = two.stands()
+def test_endless_command_causes_a_timeout(debian_robot: Robot) -> None:
+    pid = debian_robot.shell_pid()
     argv = (*CALL, "left", "until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done")
     with pytest.raises(LinkError, match="did not end in time"):
-        two.shell.run(argv, deadline=Deadline.after(0.5))
-    assert two.stands() != pid
-    (two.home / "go").touch()
+        debian_robot.shell.run(argv, deadline=Deadline.after(0.5))
+    assert debian_robot.shell_pid() != pid
+    (debian_robot.home / "go").touch()
 
 
 @pytest.mark.emulated
-def test_a_shell_that_does_not_begin_a_command_meets_the_deadline(two: Robot) -> None:
-    pid = two.stands()
+def test_shell_that_does_not_start_a_command_causes_a_timeout(debian_robot: Robot) -> None:
+    pid = debian_robot.shell_pid()
     os.kill(pid, signal.SIGSTOP)
     try:
         with pytest.raises(LinkError, match="did not start in time"):
-            two.shell.run((*CALL, "left", ":"), deadline=Deadline.after(0.5))
+            debian_robot.shell.run((*CALL, "left", ":"), deadline=Deadline.after(0.5))
     finally:
         os.kill(pid, signal.SIGCONT)
-    assert two.run("echo on").stdout == b"on\n"
+    assert debian_robot.run("echo on").stdout == b"on\n"
 
 
 @pytest.mark.emulated
-def test_more_output_than_is_taken_is_an_error_and_the_shell_is_left(two: Robot, tmp_path: Path) -> None:
-    pid = two.stands()
+def test_output_beyond_the_limit_is_an_error_and_closes_the_shell(debian_robot: Robot, tmp_path: Path) -> None:
+    pid = debian_robot.shell_pid()
     argv = (*CALL, "left", "cat /dev/zero")
     with pytest.raises(RobotError, match="sent more than 1000 bytes"):
-        two.shell.fetch(argv, tmp_path / "out", deadline=soon(), limit_bytes=1000)
-    assert two.stands() != pid
+        debian_robot.shell.fetch(argv, tmp_path / "out", deadline=soon(), limit_bytes=1000)
+    assert debian_robot.shell_pid() != pid
 
 
 @pytest.mark.emulated
-def test_a_command_whose_link_breaks_is_sent_again(two: Robot) -> None:
+def test_command_whose_link_breaks_is_sent_again(debian_robot: Robot) -> None:
     streams = []
 
     def connect(timeout_s: float) -> socket.socket:
-        streams.append(two.server.connect(timeout_s))
+        streams.append(debian_robot.server.connect(timeout_s))
         return streams[-1]
 
-    again = Robot(two.server.shell(connect=connect), two.server, two.home)
-    again.stands()
+    again = Robot(debian_robot.server.shell(connect=connect), debian_robot.server, debian_robot.home)
+    again.shell_pid()
     code = "echo >>starts; until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done; echo over"
     with ThreadPoolExecutor(1) as pool:
         done = pool.submit(again.run, code)
-        wait_until((two.home / "starts").exists, soon())
+        wait_until((debian_robot.home / "starts").exists, soon())
         streams[-1].shutdown(socket.SHUT_RDWR)
-        wait_until(lambda: (two.home / "starts").read_text() == "\n\n", soon())
-        (two.home / "go").touch()
+        wait_until(lambda: (debian_robot.home / "starts").read_text() == "\n\n", soon())
+        (debian_robot.home / "go").touch()
         assert done.result(SOON).stdout == b"over\n"
     again.shell.close()
     assert len(streams) == 2
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize(("owner", "name"), [(Link, "_open"), (StandingShell, "open")])
-def test_what_is_being_opened_over_the_radio_is_awaited_before_that_is_measured(
-    two: Robot, monkeypatch: pytest.MonkeyPatch, owner: type, name: str
+@pytest.mark.parametrize(("owner", "name"), [(Link, "_open"), (PersistentShell, "open")])
+def test_opening_channels_are_awaited_before_a_measurement(
+    debian_robot: Robot, monkeypatch: pytest.MonkeyPatch, owner: type, name: str
 ) -> None:
     go, opened, opens = threading.Event(), threading.Event(), getattr(owner, name)
 
@@ -272,9 +276,9 @@ def test_what_is_being_opened_over_the_radio_is_awaited_before_that_is_measured(
         with shell.silence(SOON):
             return opened.is_set()
 
-    shell = two.server.shell(on_air=True)
+    shell = debian_robot.server.shell(on_air=True)
     shell.run(("true",), deadline=soon())
-    shell._connection._link.settle(soon())  # type: ignore[union-attr]
+    shell._connection._link.wait_until_opened(soon())  # type: ignore[union-attr]
     monkeypatch.setattr(owner, name, slowly)
     shell.run((*CALL, "left", ":"), deadline=soon())
     with ThreadPoolExecutor(1) as pool:
@@ -286,13 +290,13 @@ def test_what_is_being_opened_over_the_radio_is_awaited_before_that_is_measured(
 
 
 @pytest.mark.emulated
-def test_nothing_is_opened_over_the_radio_while_that_is_measured(two: Robot) -> None:
+def test_nothing_is_opened_over_the_radio_during_a_measurement(debian_robot: Robot) -> None:
     def opens_or_has() -> int:
         link = shell._connection._link
         assert link is not None
         return len(link._spares)
 
-    shell = two.server.shell(on_air=True)
+    shell = debian_robot.server.shell(on_air=True)
     shell.run(("true",), deadline=soon())
     with shell.silence(SOON):
         assert opens_or_has() == SPARES
@@ -300,16 +304,16 @@ def test_nothing_is_opened_over_the_radio_while_that_is_measured(two: Robot) -> 
         assert opens_or_has() == SPARES - 1
         shell.run((*CALL, "left", ":"), deadline=soon())
         assert opens_or_has() == SPARES - 2
-        assert shell._connection.standing._opener is None
+        assert shell._connection.shells._opener is None
     shell.run((*CALL, "left", ":"), deadline=soon())
     assert opens_or_has() == SPARES
-    assert shell._connection.standing._opener is not None
+    assert shell._connection.shells._opener is not None
     shell.close()
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("sessions", [1, 2, 3])
-def test_a_server_that_allows_few_sessions_is_served_one_by_one(tmp_path: Path, sessions: int) -> None:
+def test_server_with_few_sessions_runs_commands_in_sequence(tmp_path: Path, sessions: int) -> None:
     with robot(tmp_path, MaxSessions=str(sessions)) as few:
         for _ in range(3):
             few.pid()
@@ -317,13 +321,13 @@ def test_a_server_that_allows_few_sessions_is_served_one_by_one(tmp_path: Path, 
 
 
 @pytest.mark.emulated
-def test_a_command_of_several_lines_has_a_session_of_its_own(two: Robot) -> None:
-    pid = two.stands()
-    assert int(two.run("echo \\\n$$").stdout) != pid
+def test_command_of_several_lines_uses_a_separate_session(debian_robot: Robot) -> None:
+    pid = debian_robot.shell_pid()
+    assert int(debian_robot.run("echo \\\n$$").stdout) != pid
 
 
 @pytest.mark.emulated
-def test_a_robot_whose_login_shell_greets_is_asked_by_a_session_each(tmp_path: Path) -> None:
+def test_login_shell_with_a_greeting_uses_separate_sessions(tmp_path: Path) -> None:
     with robot(tmp_path, before="echo welcome") as greeting:
         answers = [greeting.run("echo $$").stdout.split() for _ in range(4)]
     assert {answer[0] for answer in answers} == {b"welcome"}
@@ -331,19 +335,19 @@ def test_a_robot_whose_login_shell_greets_is_asked_by_a_session_each(tmp_path: P
 
 
 @pytest.mark.emulated
-def test_a_robot_without_the_script_says_so_each_time(tmp_path: Path) -> None:
+def test_missing_script_is_reported_each_time(tmp_path: Path) -> None:
     with robot(tmp_path) as bare:
         (bare.home / SCRIPT_PATH).unlink()
         for _ in range(3):
             assert SCRIPT_PATH.encode() in bare.run(":", check=False).stderr
 
 
-class Pieces:
-    """A channel on which everything has come, in pieces.
+class ReceivedChannel:
+    """A channel on which all data have arrived, in pieces.
 
     Args:
-        out: Of standard output.
-        err: Of standard error.
+        out: Pieces of standard output.
+        err: Pieces of standard error.
     """
 
     def __init__(self, out: Sequence[bytes], err: Sequence[bytes]) -> None:
@@ -387,21 +391,21 @@ CUTS = st.lists(st.integers(0, 1 << 16), max_size=6)
 
 
 @given(st.tuples(OUTPUTS, CUTS), st.tuples(OUTPUTS, CUTS), st.integers(0, 255), st.binary(max_size=9))
-def test_output_and_exit_code_are_told_apart_however_they_come(
+def test_output_and_exit_code_are_separated_for_any_pieces(
     out: tuple[bytes, list[int]], err: tuple[bytes, list[int]], code: int, stray: bytes
 ) -> None:
     end = NONCE + f" {code}\n".encode()
     begin = stray + NONCE + b"\n"
-    channel = Pieces(split(begin + out[0] + end + stray, out[1]), split(begin + err[0] + end, err[1]))
+    channel = ReceivedChannel(split(begin + out[0] + end + stray, out[1]), split(begin + err[0] + end, err[1]))
     taken = threading.Lock()
     taken.acquire()
     try:
-        turn = Turn(cast("Channel", channel), NONCE, taken)
+        running_command = RunningCommand(cast("Channel", channel), NONCE, taken)
         into = BytesIO()
-        assert turn.has_begun()
-        assert hear(turn, out[0][:3], deadline=soon(), robot="robot")
-        done = drain(turn, into, stdin=None, deadline=soon(), limit_bytes=1 << 20, robot="robot")
-        turn.close()
+        assert running_command.wait_for_start()
+        assert wait_for_output(running_command, out[0][:3], deadline=soon(), robot="robot")
+        done = drain(running_command, into, stdin=None, deadline=soon(), limit_bytes=1 << 20, robot="robot")
+        running_command.close()
     finally:
         os.close(channel.event)
     assert (into.getvalue(), done) == (out[0][3:], (code, err[0]))
@@ -410,7 +414,7 @@ def test_output_and_exit_code_are_told_apart_however_they_come(
 
 
 @pytest.mark.parametrize("end", [b"\n", b" \n", b" 1234\n", b" -1\n", b" x\n", b"x 1\n", b" 1  \n"])
-def test_an_end_without_an_exit_code_is_none(end: bytes) -> None:
-    channel = Pieces([NONCE + b"\n" + NONCE + end + b"...."], [])
+def test_end_without_an_exit_code_is_an_error(end: bytes) -> None:
+    channel = ReceivedChannel([NONCE + b"\n" + NONCE + end + b"...."], [])
     with pytest.raises(UnfitServerError, match="exit code"):
-        Turn(cast("Channel", channel), NONCE, threading.Lock()).has_begun()
+        RunningCommand(cast("Channel", channel), NONCE, threading.Lock()).wait_for_start()

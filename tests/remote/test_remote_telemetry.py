@@ -1,6 +1,6 @@
-"""The sampler of a robot's link: begun with the attempt's folder, ended when it is packed, or by whoever ends jobs.
+"""The sampler of a robot's Wi-Fi link: started with the attempt, stopped when it is packed or jobs are stopped.
 
-This machine has no Wi-Fi: `iw` is a program that gives real outputs.
+This machine has no Wi-Fi: `iw` is a program that prints outputs of real robots.
 """
 
 import os
@@ -31,17 +31,17 @@ FOLDER = jobs.work_folder("trial", "udp-01-1")
 def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell]:
     home = tmp_path / "home"
     home.mkdir()
-    made = LocalShell(home, path_of(request.param, tmp_path / "bin"))
-    jobs.install(made, Deadline.after(30))
-    yield made
-    wait_until(lambda: jobs.left(made, Deadline.after(30)) == (), Deadline.after(60))
+    local_shell = LocalShell(home, path_of(request.param, tmp_path / "bin"))
+    jobs.install(local_shell, Deadline.after(30))
+    yield local_shell
+    wait_until(lambda: jobs.left(local_shell, Deadline.after(30)) == (), Deadline.after(60))
 
 
 def give_iw(tmp_path: Path, link_file: str = "link-station") -> None:
-    """Let iw answer with real outputs, and write down what it was asked."""
+    """Replace iw by a program that prints real outputs, and records its arguments."""
     answers = {"link": link_file, "station": "station-iwlwifi-6", "survey": "survey-mt7996-6", "info": "info-station"}
     files = {verb: shlex.quote(str(DATA / "iw" / f"{name}.txt")) for verb, name in answers.items()}
-    # The two are of different machines: here the access point is the same.
+    # The outputs are from two machines, so the address of the access point is made the same.
     (link := tmp_path / "link.txt").write_text(
         (DATA / "iw" / f"{link_file}.txt").read_text().replace("f0:99:bf:0e:86:98", "04:f0:21:32:3f:d2")
     )
@@ -54,21 +54,21 @@ def give_iw(tmp_path: Path, link_file: str = "link-station") -> None:
 
 
 def begin(shell: LocalShell, least: int = 3) -> Path:
-    """Begin an attempt, and return when its link was sampled so often."""
+    """Begin an attempt, and return the file when its link was sampled at least `least` times."""
     evidence.begin(shell, FOLDER, "sender", "wlan0")
     written = shell.home / FOLDER / "sender-link.txt"
     wait_until(lambda: written.is_file() and written.read_text().count(" station <==") >= least, Deadline.after(60))
     return written
 
 
-def test_a_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_path: Path) -> None:
+def test_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_path: Path) -> None:
     give_iw(tmp_path)
     written = begin(shell)
     (line,) = jobs.left(shell, Deadline.after(30))
-    assert line.startswith(".fieldkit/trial/udp-01-1/link "), "known by its identity, as every job"
+    assert line.startswith(".fieldkit/trial/udp-01-1/link "), "identified as any job"
     assert line.endswith("sample the link of wlan0")
     evidence.begin(shell, FOLDER, "sender", "wlan0")
-    assert len(jobs.left(shell, Deadline.after(30))) == 1, "a begin whose answer was lost joins it"
+    assert len(jobs.left(shell, Deadline.after(30))) == 1, "a repeated begin joins it"
     into = tmp_path / "local"
     into.mkdir()
     fetching.fetch(shell, FOLDER, "sender", "wlan0", into)
@@ -76,18 +76,18 @@ def test_a_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_pat
     assert not written.exists()
     assert (into / "sender-link.txt.gz").stat().st_size < 4000, "it is fetched compressed"
     samples = AttemptEvidence(into).links(Role.SENDER)
-    found = link.measure(Role.SENDER, samples)
-    assert found.values["sender_signal_median_dbm"] == -60.0
-    assert found.values["sender_noise_dbm"] == -84.0
-    assert found.values["sender_tx_failures"] == found.values["sender_roams"] == 0
+    measured = link.measure(Role.SENDER, samples)
+    assert measured.values["sender_signal_median_dbm"] == -60.0
+    assert measured.values["sender_noise_dbm"] == -84.0
+    assert measured.values["sender_tx_failures"] == measured.values["sender_roams"] == 0
     after = host.state(into / "sender-after.txt")
     assert after.endings is not None
     assert after.endings["link"].cause is Cause.ASKED
     asked = (tmp_path / "asked").read_text().splitlines()
-    assert "dev wlan0 station get 04:f0:21:32:3f:d2" in asked, "of its own cell, which some drivers list nowhere"
+    assert "dev wlan0 station get 04:f0:21:32:3f:d2" in asked, "of its cell, which some drivers list nowhere"
 
 
-def test_an_access_point_is_asked_for_all_its_stations(shell: LocalShell, tmp_path: Path) -> None:
+def test_all_stations_of_an_access_point_are_sampled(shell: LocalShell, tmp_path: Path) -> None:
     give_iw(tmp_path, "link-none")
     begin(shell)
     asked = (tmp_path / "asked").read_text()
@@ -98,7 +98,7 @@ def test_an_access_point_is_asked_for_all_its_stations(shell: LocalShell, tmp_pa
 
 
 @pytest.mark.parametrize("means", ["abort", "end", "remove", "lock"])
-def test_it_ends_with_whatever_ends_the_attempt(shell: LocalShell, tmp_path: Path, means: str) -> None:
+def test_sampler_stops_with_the_attempt(shell: LocalShell, tmp_path: Path, means: str) -> None:
     give_iw(tmp_path, "link-none")
     if means == "lock":
         script.call(shell, "lock", "mine", "600", "me", "trial", deadline=Deadline.after(30))
@@ -115,7 +115,7 @@ def test_it_ends_with_whatever_ends_the_attempt(shell: LocalShell, tmp_path: Pat
     wait_until(lambda: jobs.left(shell, Deadline.after(30)) == (), Deadline.after(60))
 
 
-def test_without_wifi_it_ends_at_once_and_without_iw_it_never_begins(shell: LocalShell, tmp_path: Path) -> None:
+def test_sampler_exits_without_wifi_and_does_not_start_without_iw(shell: LocalShell, tmp_path: Path) -> None:
     evidence.begin(shell, FOLDER, "sender", "wlan0")
     assert not (shell.home / FOLDER / ".jobs" / "link").exists()
     give_iw(tmp_path)
@@ -129,8 +129,8 @@ def test_without_wifi_it_ends_at_once_and_without_iw_it_never_begins(shell: Loca
     assert link.measure(Role.SENDER, AttemptEvidence(into).links(Role.SENDER)).values == {}
 
 
-def test_a_look_that_fails_in_between_does_not_end_it(shell: LocalShell, tmp_path: Path) -> None:
-    # A station that is lost between the two questions of `iw link` is one that the kernel does not know.
+def test_failed_sample_does_not_stop_the_sampler(shell: LocalShell, tmp_path: Path) -> None:
+    # A station that is lost between the two requests of `iw link` is unknown to the kernel.
     give_iw(tmp_path)
     iw, lost = tmp_path / "bin" / "iw", tmp_path / "lost"
     fails = "{ echo 'command failed: No such file or directory (-2)' >&2; exit 254; }"
@@ -139,7 +139,7 @@ def test_a_look_that_fails_in_between_does_not_end_it(shell: LocalShell, tmp_pat
     written = begin(shell)
     lost.touch()
     looks = written.read_text().count(" link <==")
-    # The first of them may have asked before; one that failed was followed by another.
+    # The first sample may be older; a failed one was followed by another.
     wait_until(lambda: written.read_text().count(" link <==") > looks + 1, Deadline.after(60))
     lost.unlink()
     seen = written.read_text().count("Connected to ")
@@ -147,7 +147,7 @@ def test_a_look_that_fails_in_between_does_not_end_it(shell: LocalShell, tmp_pat
     evidence.end_jobs(shell, FOLDER)
 
 
-def test_a_file_that_nobody_fetches_does_not_fill_the_disk(shell: LocalShell, tmp_path: Path) -> None:
+def test_unfetched_file_does_not_fill_the_disk(shell: LocalShell, tmp_path: Path) -> None:
     give_iw(tmp_path)
     (tmp_path / "bin" / "iw").write_text("#!/bin/sh\nexec head -c 3000000 /dev/zero\n")
     evidence.begin(shell, FOLDER, "sender", "wlan0")
@@ -157,18 +157,16 @@ def test_a_file_that_nobody_fetches_does_not_fill_the_disk(shell: LocalShell, tm
 
 
 @pytest.mark.parametrize("words", [("dash",), ("busybox", "sh"), ("bash",)], ids=" ".join)
-def test_every_shell_samples_as_often_as_it_can_wait(
-    shell: LocalShell, tmp_path: Path, words: tuple[str, ...]
-) -> None:
+def test_sampling_interval_in_each_shell(shell: LocalShell, tmp_path: Path, words: tuple[str, ...]) -> None:
     give_iw(tmp_path)
     folder = shell.home / FOLDER
     (folder / ".jobs" / "link").mkdir(parents=True)
     os.mkfifo(folder / ".jobs" / "link" / "end")
     (folder / ".began").write_text("- boot\n", encoding="ascii")
-    told = folder / "told"
-    with told.open("wb") as out:
+    output_file = folder / "told"
+    with output_file.open("wb") as out:
         argv = (*words, str(shell.home / script.SCRIPT_PATH), "sample", "wlan0", "-")
         running = subprocess.Popen(argv, cwd=folder, stdout=out, env=os.environ | {"PATH": shell.path})
-    wait_until(lambda: told.read_bytes().count(b" station <==") >= 3, Deadline.after(60))
+    wait_until(lambda: output_file.read_bytes().count(b" station <==") >= 3, Deadline.after(60))
     shutil.rmtree(folder)
-    assert running.wait(60) == 0, "it ends with its folder"
+    assert running.wait(60) == 0, "it stops with its folder"

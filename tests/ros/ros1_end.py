@@ -1,6 +1,6 @@
-"""A node of ROS 1 as anybody writes one, for Debian's Python: `ros1_end.py hear|say`.
+"""A usual ROS 1 node, for Debian's Python: `ros1_end.py hear|say`.
 
-`say` publishes scans, numbered from 1, until it is ended; `hear` prints each that comes as JSON.
+`say` publishes scans with numbers from 1 until it is stopped; `hear` prints each received scan as JSON.
 """
 
 import json
@@ -20,7 +20,7 @@ def show(scan: LaserScan) -> None:
     sys.stdout.flush()
 
 
-# rospy's own handler closes topics at once, and waits for ever where the signal meets it in `publish`.
+# rospy's signal handler closes topics immediately, and deadlocks if the signal arrives during `publish`.
 rospy.init_node(verb, anonymous=True, disable_signals=True)
 for ends in (signal.SIGTERM, signal.SIGINT):
     signal.signal(ends, lambda *_: threading.Thread(target=rospy.signal_shutdown, args=("asked to",)).start())

@@ -1,4 +1,4 @@
-"""`fieldkit bridge` between a real ROS 1 on one host and DDS or Zenoh on another."""
+"""`fieldkit bridge` between a real ROS 1 on one host, and DDS or Zenoh on another."""
 
 import json
 import os
@@ -29,10 +29,10 @@ TYPE = "sensor_msgs/msg/LaserScan"
 SCAN = "/scan:sensor_msgs/LaserScan"
 DOMAIN = 5
 FOREIGN = 1000
-"""Numbers of scans from there on are from the side that has no ROS 1."""
+"""First number of the scans from the side without ROS 1."""
 ENDS = Path(__file__).parent
 LIMIT_S = 90
-"""No end runs longer: a bridge that brings nothing fails its test by then."""
+"""Time limit of all nodes: a bridge that forwards nothing fails its test by then."""
 ENOUGH = 30
 OTHER_TYPE = ("rostopic", "pub", "-r", "10", "/scan", "std_msgs/String", "x")
 
@@ -40,10 +40,10 @@ Process = subprocess.Popen[str]
 
 
 class Site:
-    """ROS 1 on one host, its master included, and another host on the same cable.
+    """ROS 1 with its master on one host, and another host on the same cable.
 
     Attributes:
-        folder: Home and temporary files of all that runs there.
+        folder: Home and temporary files of all programs.
     """
 
     def __init__(self, hosts: tuple[TestHost, TestHost], folder: Path) -> None:
@@ -68,8 +68,8 @@ class Site:
                 process.terminate()
                 process.communicate()
 
-    def asked(self, *argv: str) -> subprocess.CompletedProcess[str]:
-        """Run a command on the host with ROS 1 to its end."""
+    def completed(self, *argv: str) -> subprocess.CompletedProcess[str]:
+        """Run a command on the host with ROS 1, and return its result."""
         with self.started(self.near, *argv) as process:
             said, errors = process.communicate()
         return subprocess.CompletedProcess(argv, process.returncode, said, errors)
@@ -80,7 +80,7 @@ class Site:
 
     @contextmanager
     def bridge(self, over: str, *words: str) -> Iterator[Process]:
-        """Run a bridge while the body runs; it is up when that begins."""
+        """Run a bridge while the body runs; it is ready when the body starts."""
         with self.started(self.near, *self.bridge_line(over, *words)) as process:
             assert process.stderr is not None
             said = process.stderr.readline()
@@ -88,11 +88,11 @@ class Site:
             yield process
 
     def ros1(self, verb: str) -> AbstractContextManager[Process]:
-        """Run a node of ROS 1."""
+        """Run a ROS 1 node."""
         return self.started(self.near, "/usr/bin/python3", str(ENDS / "ros1_end.py"), verb)
 
     def wire(self, verb: str, over: str, quality: str = "") -> AbstractContextManager[Process]:
-        """Run an end that has no ROS 1 on the other host."""
+        """Run a publisher or subscriber without ROS 1 on the other host."""
         topic = topics.describe(shipped(), "/scan", TYPE, parse_qos(quality), domain=DOMAIN, node=verb)
         settings = {"listen/endpoints": f'["tcp/{self.far.address}:0"]'} if over == "zenoh" else {}
         network = {"address": self.far.address, "domain": DOMAIN, "node": verb, "settings": settings}
@@ -105,39 +105,39 @@ class Site:
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     with cabled() as hosts:
-        found = Site(hosts, tmp_path_factory.mktemp("bridge"))
-        with found.started(hosts[0], "rosmaster", "--core", "-p", "11311"):
-            # A node that is faster than its master prints a warning among the messages that it hears.
+        samples = Site(hosts, tmp_path_factory.mktemp("bridge"))
+        with samples.started(hosts[0], "rosmaster", "--core", "-p", "11311"):
+            # A node that starts before its master prints a warning among the received messages.
             master = f"/dev/tcp/{hosts[0].address}/11311"
-            assert found.asked("bash", "-c", f"until : <{master}; do sleep 0.1; done").returncode == 0
-            yield found
+            assert samples.completed("bash", "-c", f"until : <{master}; do sleep 0.1; done").returncode == 0
+            yield samples
 
 
 def scan(number: int) -> str:
-    """Return a scan as rosbags serializes it for ROS 2, hexadecimal."""
+    """Return a scan in the serialization of rosbags for ROS 2, hexadecimal."""
     kinds = shipped().ros2.types
     header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](number, 5), "base")
     ranges = np.array([number, 0.5], np.float32)
-    made = kinds[TYPE](header, 0, 0, 0, 0, 0, 0, 0, ranges, np.array([], np.float32))
-    return bytes(shipped().ros2.serialize_cdr(made, TYPE)).hex()
+    message = kinds[TYPE](header, 0, 0, 0, 0, 0, 0, 0, ranges, np.array([], np.float32))
+    return bytes(shipped().ros2.serialize_cdr(message, TYPE)).hex()
 
 
-def heard(ears: Process, number_of: Callable[[str], int]) -> list[tuple[int, str]]:
-    """Return what an end hears by its number, until it has heard enough of both sides."""
-    assert ears.stdout is not None
-    found: list[tuple[int, str]] = []
+def received(subscriber: Process, number_of: Callable[[str], int]) -> list[tuple[int, str]]:
+    """Return the received samples with their numbers, until enough have arrived from both sides."""
+    assert subscriber.stdout is not None
+    samples: list[tuple[int, str]] = []
     missing = {True: ENOUGH, False: ENOUGH}
-    for line in ears.stdout:
+    for line in subscriber.stdout:
         number = number_of(line)
-        found.append((number, line.strip()))
+        samples.append((number, line.strip()))
         missing[number >= FOREIGN] -= 1
         if max(missing.values()) <= 0:
-            return found
-    raise AssertionError(f"it ended: {ears.stderr and ears.stderr.read()}")
+            return samples
+    raise AssertionError(f"it ended: {subscriber.stderr and subscriber.stderr.read()}")
 
 
 def number_of_cdr(line: str) -> int:
-    # The seconds of the stamp are the first member.
+    # The first member is the seconds of the stamp.
     return int.from_bytes(bytes.fromhex(line)[4:8], "little")
 
 
@@ -147,88 +147,93 @@ def number_of_ros1(line: str) -> int:
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_scans_cross_both_ways_once_and_whole(site: Site, over: str) -> None:
-    """Both ends speak and hear: what a bridge sent back would come twice to the side that it is from."""
+def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, over: str) -> None:
+    """Both sides publish and subscribe: a sample that loops would arrive twice."""
     with (
-        site.wire("hear", over) as wire_ears,
-        site.ros1("hear") as ros1_ears,
+        site.wire("hear", over) as wire_subscriber,
+        site.ros1("hear") as ros1_subscriber,
         site.bridge(over, "--both", SCAN, "--json") as running,
         site.ros1("say"),
         site.wire("say", over),
     ):
-        by_wire, by_ros1 = heard(wire_ears, number_of_cdr), heard(ros1_ears, number_of_ros1)
+        received_by_wire, received_by_ros1 = (
+            received(wire_subscriber, number_of_cdr),
+            received(ros1_subscriber, number_of_ros1),
+        )
         running.send_signal(signal.SIGINT)
         said, errors = running.communicate()
-    assert [line for _, line in by_wire] == [scan(number) for number, _ in by_wire], "as rosbags writes them"
-    for number, line in by_ros1:
+    assert [line for _, line in received_by_wire] == [scan(number) for number, _ in received_by_wire], (
+        "as serialized by rosbags"
+    )
+    for number, line in received_by_ros1:
         stamp, frame, ranges = json.loads(line)
         assert (stamp, frame, ranges) == ([number, 5], "base", [number, 0.5])
-    for numbers in ([number for number, _ in by_wire], [number for number, _ in by_ros1]):
-        assert len(set(numbers)) == len(numbers), "none comes twice"
+    for numbers in ([number for number, _ in received_by_wire], [number for number, _ in received_by_ros1]):
+        assert len(set(numbers)) == len(numbers), "no sample arrives twice"
 
     assert (running.returncode, errors) == (0, "")
-    told = {(one["source"], one["target"]): one for one in json.loads(said)}
-    assert told.keys() == {("ros1", over), (over, "ros1")}
+    report = {(counts["source"], counts["target"]): counts for counts in json.loads(said)}
+    assert report.keys() == {("ros1", over), (over, "ros1")}
     size_bytes = {"ros1": len(shipped().ros2.cdr_to_ros1(bytes.fromhex(scan(1)), TYPE)), over: len(scan(1)) // 2}
-    for (source, _), one in told.items():
-        assert one["messages"] >= ENOUGH
-        assert one["bytes"] == one["messages"] * size_bytes[source]
-        assert (one["topic"], one["type"], one["refused"], one["unreadable"]) == ("/scan", TYPE, 0, 0)
-        assert 0 < one["delay_median_s"] <= one["delay_p99_s"] < LIMIT_S
-        assert one["bytes_per_s"] == pytest.approx(one["per_s"] * size_bytes[source])
+    for (source, _), counts in report.items():
+        assert counts["messages"] >= ENOUGH
+        assert counts["bytes"] == counts["messages"] * size_bytes[source]
+        assert (counts["topic"], counts["type"], counts["refused"], counts["unreadable"]) == ("/scan", TYPE, 0, 0)
+        assert 0 < counts["delay_median_s"] <= counts["delay_p99_s"] < LIMIT_S
+        assert counts["bytes_per_s"] == pytest.approx(counts["per_s"] * size_bytes[source])
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_who_comes_late_gets_what_ros_1_has_latched(site: Site, over: str) -> None:
+def test_late_subscriber_receives_the_latched_message_of_ros_1(site: Site, over: str) -> None:
     latched = ("rostopic", "pub", "--latch", "/scan", "sensor_msgs/LaserScan", "{header: {frame_id: once}}")
     late = "transient_local,depth=1"
     with site.bridge(over, f"{SCAN}:{late}"), site.started(site.near, *latched):
-        for _ in range(2):  # the second comes when it has been carried for sure
-            with site.wire("hear", over, late) as ears:
-                assert ears.stdout is not None
-                heard: Any = shipped().ros2.deserialize_cdr(bytes.fromhex(ears.stdout.readline()), TYPE)
-                assert heard.header.frame_id == "once"
+        for _ in range(2):  # the second subscriber starts after the message was forwarded
+            with site.wire("hear", over, late) as subscriber:
+                assert subscriber.stdout is not None
+                received: Any = shipped().ros2.deserialize_cdr(bytes.fromhex(subscriber.stdout.readline()), TYPE)
+                assert received.header.frame_id == "once"
 
 
 @pytest.mark.emulated
-def test_a_bridge_that_ends_leaves_nothing(site: Site) -> None:
+def test_stopped_bridge_leaves_no_process_and_file(site: Site) -> None:
     with site.bridge("dds", SCAN) as running:
-        assert " * /fieldkit_bridge " in site.asked("rostopic", "info", "/scan").stdout
+        assert " * /fieldkit_bridge " in site.completed("rostopic", "info", "/scan").stdout
         running.send_signal(signal.SIGTERM)
         said, _ = running.communicate()
     assert running.returncode == 0
     assert "/scan" in said
     assert "ros1 to dds" in said
-    assert "/fieldkit_bridge" not in site.asked("rostopic", "info", "/scan").stdout
+    assert "/fieldkit_bridge" not in site.completed("rostopic", "info", "/scan").stdout
     assert not list(site.folder.glob("fieldkit-*"))
     assert not list(site.folder.glob("ros/log/*bridge*"))
 
 
 @pytest.mark.emulated
-def test_a_topic_of_another_type_is_told_and_not_carried(site: Site) -> None:
+def test_topic_of_another_type_is_reported_and_not_forwarded(site: Site) -> None:
     with site.bridge("dds", SCAN) as running, site.started(site.near, *OTHER_TYPE):
         assert running.stderr is not None
         late = running.stderr.readline()
-        at_once = site.asked(*site.bridge_line("dds", "--node", "second", SCAN))
+        at_once = site.completed(*site.bridge_line("dds", "--node", "second", SCAN))
     sentence = "error: /scan is of type std_msgs/String in ros1, not sensor_msgs/msg/LaserScan\n"
     assert late == sentence
     assert (at_once.returncode, at_once.stderr.startswith(sentence)) == (2, True)
 
 
 @pytest.mark.emulated
-def test_no_master_is_told(site: Site) -> None:
-    done = site.asked(*site.bridge_line("dds", "--master", "127.0.0.1:9", SCAN))
+def test_missing_master_is_reported(site: Site) -> None:
+    done = site.completed(*site.bridge_line("dds", "--master", "127.0.0.1:9", SCAN))
     assert done.returncode == 3
     assert done.stderr.startswith("error: the bridge does not start: no ROS master answers at http://127.0.0.1:9\n")
     assert "roscore" in done.stderr
 
 
 @pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_a_topic_of_another_type_is_known_without_a_master(over: str) -> None:
+def test_topic_of_another_type_is_detected_without_a_master(over: str) -> None:
     def described(kind: str) -> Topic:
-        told = topics.describe(shipped(), "/t", kind, PROFILES["default"], domain=DOMAIN, node="n")
-        return Topic.from_json(told)
+        report = topics.describe(shipped(), "/t", kind, PROFILES["default"], domain=DOMAIN, node="n")
+        return Topic.from_json(report)
 
     settings = {"listen/endpoints": '["tcp/127.0.0.1:0"]'} if over == "zenoh" else {}
     network = Network("127.0.0.1", discovery="peers", domain=DOMAIN, settings=settings)
@@ -240,8 +245,8 @@ def test_a_topic_of_another_type_is_known_without_a_master(over: str) -> None:
     running.close()
 
 
-class Recorded:
-    """A middleware of which a test is both ends."""
+class FakeMiddleware:
+    """A middleware whose other side is the test."""
 
     version = "recorded"
 
@@ -250,7 +255,7 @@ class Recorded:
         self.takes = True
         self.deliver: Deliver | None = None
 
-    def publisher(self, _: Topic) -> "Recorded":
+    def publisher(self, _: Topic) -> "FakeMiddleware":
         return self
 
     def subscribe(self, _: Topic, deliver: Deliver) -> Callable[[], int]:
@@ -266,17 +271,17 @@ class Recorded:
         return 1
 
     def drain(self, limit_s: float) -> None:
-        """Nothing waits."""
+        """Do nothing."""
 
     def other_types(self, _: Topic) -> set[str]:
         return set()
 
     def close(self) -> None:
-        """Nothing runs."""
+        """Do nothing."""
 
 
-def test_what_is_no_message_is_dropped_and_counted_and_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    source, target = Recorded(), Recorded()
+def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target = FakeMiddleware(), FakeMiddleware()
     monkeypatch.setattr(
         "fieldkit.agent.middleware.adapter", lambda over: lambda _: source if over == "ros1" else target
     )
@@ -291,24 +296,24 @@ def test_what_is_no_message_is_dropped_and_counted_and_others_go_on(monkeypatch:
         target.takes = False
         source.deliver(of_ros1, time.time_ns())
         target.takes = True
-    source.deliver(of_ros1, time.time_ns())  # after its end
-    told = carrier.told()
+    source.deliver(of_ros1, time.time_ns())  # after the carrier was stopped
+    report = carrier.report()
     assert target.written == [sample]
-    assert (told.messages, told.unreadable, told.refused) == (1, 4, 1)
-    assert told.bytes == len(of_ros1)
+    assert (report.messages, report.unreadable, report.refused) == (1, 4, 1)
+    assert report.bytes == len(of_ros1)
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (("--from", "ros1", "--to", "dds"), "no topic is given"),
-        (("--from", "ros1", "--to", "dds", "/scan"), "'/scan' is no topic and its type"),
+        (("--from", "ros1", "--to", "dds", "/scan"), "'/scan' is not a topic with its type"),
         (("--from", "ros1", "--to", "dds", "/scan:sensor_msgs/LasrScan"), "there is no message type"),
-        (("--from", "ros1", "--to", "dds", "/marker:visualization_msgs/Marker"), "not the same in ROS 1 and ROS 2"),
-        (("--from", "zenoh", "--to", "dds", "/t:std_msgs/Time"), "not the same in ROS 1 and ROS 2"),
-        (("--from", "ros1", "--to", "dds", f"{SCAN}:sensor"), "'sensor' is no quality of service"),
+        (("--from", "ros1", "--to", "dds", "/marker:visualization_msgs/Marker"), "differs between ROS 1 and ROS 2"),
+        (("--from", "zenoh", "--to", "dds", "/t:std_msgs/Time"), "differs between ROS 1 and ROS 2"),
+        (("--from", "ros1", "--to", "dds", f"{SCAN}:sensor"), "'sensor' is not a quality of service"),
         (("--from", "ros1", "--to", "dds", SCAN, "--both", SCAN), "/scan is named twice"),
-        (("--from", "dds", "--to", "dds", SCAN), "a bridge from dds to dds is none"),
+        (("--from", "dds", "--to", "dds", SCAN), "a bridge cannot connect dds with dds"),
         (("--from", "ros2", "--to", "dds", SCAN), "cannot be 'ros2'"),
         (("--from", "ros1", "--to", "dds", SCAN, "--address", "robot"), "'robot' is not an IPv4 address"),
         (("--from", "ros1", "--to", "dds", SCAN, "--master", "http://robot"), "is not a host and port"),
@@ -321,12 +326,12 @@ def test_what_is_no_message_is_dropped_and_counted_and_others_go_on(monkeypatch:
         ),
     ],
 )
-def test_what_cannot_be_bridged_is_told_before_anything_starts(
+def test_invalid_arguments_are_reported_before_anything_starts(
     words: Sequence[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["bridge", *words]) == 2
     assert said in capsys.readouterr().err.replace("\n", " ")
 
 
-def test_the_command_line_names_every_middleware() -> None:
+def test_command_line_accepts_all_middlewares() -> None:
     assert {*MIDDLEWARES, "ros2"} == set(ADAPTERS)

@@ -1,4 +1,4 @@
-"""Types that differ between ROS 1 and ROS 2 and are bridged all the same, with rosbags' serializers as the oracle."""
+"""Types that differ between ROS 1 and ROS 2 but can be bridged, compared with the serializers of rosbags."""
 
 import time
 from typing import Any
@@ -14,8 +14,8 @@ from fieldkit.ros.crossings import Crossing
 from fieldkit.ros.types import Distribution, MessageTypes, shipped
 
 
-class BothEnds:
-    """A middleware of which the test is the other end; it notes the topics that it is asked for."""
+class FakeMiddleware:
+    """A middleware whose other side is the test; it records the requested topics."""
 
     version = "test"
 
@@ -24,7 +24,7 @@ class BothEnds:
         self.topics: list[Topic] = []
         self.deliver: Deliver | None = None
 
-    def publisher(self, topic: Topic) -> "BothEnds":
+    def publisher(self, topic: Topic) -> "FakeMiddleware":
         self.topics.append(topic)
         return self
 
@@ -41,20 +41,20 @@ class BothEnds:
         return 1
 
     def drain(self, limit_s: float) -> None:
-        """Nothing waits."""
+        """Do nothing."""
 
     def other_types(self, _: Topic) -> set[str]:
         return set()
 
     def close(self) -> None:
-        """Nothing runs."""
+        """Do nothing."""
 
 
 def carried(
     monkeypatch: pytest.MonkeyPatch, type_name: str, sample: bytes, types: MessageTypes, *, back: bool
 ) -> tuple[list[bytes], str, str]:
-    """Return what the bridge writes of a sample, and the MD5 sum in ROS 1 and the name in DDS that it announces."""
-    of_ros1, of_dds = BothEnds(), BothEnds()
+    """Return the converted sample, and the announced MD5 sum in ROS 1 and name in DDS."""
+    of_ros1, of_dds = FakeMiddleware(), FakeMiddleware()
     monkeypatch.setattr(
         "fieldkit.agent.middleware.adapter", lambda over: lambda _: of_ros1 if over == "ros1" else of_dds
     )
@@ -68,14 +68,14 @@ def carried(
     return target.written, ros1_topic.md5, dds_topic.dds_types[dds_topic.type]
 
 
-# The sums are those that `rosmsg md5` of Noetic prints.
+# The MD5 sums are those of `rosmsg md5` in Noetic.
 @pytest.mark.parametrize(
     ("name", "md5"),
     [("Time", "cd7166c74c552c311fbcc2fe5a7bc289"), ("Duration", "3e286caf4241d664e55f3ad380e2ae46")],
 )
 @pytest.mark.parametrize("package", ["std_msgs", "builtin_interfaces"])
 @pytest.mark.parametrize("back", [False, True])
-def test_times_cross_under_the_name_of_each_ros(
+def test_time_types_are_bridged_under_their_names(
     monkeypatch: pytest.MonkeyPatch, name: str, md5: str, package: str, *, back: bool
 ) -> None:
     types = shipped()
@@ -91,20 +91,20 @@ def test_times_cross_under_the_name_of_each_ros(
 
 
 def ranges(variance: float) -> tuple[bytes, bytes]:
-    """Return a range as rosbags serializes it for Noetic and for Jazzy."""
+    """Return a range in the serialization of rosbags for Noetic and for Jazzy."""
     types = shipped()
-    found = []
+    messages = []
     for store, more in ((types.ros1, ()), (types.ros2, (variance,))):
         stamp = store.types["builtin_interfaces/msg/Time"](3, 4)
         numbers = {"seq": 0} if store is types.ros1 else {}
         header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="sonar", **numbers)
-        found.append(store.types["sensor_msgs/msg/Range"](header, 0, 0.5, 0.25, 4.0, 1.5, *more))
-    ros1, ros2 = found
+        messages.append(store.types["sensor_msgs/msg/Range"](header, 0, 0.5, 0.25, 4.0, 1.5, *more))
+    ros1, ros2 = messages
     kind = "sensor_msgs/msg/Range"
     return bytes(types.ros1.serialize_ros1(ros1, kind)), bytes(types.ros2.serialize_cdr(ros2, kind))
 
 
-def test_a_range_gets_variance_0_to_ros_2_and_loses_it_to_ros_1(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_range_has_variance_0_in_ros_2_and_none_in_ros_1(monkeypatch: pytest.MonkeyPatch) -> None:
     of_noetic, of_jazzy = ranges(0.0)
     written, md5, _ = carried(monkeypatch, "sensor_msgs/Range", of_noetic, shipped(), back=False)
     assert written == [of_jazzy]
@@ -116,7 +116,7 @@ def test_a_range_gets_variance_0_to_ros_2_and_loses_it_to_ros_1(monkeypatch: pyt
 
 
 @pytest.mark.parametrize("cut", [1, 4, 5, 20])
-def test_a_range_that_is_too_short_or_too_long_is_no_message(cut: int) -> None:
+def test_range_with_a_wrong_length_is_invalid(cut: int) -> None:
     pair = counterparts.of_type(shipped(), "sensor_msgs/Range")
     assert pair is not None
     of_noetic, of_jazzy = ranges(0.0)
@@ -127,7 +127,7 @@ def test_a_range_that_is_too_short_or_too_long_is_no_message(cut: int) -> None:
         pair.to_ros1(shipped(), of_jazzy[:-cut])
 
 
-def test_members_are_added_only_where_the_distribution_has_them() -> None:
+def test_additional_members_depend_on_the_distribution() -> None:
     added = {
         distribution: counterparts.of_type(shipped(distribution), "sensor_msgs/Range")
         for distribution in (Distribution.HUMBLE, Distribution.IRON)

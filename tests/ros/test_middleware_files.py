@@ -1,4 +1,4 @@
-"""Files for middlewares: the real middleware reads each, and has the settings that were measured."""
+"""Configuration files of middlewares: the real middleware reads each file, and applies the measured settings."""
 
 import json
 import os
@@ -37,19 +37,19 @@ def run(*argv: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("settings", [{}, tuning.tuned("dds", "tcp"), {"Discovery/Tag@x": "1", "No/Such": "1"}])
-def test_cyclonedds_takes_its_file(tmp_path: Path, settings: dict[str, str]) -> None:
+def test_cyclonedds_reads_its_file(tmp_path: Path, settings: dict[str, str]) -> None:
     path = tmp_path / "cyclonedds.xml"
     path.write_text(configurations.written("dds", "tcp", settings, COMMENT), encoding="utf-8")
     program = "from cyclonedds.domain import DomainParticipant; DomainParticipant(71)"
-    ended = run(sys.executable, "-c", program, CYCLONEDDS_URI=f"file://{path}")
-    known = "No/Such" not in settings
-    assert (ended.returncode == 0) == known, ended.stderr
+    completed = run(sys.executable, "-c", program, CYCLONEDDS_URI=f"file://{path}")
+    is_known = "No/Such" not in settings
+    assert (completed.returncode == 0) == is_known, completed.stderr
     for path_, value in settings.items():
         assert value in path.read_text(encoding="utf-8"), path_
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
-def test_zenoh_takes_its_file(tmp_path: Path, transport: str) -> None:
+def test_zenoh_reads_its_file(tmp_path: Path, transport: str) -> None:
     zenoh = pytest.importorskip("zenoh")
     path = tmp_path / "zenoh.json5"
     settings = tuning.tuned("zenoh", transport)
@@ -59,20 +59,20 @@ def test_zenoh_takes_its_file(tmp_path: Path, transport: str) -> None:
         read, wanted = json.loads(config.get_json(where)), json.loads(text)
         pairs = zip(read, wanted, strict=True) if isinstance(wanted, list) else []
         assert read == wanted or all(
-            {key: one["config"][key] for key in other["config"]} == other["config"] for one, other in pairs
+            {key: printed["config"][key] for key in other["config"]} == other["config"] for printed, other in pairs
         )
     zenoh.open(config).close()
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize(("transports", "loads"), [("LARGE_DATA", True), ("DEFAULT", True), ("NO_SUCH", False)])
-def test_fast_dds_takes_its_file(tmp_path: Path, transports: str, *, loads: bool) -> None:
+def test_fast_dds_reads_its_file(tmp_path: Path, transports: str, *, loads: bool) -> None:
     path = tmp_path / "fastdds.xml"
     settings = {"FASTDDS_BUILTIN_TRANSPORTS": transports}
     path.write_text(configurations.written("ros2", "tcp", settings, COMMENT), encoding="utf-8")
     python = str(ROOT / ".ros2" / "bin" / "python")
     wanted = str(int(transports == "LARGE_DATA"))
-    ended = run(
+    completed = run(
         python,
         "-c",
         SOCKETS,
@@ -82,13 +82,13 @@ def test_fast_dds_takes_its_file(tmp_path: Path, transports: str, *, loads: bool
         HOME=str(tmp_path),
         PATH=os.environ["PATH"],
     )
-    assert ended.returncode == 0, ended.stderr
-    assert ("XML" not in ended.stderr + ended.stdout) == loads, ended.stderr
-    # Only LARGE_DATA listens by TCP.
-    assert ended.stdout.splitlines()[-1] == wanted, ended.stdout
+    assert completed.returncode == 0, completed.stderr
+    assert ("XML" not in completed.stderr + completed.stdout) == loads, completed.stderr
+    # Only LARGE_DATA listens on TCP.
+    assert completed.stdout.splitlines()[-1] == wanted, completed.stdout
 
 
-def test_what_a_file_cannot_hold_is_refused() -> None:
+def test_setting_that_a_file_cannot_contain_is_rejected() -> None:
     with pytest.raises(ConfigurationError, match="cannot hold FASTDDS_X"):
         configurations.written("ros2", "tcp", {"FASTDDS_X": "1"}, [])
     with pytest.raises(ConfigurationError, match="cannot hold rmw_cyclonedds_cpp"):

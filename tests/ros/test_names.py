@@ -1,4 +1,4 @@
-"""Names on the wire, against the examples of rmw_zenoh's docs/design.md and tokens seen in public."""
+"""Names of topics and tokens, compared with the examples in rmw_zenoh's docs/design.md and with public tokens."""
 
 import pytest
 
@@ -12,7 +12,7 @@ CHATTER = f"%chatter/std_msgs::msg::dds_::String_/{STRING}"
 LISTENER = "aac3178e146ba6f1fc6e6a4085e77f21"
 TALKER = "8b20917502ee955ac4476e0266340d5c"
 
-# As they stand in design.md; the depths are those of its demo nodes.
+# From design.md; the depths are those of its demo nodes.
 NODE = f"@ros2_lv/0/{LISTENER}/0/0/NN/%/%/listener"
 SUBSCRIPTION = f"@ros2_lv/0/{LISTENER}/0/10/MS/%/%/listener/{CHATTER}/::,10:,:,:,,"
 PUBLISHER = f"@ros2_lv/0/{TALKER}/0/10/MP/%/%/talker/{CHATTER}/::,7:,:,:,,"
@@ -29,7 +29,7 @@ def test_tokens_are_those_of_the_design_document() -> None:
     assert token(Entity.PUBLISHER, TALKER, "talker", 7).key == PUBLISHER
 
 
-def test_a_topic_has_the_key_of_the_design_document() -> None:
+def test_key_of_a_topic_is_that_of_the_design_document() -> None:
     assert names.zenoh_key(0, "/chatter", "std_msgs/msg/String", STRING) == (
         f"0/chatter/std_msgs::msg::dds_::String_/{STRING}"
     )
@@ -39,16 +39,16 @@ def test_a_topic_has_the_key_of_the_design_document() -> None:
 
 
 @pytest.mark.parametrize(("topic", "mangled"), [("/scan", "rt/scan"), ("/robot1/scan", "rt/robot1/scan")])
-def test_topics_are_mangled_for_dds(topic: str, mangled: str) -> None:
+def test_dds_name_of_a_topic(topic: str, mangled: str) -> None:
     assert names.dds_topic(topic) == mangled
 
 
-def test_types_are_named_for_dds() -> None:
+def test_dds_name_of_a_type() -> None:
     assert names.dds_type("sensor_msgs/msg/LaserScan") == "sensor_msgs::msg::dds_::LaserScan_"
 
 
-def test_user_data_tell_the_hash() -> None:
-    """The example of test_qos.cpp in rmw_dds_common."""
+def test_user_data_contain_the_hash() -> None:
+    """The example in test_qos.cpp of rmw_dds_common."""
     counted = "RIHS01_" + "".join(f"{byte:02x}" for byte in range(32))
     assert names.user_data(counted) == (
         "typehash=RIHS01_000102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f;"
@@ -56,8 +56,8 @@ def test_user_data_tell_the_hash() -> None:
     assert names.user_data("") == ""
 
 
-def test_a_subscription_with_sensor_data() -> None:
-    """As public projects pin it for rmw_zenoh's listeners: best effort, 5 samples."""
+def test_subscription_with_sensor_data() -> None:
+    """As public projects define it for rmw_zenoh: best effort, 5 samples."""
     hashed = shipped().get("std_msgs/Bool").rihs01
     endpoint = Endpoint("/rovi/arm", "std_msgs/msg/Bool", hashed, PROFILES["sensor_data"])
     assert Token(0, LISTENER, 0, 2, Entity.SUBSCRIPTION, "rovi", endpoint=endpoint).key.endswith(

@@ -1,4 +1,4 @@
-"""Qualities of service, against the values of rmw/qos_profiles.h and the texts of rmw_zenoh."""
+"""Qualities of service, compared with the values of rmw/qos_profiles.h and the texts of rmw_zenoh."""
 
 import pytest
 
@@ -20,8 +20,8 @@ SECOND_NS = 10**9
     ],
 )
 def test_profiles_have_the_values_of_rmw(name: str, values: tuple[object, ...]) -> None:
-    found = PROFILES[name]
-    assert (found.reliability, found.history, found.depth, found.durability) == values
+    profile = PROFILES[name]
+    assert (profile.reliability, profile.history, profile.depth, profile.durability) == values
 
 
 @pytest.mark.parametrize(
@@ -32,10 +32,10 @@ def test_profiles_have_the_values_of_rmw(name: str, values: tuple[object, ...]) 
         (PROFILES["system_default"], "::,:,:,:,,"),
         (QosProfile(depth=42), "::,:,:,:,,"),
         (QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1), ":1:,1:,:,:,,"),
-        # The example in liveliness_utils.hpp, less what equals the defaults: deadline 5 s, lifespan 60 s and 3 us.
+        # The example in liveliness_utils.hpp without the default values: deadline 5 s, lifespan 60 s and 3 us.
         (QosProfile(deadline_ns=5 * SECOND_NS, lifespan_ns=60 * SECOND_NS + 3000), "::,10:5,0:60,3000:,,"),
         (QosProfile(history=History.KEEP_ALL, liveliness=Liveliness.MANUAL_BY_TOPIC), "::2,10:,:,:3,,"),
     ],
 )
-def test_rmw_zenoh_leaves_out_what_it_takes_anyway(profile: QosProfile, text: str) -> None:
+def test_rmw_zenoh_omits_default_values(profile: QosProfile, text: str) -> None:
     assert qos.to_zenoh(profile) == text

@@ -1,4 +1,4 @@
-"""Message types, against hashes and sums that others computed."""
+"""Message types, compared with published hashes and MD5 sums."""
 
 import json
 
@@ -41,15 +41,13 @@ PUBLISHED = {
 
 @pytest.mark.parametrize(("name", "published"), PUBLISHED.items())
 @pytest.mark.parametrize("distribution", Distribution)
-def test_hashes_are_those_that_ros_publishes(
-    name: str, published: tuple[str, str], distribution: Distribution
-) -> None:
-    found = shipped(distribution).get(name)
-    assert (found.rihs01, found.md5) == published
+def test_hashes_are_the_published_ones(name: str, published: tuple[str, str], distribution: Distribution) -> None:
+    message_type = shipped(distribution).get(name)
+    assert (message_type.rihs01, message_type.md5) == published
 
 
-def test_every_hash_is_that_of_a_real_ros_2() -> None:
-    """Those that rosidl itself wrote into the packages of ROS 2 Kilted."""
+def test_hashes_are_those_of_a_real_ros_2() -> None:
+    """The hashes that rosidl has written to the packages of ROS 2 Kilted."""
     published = json.loads((DATA / "ros2" / "kilted" / "type_hashes.json").read_text(encoding="utf-8"))
     assert len(published) > 100
     assert {name: shipped().get(name).rihs01 for name in published} == published
@@ -59,11 +57,11 @@ def test_either_spelling_names_a_type() -> None:
     assert shipped().get("sensor_msgs/LaserScan") == shipped().get("sensor_msgs/msg/LaserScan")
 
 
-def test_a_definition_of_ones_own_is_a_type_like_others() -> None:
+def test_custom_type() -> None:
     text = "std_msgs/Header header\nfloat32[4] level\nstring<=8 name\nuint8[] raw\nint16[<=3] few\n"
     types = MessageTypes(definitions={"lab_msgs/Radio": text})
-    found = types.get("lab_msgs/Radio")
-    assert len(found.rihs01) == len(PUBLISHED["std_msgs/msg/String"][0])
+    message_type = types.get("lab_msgs/Radio")
+    assert len(message_type.rihs01) == len(PUBLISHED["std_msgs/msg/String"][0])
     assert types.fields("lab_msgs/Radio")["lab_msgs/msg/Radio"] == (
         MessageField("header", "std_msgs/msg/Header", None),
         MessageField("level", "float32", 4),
@@ -74,32 +72,32 @@ def test_a_definition_of_ones_own_is_a_type_like_others() -> None:
     assert list(types.fields("lab_msgs/Radio"))[1:] == ["std_msgs/msg/Header", "builtin_interfaces/msg/Time"]
 
 
-def test_the_same_text_has_the_sum_of_the_type_that_ships_under_another_name() -> None:
-    """The sum of ROS 1 is over members, not over the name of the type."""
+def test_md5_sum_is_independent_of_the_name() -> None:
+    """The MD5 sum of ROS 1 covers the members, not the name of the type."""
     types = MessageTypes(definitions={"lab_msgs/Words": "string data\n"})
     assert types.get("lab_msgs/Words").md5 == PUBLISHED["std_msgs/msg/String"][1]
     assert types.get("lab_msgs/Words").rihs01 != PUBLISHED["std_msgs/msg/String"][0]
 
 
-def test_own_types_stay_where_they_are_defined() -> None:
+def test_custom_types_do_not_affect_other_instances() -> None:
     MessageTypes(definitions={"lab_msgs/Once": "string data\n"})
     with pytest.raises(ConfigurationError):
         shipped().get("lab_msgs/Once")
 
 
-def test_an_unknown_type_is_told_the_nearest() -> None:
+def test_unknown_type_is_reported_with_the_nearest() -> None:
     with pytest.raises(ConfigurationError) as failed:
         shipped().get("sensor_msgs/LaserScn")
     assert failed.value.remedy == "did you mean 'sensor_msgs/msg/LaserScan'?"
 
 
-def test_a_definition_that_names_an_unknown_type_is_refused() -> None:
+def test_definition_with_an_unknown_type_is_rejected() -> None:
     with pytest.raises(ConfigurationError, match="lab_msgs/msg/Foo"):
         MessageTypes(definitions={"lab_msgs/Radio": "Foo bar\n"})
 
 
 @given(st.text(max_size=60))
-def test_any_text_is_a_definition_or_is_refused(text: str) -> None:
+def test_any_text_is_a_definition_or_is_rejected(text: str) -> None:
     try:
         types = MessageTypes(definitions={"lab_msgs/Any": text})
     except ConfigurationError:
@@ -108,13 +106,13 @@ def test_any_text_is_a_definition_or_is_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "hashes"), [("foxy", False), ("humble", False), ("iron", True), ("rolling", True)])
-def test_hashes_are_told_from_iron_on(name: str, *, hashes: bool) -> None:
+def test_hashes_are_announced_since_iron(name: str, *, hashes: bool) -> None:
     distribution = Distribution.of(name)
-    assert (distribution.tells_hashes, distribution.gid_bytes) == (hashes, 16 if hashes else 24)
+    assert (distribution.has_type_hashes, distribution.gid_bytes) == (hashes, 16 if hashes else 24)
     types, quality = MessageTypes(distribution), PROFILES["default"]
-    told = topics.describe(types, "/scan", "sensor_msgs/LaserScan", quality, domain=0, node="n")
-    known = types.get("sensor_msgs/LaserScan").rihs01
-    assert told["user_data"] == (f"typehash={known};" if hashes else "")
-    shown = known if hashes else "TypeHashNotSupported"
-    assert told["key"] == f"0/scan/sensor_msgs::msg::dds_::LaserScan_/{shown}"
-    assert f"/{shown}/" in told["tokens"]["publisher"][1]
+    description = topics.describe(types, "/scan", "sensor_msgs/LaserScan", quality, domain=0, node="n")
+    type_hash = types.get("sensor_msgs/LaserScan").rihs01
+    assert description["user_data"] == (f"typehash={type_hash};" if hashes else "")
+    announced = type_hash if hashes else "TypeHashNotSupported"
+    assert description["key"] == f"0/scan/sensor_msgs::msg::dds_::LaserScan_/{announced}"
+    assert f"/{announced}/" in description["tokens"]["publisher"][1]

@@ -1,7 +1,7 @@
-"""An end of `/scan` over DDS or Zenoh: `wire_end.py hear|say OVER NETWORK TOPIC FILE`, with JSON for two of them.
+"""A publisher or subscriber of `/scan` over DDS or Zenoh: `wire_end.py hear|say OVER NETWORK TOPIC FILE`.
 
-`say` publishes the samples in the file, a line of hexadecimal each, and prints `matched` once a
-subscription matches; `hear` prints each that comes.
+NETWORK and TOPIC are JSON. `say` publishes the samples in the file, one hexadecimal line each, and prints `matched`
+when a subscription matches; `hear` prints each received sample.
 """
 
 import json

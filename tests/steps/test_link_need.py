@@ -38,7 +38,7 @@ def test_detail_names_connection_and_programs(connection: str, kind: str) -> Non
     [
         (CLOSED, "cannot be opened: Connection refused", "this computer has TCP port 5760, /dev/ttyACM0; write"),
         (SILENT, "no heartbeat of an autopilot", "no other common connection"),
-        ("error: MAVLink by usb: is not a connection", "is not a connection", "mavlink.connection"),
+        ("error: MAVLink over usb: is not a connection", "is not a connection", "mavlink.connection"),
         ("", "no answer", "mavlink.connection"),
         ("[]", "[]", "mavlink.connection"),
     ],

@@ -1,1 +1,1 @@
-"""Parts of the programs that fly a drone and guard it: the origin and the fence, liveness, the guard."""
+"""Parts of the programs that fly, guard and rescue a drone: origin and fence, liveness, loop, guard, rescue."""

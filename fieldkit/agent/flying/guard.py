@@ -1,9 +1,9 @@
-"""The guard of a drone: a program that brings the drone down where the program that leads it does not run any more.
+"""The guard of a drone: a program that lands the drone if the program that flies it has stopped.
 
-The guard of a step `fly` acts only during a flight of its pilot, and only in the mode that the pilot has set. A guard
-of a drone that is flown by other programs acts in modes in which programs lead a drone, and in the mode that a flying
-drone had when the guard began, until that is changed for the first time. In all other modes a person or a failsafe of
-the autopilot has the drone, and the guard sends nothing.
+The guard of a step `fly` acts only during a flight of its pilot, and only in the mode that the pilot has set. The
+guard of a drone that other programs fly acts in modes in which programs control a drone, and in the mode that a
+flying drone had when the guard started, until this mode changes for the first time. In all other modes a person or a
+failsafe of the autopilot controls the drone, and the guard sends nothing.
 """
 
 from __future__ import annotations
@@ -16,8 +16,18 @@ from fieldkit.agent.flight_plan import LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying import liveness
 from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING, LivenessFile
 from fieldkit.agent.flying.loop import GAP_S, HEARTBEAT_S, RATE_HZ
-from fieldkit.agent.flying.talk import AutopilotTalk
-from fieldkit.agent.landing import CALLED_OFF, GONE, LAPSED, REFUSED, FlightError, alarm, bring_down, say, unhurried
+from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.landing import (
+    CANCELLED,
+    LEASE_EXPIRED,
+    PEER_STOPPED,
+    REFUSED,
+    FlightError,
+    alarm,
+    bring_down,
+    landing_marker,
+    log_line,
+)
 from fieldkit.agent.mavlink_frames import HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.orders import Orders
 
@@ -26,120 +36,122 @@ class FlightGuard:
     """Guards one drone.
 
     Args:
-        plan: With `guards`; with `liveness` where a pilot of ours flies the drone.
-        over: Set when the job is to end.
+        plan: A plan with `guards`, and with `liveness` if fieldkit's pilot flies the drone.
+        stop_event: Set when the job must stop.
 
     Raises:
-        OSError: The connection or the file of liveness cannot be opened.
+        OSError: The connection or the liveness file cannot be opened.
     """
 
-    def __init__(self, plan: FlightPlan, over: threading.Event) -> None:
+    def __init__(self, plan: FlightPlan, stop_event: threading.Event) -> None:
         self._plan = plan
-        self._over = over
+        self._stop_event = stop_event
         self._liveness = LivenessFile(plan.liveness, liveness.GUARD) if plan.liveness else None
         self._state = liveness.IDLE
-        self._talk = AutopilotTalk(plan.connection, component=GUARD)
-        self._drone = self._talk.drone
+        self._session = AutopilotSession(plan.connection, component=GUARD)
+        self._drone = self._session.drone
         self._orders = Orders(plan.orders, (STAY, LEAVE), plan.lease_s)
-        self._turned_s: float | None = None
+        self._iteration_s: float | None = None
         self._first_mode: int | None = None
         self._mode_name = ""
 
     def run(self) -> None:
-        """Guard the drone until the order to leave it.
+        """Guard the drone until the order `leave`.
 
         Raises:
-            FlightError: The flight was cut short; the drone was brought down, where that is ours to do.
+            FlightError: The flight was aborted; the drone has landed if the guard may control it.
         """
         try:
-            say(f"waiting for the heartbeat of an autopilot at {self._plan.connection}")
+            log_line(f"waiting for the heartbeat of an autopilot at {self._plan.connection}")
             self._wait_for_autopilot()
-            say("ready")
+            log_line("ready")
             self._watch()
         except FlightError as error:
             self._give_up(error)
             raise
         finally:
             self._state = ENDED
-            self._beat()
-            self._talk.close()
+            self._update()
+            self._session.close()
 
     def _wait_for_autopilot(self) -> None:
-        began_s = time.monotonic()
+        start_s = time.monotonic()
         while not self._drone.alive:
-            if self._over.is_set():
-                raise FlightError(CALLED_OFF, "the job was ended")
-            if time.monotonic() > began_s + HEARTBEAT_S:
+            if self._stop_event.is_set():
+                raise FlightError(CANCELLED, "the job was ended")
+            if time.monotonic() > start_s + HEARTBEAT_S:
                 where = self._plan.connection
                 raise FlightError(REFUSED, f"no heartbeat of an autopilot at {where} in {HEARTBEAT_S:g} s")
-            self._turn()
+            self._exchange()
         self._first_mode = self._drone.mode if self._drone.armed else None
         for kind in (HEARTBEAT, LOCAL_POSITION_NED):
             self._drone.request_stream(kind, RATE_HZ)
         self._orders = Orders(self._plan.orders, (STAY, LEAVE), self._plan.lease_s)
-        self._turned_s = None
+        self._iteration_s = None
 
     def _watch(self) -> None:
-        """Return with the order to leave; raise `FlightError` where the drone is to come down."""
+        """Return after the order `leave`; raise `FlightError` if the drone must land."""
         while self._orders.order != LEAVE:
-            before_s, self._turned_s = self._turned_s, time.monotonic()
-            if before_s is not None and (gap_s := self._turned_s - before_s) > GAP_S:
-                raise FlightError(LAPSED, f"the guard did not run for {gap_s:.1f} s")
-            if self._over.is_set():
-                raise FlightError(CALLED_OFF, "the job was ended")
-            self._orders.look()
-            if self._orders.lapsed:
-                raise FlightError(LAPSED, "the order was not renewed in time: the laptop does not answer any more")
-            self._demand_pilot()
+            previous_s, self._iteration_s = self._iteration_s, time.monotonic()
+            if previous_s is not None and (gap_s := self._iteration_s - previous_s) > GAP_S:
+                raise FlightError(LEASE_EXPIRED, f"the guard did not run for {gap_s:.1f} s")
+            if self._stop_event.is_set():
+                raise FlightError(CANCELLED, "the job was ended")
+            self._orders.poll()
+            if self._orders.expired:
+                raise FlightError(
+                    LEASE_EXPIRED, "the order was not renewed in time: the laptop does not answer any more"
+                )
+            self._require_pilot()
             if self._first_mode != self._drone.mode:
                 self._first_mode = None
-            self._turn()
+            self._exchange()
 
-    def _demand_pilot(self) -> None:
-        """Go on only while the pilot runs, if it flies."""
+    def _require_pilot(self) -> None:
+        """Raise `FlightError` if the pilot has stopped during its flight."""
         if self._liveness is None:
             return
-        why = self._liveness.look()
-        if why and self._flies:
-            self._liveness.end_other()
-            raise FlightError(GONE, f"the pilot {why}")
+        problem = self._liveness.poll()
+        if problem and self._pilot_flies:
+            self._liveness.kill_other()
+            raise FlightError(PEER_STOPPED, f"the pilot {problem}")
 
     @property
-    def _flies(self) -> bool:
-        """Whether a pilot of ours has begun a flight and has not ended it."""
+    def _pilot_flies(self) -> bool:
+        """Whether fieldkit's pilot has started a flight and has not finished it."""
         return self._liveness is not None and self._liveness.other_state in (FLYING, LANDING)
 
-    def _led(self) -> bool:
-        """Return whether the drone is in a mode in which it is ours to bring down."""
+    def _may_command(self) -> bool:
+        """Return True if the drone is in a mode in which the guard may control it."""
         drone = self._drone
         if self._liveness is not None:
             return drone.guided
-        program = drone.dialect is not None and drone.dialect.is_led(drone.mode)
-        return program or drone.mode == self._first_mode
+        is_program = drone.dialect is not None and drone.dialect.is_program_controlled(drone.mode)
+        return is_program or drone.mode == self._first_mode
 
     def _give_up(self, error: FlightError) -> None:
-        """Bring the drone down where that is ours to do; errors as `bring_down`, with an alarm in the log."""
+        """Land the drone if the guard may control it; raises as `bring_down`, with an alarm in the log."""
         drone = self._drone
-        if not drone.armed or not (self._flies if self._liveness is not None else self._led()):
+        if not drone.armed or not (self._pilot_flies if self._liveness is not None else self._may_command()):
             return
-        say(f"{self._plan.abort}: {error}")
+        log_line(f"{self._plan.abort}: {error}")
         self._state = LANDING
         try:
-            with unhurried(self._plan.unhurried):
-                bring_down(self._talk, self._plan.abort, self._led, self._beat)
+            with landing_marker(self._plan.unhurried):
+                bring_down(self._session, self._plan.abort, self._may_command, self._update)
         except FlightError:
-            say(alarm(drone))
+            log_line(alarm(drone))
             raise
-        say("landed")
+        log_line("landed")
 
-    def _turn(self) -> None:
-        self._beat()
-        self._talk.turn(1 / RATE_HZ)
+    def _exchange(self) -> None:
+        self._update()
+        self._session.exchange(1 / RATE_HZ)
 
-    def _beat(self) -> None:
-        """Show the pilot that this program runs, and report modes of the autopilot that are new."""
+    def _update(self) -> None:
+        """Update the liveness entry of this program, and log a changed mode of the autopilot."""
         if self._liveness is not None:
-            self._liveness.beat(self._state)
+            self._liveness.update(self._state)
         if self._drone.dialect is not None and self._drone.mode_name != self._mode_name:
             self._mode_name = self._drone.mode_name
-            say(f"mode {self._mode_name}")
+            log_line(f"mode {self._mode_name}")

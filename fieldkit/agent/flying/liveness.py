@@ -1,7 +1,7 @@
-"""Liveness of the pilot and the guard of a drone: each sees within 1 s that the other does not run any more.
+"""Mutual supervision of the pilot and the guard of a drone: each detects within 1 s that the other has stopped.
 
-Both map one file, which is allocated before the flight: a full disk does not look like a program that has ended. Each
-has an entry in it: its process, what it does, and a counter that it increments with each turn, ten times a second.
+Both programs map one file, which is allocated before the flight, so that a full disk is not mistaken for a stopped
+program. Each program has an entry with its process, its state, and a counter that it increments ten times a second.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from contextlib import suppress
 from typing import NamedTuple
 
 PILOT, GUARD = 0, 1
-"""Entries of the file."""
+"""Indices of the entries."""
 IDLE, FLYING, LANDING, ENDED = 0, 1, 2, 3
-"""What a program does: waits, leads the drone, brings it down, has ended."""
+"""State of a program: it waits, flies the drone, lands it, or has ended."""
 
 SILENT_S = 0.8
-"""A program whose counter does not change for this time does not run."""
-_LOOK_S = 0.2
-"""A look counts for at most this time: a delay of the watching program is not one of the program that it watches."""
+"""A program whose counter does not change for this time has stopped."""
+_MAX_POLL_S = 0.2
+"""Maximum time that one poll adds to the silence: delays of the polling program must not count."""
 _ENTRY = struct.Struct("<QQQQ")
 SIZE = 2 * _ENTRY.size
-"""Of the file, in bytes."""
-_SUSPENDED = "Tt"
-_ENDED = "ZXx"
+"""Size of the file in bytes."""
+_SUSPENDED_STATES = "Tt"
+_ENDED_STATES = "ZXx"
 """States of a process in /proc/PID/stat (proc_pid_stat(5))."""
 
 
@@ -35,10 +35,10 @@ class LifeEntry(NamedTuple):
     """Entry of a program.
 
     Attributes:
-        pid: Its process.
-        started: When that started, in clock ticks since boot.
-        turns: How many turns it has taken.
-        state: What it does.
+        pid: Its process id.
+        started: Start time of the process, in clock ticks since boot.
+        turns: Counter of its iterations.
+        state: Its state: `IDLE`, `FLYING`, `LANDING` or `ENDED`.
     """
 
     pid: int
@@ -51,7 +51,7 @@ def entries(content: bytes) -> tuple[LifeEntry, LifeEntry]:
     """Return the entries of the pilot and of the guard.
 
     Raises:
-        ValueError: This is not the content of such a file.
+        ValueError: The content has a wrong length.
     """
     if len(content) != SIZE:
         raise ValueError(f"{len(content)} bytes instead of {SIZE}")
@@ -63,11 +63,11 @@ class LivenessFile:
     """The file that the pilot and the guard of a drone share.
 
     Args:
-        path: The file; it is made where it is missing.
+        path: The file; it is created if it is missing.
         own: `PILOT` or `GUARD`: the entry of this program.
 
     Raises:
-        OSError: It cannot be made, or has no room.
+        OSError: It cannot be created or allocated.
     """
 
     def __init__(self, path: str, own: int) -> None:
@@ -79,39 +79,39 @@ class LivenessFile:
             os.close(descriptor)
         self._own = own
         self._count = self._other_count = 0
-        self._silent_s, self._looked_s = 0.0, time.monotonic()
+        self._silent_s, self._polled_s = 0.0, time.monotonic()
 
-    def beat(self, state: int) -> None:
-        """Increment the own counter, and write what this program does."""
+    def update(self, state: int) -> None:
+        """Increment the counter of this program, and write its state."""
         self._count += 1
         entry = os.getpid(), _process(os.getpid())[1], self._count, state
         _ENTRY.pack_into(self._map, self._own * _ENTRY.size, *entry)
 
     @property
     def other_state(self) -> int:
-        """What the other program does, or did when it ran last."""
+        """The last state that the other program has written."""
         return self._other().state
 
-    def look(self) -> str:
-        """Look at the other program; to be called with each turn.
+    def poll(self) -> str:
+        """Check the other program; must be called in each iteration.
 
         Returns:
-            How it came that it does not run; empty while it runs.
+            The reason why it does not run, for example `has ended`; empty while it runs.
         """
         pid, started, count, _ = self._other()
         now_s = time.monotonic()
-        passed_s, self._looked_s = min(now_s - self._looked_s, _LOOK_S), now_s
+        passed_s, self._polled_s = min(now_s - self._polled_s, _MAX_POLL_S), now_s
         self._silent_s = self._silent_s + passed_s if count == self._other_count else 0.0
         self._other_count = count
         state, other_started = _process(pid)
-        if not pid or other_started != started or state in _ENDED:
+        if not pid or other_started != started or state in _ENDED_STATES:
             return "has ended"
-        if state in _SUSPENDED:
+        if state in _SUSPENDED_STATES:
             return "is suspended"
         return f"has not run for {self._silent_s:.1f} s" if self._silent_s > SILENT_S else ""
 
-    def end_other(self) -> None:
-        """Kill the other program, which must not continue later; not another process that has its number now."""
+    def kill_other(self) -> None:
+        """Kill the other program, so that it cannot continue later; never another process that reuses its pid."""
         pid, started, *_ = self._other()
         if pid and _process(pid)[1] == started:
             with suppress(ProcessLookupError):
@@ -122,7 +122,7 @@ class LivenessFile:
 
 
 def _process(pid: int) -> tuple[str, int]:
-    """Return the state of a process, and when it started in clock ticks since boot; `X`, 0 if it does not exist."""
+    """Return the state of a process and its start time in clock ticks since boot; `X` and 0 if it does not exist."""
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:  # noqa: PTH123 (Python 3.8)
             fields = file.read().rpartition(")")[2].split()

@@ -1,59 +1,59 @@
-"""Texts of an autopilot for people."""
+"""Text messages of an autopilot (STATUSTEXT)."""
 
 from __future__ import annotations
 
 import struct
 
 NOTICE, WARNING = 5, 4
-"""MAV_SEVERITY; what is more severe has a lower number."""
+"""MAV_SEVERITY; a lower number is more severe."""
 
-_MOST_TEXTS, _MOST_CHARACTERS = 30, 500
+_MAX_TEXTS, _MAX_CHARACTERS = 30, 500
 _CHUNK = struct.Struct("<HB")
 
 
 class AutopilotTexts:
-    """Texts of STATUSTEXT, notices and what is more severe."""
+    """The last texts of STATUSTEXT messages with severity `NOTICE` or more severe."""
 
     def __init__(self) -> None:
         self._texts: list[tuple[int, str]] = []
-        self._number = self._count = self._taken = 0
+        self._number = self._count = self._read_count = 0
 
-    def take(self, payload: bytes) -> None:
-        """Take a message; a long text comes in pieces with one number (STATUSTEXT, id and chunk_seq)."""
+    def add_message(self, payload: bytes) -> None:
+        """Add a message; the pieces of a long text have the same number (STATUSTEXT, id and chunk_seq)."""
         text = printable(payload[1:51].split(b"\0")[0].decode("utf-8", "replace"))
         number, piece = _CHUNK.unpack_from(payload, 51)
         severity = payload[0]
         if severity > NOTICE:
             return
         if piece and number == self._number and self._texts:
-            severity, before = self._texts[-1]
-            self._texts[-1] = severity, (before + text)[:_MOST_CHARACTERS]
+            severity, previous = self._texts[-1]
+            self._texts[-1] = severity, (previous + text)[:_MAX_CHARACTERS]
         elif not piece:
-            self._texts = [*self._texts[1 - _MOST_TEXTS :], (severity, text)]
+            self._texts = [*self._texts[1 - _MAX_TEXTS :], (severity, text)]
             self._count += 1
         self._number = number
 
-    def new(self) -> list[str]:
-        """Return the texts that have come since the last call."""
-        count, self._taken = min(self._count - self._taken, len(self._texts)), self._count
+    def unread(self) -> list[str]:
+        """Return the texts that have arrived since the last call."""
+        count, self._read_count = min(self._count - self._read_count, len(self._texts)), self._count
         return [text for _, text in self._texts[len(self._texts) - count :]]
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings and what is more severe, the last at the end."""
+        """The texts with severity `WARNING` or more severe, in order of arrival."""
         return [text for severity, text in self._texts if severity <= WARNING]
 
     @property
     def last(self) -> str:
-        """The last text; empty where there is none."""
+        """The last text; empty if there is none."""
         return self._texts[-1][1] if self._texts else ""
 
-    def forget(self) -> None:
-        """Forget all texts."""
+    def clear(self) -> None:
+        """Delete all texts."""
         self._texts = []
-        self._taken = self._count
+        self._read_count = self._count
 
 
 def printable(text: str) -> str:
-    """Return a text of an autopilot with a `?` for each character that is not printable."""
+    """Return a text in which each character that is not printable is replaced by `?`."""
     return "".join(character if character.isprintable() else "?" for character in text)

@@ -1,4 +1,4 @@
-"""The rescue of a drone: lands it where neither its pilot nor its guard runs; fieldkit starts it from the laptop."""
+"""The rescue of a drone: lands it if neither its pilot nor its guard runs. fieldkit starts it from the laptop."""
 
 from __future__ import annotations
 
@@ -9,73 +9,84 @@ from fieldkit.agent.autopilot import GUARD, AutopilotState
 from fieldkit.agent.flight_plan import FlightPlan
 from fieldkit.agent.flying import liveness
 from fieldkit.agent.flying.liveness import LivenessFile
-from fieldkit.agent.flying.talk import AutopilotTalk
-from fieldkit.agent.landing import MANUAL_ACTION, REFUSED, UNHEARD_S, FlightError, alarm, bring_down, say, unhurried
+from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.landing import (
+    MANUAL_ACTION,
+    REFUSED,
+    UNHEARD_S,
+    FlightError,
+    alarm,
+    bring_down,
+    landing_marker,
+    log_line,
+)
 
-_TURN_S = 0.1
+_POLL_S = 0.1
 _WARNS_S = 4.0
-"""An autopilot that is not heard for this time is reported."""
+"""An alarm is logged after this time without a heartbeat."""
 
 
 def rescue(plan: FlightPlan) -> None:
-    """End the pilot and the guard, and bring the drone down if their flight still leads it; no order stops this.
+    """Kill the pilot and the guard, and land the drone if it is still under their control. Orders are ignored.
 
     Args:
-        plan: With the file of liveness that the pilot and the guard share.
+        plan: A plan with the liveness file that the pilot and the guard share.
 
     Raises:
-        FlightError: The autopilot was not heard for `UNHEARD_S`, another party flies the drone, or it did not land.
-        OSError: The file of liveness cannot be opened.
-        ValueError: The connection is not the name of one.
+        FlightError: No heartbeat arrived for `UNHEARD_S`, another party flies the drone, or it did not land.
+        OSError: The liveness file cannot be opened.
+        ValueError: The name of the connection is invalid.
     """
     for own in (liveness.PILOT, liveness.GUARD):
-        LivenessFile(plan.liveness, own).end_other()
-    say(f"{plan.abort}: neither the pilot nor the guard runs")
-    end_s = time.monotonic() + UNHEARD_S
-    with unhurried(plan.unhurried):
-        talk = _opened(plan.connection, end_s)
+        LivenessFile(plan.liveness, own).kill_other()
+    log_line(f"{plan.abort}: neither the pilot nor the guard runs")
+    deadline_s = time.monotonic() + UNHEARD_S
+    with landing_marker(plan.unhurried):
+        session = _open_session(plan.connection, deadline_s)
         try:
-            _wait_for_autopilot(talk, end_s)
-            bring_down(talk, plan.abort, lambda: is_led(talk.drone))
+            _wait_for_autopilot(session, deadline_s)
+            bring_down(session, plan.abort, lambda: is_under_control(session.drone))
         except FlightError:
-            say(alarm(talk.drone))
+            log_line(alarm(session.drone))
             raise
         finally:
-            talk.close()
-    say("landed")
+            session.close()
+    log_line("landed")
 
 
-def is_led(drone: AutopilotState) -> bool:
-    """Return whether the drone is in the mode of the flight, or in the failsafe that follows lost set-points.
+def is_under_control(drone: AutopilotState) -> bool:
+    """Return True if the drone is in the mode of the flight, or in the failsafe for missing set-points.
 
-    A person who takes the drone over ends the failsafe, also where the mode stays the same.
+    A person who takes the drone over ends the failsafe, even if the mode stays the same.
     """
-    return drone.guided or (drone.failsafe and drone.dialect is not None and drone.dialect.waits(drone.mode))
+    return drone.guided or (
+        drone.failsafe and drone.dialect is not None and drone.dialect.is_failsafe_hold(drone.mode)
+    )
 
 
-def _opened(connection: str, end_s: float) -> AutopilotTalk:
-    """Return the conversation with the autopilot, through a new link server where the old one does not run.
+def _open_session(connection: str, deadline_s: float) -> AutopilotSession:
+    """Open a session with the autopilot. A link server that has stopped is replaced.
 
     Raises:
-        FlightError: The connection cannot be opened until `end_s`.
-        ValueError: It is not the name of a connection.
+        FlightError: The connection cannot be opened before `deadline_s`.
+        ValueError: The name of the connection is invalid.
     """
-    warned = False
-    while time.monotonic() < end_s:
-        with suppress(OSError):  # it is tried for seconds
-            return AutopilotTalk(connection, component=GUARD)
-        if not warned:
-            say(f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {connection} CANNOT BE OPENED. {MANUAL_ACTION}")
-        warned = True
+    has_warned = False
+    while time.monotonic() < deadline_s:
+        with suppress(OSError):  # each attempt takes up to some seconds
+            return AutopilotSession(connection, component=GUARD)
+        if not has_warned:
+            log_line(f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {connection} CANNOT BE OPENED. {MANUAL_ACTION}")
+        has_warned = True
     raise FlightError(REFUSED, f"{connection} could not be opened in {UNHEARD_S:g} s")
 
 
-def _wait_for_autopilot(talk: AutopilotTalk, end_s: float) -> None:
-    warns_s = time.monotonic() + _WARNS_S
-    while not talk.drone.alive:
-        if time.monotonic() > end_s:
+def _wait_for_autopilot(session: AutopilotSession, deadline_s: float) -> None:
+    warning_s = time.monotonic() + _WARNS_S
+    while not session.drone.alive:
+        if time.monotonic() > deadline_s:
             raise FlightError(REFUSED, f"no heartbeat of the autopilot in {UNHEARD_S:g} s")
-        if time.monotonic() > warns_s:
-            say(alarm(talk.drone))
-            warns_s = end_s
-        talk.turn(_TURN_S)
+        if time.monotonic() > warning_s:
+            log_line(alarm(session.drone))
+            warning_s = deadline_s
+        session.exchange(_POLL_S)

@@ -1,4 +1,4 @@
-"""The conversation of a program with an autopilot: heartbeats, and what the autopilot sends."""
+"""A program's session with an autopilot: sends heartbeats, and receives the messages of the autopilot."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import time
 from typing import Callable
 
 from fieldkit.agent.autopilot import PILOT, AutopilotState
-from fieldkit.agent.mavlink_links import opened
+from fieldkit.agent.mavlink_links import open_link
 
 _BEAT_S = 1.0
 
 
-class AutopilotTalk:
-    """Exchanges messages with an autopilot. The link server opens a lost connection again, and repeats requests.
+class AutopilotSession:
+    """Exchanges messages with an autopilot. The link server reopens a lost connection, and repeats requests.
 
     Args:
-        connection: Where the autopilot is, as `mavlink_links.opened` takes it.
-        look: Called at the end of each turn, with the state of the autopilot.
+        connection: Name of the connection, as for `mavlink_links.open_link`.
+        poll: Called at the end of each `exchange` with the state of the autopilot.
         component: Component id of this program.
 
     Attributes:
@@ -26,31 +26,31 @@ class AutopilotTalk:
 
     Raises:
         OSError: The connection cannot be opened.
-        ValueError: It is not a connection.
+        ValueError: The name of the connection is invalid.
     """
 
     def __init__(
-        self, connection: str, look: Callable[[AutopilotState], None] = lambda _: None, component: int = PILOT
+        self, connection: str, on_state: Callable[[AutopilotState], None] = lambda _: None, component: int = PILOT
     ) -> None:
-        self._look = look
-        self.link = opened(connection)
+        self._on_state = on_state
+        self.link = open_link(connection)
         self.drone = AutopilotState(self.link, component)
         self._waiting = selectors.DefaultSelector()
         self._waiting.register(self.link.fileno(), selectors.EVENT_READ)
-        self._beat_s = 0.0
+        self._next_beat_s = 0.0
 
-    def turn(self, lasts_s: float) -> None:
-        """Receive and send for this time; in seconds."""
-        end_s = time.monotonic() + lasts_s
-        if time.monotonic() > self._beat_s:
-            self._beat_s = time.monotonic() + _BEAT_S
-            self.drone.beat()
+    def exchange(self, duration_s: float) -> None:
+        """Receive and send messages for this time in seconds."""
+        end_s = time.monotonic() + duration_s
+        if time.monotonic() > self._next_beat_s:
+            self._next_beat_s = time.monotonic() + _BEAT_S
+            self.drone.send_heartbeat()
         while (left_s := end_s - time.monotonic()) > 0:
             if self._waiting.select(left_s):
                 self.drone.receive()
-        self._look(self.drone)
+        self._on_state(self.drone)
 
     def close(self) -> None:
-        """Close the connection, which ends the requests for messages of this program."""
+        """Close the connection, which ends this program's requests for messages."""
         self._waiting.close()
         self.link.close()

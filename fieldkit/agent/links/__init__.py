@@ -1,1 +1,1 @@
-"""The link server: one program on a robot that shares a MAVLink connection between the programs of fieldkit there."""
+"""The link server: a program on a robot that shares a MAVLink connection between the programs of fieldkit there."""

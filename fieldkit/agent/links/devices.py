@@ -1,7 +1,7 @@
-"""Connections to an autopilot: UDP in both directions, TCP, a serial line.
+"""Connections to an autopilot: UDP in both directions, TCP, serial lines.
 
-They are named as MAVLink's tools name them: `udpout:HOST:PORT` sends first, `udpin:HOST:PORT` waits for the first
-datagram, `tcp:HOST:PORT`, `/dev/ttyAMA0:921600`.
+The names follow MAVLink's tools: `udpout:HOST:PORT` sends first, `udpin:HOST:PORT` waits for the first datagram,
+`tcp:HOST:PORT`, `/dev/ttyAMA0:921600`.
 """
 
 from __future__ import annotations
@@ -14,49 +14,49 @@ import tty
 from contextlib import suppress
 from typing import Protocol
 
-MOST_BYTES = 65_536
-_CONNECTS_S = 2.0
-_GONE_S = 3.0
-"""After that long without a datagram from a peer, the next sender replaces it: it restarted at another port."""
-_MOST_WAITING_BYTES = 4096
-"""Bytes that wait for a slow line: 0.7 s at 57600 baud. More would be too late to be useful."""
+MAX_BYTES = 65_536
+_CONNECT_TIMEOUT_S = 2.0
+_PEER_TIMEOUT_S = 3.0
+"""After this time without a datagram from the peer the next sender replaces it: a restarted peer has a new port."""
+_MAX_QUEUED_BYTES = 4096
+"""Maximum number of queued bytes for a slow line: 0.7 s at 57600 baud. Older data would be useless."""
 
 
 class FlightDevice(Protocol):
     """An open connection to an autopilot."""
 
     whole: bool
-    """Whether each read returns whole frames."""
+    """Whether each read returns complete frames."""
 
     def fileno(self) -> int:
-        """Return the descriptor to wait for."""
+        """Return the file descriptor to wait for."""
 
     def read(self) -> bytes:
         """Return the bytes that have arrived; empty if there are none.
 
         Raises:
-            OSError: The connection has ended.
+            OSError: The connection is lost.
         """
 
     def write(self, frame: bytes) -> None:
-        """Send a frame, or leave it out whole if the line is busy.
+        """Send a complete frame, or drop it if the line is busy.
 
         Raises:
-            OSError: The connection has ended.
+            OSError: The connection is lost.
         """
 
     def flush(self) -> None:
-        """Send what waits for a slow line; errors as `write`."""
+        """Send queued bytes of a slow line; raises as `write`."""
 
     def close(self) -> None:
-        """Close it."""
+        """Close the connection."""
 
 
 def check(connection: str) -> None:
     """Check the name of a connection.
 
     Raises:
-        ValueError: It is not the name of a connection.
+        ValueError: The name is invalid.
     """
     kind, _, rest = connection.partition(":")
     if kind.startswith("/"):
@@ -70,20 +70,20 @@ def check(connection: str) -> None:
         raise ValueError(f"{connection} has no HOST:PORT")
 
 
-def opened(connection: str) -> FlightDevice:
-    """Return an open connection to an autopilot.
+def open_device(connection: str) -> FlightDevice:
+    """Open a connection to an autopilot.
 
     Raises:
         OSError: It cannot be opened.
-        ValueError: It is not the name of a connection.
+        ValueError: The name of the connection is invalid.
     """
     check(connection)
     kind, _, rest = connection.partition(":")
     if kind.startswith("/"):
-        return StreamDevice(_serial(kind, int(rest)))
+        return StreamDevice(_open_serial(kind, int(rest)))
     host, _, port = rest.rpartition(":")
     if kind == "tcp":
-        stream = socket.create_connection((host, int(port)), timeout=_CONNECTS_S)
+        stream = socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S)
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         stream.settimeout(None)
         return StreamDevice(stream.detach())
@@ -91,11 +91,11 @@ def opened(connection: str) -> FlightDevice:
 
 
 class UdpDevice:
-    """Datagrams: each has whole frames, and a truncated one does not damage the next.
+    """UDP. Each datagram contains complete frames, so that a truncated one does not damage the next.
 
     Args:
-        address: The destination; or the address to listen at.
-        listens: Whether to wait for the first datagram.
+        address: The destination, or the local address if `listens`.
+        listens: Whether to wait for the first datagram, whose sender becomes the peer.
     """
 
     whole = True
@@ -104,7 +104,7 @@ class UdpDevice:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._peer = None if listens else (socket.gethostbyname(address[0]), address[1])
         self._listens = listens
-        self._heard_s = float("-inf")
+        self._received_s = float("-inf")
         try:
             if listens:
                 self._socket.bind(address)
@@ -114,30 +114,30 @@ class UdpDevice:
         self._socket.setblocking(False)
 
     def fileno(self) -> int:
-        """See `FlightDevice.fileno`."""
+        """Return the file descriptor to wait for."""
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """See `FlightDevice.read`; an unreachable port is not an error: the other end may start later."""
+        """Return the next datagram; an unreachable port is not an error, since the peer may start later."""
         with suppress(BlockingIOError, ConnectionRefusedError):
-            datagram, sender = self._socket.recvfrom(MOST_BYTES)
+            datagram, sender = self._socket.recvfrom(MAX_BYTES)
             now_s = time.monotonic()
-            if self._listens and (sender == self._peer or now_s > self._heard_s + _GONE_S):
-                self._peer, self._heard_s = sender, now_s
+            if self._listens and (sender == self._peer or now_s > self._received_s + _PEER_TIMEOUT_S):
+                self._peer, self._received_s = sender, now_s
             return datagram
         return b""
 
     def write(self, frame: bytes) -> None:
-        """See `FlightDevice.write`; a datagram may be lost anyway, so an error of one is not reported."""
+        """Send a frame; errors are ignored, because datagrams may be lost anyway."""
         if self._peer is not None:
             with suppress(OSError):
                 self._socket.sendto(frame, self._peer)
 
     def flush(self) -> None:
-        """See `FlightDevice.flush`; nothing waits."""
+        """Do nothing: datagrams are not queued."""
 
     def close(self) -> None:
-        """See `FlightDevice.close`."""
+        """Close the socket."""
         self._socket.close()
 
 
@@ -145,24 +145,24 @@ class StreamDevice:
     """A byte stream: TCP or a serial line.
 
     Args:
-        descriptor: What is read from and written to; it is closed with the device.
+        descriptor: The file descriptor of the stream; it is closed with the device.
     """
 
     whole = False
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
-        self._waiting = bytearray()
+        self._queue = bytearray()
         os.set_blocking(descriptor, False)
 
     def fileno(self) -> int:
-        """See `FlightDevice.fileno`."""
+        """Return the file descriptor to wait for."""
         return self._descriptor
 
     def read(self) -> bytes:
-        """See `FlightDevice.read`."""
+        """Return the bytes that have arrived; raises `ConnectionResetError` at the end of the stream."""
         try:
-            data = os.read(self._descriptor, MOST_BYTES)
+            data = os.read(self._descriptor, MAX_BYTES)
         except BlockingIOError:
             return b""
         if not data:
@@ -170,24 +170,24 @@ class StreamDevice:
         return data
 
     def write(self, frame: bytes) -> None:
-        """See `FlightDevice.write`."""
-        if len(self._waiting) + len(frame) <= _MOST_WAITING_BYTES:
-            self._waiting += frame
+        """Send a frame, or drop it if too many bytes are queued."""
+        if len(self._queue) + len(frame) <= _MAX_QUEUED_BYTES:
+            self._queue += frame
         self.flush()
 
     def flush(self) -> None:
-        """See `FlightDevice.flush`."""
+        """Send queued bytes."""
         with suppress(BlockingIOError):
-            while self._waiting:
-                del self._waiting[: os.write(self._descriptor, self._waiting)]
+            while self._queue:
+                del self._queue[: os.write(self._descriptor, self._queue)]
 
     def close(self) -> None:
-        """See `FlightDevice.close`."""
+        """Close the file descriptor."""
         os.close(self._descriptor)
 
 
-def _serial(path: str, baud: int) -> int:
-    """Open a serial line: 8 bits, no parity, no handshake, at this rate."""
+def _open_serial(path: str, baud: int) -> int:
+    """Open a serial line with 8 data bits, no parity and no flow control at this rate."""
     speed = getattr(termios, f"B{baud}")
     descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     try:

@@ -1,7 +1,7 @@
-"""Where a link server is found: a Unix-domain socket and a lock file in a private folder.
+"""Paths of a link server: a Unix-domain socket and a lock file in a private folder.
 
-Their name stands for the connection in this network namespace since this boot, so that neither a home folder that
-several robots share nor a container mixes connections up.
+Their name is a hash of the connection, the network namespace and the boot ID, so that connections of different robots
+with a shared home folder, or of containers, are not confused.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ _CREDENTIALS = struct.Struct("iII")
 
 
 def folder() -> str:
-    """Return the folder of sockets, which only this user can enter.
+    """Return the folder of sockets, which only this user can access.
 
     Raises:
-        OSError: It cannot be made, or belongs to another user.
+        OSError: It cannot be created, or belongs to another user.
     """
     path = os.path.expanduser(os.path.join(*_FOLDER))  # noqa: PTH111, PTH118 (Python 3.8)
     os.makedirs(path, mode=0o700, exist_ok=True)  # noqa: PTH103
-    found = os.lstat(path)
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+    status = os.lstat(path)
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
         raise PermissionError(f"{path} is not a folder of this user")
-    if stat.S_IMODE(found.st_mode) != 0o700:
+    if stat.S_IMODE(status.st_mode) != 0o700:
         os.chmod(path, 0o700)  # noqa: PTH101
     return path
 
 
 def name(connection: str) -> str:
-    """Return the name of the files of a connection, without suffix."""
+    """Return the file name of a connection, without suffix."""
     with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:  # noqa: PTH123
         boot = file.read().strip()
     network = os.stat("/proc/self/ns/net").st_ino  # noqa: PTH116
@@ -45,7 +45,7 @@ def name(connection: str) -> str:
 
 @contextmanager
 def address(connection: str) -> Iterator[str]:
-    """Yield the address of a connection's socket, which is short however long the path of the home folder is."""
+    """Yield the address of a connection's socket, which is short for home folders with any path."""
     descriptor = os.open(folder(), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield f"/proc/self/fd/{descriptor}/{name(connection)}.sock"
@@ -54,10 +54,10 @@ def address(connection: str) -> Iterator[str]:
 
 
 def lock(connection: str) -> int | None:
-    """Return the locked lock file of a connection; None where another server has it.
+    """Return the descriptor of a connection's locked lock file, or None if another server holds the lock.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: The file cannot be created.
     """
     path = f"{folder()}/{name(connection)}.lock"
     while True:
@@ -71,18 +71,18 @@ def lock(connection: str) -> int | None:
             if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # noqa: PTH116
                 return descriptor
         except FileNotFoundError:
-            pass  # its former owner has removed it
+            pass  # the previous owner of the lock has removed the file
         os.close(descriptor)
 
 
 def remove(connection: str) -> None:
-    """Remove the files of a connection; only the owner of its lock may."""
+    """Remove the files of a connection. The caller must hold its lock."""
     for suffix in ("sock", "log", "lock"):
         with suppress(FileNotFoundError):
             os.unlink(f"{folder()}/{name(connection)}.{suffix}")  # noqa: PTH108
 
 
-def peer(stream: socket.socket) -> tuple[int, int]:
+def peer_credentials(stream: socket.socket) -> tuple[int, int]:
     """Return the process id and the user id of the other end of a Unix-domain socket."""
     packed = stream.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     pid, uid, _ = _CREDENTIALS.unpack(packed)

@@ -1,7 +1,7 @@
-"""The link server: it owns the connection to an autopilot and forwards frames between it and its clients.
+"""The link server: it owns the connection to an autopilot, and forwards frames between the autopilot and its clients.
 
-Clients are connected by a Unix-domain socket of packets. The first byte of a packet says what it is: `FRAMES` whole
-frames, `ALIVE` a question of a client whether the server works, `STATE` its answer, as JSON.
+Clients connect to a Unix-domain socket of type SOCK_SEQPACKET. The first byte of a packet is its type: `FRAMES`
+precedes complete frames, `ALIVE` is a poll of a client, and `STATE` precedes the answer to it, a JSON object.
 """
 
 from __future__ import annotations
@@ -36,32 +36,33 @@ from fieldkit.agent.mavlink_frames import (
 
 FRAMES, ALIVE, STATE = b"F", b"P", b"S"
 
-_OWN = 245, 194
-"""System and component of the server: MAV_COMP_ID_ONBOARD_COMPUTER4, so that no client has the same."""
+_ADDRESS = 245, 194
+"""System and component id of the server: MAV_COMP_ID_ONBOARD_COMPUTER4, which no client uses."""
 _COMMAND = struct.Struct("<7fHBB")
-_ANSWER = struct.Struct("<HB5xBB")
-_TURN_S = 0.02
-_LINGERS_S = 1.0
-"""It ends that long after its last client at the latest."""
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 0.5
+_COMMAND_ACK = struct.Struct("<HB5xBB")
+_POLL_S = 0.02
+_LINGER_S = 1.0
+"""Maximum time for which the server runs after its last client has disconnected."""
+_FIRST_PAUSE_S, _MAX_PAUSE_S = 0.1, 0.5
 """Bounds of the time between two attempts to open the connection."""
 _SILENT_S = 5.0
-"""After that long without a byte a connection of TCP is opened anew: its other end may be gone without a word."""
-_MOST_CLIENTS = 16
+"""After this time without a byte a TCP connection is reopened: its peer may have disappeared without a FIN."""
+_MAX_CLIENTS = 16
 _BUFFER_BYTES = 1 << 20
 
 
 class SharedDevice:
-    """The connection to the autopilot, opened again after each error.
+    """The connection to the autopilot, which is reopened after each error.
 
-    A thread opens it: the name of a host, a connection or a line may take long, and clients must be answered.
+    It is opened in a separate thread, because name resolution, TCP or a serial line may take long, and clients must
+    be answered in the meantime.
 
     Args:
-        connection: Its name.
+        connection: Name of the connection.
 
     Attributes:
         error: Number and text of the last error.
-        lost_since_s: Monotonic time since which it is not open; None while it is.
+        lost_since_s: Monotonic time since which the connection is closed; None while it is open.
     """
 
     def __init__(self, connection: str) -> None:
@@ -71,38 +72,38 @@ class SharedDevice:
         self._opened: list[FlightDevice | OSError] = []
         self._next_s, self._pause_s = 0.0, _FIRST_PAUSE_S
         self._buffer = bytearray()
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self.error = (0, "")
         self.lost_since_s: float | None = time.monotonic()
 
     def fileno(self) -> int:
-        """Return the descriptor to wait for; -1 while it is not open."""
+        """Return the file descriptor to wait for; -1 while the connection is closed."""
         return -1 if self._device is None else self._device.fileno()
 
     def advance(self, now_s: float) -> bool:
-        """Go on with opening; return whether it was opened just now."""
+        """Reopen the connection if it is lost, without blocking; return True if it was opened since the last call."""
         if self._device is not None:
-            if self._connection.startswith("tcp:") and now_s > self._heard_s + _SILENT_S:
-                self._lose(TimeoutError(errno.ETIMEDOUT, f"no byte in {_SILENT_S:g} s"))
+            if self._connection.startswith("tcp:") and now_s > self._received_s + _SILENT_S:
+                self._disconnect(TimeoutError(errno.ETIMEDOUT, f"no byte in {_SILENT_S:g} s"))
             return False
         if self._opening is None and now_s >= self._next_s:
             self._opening = threading.Thread(target=self._open, daemon=True)
             self._opening.start()
         if not self._opened:
             return False
-        opened, self._opening = self._opened.pop(), None
-        if isinstance(opened, OSError):
-            self.error = opened.errno or errno.EIO, opened.strerror or str(opened)
-            self._next_s, self._pause_s = now_s + self._pause_s, min(2 * self._pause_s, _LONGEST_PAUSE_S)
+        result, self._opening = self._opened.pop(), None
+        if isinstance(result, OSError):
+            self.error = result.errno or errno.EIO, result.strerror or str(result)
+            self._next_s, self._pause_s = now_s + self._pause_s, min(2 * self._pause_s, _MAX_PAUSE_S)
             return False
-        self._device, self.lost_since_s, self._pause_s = opened, None, _FIRST_PAUSE_S
-        self._heard_s = now_s
+        self._device, self.lost_since_s, self._pause_s = result, None, _FIRST_PAUSE_S
+        self._received_s = now_s
         self._buffer.clear()
         return True
 
     def _open(self) -> None:
         try:
-            self._opened.append(devices.opened(self._connection))
+            self._opened.append(devices.open_device(self._connection))
         except OSError as error:
             self._opened.append(error)
 
@@ -113,39 +114,39 @@ class SharedDevice:
         try:
             data = self._device.read()
         except OSError as error:
-            self._lose(error)
+            self._disconnect(error)
             return []
         if data:
-            self._heard_s = time.monotonic()
+            self._received_s = time.monotonic()
         if self._device.whole:
             return list(frames(bytearray(data)))
         self._buffer += data
         return list(frames(self._buffer))
 
     def send(self, frame: bytes) -> None:
-        """Send a frame; while the connection is not open it is left out."""
+        """Send a frame; it is dropped while the connection is closed."""
         if self._device is not None:
             try:
                 self._device.write(frame)
             except OSError as error:
-                self._lose(error)
+                self._disconnect(error)
 
     def flush(self) -> None:
-        """Send what waits for a slow line."""
+        """Send queued bytes of a slow line."""
         if self._device is not None:
             try:
                 self._device.flush()
             except OSError as error:
-                self._lose(error)
+                self._disconnect(error)
 
-    def _lose(self, error: OSError) -> None:
+    def _disconnect(self, error: OSError) -> None:
         self.error = error.errno or errno.EIO, error.strerror or str(error)
         self.close()
         self.lost_since_s = time.monotonic()
         self._next_s = 0.0
 
     def close(self) -> None:
-        """Close it."""
+        """Close the connection."""
         if self._device is not None:
             self._device.close()
             self._device = None
@@ -155,10 +156,10 @@ class LinkClient:
     """A client of the server.
 
     Args:
-        stream: To the client.
+        stream: The socket that is connected to the client.
 
     Attributes:
-        left_out: Frames that it was too slow to take.
+        left_out: Number of frames that were dropped because the client was too slow.
     """
 
     def __init__(self, stream: socket.socket) -> None:
@@ -168,7 +169,7 @@ class LinkClient:
         stream.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
 
     def send(self, packet: bytes, count: int = 0) -> None:
-        """Send a packet of frames; what a slow client cannot take is left out and counted."""
+        """Send a packet with `count` frames. If the buffer of a slow client is full, they are dropped and counted."""
         try:
             self.stream.send(packet)
         except OSError:
@@ -179,109 +180,112 @@ class LinkServer:
     """Forwards frames between an autopilot and the programs of fieldkit on its computer.
 
     Args:
-        connection: To the autopilot.
-        listener: Where clients connect.
+        connection: Name of the connection to the autopilot.
+        listener: The socket to which clients connect.
     """
 
     def __init__(self, connection: str, listener: socket.socket) -> None:
         self._device = SharedDevice(connection)
         self._listener = listener
         self._clients: dict[int, LinkClient] = {}
-        self._writer = FrameWriter(*_OWN)
+        self._writer = FrameWriter(*_ADDRESS)
         self._intervals = MessageIntervals(self._request)
-        self._waiting = selectors.DefaultSelector()
-        self._waiting.register(listener, selectors.EVENT_READ)
-        self._watched = -1
-        self._left_s = time.monotonic()
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(listener, selectors.EVENT_READ)
+        self._device_descriptor = -1
+        self._last_client_s = time.monotonic()
 
-    def run(self, over: threading.Event) -> None:
-        """Serve until the last client left and the intervals are as before, or for `_LINGERS_S` after it.
+    def run(self, stop_event: threading.Event) -> None:
+        """Serve until `_LINGER_S` after the last client has disconnected.
 
-        A signal does not take the connection from clients: they may have a drone in the air.
+        If `stop_event` is set, the server stops as soon as it has no clients and the message intervals are reset. It
+        does not disconnect clients, because they may have a drone in the air.
         """
         while True:
             now_s = time.monotonic()
             if self._clients:
-                self._left_s = now_s
-            elif now_s > self._left_s + _LINGERS_S or (over.is_set() and self._intervals.settled):
+                self._last_client_s = now_s
+            elif now_s > self._last_client_s + _LINGER_S or (stop_event.is_set() and self._intervals.settled):
                 break
             if self._device.advance(now_s):
-                self._intervals.reopened()
-            self._watch()
-            for key, _ in self._waiting.select(_TURN_S):
+                self._intervals.on_reopened()
+            self._register_device()
+            for key, _ in self._selector.select(_POLL_S):
                 self._serve(key.fd)
             self._device.flush()
             self._intervals.advance(time.monotonic())
         self._device.close()
 
-    def _watch(self) -> None:
-        """Wait for the device that is open now."""
-        if self._watched == self._device.fileno():
+    def _register_device(self) -> None:
+        """Register the present descriptor of the device with the selector."""
+        if self._device_descriptor == self._device.fileno():
             return
-        if self._watched >= 0:
-            self._waiting.unregister(self._watched)
-        self._watched = self._device.fileno()
-        if self._watched >= 0:
-            self._waiting.register(self._watched, selectors.EVENT_READ)
+        if self._device_descriptor >= 0:
+            self._selector.unregister(self._device_descriptor)
+        self._device_descriptor = self._device.fileno()
+        if self._device_descriptor >= 0:
+            self._selector.register(self._device_descriptor, selectors.EVENT_READ)
 
     def _serve(self, descriptor: int) -> None:
         if descriptor == self._listener.fileno():
             self._accept()
-        elif descriptor == self._watched:
+        elif descriptor == self._device_descriptor:
             self._distribute(self._device.receive())
-            self._watch()  # before another descriptor gets the same number
+            self._register_device()  # before another descriptor gets the same number
         elif descriptor in self._clients:
-            self._take(descriptor, self._clients[descriptor])
+            self._receive_packet(descriptor, self._clients[descriptor])
 
     def _accept(self) -> None:
-        with suppress(OSError):  # it has gone already
+        with suppress(OSError):  # the client has disconnected already
             stream, _ = self._listener.accept()
-            if places.peer(stream)[1] != os.geteuid() or len(self._clients) >= _MOST_CLIENTS:
+            if places.peer_credentials(stream)[1] != os.geteuid() or len(self._clients) >= _MAX_CLIENTS:
                 stream.close()
                 return
             self._clients[stream.fileno()] = LinkClient(stream)
-            self._waiting.register(stream, selectors.EVENT_READ)
+            self._selector.register(stream, selectors.EVENT_READ)
 
-    def _distribute(self, came: list[bytes]) -> None:
+    def _distribute(self, received: list[bytes]) -> None:
         now_s = time.monotonic()
-        for frame in came:
+        for frame in received:
             message = head(frame)
             source = message.system, message.component
-            self._intervals.heard(source, message.kind, now_s)
+            self._intervals.on_message(source, message.kind, now_s)
             if message.kind == COMMAND_ACK and is_intact(frame):
-                self._answered(source, message, now_s)
-        if came:
-            packet = FRAMES + b"".join(came)
+                self._on_command_ack(source, message, now_s)
+        if received:
+            packet = FRAMES + b"".join(received)
             for client in self._clients.values():
-                client.send(packet, len(came))
+                client.send(packet, len(received))
 
-    def _answered(self, source: Target, message: FrameHead, now_s: float) -> None:
-        command, result, *to = _ANSWER.unpack(message.payload[: _ANSWER.size].ljust(_ANSWER.size, b"\0"))
-        if command == SET_MESSAGE_INTERVAL and tuple(to) in (_OWN, (0, 0)):
-            self._intervals.answered(source, result, now_s)
+    def _on_command_ack(self, source: Target, message: FrameHead, now_s: float) -> None:
+        command, result, *target = _COMMAND_ACK.unpack(
+            message.payload[: _COMMAND_ACK.size].ljust(_COMMAND_ACK.size, b"\0")
+        )
+        if command == SET_MESSAGE_INTERVAL and tuple(target) in (_ADDRESS, (0, 0)):
+            self._intervals.on_answer(source, result, now_s)
 
-    def _take(self, descriptor: int, client: LinkClient) -> None:
-        """Take a packet of a client."""
+    def _receive_packet(self, descriptor: int, client: LinkClient) -> None:
+        """Process a packet of a client."""
         try:
-            packet = client.stream.recv(devices.MOST_BYTES)
+            packet = client.stream.recv(devices.MAX_BYTES)
         except BlockingIOError:
             return
         except OSError:
             packet = b""
         if not packet:
-            self._waiting.unregister(client.stream)
+            self._selector.unregister(client.stream)
             client.stream.close()
             del self._clients[descriptor]
-            self._intervals.leave(descriptor)
+            self._intervals.remove_client(descriptor)
         elif packet[:1] == ALIVE:
             client.send(STATE + json.dumps(self._state(descriptor)).encode())
         elif packet[:1] == FRAMES:
             for frame in frames(bytearray(packet[1:])):
-                if not self._arbitrate(descriptor, frame):
+                if not self._intercept_request(descriptor, frame):
                     self._device.send(frame)
 
-    def _arbitrate(self, client: int, frame: bytes) -> bool:
-        """Take a request for an interval, which is not forwarded; return whether the frame is one."""
+    def _intercept_request(self, client: int, frame: bytes) -> bool:
+        """Process a frame that requests an interval, which is not forwarded; return True if the frame is one."""
         message = head(frame)
         if message.kind != COMMAND_LONG or not is_intact(frame):
             return False
@@ -305,21 +309,21 @@ class LinkServer:
         }
 
 
-def serve(connection: str, over: threading.Event) -> None:
-    """Serve a connection in a process of its own; return when it serves, or when another server does.
+def serve(connection: str, stop_event: threading.Event) -> None:
+    """Start a server in a separate process; return when this or another server of the connection is ready.
 
     Raises:
         OSError: The folder of sockets cannot be used.
-        ValueError: It is not the name of a connection.
+        ValueError: The name of the connection is invalid.
     """
     devices.check(connection)
     lock = places.lock(connection)
     if lock is None:
         return
-    ready, tell = os.pipe()
+    ready, notify = os.pipe()
     if os.fork():
-        os.close(tell)
-        os.read(ready, 1)  # or the end of the file, if it failed
+        os.close(notify)
+        os.read(ready, 1)  # returns at the end of the file: when the server is ready, or has failed
         return
     code = 1
     try:
@@ -330,11 +334,11 @@ def serve(connection: str, over: threading.Event) -> None:
                 os.unlink(address)  # noqa: PTH108 (of a server that was killed)
             listener.bind(address)
             os.chmod(address, 0o600)  # noqa: PTH101
-            listener.listen(_MOST_CLIENTS)
+            listener.listen(_MAX_CLIENTS)
             listener.setblocking(False)
-            os.close(tell)
-            LinkServer(connection, listener).run(over)
-            places.remove(connection)  # before the lock is gone
+            os.close(notify)
+            LinkServer(connection, listener).run(stop_event)
+            places.remove(connection)  # while the lock is held
         code = 0
     except Exception:  # noqa: BLE001 (the log has it, and clients start another server)
         traceback.print_exc()
@@ -344,7 +348,7 @@ def serve(connection: str, over: threading.Event) -> None:
 
 
 def _detach(log: str) -> None:
-    """Leave the session, the folder and the files of the client that started this process; write errors to a log."""
+    """Detach from the working folder, the standard files and SIGHUP of the starting client; write errors to a log."""
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     os.chdir("/")
     null = os.open(os.devnull, os.O_RDWR)

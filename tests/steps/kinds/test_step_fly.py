@@ -23,7 +23,7 @@ DRONE = next(role for role, robot in CAST.items() if robot.profile.mavlink is no
 PERMITTED = {role: robot.model_copy(update={"flies": True}) for role, robot in CAST.items()}
 SCENE = Scene(Protocol.TCP, PERMITTED, "f")
 LOW = '{"what": "its battery has 10%", "remedy": "charge it", "grave": true}'
-MODE = '{"what": "PX4 does not let itself be armed", "remedy": "see to that", "grave": false}'
+MODE = '{"what": "PX4 refuses to be armed", "remedy": "remove the cause", "grave": false}'
 LIMITS = CAST[DRONE].profile.limits
 
 

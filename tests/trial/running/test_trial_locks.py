@@ -69,7 +69,7 @@ def test_a_held_robot_names_its_holder_and_is_given_back(robot: LocalShell) -> N
         ):
             raise AssertionError("taken twice")
         assert re.search(r"; expires in (1 h 00 min|59 min \d\d s)$", caught.value.what)
-        assert caught.value.remedy == "wait, go on with it if it is yours, or end it: fieldkit abort"
+        assert caught.value.remedy == "wait, resume that trial if it is yours, or end it: fieldkit abort"
     with taken({Role.SENDER: robot}, BERT, sink=quiet):
         begin(robot, BERT)
 

@@ -149,7 +149,7 @@ def test_no_piece_is_asked_for_after_somebody_hung_up(tmp_path: Path) -> None:
     shells[Role.SENDER].hang_up = robots.hang_up
     into = tmp_path / "into"
     into.mkdir()
-    assert robots.fetch(remote, into, clean=True) == ["the fetch was given up"]
+    assert robots.fetch(remote, into, clean=True) == ["the fetch was cancelled"]
     assert shells[Role.SENDER].pieces == 1
     shells[Role.SENDER].hang_up = lambda: None
     for path in into.glob("*.txt"):
