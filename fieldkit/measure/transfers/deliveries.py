@@ -110,7 +110,7 @@ def arrivals_ns(packets: UdpPackets) -> Ints:
     index = np.flatnonzero((packets.datagram != NO_DATAGRAM) & packets.match.arrived)
     last_ns = np.full(len(packets.first), NO_TIME)
     np.maximum.at(last_ns, packets.datagram[index], packets.received.time_ns[packets.match.received_index[index]])
-    return np.where(udp.whole(packets)[:-1], last_ns, NO_TIME)
+    return np.where(udp.complete(packets)[:-1], last_ns, NO_TIME)
 
 
 def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Delivery:
