@@ -276,7 +276,7 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
         Measured({"one_way_error_s": error_s})
         | Measured.of({"one_way_median_sent_s": of_sent}, "the median is withheld, or half of the packets were lost")
         | Measured.of(shown, "its error is above a tenth of it")
-        | Measured.of({"one_way_withheld": reason}, "nothing is withheld_names")
+        | Measured.of({"one_way_withheld": reason}, "nothing is withheld")
     )
 
 
