@@ -185,7 +185,7 @@ def test_captures_of_something_else_tell_nothing_of_a_transfer(tmp_path: Path, p
     found = figures.measure(AttemptEvidence(tmp_path), replace(transfer(protocol), captures=(None, None)))
     of_captures = {name for name in LAYERS if name in found.missing}
     assert found.values.keys().isdisjoint(LAYERS | {"paper_packets", "paper_received"})
-    assert {found.missing[name] for name in of_captures} == {"there are no whole captures of both ends"}
+    assert {found.missing[name] for name in of_captures} == {"there are no complete captures of both ends"}
     assert (found.values["sent_bytes"], found.values["received_bytes"]) == (10240, 7680)
 
 

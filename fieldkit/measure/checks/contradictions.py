@@ -48,7 +48,7 @@ def find(evidence: AttemptEvidence, transfer: Transfer, *, finished: bool, cut: 
     if sender is None or receiver is None:
         return
     if earlier_packets := _earlier_traffic(sender.packets, receiver.packets, transfer):
-        yield f"packets of an earlier attempt were still under way: {earlier_packets}"
+        yield f"packets of an earlier attempt were still on the way: {earlier_packets}"
     elif transfer.protocol is Protocol.UDP:
         size_problems = list(_udp(sender.packets, receiver.packets, files, transfer))
         yield from size_problems or udp_file.find(evidence, transfer, sender.packets, receiver.packets, cut=cut)
@@ -79,7 +79,7 @@ def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> 
     ports, first = np.unique(starts.sport, return_index=True)
     if len(ports) > 1:
         delayed = int((starts.sport != ports[first.argmax()]).sum())
-        return f"{format_count(delayed, 'packet')} to the transfer's port were sent before its sender started"
+        return f"{format_count(delayed, 'packet')} left for the transfer's port before its sender started"
     return None
 
 

@@ -140,7 +140,7 @@ def _unprinted_replies(output: Ping, captured: CapturedPing, interval_s: float, 
         if seq not in printed and seq in captured.requested_ns and at_ns <= until_ns
     ]
     if missing:
-        replies = format_count(len(missing), "reply")
+        replies = format_count(len(missing), "answer")
         yield f"the {role}'s capture has {replies} that ping did not print, the first to request {min(missing)}"
 
 

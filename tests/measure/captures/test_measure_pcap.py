@@ -22,8 +22,8 @@ def test_a_capture_without_packets_is_whole(link_type: int) -> None:
     ("data", "what"),
     [
         (b"", "is empty"),
-        (b"#ROSBAG V2.0\n" + bytes(100), "no pcap or pcapng file"),
-        (file_bytes([])[:3], "no pcap or pcapng file"),
+        (b"#ROSBAG V2.0\n" + bytes(100), "not a pcap or pcapng file"),
+        (file_bytes([])[:3], "not a pcap or pcapng file"),
         (file_bytes([])[:23], "ends inside its header"),
         (file_bytes([], link_type=147), "link type 147"),
     ],

@@ -160,7 +160,7 @@ def test_a_broken_block_ends_the_packets_and_is_named(index: int, at: int, value
     "head", [b"\x0a\x0d\x0d\x0a", b"\x0a\x0d\x0d\x0a" + bytes(100), section()[:27], section()[:-1] + b"\x01"]
 )
 def test_what_has_no_section_header_is_refused(head: bytes) -> None:
-    with pytest.raises(EvidenceError, match="no whole section header") as caught:
+    with pytest.raises(EvidenceError, match="no complete section header") as caught:
         pcap.parse(head, where="x.pcapng")
     assert caught.value.remedy
 

@@ -37,7 +37,7 @@ def test_chunks_of_every_size_equal_the_whole(tmp_path: Path, name: str) -> None
     assert len(whole.packets) == whole.frames == {"empty": 0, "classic, broken": 6}.get(name, whole.frames)
     for chunk_bytes in range(1, len(FILES[name]) + 2):
         chunks = list(pcap.stream(path, chunk_bytes=chunk_bytes))
-        assert rows(Packets.joined(one.packets for one in chunks)) == rows(whole.packets)
+        assert rows(Packets.concatenated(one.packets for one in chunks)) == rows(whole.packets)
         assert sum(one.frames for one in chunks) == whole.frames
         assert [one.damage for one in chunks] == [None] * (len(chunks) - 1) + [whole.damage]
         assert chunk_bytes > 1 or name == "empty" or len(chunks) >= whole.frames
@@ -59,7 +59,7 @@ def test_a_recorded_capture_in_chunks(name: str) -> None:
     path = TCPDUMP / f"{name}.pcap"
     chunks = [one.packets for one in pcap.stream(path, chunk_bytes=1000)]
     assert len(chunks) > 5
-    assert rows(Packets.joined(chunks)) == rows(pcap.read(path).packets)
+    assert rows(Packets.concatenated(chunks)) == rows(pcap.read(path).packets)
 
 
 def test_a_capture_that_shrinks_while_it_is_read_ends_no_process(tmp_path: Path) -> None:

@@ -36,6 +36,6 @@ def test_sums_of_columns_do_not_overflow() -> None:
 
 
 def test_joined_rows_are_those_of_the_parts() -> None:
-    joined = Packets.joined([PACKETS, PACKETS.where(slice(1, 3))])
+    joined = Packets.concatenated([PACKETS, PACKETS.where(slice(1, 3))])
     assert joined.sport.tolist() == [*PACKETS.sport.tolist(), *PACKETS.sport.tolist()[1:3]]
     assert joined.echo.tolist() == [*PACKETS.echo.tolist(), *PACKETS.echo.tolist()[1:3]]

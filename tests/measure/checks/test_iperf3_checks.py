@@ -85,7 +85,7 @@ def test_an_interval_that_is_missing(version: str, test: str, number: int) -> No
 def test_the_json_of_another_test(version: str, test: str, end: str) -> None:
     ends = {name: document(version, test, name) for name in ("client", "server")}
     ends[end] = document(version, next(one for one in TESTS if one != test), end)
-    assert "they are two tests" in " ".join(contradictions(ends["client"], ends["server"], test))
+    assert "they are different tests" in " ".join(contradictions(ends["client"], ends["server"], test))
 
 
 def changes_of_start() -> Iterator[tuple[str, Any, str]]:
@@ -107,7 +107,7 @@ def test_a_test_that_nobody_asked_for(version: str, key: str, value: object, rea
 def test_a_test_that_ended_too_soon_or_is_of_another_time() -> None:
     client, server = (iperf3.parse(json.dumps(document("3.12", "tcp", end))) for end in ("client", "server"))
     (reason,) = iperf3_checks.between(client, server, replace(order("tcp"), lasts_s=10.0))
-    assert reason == "the client has intervals of 3.0 s in all, of 10 s"
+    assert reason == "the client's intervals last 3.0 s in total instead of 10 s"
     began_ns = 10**9 * (client.start.began_utc_s or 0)
     assert iperf3_checks.misdated(client, (began_ns - 10**9, began_ns + 5 * 10**9)) is None
     assert iperf3_checks.misdated(client, None) is None

@@ -86,7 +86,7 @@ def test_a_log_with_shifted_arrivals_is_noticed(kind: str, shift_ns: int, tmp_pa
     reasons, _ = topic_attempts.judged(replace(made, came=came), tmp_path)
     assert reasons
     which = "before their packets" if shift_ns < 0 else "later than its capture for every sample"
-    which = "from before its beginning or after its end" if abs(shift_ns) == HOUR else which
+    which = "from before its start or after its end" if abs(shift_ns) == HOUR else which
     assert which in reasons[0]
 
 
@@ -98,7 +98,7 @@ def test_a_log_that_lacks_half_of_what_arrived_is_noticed(kind: str, tmp_path: P
     if kind == "reliable with samples given up":  # nothing behind a gap need ever be handed over
         assert reasons
         return
-    assert "arrived by the subscriber's capture, and are not in the subscriber's log" in reasons[0]
+    assert "arrived by the subscriber's capture, but are not in the subscriber's log" in reasons[0]
 
 
 def other_numbers(_: int, row: Row) -> Row:
@@ -117,7 +117,7 @@ def other_sending(place: int, row: Row) -> Row:
     ("change", "why"),
     [
         (other_numbers, "numbers that the publisher's log does not have"),
-        (other_sizes, "of another size than 1016 bytes"),
+        (other_sizes, "with a size other than 1016 bytes"),
         (other_sending, "the publisher did not send"),
     ],
 )
@@ -222,7 +222,7 @@ def test_a_queue_that_overflowed_is_no_contradiction(tmp_path: Path) -> None:
     reasons, measured = topic_attempts.judged(replace(made, came=with_samples(made.came, held)), tmp_path)
     assert reasons == []
     assert measured.values["topic_received"] == SAMPLES - 5
-    assert "its program was held up" in measured.missing["topic_delay_max_s"]
+    assert "its program was delayed" in measured.missing["topic_delay_max_s"]
 
 
 def test_a_capture_that_shows_no_heads_bounds_what_arrived(tmp_path: Path) -> None:
@@ -231,7 +231,7 @@ def test_a_capture_that_shows_no_heads_bounds_what_arrived(tmp_path: Path) -> No
     cut = replace(made, near=shorter(made.near), far=shorter(made.far))
     assert topic_attempts.judged(cut, tmp_path)[0] == []
     early = with_samples(made.came, lambda _, row: later(row, -20 * MS))
-    assert "before its capture has their bytes" in topic_attempts.judged(replace(cut, came=early), tmp_path)[0][0]
+    assert "before their bytes in its capture" in topic_attempts.judged(replace(cut, came=early), tmp_path)[0][0]
     few = with_samples(made.came, lambda place, row: row if place < 8 else None)
     assert "are not in the subscriber's log" in topic_attempts.judged(replace(cut, came=few), tmp_path)[0][0]
 
@@ -322,4 +322,4 @@ def test_the_checks_know_what_the_agent_does() -> None:
 def test_every_time_of_a_topic_is_compared_with_the_capture() -> None:
     """Also one that is added later."""
     times = {column.name for column in topics.COLUMNS if column.name.endswith("_s")} - {"topic_discovery_s"}
-    assert times | {"topic_deadline_misses"} == topic_captures.MADE.keys()
+    assert times | {"topic_deadline_misses"} == topic_captures.SHARE_FIGURES.keys()

@@ -8,12 +8,12 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from fieldkit.measure.positions import trajectories
-from fieldkit.measure.positions.trajectories import Trajectory, apart, standing
+from fieldkit.measure.positions.trajectories import Trajectory, apart, stationary
 
 S = 10**9
 EPOCH_NS = 1_795_365_294 * S
 """As large as times are."""
-ORIGIN = standing(np.zeros(3))
+ORIGIN = stationary(np.zeros(3))
 
 
 def trajectory(*samples: tuple[float, float, float], gap_s: float = 3.0) -> Trajectory:
@@ -65,16 +65,16 @@ def test_noise_between_near_samples_is_no_speed() -> None:
     [
         (0, 4, None),
         (1, 1, None),
-        (4, 9.5, "has a gap of 5.0 s, and 3 s are allowed"),
-        (6, 7, "has a gap of 5.0 s, and 3 s are allowed"),
+        (4, 9.5, "have a gap of 5.0 s, and 3 s are allowed"),
+        (6, 7, "have a gap of 5.0 s, and 3 s are allowed"),
         (9.5, 10, None),
-        (-1.5, 2, "begins 1.5 s too late"),
+        (-1.5, 2, "begin 1.5 s too late"),
         (3, 12, "ends 2.0 s too early"),
     ],
 )
 def test_nobody_knows_in_a_gap_and_beyond_the_ends(begin_s: float, end_s: float, why: str | None) -> None:
     walked = trajectory((0, 0, 0), (2, 1, 0), (4, 2, 0), (9, 3, 0), (10, 4, 0))
-    assert walked.unknown(at(begin_s), at(end_s)) == why
+    assert walked.coverage_problem(at(begin_s), at(end_s)) == why
 
 
 COORDINATES = st.floats(-1000, 1000)

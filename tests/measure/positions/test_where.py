@@ -74,7 +74,7 @@ def test_what_was_given_later_counts_before_what_was_recorded_and_that_before_th
     tell(trial, {SENDER: local, RECEIVER: later})
     assert mean_m(attempt) == pytest.approx(33), "each line was so a second before"
     tell(trial, {RECEIVER: later})
-    assert mean_m(attempt) == f"robots are not told of in one frame: the sender {PLACED}, the receiver {LOCAL}"
+    assert mean_m(attempt) == f"the positions of the robots are in different frames: the sender {PLACED}, the receiver {LOCAL}"
 
 
 @pytest.mark.parametrize(
@@ -105,8 +105,8 @@ def test_clocks_of_robots_are_brought_to_one(attempt: Path, clocks: Mapping[Role
 @pytest.mark.parametrize(
     ("begin_s", "end_s", "why"),
     [
-        (-1, 2, "what /where tells of the receiver begins 1.0 s too late"),
-        (2, 6, "what /where tells of the receiver ends 2.0 s too early"),
+        (-1, 2, "the positions of the receiver from /where begin 1.0 s too late"),
+        (2, 6, "the positions of the receiver from /where end 2.0 s too early"),
     ],
 )
 def test_times_that_are_not_covered_are_missing_for_a_reason(
@@ -120,7 +120,7 @@ def test_times_that_are_not_covered_are_missing_for_a_reason(
 def test_a_gap_is_missing_and_not_made_up(attempt: Path) -> None:
     written(attempt, AWAY[:2] + AWAY[3:])
     tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
-    why = "what /where tells of the receiver has a gap of 2.0 s, and 1.5 s are allowed"
+    why = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
     assert mean_m(attempt) == why
 
 
@@ -138,7 +138,7 @@ def test_a_time_line_is_by_the_clock_of_who_sends_and_nobody_knows_in_a_gap(atte
 def test_whom_nobody_tells_of_has_no_distance(attempt: Path) -> None:
     written(attempt, AWAY)
     tell(attempt, {RECEIVER: ODOMETRY})
-    assert mean_m(attempt) == "nobody tells where the sender was"
+    assert mean_m(attempt) == "no source has the position of the sender"
     (attempt / "track.bag").unlink()
     tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert "cannot be read" in str(mean_m(attempt))
@@ -150,7 +150,7 @@ def test_a_tracker_and_a_place_in_its_frame(attempt: Path) -> None:
     tell(attempt, {SENDER: Account(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
     assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)
     tell(attempt, {SENDER: HERE, RECEIVER: tracker})
-    assert mean_m(attempt) == "robots are not told of in one frame: the sender as placed, the receiver frame map"
+    assert mean_m(attempt) == "the positions of the robots are in different frames: the sender as placed, the receiver frame map"
 
 
 def test_on_the_earth_heights_count_only_if_they_are_to(attempt: Path) -> None:
@@ -165,7 +165,7 @@ def test_on_the_earth_heights_count_only_if_they_are_to(attempt: Path) -> None:
     assert mean_m(attempt) == pytest.approx(math.hypot(level_m, 50), abs=0.002)
     untold = robots | {SENDER: Account(place=(latitude, longitude, None), frame=WGS84)}
     (attempt / accounts.FILE).write_text(accounts.text(Accounts(untold, heights=True)), encoding="utf-8")
-    assert mean_m(attempt) == "heights are to count, and are not told everywhere"
+    assert mean_m(attempt) == "heights are to be used, but some positions have none"
 
 
 FLOATS = st.floats(-1e9, 1e9)
@@ -223,6 +223,6 @@ def test_accounts_that_are_none_are_refused_and_leave_the_columns_empty(attempt:
     assert isinstance(damage, dict)
     path = attempt / accounts.FILE
     path.write_text(json.dumps({"robots": {}, "clocks": {}, "heights": False} | damage), encoding="utf-8")
-    with pytest.raises(EvidenceError, match="who tells where robots were"):
+    with pytest.raises(EvidenceError, match="list of position sources"):
         accounts.read(path)
-    assert "who tells where robots were" in str(mean_m(attempt))
+    assert "list of position sources" in str(mean_m(attempt))

@@ -64,27 +64,27 @@ def _found(counts: udp.UdpCounts) -> Fate:
 def test_content_tells_what_headers_do_not(link: Link, ip_id: int | None) -> None:
     counts, truth = _udp(link, [link.draw.randbytes(40) for _ in range(120)], ids=[ip_id] * 120)
     assert _found(counts) == truth
-    assert counts.packets_doubtful == counts.packets_dubious == 0
+    assert counts.packets_ambiguous == counts.possible_copies == 0
 
 
 @given(lossy, same_ids)
 @settings(max_examples=100)
 def test_without_content_a_number_is_right_or_marked(link: Link, ip_id: int | None) -> None:
     counts, truth = _udp(link, [bytes(40)] * 120, ids=[ip_id] * 120)
-    assert counts.packets_doubtful == 120
+    assert counts.packets_ambiguous == 120
     assert counts.packets_reordered is None
     if not truth.duplicated:
         assert counts.packets_received == 120 - truth.lost
         assert counts.loss_bursts is None if truth.lost else counts.loss_bursts == 0
     else:
-        assert counts.packets_dubious, "a copy beside its twin, or all so late that any may be a copy"
+        assert counts.possible_copies, "a copy beside its twin, or all so late that any may be a copy"
 
 
 def test_as_many_copies_as_losses_are_no_transfer_without_loss() -> None:
     """6 % lost and 6 % copied, all with id 0 and the same bytes: the number received alone would hide both."""
     counts, truth = _udp(Link(3, loss=0.06, copied=0.06, jitter_ns=30_000), [bytes(100)] * 500, ids=[0] * 500)
     assert (truth.lost, truth.duplicated) == (33, 29)
-    assert (counts.packets_doubtful, counts.packets_dubious) == (500, 496)
+    assert (counts.packets_ambiguous, counts.possible_copies) == (500, 496)
 
 
 def test_a_copy_that_comes_long_after_its_twin_hides_no_loss() -> None:
@@ -93,7 +93,7 @@ def test_a_copy_that_comes_long_after_its_twin_hides_no_loss() -> None:
     late_ns = [*(at * MS for at in range(10) if at != 5), 2 * MS + 2_400_000]
     received = [Frame(10**18 + 7 * MS + at, sent[0].data) for at in sorted(late_ns)]
     counts = udp.count(udp.cross(packets(sent), packets(received), transfer(Protocol.UDP)))
-    assert (counts.packets_doubtful, counts.packets_dubious) == (10, 10)
+    assert (counts.packets_ambiguous, counts.possible_copies) == (10, 10)
 
 
 def test_of_a_single_segment_nothing_tells_which_copy_arrived() -> None:
@@ -102,7 +102,7 @@ def test_of_a_single_segment_nothing_tells_which_copy_arrived() -> None:
     sent = [Frame(10**18 + at * MS, one) for at, one in ((0, syn), (10, data), (220, data))]
     received = [Frame(10**18 + at * MS, one) for at, one in ((3, syn), (223, data))]
     counts = tcp.count(tcp.cross(packets(sent), packets(received), transfer(Protocol.TCP)))
-    assert (counts.doubtful_frames, counts.dubious_frames, counts.received_bytes) == (2, 0, 700)
+    assert (counts.ambiguous_frames, counts.possible_copies, counts.received_bytes) == (2, 0, 700)
     assert counts.spurious_frames is counts.reordered_frames is None
 
 
@@ -112,7 +112,7 @@ def test_of_joined_segments_that_are_repeated_at_once_nothing_tells_which_arrive
     sent = timed([syn, segment(1, 2100, ip_id=10), segment(1, 2100, ip_id=13)])
     cut = [segment(1 + 700 * (number % 3), 700, ip_id=10 + number) for number in range(6)]
     counts = tcp.count(tcp.cross(packets(sent), packets(timed([syn, *cut])), transfer(Protocol.TCP)))
-    assert (counts.doubtful_frames, counts.lost_bytes, counts.received_bytes) == (2, 0, 4200)
+    assert (counts.ambiguous_frames, counts.lost_bytes, counts.received_bytes) == (2, 0, 4200)
     assert counts.spurious_frames is counts.reordered_frames is None
 
 
@@ -125,7 +125,7 @@ def test_a_repeat_tells_no_loss_that_copies_may_hide(tmp_path: Path) -> None:
     (tmp_path / "receiver.pcap").write_bytes(file_bytes(Frame(at, sent[which].data, 128) for at, which in arrivals))
     found = measure(tmp_path, transfer(Protocol.UDP))
     assert (found.ip_packets_sent, found.ip_packets_doubtful, found.datagrams_sent) == (500, 500, 500)
-    assert found.one_way_withheld == "the packets of the transfer look alike"
+    assert found.one_way_withheld == "the packets of the transfer cannot be distinguished"
     told = {name for name in found if name.startswith(("ip_", "datagram", "byte_"))}
     assert told == {"ip_packets_sent", "ip_packets_doubtful", "datagrams_sent"}
     assert fates.read(AttemptEvidence(tmp_path), transfer(Protocol.UDP)) is None
@@ -149,7 +149,7 @@ def test_ids_that_come_again_after_65536_datagrams(kept: bool) -> None:
     truth = Fate.of(count, [which for _, which in arrivals])
     assert _found(counts) == truth
     assert (truth.lost, truth.duplicated, truth.bursts) == (12, 2, 3)
-    assert counts.packets_doubtful == counts.packets_dubious == 0
+    assert counts.packets_ambiguous == counts.possible_copies == 0
 
 
 def _is(counts: tcp.TcpCounts, truth: links.TcpTruth) -> None:
@@ -168,7 +168,7 @@ def test_time_stamps_tell_a_retransmission_whatever_offload_does(
     _is(counts, truth)
     assert counts.received_bytes == truth.received_bytes
     assert (counts.spurious_frames, counts.reordered_frames) == (truth.spurious, truth.reordered)
-    assert counts.doubtful_frames == 0
+    assert counts.ambiguous_frames == 0
 
 
 @given(lossy, joined, shares, names)
@@ -179,9 +179,9 @@ def test_without_time_stamps_order_is_told_or_empty(link: Link, offload: int, ag
     counts = tcp.count(tcp.cross(packets(truth.sender), packets(truth.receiver), _to(Protocol.TCP, ipv6=ipv6)))
     _is(counts, truth)
     if counts.received_bytes != truth.received_bytes:
-        assert counts.doubtful_frames
-        assert counts.dubious_frames
-    if counts.doubtful_frames:
+        assert counts.ambiguous_frames
+        assert counts.possible_copies
+    if counts.ambiguous_frames:
         assert counts.spurious_frames is counts.reordered_frames is None
         assert truth.retransmitted
         assert name != "ids" or offload > 1
@@ -197,13 +197,13 @@ def test_what_one_capture_cut_off_tells_nothing_and_misleads_nobody() -> None:
     arrivals = link.arrivals([frame.time_ns for frame in sent])
     received = [Frame(at, sent[which].data[:58], 68) for at, which in arrivals]
     counts = udp.count(udp.cross(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
-    assert (counts.packets_sent, counts.packets_doubtful) == (200, 200)
-    assert counts.packets_dubious
+    assert (counts.packets_sent, counts.packets_ambiguous) == (200, 200)
+    assert counts.possible_copies
     truth = links.tcp(Link(8, loss=0.1), 100, ids=False, again=0.2)
     short = [Frame(one.time_ns, one.data[:44], one.wire_bytes) for one in truth.receiver]
     found = tcp.count(tcp.cross(packets(truth.sender), packets(short), _to(Protocol.TCP, ipv6=False)))
     _is(found, truth)
-    assert found.doubtful_frames
+    assert found.ambiguous_frames
     assert found.spurious_frames is found.reordered_frames is None
 
 

@@ -149,7 +149,7 @@ def test_a_clock_that_is_set_in_the_midst_fits_no_line(step_s: float) -> None:
     before, after = World(0.0, 0.0), World(step_s, 0.0)
     early, late, delay = np.array([0.0]), np.array([1.0]), np.array([0.01])
     sides = [
-        StampPairs.joined((before_part, after_part))
+        StampPairs.concatenated((before_part, after_part))
         for before_part, after_part in (
             (before.forward(early, delay), after.forward(late, delay)),
             (before.reverse(early, delay), after.reverse(late, delay)),

@@ -11,7 +11,7 @@ from scapy.packet import Raw
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.arrays import Ints
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.transfers.match import NONE, match, match_payload, paired, places
+from fieldkit.measure.transfers.match import NONE, match, match_payload, match_keys, assign
 from tests.helpers.captures import Frame, datagram, ipv4, packets, segment, timed
 
 moments = st.sets(st.integers(0, 30), min_size=1, max_size=12).map(lambda these: [4 * one for one in sorted(these)])
@@ -68,7 +68,7 @@ def test_a_wrap_of_the_ids_matches_no_packet_with_one_of_another_round(
 @settings(max_examples=500)
 def test_the_nearest_in_time_is_taken_as_far_as_each_finds_one(sent: list[int], received: list[int]) -> None:
     """Against a loop over one group; a second group, of as many sent as received, tells the clock: 1 ahead."""
-    found, told, _ = places(
+    found, told, _ = assign(
         np.array([0] * len(sent) + [1, 1, 1]),
         np.array([*sent, 5, 7, 9]),
         np.array([0] * len(received) + [1, 1, 1]),
@@ -96,13 +96,13 @@ def test_packets_that_all_look_alike_are_matched_in_order_and_doubted() -> None:
     assert found.sent_index.tolist() == [0, 2, 4, 5]
     assert found.doubtful.all()
     assert match(sent, sent).doubtful.all(), "as many losses as copies look the same"
-    assert not found.dubious.any()
+    assert not found.possible_copy.any()
 
 
 def test_the_clocks_are_compared_by_what_came_whole() -> None:
     """Ids come again, the first round was not captured at the receiver: nearest to the clock is the second."""
     key, came = np.array([1, 2, 1, 2, 3], dtype=np.uint64), np.array([1, 2, 3], dtype=np.uint64)
-    found = paired(key, np.array([0, 1, 50, 51, 60]), came, np.array([150, 151, 160]))
+    found = match_keys(key, np.array([0, 1, 50, 51, 60]), came, np.array([150, 151, 160]))
     assert found.received_index.tolist() == [NONE, NONE, 0, 1, 2]
 
 
@@ -176,7 +176,7 @@ def test_of_each_byte_as_many_copies_arrive_as_were_sent_and_received(
     left, came, arrived = found.sent, found.received, found.match.arrived
     bytes_sent, bytes_received = _singly(sent), _singly(received)
     assert (left.size_bytes.sum(), came.size_bytes.sum()) == (len(bytes_sent), len(bytes_received))
-    assert left.stretch[arrived].tolist() == came.stretch[found.match.received_index[arrived]].tolist()
+    assert left.range_id[arrived].tolist() == came.range_id[found.match.received_index[arrived]].tolist()
     expected = sum(min(bytes_sent.count(byte), bytes_received.count(byte)) for byte in set(bytes_sent))
     assert (left.size_bytes[arrived].sum() == expected) if other_ids else (left.size_bytes[arrived].sum() <= expected)
     first_copies = (found.match.sent_index != NONE) & ~found.match.duplicates

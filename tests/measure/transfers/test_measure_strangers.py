@@ -22,8 +22,8 @@ from tests.helpers.plans import problems
 Change = Callable[[bytes], bytes]
 
 ROUTER = "10.9.0.77"
-TRANSLATED = "an address or a port is translated on the way"
-CHANGED = "they are changed on the way, or the sender's capture lacks them"
+TRANSLATED = "a router on the path translates an address or a port"
+CHANGED = "they were changed on the path, or the sender's capture is incomplete"
 
 
 def _put(at: int, form: str, value: int) -> Change:
@@ -125,7 +125,7 @@ def test_packets_that_the_sender_captured_on_two_interfaces_are_told(protocol: P
     twice = [one for frame in sent for one in (frame, replace(frame, time_ns=frame.time_ns + 5000))]
     found = _why((twice, received), protocol)
     assert found
-    assert "in the sender's capture are there twice" in found
+    assert "in the sender's capture occur twice" in found
     assert _why((sent, [*received, *received]), protocol) is None, "a link may copy"
 
 
@@ -139,7 +139,7 @@ def test_a_snap_length_within_the_headers_makes_no_loss(protocol: Protocol, kept
     cut = [replace(one, data=one.data[: 20 + kept]) for one in (sent if end == "sender" else received)]
     found = _why((cut, received) if end == "sender" else (sent, cut), protocol)
     assert found
-    assert f"in the {end}'s capture were cut off before the end of their TCP or UDP header" in found
+    assert f"in the {end}'s capture were truncated in their TCP or UDP header" in found
 
 
 def test_what_looks_like_it_is_no_translation() -> None:
@@ -201,4 +201,4 @@ def test_a_repeat_of_which_addresses_are_translated_is_void(tmp_path: Path) -> N
     assert [one for one in said if "left as 10.42.0.1:40000 > 10.42.0.2:1234" in one], said
     (tmp_path / "receiver.pcap").write_bytes(file_bytes([]))
     said = problems(plan, Protocol.UDP, tmp_path)
-    assert [one for one in said if "recv.bag has bytes, and no packet of the transfer" in one], said
+    assert [one for one in said if "recv.bag is not empty, but the capture of" in one], said

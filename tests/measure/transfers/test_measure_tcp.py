@@ -84,7 +84,7 @@ def test_what_needs_the_order_equals_a_slow_count(isn: int, sent: list[Range], d
     assert (counts.spurious_frames, counts.reordered_frames) == _slow_order(sent, arrivals)
     came = _bytes(sent[index] for index in arrivals)
     assert counts.duplicated_bytes == came.total() - len(came)
-    assert (counts.doubtful_frames, counts.superframes) == (0, None)
+    assert (counts.ambiguous_frames, counts.superframes) == (0, None)
 
 
 @given(initial, st.lists(st.integers(1, 90_000), min_size=1, max_size=6), st.data())
@@ -104,7 +104,7 @@ def test_offload_alone_loses_repeats_and_reorders_nothing(isn: int, sizes: list[
     counts = tcp.count(tcp.cross(packets(both[0]), packets(both[1]), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes, counts.lost_bytes) == (end, end, end, 0)
     assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (0, 0, 0)
-    assert (counts.duplicated_bytes, counts.doubtful_frames) == (0, 0)
+    assert (counts.duplicated_bytes, counts.ambiguous_frames) == (0, 0)
     assert counts.superframes == sum(size > 1460 for _, size in [*sent, *received])
 
 

@@ -12,7 +12,7 @@ from scapy.layers.inet import IP, UDP, fragment
 
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import topics
-from fieldkit.measure.transfers.topic_log import Stamped, TopicLog
+from fieldkit.measure.transfers.topic_log import TopicSamples, TopicLog
 from fieldkit.measure.transfers.topics import TopicTraffic
 from tests.helpers.captures import RECEIVER, SENDER, Frame, datagram, ipv4, packets
 
@@ -27,7 +27,7 @@ EVERY = 100 * MS
 
 def log(sequence: Sequence[int], at_ns: Sequence[int], **changes: int | None) -> TopicLog:
     sent_ns = np.array([START + EVERY * one for one in sequence], dtype=np.int64)
-    samples = Stamped(
+    samples = TopicSamples(
         np.array(sequence, dtype=np.int64),
         np.full(len(sequence), 100, dtype=np.int64),
         sent_ns,
@@ -162,7 +162,7 @@ def test_the_mean_age_is_the_area_under_the_saw(gaps: list[float], delays: list[
     [([0, 100, 200], 0), ([0, 150], 0), ([0, 151], 1), ([0, 300, 350], 1), ([0, 460], 3), ([0], 0)],
 )
 def test_each_deadline_without_a_sample_is_missed(at_ms: list[int], missed: int) -> None:
-    assert topics.misses(np.array(at_ms, dtype=np.int64) * MS, 0.15) == missed
+    assert topics.deadline_misses(np.array(at_ms, dtype=np.int64) * MS, 0.15) == missed
 
 
 def test_traffic_is_told_by_its_ports() -> None:

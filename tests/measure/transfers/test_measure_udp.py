@@ -72,7 +72,7 @@ def test_bursts_copies_and_reordering_equal_a_slow_count(sizes: list[int], data:
     assert counts.packets_duplicated == sum(index < ours for index in arrivals) - len(arrived)
     assert counts.packets_reordered == late
     assert (counts.loss_bursts, counts.longest_burst) == (len(runs), max(runs, default=0))
-    assert counts.packets_doubtful == 0
+    assert counts.packets_ambiguous == 0
 
 
 def len_of(packet: bytes) -> int:
@@ -125,7 +125,7 @@ def test_unfragmented_packets_that_all_have_the_same_id_are_counted_as_a_multise
     counts = _count(frames, arrivals)
     assert counts.packets_received == counts.datagrams_received == received
     assert counts.bytes_received == 100 * received
-    assert counts.packets_doubtful == (sent if sent > 1 and received else 0)
+    assert counts.packets_ambiguous == (sent if sent > 1 and received else 0)
 
 
 def test_duplicates_on_the_way_count_once() -> None:

@@ -77,8 +77,8 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
     assert not found.duplicates.any()
     # Joined segments that TCP repeats within the same millisecond have the same time stamp, and the router cuts both.
     assert set(np.flatnonzero(found.doubtful)) <= repeated_at_once(sent)
-    assert (counts.doubtful_frames > 0) == found.doubtful.any()
-    if counts.doubtful_frames:
+    assert (counts.ambiguous_frames > 0) == found.doubtful.any()
+    if counts.ambiguous_frames:
         assert counts.spurious_frames is counts.reordered_frames is None
     else:
         assert counts.spurious_frames == counts.retransmitted_frames

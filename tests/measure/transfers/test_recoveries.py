@@ -130,5 +130,5 @@ def test_times_are_read_as_they_were_written(began_ns: int, ended_ns: int | None
 )
 def test_a_file_that_was_cut_says_nothing(tmp_path: Path, text: str) -> None:
     (tmp_path / "times.txt").write_text(text, encoding="ascii")
-    with pytest.raises(EvidenceError, match="when the fault began"):
+    with pytest.raises(EvidenceError, match="the start of the fault is unknown"):
         fault_times.read(tmp_path / "times.txt")

@@ -51,7 +51,7 @@ def test_a_log_that_counts_wrongly_is_refused(tmp_path: Path) -> None:
     start = len(records.MAGIC) + 2 * size
     for damaged in (whole[:start] + whole[start + size :], whole + whole[-size:]):
         (tmp_path / "log").write_bytes(damaged)
-        with pytest.raises(EvidenceError, match="counts other samples"):
+        with pytest.raises(EvidenceError, match="does not have the number of samples"):
             topic_log.read(tmp_path / "log")
 
 
@@ -72,7 +72,7 @@ def test_zeros_behind_the_last_record_are_no_records(
 @pytest.mark.parametrize("content", [b"", b"fieldkit", b"\xd4\xc3\xb2\xa1" * 9])
 def test_another_file_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "log").write_bytes(content)
-    with pytest.raises(EvidenceError, match="no log of a topic"):
+    with pytest.raises(EvidenceError, match="not a log of a topic"):
         topic_log.read(tmp_path / "log")
 
 
