@@ -37,7 +37,7 @@ class AttemptEvidence:
             parse: Reads the file; called once for each combination of file and options.
             name: The file's name; empty if `parse` reads several files of the folder.
             options: Passed to `parse` after the path.
-            keywords: None are accepted: positional options alone are the cache key.
+            keywords: Must be empty, because only the positional options are part of the cache key.
 
         Raises:
             EvidenceError: The file is missing or invalid.

@@ -171,7 +171,10 @@ STAMP = r"(\[)([0-9.]+)"
         (replies(lambda s: s + 3600, STAMP, "{:.6f}"), "before or after the attempt"),
         (replies(lambda s: s + 1.1, STAMP, "{:.6f}"), "after its arrival"),
         (replies(lambda s: s - 0.05, STAMP, "{:.6f}"), "after its arrival"),
-        (lambda text: text.replace(b"20 packets transmitted", b"40 packets transmitted"), "40 requests instead of 20"),
+        (
+            lambda text: text.replace(b"20 packets transmitted", b"40 packets transmitted"),
+            "40 requests instead of 20",
+        ),
     ],
 )
 def test_pings_that_captures_contradict(protocol: Protocol, change: Change, reason: str, tmp_path: Path) -> None:

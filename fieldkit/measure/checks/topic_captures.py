@@ -71,8 +71,8 @@ class Captured:
     """A topic in both captures.
 
     Attributes:
-        near: Packets in the publisher's capture; None without an undamaged capture.
-        far: Packets in the subscriber's capture; None without an undamaged capture.
+        publisher: Packets in the publisher's capture; None without an undamaged capture.
+        subscriber: Packets in the subscriber's capture; None without an undamaged capture.
         complete: True if all packets of its data that were sent are in the subscriber's capture.
     """
 
@@ -98,14 +98,17 @@ def of_captures(plan: TopicPlan, sent: TopicLog, received: TopicLog, captured: C
         received: Complete log of the subscriber.
         captured: The topic in both captures.
     """
-    if any(flow is not None and (flow.packets.time_ns == NO_TIME).any() for flow in (captured.near, captured.far)):
+    if any(
+        flow is not None and (flow.packets.time_ns == NO_TIME).any()
+        for flow in (captured.publisher, captured.subscriber)
+    ):
         return
-    if captured.near is not None:
-        yield from _of_content(captured.near.heads, sent.samples, sent.samples.sequence, "publisher")
-        yield from _of_sending(captured.near.heads)
-    if captured.far is not None:
-        yield from _of_content(captured.far.heads, received.samples, None, "subscriber")
-        yield from _of_arrivals(plan, received, captured.far, complete=captured.complete)
+    if captured.publisher is not None:
+        yield from _of_content(captured.publisher.heads, sent.samples, sent.samples.sequence, "publisher")
+        yield from _of_sending(captured.publisher.heads)
+    if captured.subscriber is not None:
+        yield from _of_content(captured.subscriber.heads, received.samples, None, "subscriber")
+        yield from _of_arrivals(plan, received, captured.subscriber, complete=captured.complete)
 
 
 def _of_arrivals(plan: TopicPlan, received: TopicLog, subscriber: SampleFlow, *, complete: bool) -> Iterator[str]:
@@ -136,9 +139,9 @@ def withheld(
         reliable: As in `TopicPlan`.
         deadline_s: Deadline of the topic; None without one.
     """
-    if captured.far is None or not len(arrived):
+    if captured.subscriber is None or not len(arrived):
         return {}
-    latency_s = _Arrivals.of(arrived, captured.far, complete=captured.complete, reliable=reliable).latency_s
+    latency_s = _Arrivals.of(arrived, captured.subscriber, complete=captured.complete, reliable=reliable).latency_s
     if latency_s is None or not len(latency_s):
         return {}
     figures_s = {
@@ -179,18 +182,18 @@ class _Arrivals:
     latency_s: Floats | None
 
     @classmethod
-    def of(cls, samples: TopicSamples, far: SampleFlow, *, complete: bool, reliable: bool) -> "_Arrivals":
+    def of(cls, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool, reliable: bool) -> "_Arrivals":
         """Return the arrivals of samples, each of which occurs once; arguments as in `Captured` and `TopicPlan`."""
-        heads = far.heads.first()
+        heads = subscriber.heads.first()
         _, logged, captured = np.intersect1d(samples.sequence, heads.sequence, return_indices=True)
         at_ns, head_ns = samples.at_ns[logged], heads.at_ns[captured]
-        complete_ns = _complete_ns(far, heads, complete=complete, reliable=reliable) if len(heads) else None
+        complete_ns = _complete_ns(subscriber, heads, complete=complete, reliable=reliable) if len(heads) else None
         if complete_ns is None:
             return cls(at_ns - head_ns, None)
         latency_s = (at_ns - complete_ns[captured]) / 1e9
         return cls(
             at_ns - head_ns,
-            latency_s[~_may_have_waited(samples, heads)] if reliable and not far.is_tcp else latency_s,
+            latency_s[~_may_have_waited(samples, heads)] if reliable and not subscriber.is_tcp else latency_s,
         )
 
     def contradictions(self) -> Iterator[str]:
@@ -206,14 +209,14 @@ class _Arrivals:
                 yield f"the subscriber's log is {least_s:.6f} s or more later than its capture for every sample"
 
 
-def _complete_ns(far: SampleFlow, heads: SampleHeads, *, complete: bool, reliable: bool) -> Ints | None:
+def _complete_ns(subscriber: SampleFlow, heads: SampleHeads, *, complete: bool, reliable: bool) -> Ints | None:
     """Return the time at which each sample and all earlier ones had arrived, by number; None if it is unknown."""
-    if far.is_tcp:
-        return _contiguous_ns(far, heads.end)
+    if subscriber.is_tcp:
+        return _contiguous_ns(subscriber, heads.end)
     if heads.whole.all():
         delivered_ns: Ints = np.maximum.accumulate(heads.at_ns) if reliable else heads.at_ns
         return delivered_ns
-    return _before_next_ns(far, heads) if complete else None
+    return _before_next_ns(subscriber, heads) if complete else None
 
 
 def _may_have_waited(samples: TopicSamples, heads: SampleHeads) -> Mask:
@@ -234,9 +237,9 @@ def _may_have_waited(samples: TopicSamples, heads: SampleHeads) -> Mask:
     return mask
 
 
-def _contiguous_ns(far: SampleFlow, end: Ints) -> Ints | None:
+def _contiguous_ns(subscriber: SampleFlow, end: Ints) -> Ints | None:
     """Return when a TCP connection had delivered every byte before `end`, from the first copy of each segment."""
-    if (connection := far.connection()) is None:
+    if (connection := subscriber.connection()) is None:
         return None
     data, _ = connection
     base = int(end[0])
@@ -253,9 +256,9 @@ def _seq_difference(number: Ints, base: int) -> Ints:
     return (number - base + (1 << 31)) % (1 << 32) - (1 << 31)
 
 
-def _before_next_ns(far: SampleFlow, heads: SampleHeads) -> Ints:
+def _before_next_ns(subscriber: SampleFlow, heads: SampleHeads) -> Ints:
     """Return the time of the last packet before the next sample starts, for samples in several packets."""
-    times_ns, begins_ns = np.sort(far.packets.time_ns), np.sort(heads.at_ns)
+    times_ns, begins_ns = np.sort(subscriber.packets.time_ns), np.sort(heads.at_ns)
     next_index = np.searchsorted(begins_ns, heads.at_ns, side="right")
     next_ns = np.append(begins_ns, times_ns[-1] + 1)[next_index]
     last: Ints = times_ns[np.maximum(np.searchsorted(times_ns, next_ns, side="left") - 1, 0)]
@@ -273,9 +276,9 @@ def _of_content(heads: SampleHeads, samples: TopicSamples, numbers: Ints | None,
         yield f"{what} have another time of sending than in its capture"
 
 
-def _of_sending(near: SampleHeads) -> Iterator[str]:
+def _of_sending(publisher: SampleHeads) -> Iterator[str]:
     """Yield contradictions between the times of sending and the publisher's capture."""
-    first = near.first()
+    first = publisher.first()
     after_ns = first.at_ns - first.sent_ns
     if len(after_ns) and int(after_ns.min()) < -STAMP_NS:
         early_s = -int(after_ns.min()) / 1e9
@@ -287,34 +290,34 @@ def _of_sending(near: SampleHeads) -> Iterator[str]:
         yield f"every sample was sent {late_s:.6f} s or more after it was created, by the publisher's capture and log"
 
 
-def _surplus_copies(samples: TopicSamples, far: SampleFlow) -> Iterator[str]:
+def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
     """Yield a contradiction if a log has samples more often than the capture."""
     numbers, copies = np.unique(samples.sequence, return_counts=True)
-    shown_numbers, shown_copies = np.unique(far.heads.sequence, return_counts=True)
+    shown_numbers, shown_copies = np.unique(subscriber.heads.sequence, return_counts=True)
     known = np.isin(numbers, shown_numbers)
     max_copies = np.ones(len(numbers), dtype=np.int64)
-    if not far.is_tcp:  # TCP delivers every byte once, however often it arrived
+    if not subscriber.is_tcp:  # TCP delivers every byte once, however often it arrived
         max_copies[known] = shown_copies[np.searchsorted(shown_numbers, numbers[known])]
-    if surplus := int(((copies > max_copies) & (known | far.is_tcp)).sum()):
+    if surplus := int(((copies > max_copies) & (known | subscriber.is_tcp)).sum()):
         yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than they arrived"
 
 
-def _uncaptured_samples(plan: TopicPlan, arrived: TopicSamples, far: SampleFlow) -> Iterator[str]:
+def _uncaptured_samples(plan: TopicPlan, arrived: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
     """Yield a contradiction if the capture has too few packets for the samples in a log, which has no duplicates."""
-    if not plan.on_ports and not len(far.heads):
+    if not plan.on_ports and not len(subscriber.heads):
         return
-    packets = far.packets
+    packets = subscriber.packets
     size_bytes = plan.size_bytes + plan.envelope_bytes
-    without_head = int((~np.isin(arrived.sequence, far.heads.sequence)).sum())
+    without_head = int((~np.isin(arrived.sequence, subscriber.heads.sequence)).sum())
     payload_bytes = packets.tcp_payload_bytes + np.maximum(packets.udp_bytes - UDP_HEADER_BYTES, 0)
-    if far.is_tcp or size_bytes > _DATAGRAM_BYTES:
-        capacity = int(payload_bytes.sum()) // size_bytes - len(far.heads.first())
+    if subscriber.is_tcp or size_bytes > _DATAGRAM_BYTES:
+        capacity = int(payload_bytes.sum()) // size_bytes - len(subscriber.heads.first())
     else:
-        capacity = int((payload_bytes // size_bytes).sum()) - len(far.heads)
+        capacity = int((payload_bytes // size_bytes).sum()) - len(subscriber.heads)
     if without_head > max(capacity, 0):
         missing_text = f"{format_count(without_head - max(capacity, 0), 'sample')} in the subscriber's log"
         yield f"{missing_text} are not in its capture"
-    if not len(far.heads):
+    if not len(subscriber.heads):
         yield from _early_samples(arrived, packets.time_ns, payload_bytes, size_bytes)
 
 
@@ -332,18 +335,18 @@ def _early_samples(samples: TopicSamples, times_ns: Ints, payload_bytes: Ints, s
         yield f"{format_count(early_count, 'sample')} in the subscriber's log came before their bytes in its capture"
 
 
-def _missing_count(plan: TopicPlan, log: TopicLog, far: SampleFlow, *, complete: bool) -> int:
+def _missing_count(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow, *, complete: bool) -> int:
     """Return the number of samples that arrived completely but are missing in the log without a known reason.
 
     Known reasons: the subscriber had not discovered the publisher; its queue overflowed, because its program did not
     read the samples in time; an earlier sample was missing, or a later one had arrived.
     """
-    if not len(far.heads):
-        return _missing_bytes(plan, log, far)
-    heads = far.heads.first()
+    if not len(subscriber.heads):
+        return _missing_bytes(plan, log, subscriber)
+    heads = subscriber.heads.first()
     begins_ns = int(log.times_ns[-1] if log.matched_ns is None else log.matched_ns)
     settled = (heads.at_ns > begins_ns + _GRACE_NS) & (heads.at_ns < log.times_ns[-1] - _GRACE_NS)
-    received = _is_received(plan, heads, log.samples, far, complete=complete)
+    received = _is_received(plan, heads, log.samples, subscriber, complete=complete)
     is_missing = settled & received & ~np.isin(heads.sequence, log.samples.sequence)
     if not is_missing.any():
         return 0
@@ -351,11 +354,11 @@ def _missing_count(plan: TopicPlan, log: TopicLog, far: SampleFlow, *, complete:
 
 
 def _is_received(
-    plan: TopicPlan, heads: SampleHeads, samples: TopicSamples, far: SampleFlow, *, complete: bool
+    plan: TopicPlan, heads: SampleHeads, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool
 ) -> Mask:
     """Return a mask of the samples, by number, that the subscriber's middleware must have delivered."""
-    if far.is_tcp:
-        return _is_acknowledged(heads, far)
+    if subscriber.is_tcp:
+        return _is_acknowledged(heads, subscriber)
     is_complete = heads.whole | complete
     if plan.reliable:
         # No sample is delivered after a gap; a sample that arrives before a later one is delivered precedes it.
@@ -368,9 +371,9 @@ def _is_received(
     return received
 
 
-def _is_acknowledged(heads: SampleHeads, far: SampleFlow) -> Mask:
+def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:
     """Return a mask of the samples over TCP that the subscriber's kernel acknowledged completely."""
-    connection = far.connection()
+    connection = subscriber.connection()
     if connection is None or not len(connection[1]):
         return np.zeros(len(heads), dtype=np.bool_)
     base = int(heads.end[0])
@@ -396,12 +399,12 @@ def _overflowed(plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_m
     return overflowed
 
 
-def _missing_bytes(plan: TopicPlan, log: TopicLog, far: SampleFlow) -> int:
+def _missing_bytes(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow) -> int:
     """Return how many samples are missing in a log by the TCP bytes that arrived, if the capture has no heads."""
-    if not far.is_tcp:
+    if not subscriber.is_tcp:
         return 0
     max_bytes = plan.size_bytes + plan.envelope_bytes + _OVERHEAD_BYTES
-    payload = far.packets.where(far.packets.tcp_payload_bytes > 0)
+    payload = subscriber.packets.where(subscriber.packets.tcp_payload_bytes > 0)
     _, first = np.unique(payload.tcp_seq, return_index=True)
     arrived_bytes = int(payload.tcp_payload_bytes[first].sum()) - _OVERHEAD_ONCE_BYTES
     return max(arrived_bytes // max_bytes - len(log.samples), 0)

@@ -215,7 +215,7 @@ def _ecef_m(source: Samples, destination: Samples, *, heights: bool) -> tuple[Fl
     heights_m = np.concatenate((source.values[:, 2], destination.values[:, 2]))
     known_heights_m = heights_m[np.isfinite(heights_m)]
     if heights and len(known_heights_m) < len(heights_m):
-        raise EvidenceError("heights are to be used, but some positions have none")
+        raise EvidenceError("heights are required, but some positions have none")
     median_m = float(np.median(known_heights_m)) if len(known_heights_m) else 0.0
 
     def place_m(samples: Samples) -> Floats:

@@ -74,7 +74,10 @@ def test_what_was_given_later_counts_before_what_was_recorded_and_that_before_th
     tell(trial, {SENDER: local, RECEIVER: later})
     assert mean_m(attempt) == pytest.approx(33), "each line was so a second before"
     tell(trial, {RECEIVER: later})
-    assert mean_m(attempt) == f"the positions of the robots are in different frames: the sender {PLACED}, the receiver {LOCAL}"
+    assert (
+        mean_m(attempt)
+        == f"the positions of the robots are in different frames: the sender {PLACED}, the receiver {LOCAL}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -150,7 +153,10 @@ def test_a_tracker_and_a_place_in_its_frame(attempt: Path) -> None:
     tell(attempt, {SENDER: Account(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
     assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)
     tell(attempt, {SENDER: HERE, RECEIVER: tracker})
-    assert mean_m(attempt) == "the positions of the robots are in different frames: the sender as placed, the receiver frame map"
+    assert (
+        mean_m(attempt)
+        == "the positions of the robots are in different frames: the sender as placed, the receiver frame map"
+    )
 
 
 def test_on_the_earth_heights_count_only_if_they_are_to(attempt: Path) -> None:
@@ -165,7 +171,7 @@ def test_on_the_earth_heights_count_only_if_they_are_to(attempt: Path) -> None:
     assert mean_m(attempt) == pytest.approx(math.hypot(level_m, 50), abs=0.002)
     untold = robots | {SENDER: Account(place=(latitude, longitude, None), frame=WGS84)}
     (attempt / accounts.FILE).write_text(accounts.text(Accounts(untold, heights=True)), encoding="utf-8")
-    assert mean_m(attempt) == "heights are to be used, but some positions have none"
+    assert mean_m(attempt) == "heights are required, but some positions have none"
 
 
 FLOATS = st.floats(-1e9, 1e9)

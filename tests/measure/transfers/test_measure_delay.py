@@ -190,7 +190,10 @@ def test_packets_that_overtake_others_and_ones_of_another_transfer() -> None:
     sender, receiver = _exchange([0.0, 10.0, 20.0, 30.0], [100.0, 300.0, 100.0, 100.0], (5.0, 0))
     other = [Frame(START_NS + n * MILLISECOND_NS, one) for n in range(9) for one in datagram(900 + n, 3000, port=9)]
     later = [replace(one, time_ns=one.time_ns + 5_000_000_000) for one in other]
-    sender, receiver = Packets.concatenated((sender, packets(other))), Packets.concatenated((receiver, packets(later)))
+    sender, receiver = (
+        Packets.concatenated((sender, packets(other))),
+        Packets.concatenated((receiver, packets(later))),
+    )
     found = _measured(sender, receiver, transfer(Protocol.UDP))
     assert found.jitter_s == pytest.approx(0.2 / 16)
     assert found.delay_variation_p95_s == pytest.approx(0.2 * 0.85), "the other transfer's are 5 s late"

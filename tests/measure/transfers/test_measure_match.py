@@ -11,7 +11,7 @@ from scapy.packet import Raw
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.arrays import Ints
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.transfers.match import NONE, match, match_payload, match_keys, assign
+from fieldkit.measure.transfers.match import NONE, assign, match, match_keys, match_payload
 from tests.helpers.captures import Frame, datagram, ipv4, packets, segment, timed
 
 moments = st.sets(st.integers(0, 30), min_size=1, max_size=12).map(lambda these: [4 * one for one in sorted(these)])

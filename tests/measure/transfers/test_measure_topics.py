@@ -12,7 +12,7 @@ from scapy.layers.inet import IP, UDP, fragment
 
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import topics
-from fieldkit.measure.transfers.topic_log import TopicSamples, TopicLog
+from fieldkit.measure.transfers.topic_log import TopicLog, TopicSamples
 from fieldkit.measure.transfers.topics import TopicTraffic
 from tests.helpers.captures import RECEIVER, SENDER, Frame, datagram, ipv4, packets
 
