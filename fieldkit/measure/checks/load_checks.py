@@ -112,9 +112,9 @@ def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, witness:
         return
     first_ns = int(progress.times_ns[0])
     request_ns = _last_request_ns(flow, witness, first_ns)
-    refused_bytes = 0
+    dropped_bytes = 0
     if flow.protocol is Protocol.UDP:
-        refused_bytes = (witness.receiver_counters.udp_undelivered or 0) * flow.payload_bytes
+        dropped_bytes = (witness.receiver_counters.udp_undelivered or 0) * flow.payload_bytes
     received_bytes = 0
     for interval in received.intervals:
         received_bytes += interval.payload_bytes
@@ -122,7 +122,7 @@ def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, witness:
             continue
         end_ns = round(1e9 * interval.end_s)
         upper = progress.upper_bound(first_ns + end_ns + EARLY_NS)
-        lower = progress.lower_bound(request_ns + end_ns - LATE_NS) - refused_bytes
+        lower = progress.lower_bound(request_ns + end_ns - LATE_NS) - dropped_bytes
         if not lower <= received_bytes <= upper:
             bound = f"at least {lower}" if received_bytes < lower else f"at most {upper}"
             when = f"by second {interval.end_s:.1f} of the test"

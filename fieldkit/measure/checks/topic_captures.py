@@ -359,15 +359,15 @@ def _is_received(
     """Return a mask of the samples, by number, that the subscriber's middleware must have delivered."""
     if subscriber.is_tcp:
         return _is_acknowledged(heads, subscriber)
-    is_complete = heads.whole | complete
+    has_all_bytes = heads.whole | complete
     if plan.reliable:
         # No sample is delivered after a gap; a sample that arrives before a later one is delivered precedes it.
         gapless = np.logical_and.accumulate(heads.sequence == np.arange(len(heads)))
         numbers, first = np.unique(samples.sequence, return_index=True)
         next_index = np.searchsorted(numbers, heads.sequence, side="right")
         next_ns = np.append(samples.at_ns[first], -1)[next_index]
-        return is_complete & (gapless | (next_ns >= heads.at_ns))
-    received: Mask = is_complete & (heads.at_ns >= np.maximum.accumulate(heads.at_ns))
+        return has_all_bytes & (gapless | (next_ns >= heads.at_ns))
+    received: Mask = has_all_bytes & (heads.at_ns >= np.maximum.accumulate(heads.at_ns))
     return received
 
 

@@ -76,7 +76,7 @@ def test_a_missing_interval_is_a_contradiction(version: str, test: str, number: 
     receiver = ends["client" if test.endswith("reverse") else "server"]
     removed = receiver["intervals"].pop(number % len(receiver["intervals"]))
     reasons = contradictions(ends["client"], ends["server"], test)
-    assert reasons or removed["sum"]["bytes"] == 0, "an interval in which nothing came changes no column"
+    assert reasons or removed["sum"]["bytes"] == 0, "an interval without data changes no column"
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -104,7 +104,7 @@ def test_no_tcp_transfer_over_any_link_has_a_contradiction(
     starts = [sum(sizes[:index]) for index in range(segments)]
     # The sender gives up after some time, and the transfer ends incomplete.
     tries = chance.randrange(1, 500)
-    came, done = set[int](), False
+    arrived, done = set[int](), False
 
     def send(at: int, flags: int, size: int = 0) -> bool:
         nonlocal tries
@@ -123,13 +123,13 @@ def test_no_tcp_transfer_over_any_link_has_a_contradiction(
         for index in (*order, *chance.choices(order, k=3)) if order else ():
             if not send(1 + starts[index], ACK, sizes[index]):
                 break
-            came.add(index)
-            reached = next((number for number in range(segments) if number not in came), segments)
+            arrived.add(index)
+            reached = next((number for number in range(segments) if number not in arrived), segments)
             acknowledge(1 + sum(sizes[:reached]))
-        if len(came) == segments and send(1 + len(data), FIN | ACK):
+        if len(arrived) == segments and send(1 + len(data), FIN | ACK):
             done = True
             acknowledge(2 + len(data))
-    reached = next((number for number in range(segments) if number not in came), segments)
+    reached = next((number for number in range(segments) if number not in arrived), segments)
     received = data[: sum(sizes[:reached])]
     if not done:  # stopped at its limit, so it may not have read everything
         received = received[: chance.randrange(len(received) + 1)]
@@ -186,7 +186,7 @@ def test_bytes_after_a_gap_may_be_missing_in_the_file() -> None:
     link.carry(frame(0, 1, SYN | ACK, back=True), back=True)
     for number in (0, 2):
         link.carry(frame(1 + 100 * number, 0, ACK, 100))
-    link.carry(segment(9, 0, flags=0x04, port=11_311, back=True), back=True)  # ROS refuses somebody
+    link.carry(segment(9, 0, flags=0x04, port=11_311, back=True), back=True)  # ROS refuses another connection
     assert link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True) == []
     link.carry(segment(9, 0, flags=0x04, back=True), back=True)
     (reasons,) = link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True)

@@ -29,13 +29,13 @@ Wrong = tuple[float, float]  # offset in seconds, drift in seconds per second
 CLOCKS: list[Wrong] = [(0, 0), (3600, 0), (-3600, 0), (0, 100e-6), (0, -100e-6), (3600, -100e-6), (-3600, 100e-6)]
 
 
-def _measured(sender: Packets, receiver: Packets, what: Transfer, sent: int | None = None) -> Measures:
-    if what.protocol is Protocol.UDP:
-        own = delay.udp_packets(udp.cross(sender, receiver, what))
+def _measured(sender: Packets, receiver: Packets, aim: Transfer, sent: int | None = None) -> Measures:
+    if aim.protocol is Protocol.UDP:
+        pairs = delay.udp_packets(udp.cross(sender, receiver, aim))
     else:
-        own = delay.tcp_frames(tcp.cross(sender, receiver, what))
-    columns = delay.measure(own, sender, receiver, what, sent=len(own) if sent is None else sent)
-    assert not columns.values.keys() & columns.missing.keys(), "no column is told twice"
+        pairs = delay.tcp_frames(tcp.cross(sender, receiver, aim))
+    columns = delay.measure(pairs, sender, receiver, aim, sent=len(pairs) if sent is None else sent)
+    assert not columns.values.keys() & columns.missing.keys(), "no column has both a value and a reason"
     assert columns.values.keys() | columns.missing.keys() == {
         column.name for column in (*delay.COLUMNS, *delay.SENT_COLUMNS)
     }
@@ -70,8 +70,8 @@ def _real(protocol: Protocol, offset_s: float = 0.0, drift: float = 0.0) -> Meas
     sender, receiver = (pcap.read(TWO_WAY / f"{protocol}-{role}.pcap").packets for role in ("sender", "receiver"))
     start_ns = int(sender.time_ns.min()) - START_NS
     sender, receiver = (replace(capture, time_ns=capture.time_ns - start_ns) for capture in (sender, receiver))
-    what = replace(transfer(protocol), sender_address="10.42.0.1", receiver_address="10.42.0.2", port=1234)
-    return _measured(sender, _on_another_clock(receiver, offset_s, drift), what)
+    aim = replace(transfer(protocol), sender_address="10.42.0.1", receiver_address="10.42.0.2", port=1234)
+    return _measured(sender, _on_another_clock(receiver, offset_s, drift), aim)
 
 
 @pytest.mark.parametrize(("offset_s", "drift"), CLOCKS)
@@ -119,13 +119,13 @@ def _exchange(
         for n, ms in enumerate(asked_ms)
     ]
 
-    def seen(items: list[tuple[float, bytes]]) -> Packets:
+    def capture(items: list[tuple[float, bytes]]) -> Packets:
         return packets(
             Frame(START_NS + round(ms * MILLISECOND_NS), data) for ms, data in sorted(items, key=lambda item: item[0])
         )
 
-    sender = seen([(ms, data) for ms, _, data in there] + [(ms + extra, data) for ms, extra, data in back])
-    receiver = seen([(ms + extra, data) for ms, extra, data in there] + [(ms, data) for ms, _, data in back])
+    sender = capture([(ms, data) for ms, _, data in there] + [(ms + extra, data) for ms, extra, data in back])
+    receiver = capture([(ms + extra, data) for ms, extra, data in there] + [(ms, data) for ms, _, data in back])
     return sender, _on_another_clock(receiver, *wrong)
 
 
@@ -219,11 +219,11 @@ def test_with_offload_a_tcp_frame_arrives_with_its_last_byte() -> None:
     sent += [(60, segment(isn + 3001, 1000)), (70, segment(isn + 4001, 500))]
     back = segment(9, 0, sport=1234, port=40000)
     back = back[:12] + back[16:20] + back[12:16] + back[20:]
-    came = [(1, sent[0][1]), *((110 + 5 * n, segment(isn + 1 + 1000 * n, 1000)) for n in range(3))]
-    came += [(150, segment(isn + 3001, 1000)), (200, sent[-1][1])]
+    arrivals = [(1, sent[0][1]), *((110 + 5 * n, segment(isn + 1 + 1000 * n, 1000)) for n in range(3))]
+    arrivals += [(150, segment(isn + 3001, 1000)), (200, sent[-1][1])]
     sender, receiver = (
         packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames)
-        for frames in ([*sent, (3, back)], [*came, (2, back)])
+        for frames in ([*sent, (3, back)], [*arrivals, (2, back)])
     )
     measures = _measured(sender, receiver, transfer(Protocol.TCP))
     assert measures.one_way_error_s == pytest.approx(0.001, abs=0.2e-3)
@@ -234,10 +234,10 @@ def test_with_offload_a_tcp_frame_arrives_with_its_last_byte() -> None:
 def test_a_lost_tcp_frame_does_not_match_a_retransmission_in_a_larger_frame() -> None:
     """Two segments are lost and sent again as one superframe; they arrive separately 10 ms later."""
     sent = [(0, segment(0, 0, flags=2)), (10, segment(1, 1000)), (12, segment(1001, 1000)), (14, segment(2001, 1000))]
-    came = [(10, sent[0][1]), (24, sent[3][1]), (310, sent[1][1]), (310, sent[2][1])]
+    arrivals = [(10, sent[0][1]), (24, sent[3][1]), (310, sent[1][1]), (310, sent[2][1])]
     sent += [(300, segment(1, 2000))]
     sender, receiver = (
-        packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, came)
+        packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, arrivals)
     )
     own = delay.tcp_frames(tcp.cross(sender, receiver, transfer(Protocol.TCP)))
     assert ((own.receiver_ns - own.sender_ns) / MILLISECOND_NS).tolist() == [10, 10]

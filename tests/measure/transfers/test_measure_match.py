@@ -171,8 +171,10 @@ def test_each_byte_has_as_many_matches_as_copies_sent_and_received(
 ) -> None:
     """Any frames at both ends compared with lists of single bytes; if equal frames exist, fewer bytes may match."""
     ends = [
-        packets(timed([segment(isn + start, size, ip_id=ip_id + more) for start, size, ip_id in ((0, 0, 0), *these)]))
-        for these, more in ((sent, 0), (received, other_ids))
+        packets(
+            timed([segment(isn + start, size, ip_id=ip_id + more) for start, size, ip_id in ((0, 0, 0), *ranges)])
+        )
+        for ranges, more in ((sent, 0), (received, other_ids))
     ]
     matched = match_payload(*ends)
     sent_pieces, received_pieces, arrived = matched.sent, matched.received, matched.match.arrived

@@ -193,12 +193,12 @@ def _planned(packet: bytes) -> bytes:
 
 def test_a_repeat_with_translated_addresses_is_void(tmp_path: Path) -> None:
     plan = los_plan(protocols=(Protocol.UDP,))
-    sent, received = _udp(lambda frame: source(_planned(frame)))
+    sent, received = _udp(lambda packet: source(_planned(packet)))
     (tmp_path / "sender.pcap").write_bytes(file_bytes([Frame(frame.time_ns, _planned(frame.data)) for frame in sent]))
     (tmp_path / "receiver.pcap").write_bytes(file_bytes(received))
     (tmp_path / "recv.bag").write_bytes(b"x")
-    said = problems(plan, Protocol.UDP, tmp_path)
-    assert [frame for frame in said if "left as 10.42.0.1:40000 > 10.42.0.2:1234" in frame], said
+    reasons = problems(plan, Protocol.UDP, tmp_path)
+    assert [reason for reason in reasons if "left as 10.42.0.1:40000 > 10.42.0.2:1234" in reason], reasons
     (tmp_path / "receiver.pcap").write_bytes(file_bytes([]))
-    said = problems(plan, Protocol.UDP, tmp_path)
-    assert [frame for frame in said if "recv.bag is not empty, but the capture of" in frame], said
+    reasons = problems(plan, Protocol.UDP, tmp_path)
+    assert [reason for reason in reasons if "recv.bag is not empty, but the capture of" in reason], reasons

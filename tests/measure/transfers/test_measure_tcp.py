@@ -34,12 +34,12 @@ def _bytes(byte_ranges: Iterable[Range]) -> Counter[int]:
 
 
 def _retransmitted(sent: Iterable[Range]) -> int:
-    seen: set[int] = set()
+    sent_before: set[int] = set()
     repeated = 0
     for start, size in sent:
         own = set(range(start, start + size))
-        repeated += bool(own & seen)
-        seen |= own
+        repeated += bool(own & sent_before)
+        sent_before |= own
     return repeated
 
 
@@ -50,11 +50,11 @@ def test_ranges_equal_a_model_of_single_bytes(isn: int, sent: list[Range], recei
     counts = tcp.count(
         tcp.cross(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received, syn=syn))), TCP_TRANSFER)
     )
-    left, came = _bytes(sent), _bytes(received)
-    assert counts.sent_bytes == left.total()
-    assert counts.unique_bytes == len(left)
-    assert counts.received_bytes == (left & came).total()
-    assert counts.lost_bytes == len(set(left) - set(came))
+    sent_bytes, received_bytes = _bytes(sent), _bytes(received)
+    assert counts.sent_bytes == sent_bytes.total()
+    assert counts.unique_bytes == len(sent_bytes)
+    assert counts.received_bytes == (sent_bytes & received_bytes).total()
+    assert counts.lost_bytes == len(set(sent_bytes) - set(received_bytes))
     assert counts.retransmitted_frames == _retransmitted(sent)
     assert (counts.frames_sent, counts.frames_received) == (1 + len(sent), syn + len(received))
 
@@ -82,8 +82,8 @@ def test_counts_that_depend_on_the_order_equal_a_slow_count(isn: int, sent: list
         tcp.cross(packets(frames), packets(timed([frames[1 + index].data for index in arrivals])), TCP_TRANSFER)
     )
     assert (counts.spurious_frames, counts.reordered_frames) == _slow_order(sent, arrivals)
-    came = _bytes(sent[index] for index in arrivals)
-    assert counts.duplicated_bytes == came.total() - len(came)
+    received_bytes = _bytes(sent[index] for index in arrivals)
+    assert counts.duplicated_bytes == received_bytes.total() - len(received_bytes)
     assert (counts.ambiguous_frames, counts.superframes) == (0, None)
 
 
@@ -99,9 +99,9 @@ def test_offload_alone_is_not_loss_retransmission_or_reordering(
     both = [
         [
             Frame(10**18 + number, segment(isn, 0, flags=SYN, mss=1460)),
-            *(Frame(10**18 + number, _lengthless(isn + 1 + start, size), 40 + size) for start, size in these),
+            *(Frame(10**18 + number, _lengthless(isn + 1 + start, size), 40 + size) for start, size in ranges),
         ]
-        for number, these in enumerate((sent, received))
+        for number, ranges in enumerate((sent, received))
     ]
     counts = tcp.count(tcp.cross(packets(both[0]), packets(both[1]), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes, counts.lost_bytes) == (end, end, end, 0)

@@ -62,9 +62,9 @@ def test_a_subscription_that_received_nothing_at_first_has_stalled() -> None:
 
 
 def test_a_clock_that_was_set_is_rejected() -> None:
-    came = arrived(list(range(100)))
-    at_ns = came.samples.at_ns + np.where(came.samples.sequence >= 50, -10 * SECOND, 0)
-    assert not measured(published(100), replace(came, samples=replace(came.samples, at_ns=at_ns)))
+    received = arrived(list(range(100)))
+    at_ns = received.samples.at_ns + np.where(received.samples.sequence >= 50, -10 * SECOND, 0)
+    assert not measured(published(100), replace(received, samples=replace(received.samples, at_ns=at_ns)))
     near, far = captures()
     forward = replace(far, time_ns=far.time_ns + 3600 * SECOND * (np.arange(len(far)) > len(far) // 2))
     result = topic_stalls.measure(FLOW, (published(100), arrived(list(range(100)))), (near, forward), EXPECTED)
