@@ -98,7 +98,7 @@ def headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
     parts = [_ipv4(integers, four, at[four], kept[four], wire[four])]
     if not len(six):
         return parts[0]
-    both = Headers.joined([*parts, _ipv6(integers, six, at[six], kept[six], wire[six])])
+    both = Headers.concatenated([*parts, _ipv6(integers, six, at[six], kept[six], wire[six])])
     return both.where(np.argsort(both.frame))
 
 

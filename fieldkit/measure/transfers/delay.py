@@ -157,7 +157,7 @@ def measure(
     if not len(reverse):
         variation = _variation((transit_ns - transit_ns.min()) / 1e9)
         return jitter | variation | _withheld("no packet from receiver to sender is in both captures")
-    clocks = estimate(StampPairs.joined((pairs, others)), reverse)
+    clocks = estimate(StampPairs.concatenated((pairs, others)), reverse)
     if clocks is None:
         return _withheld(UNSTEADY)
     delay_s, error_s = _delays_s(pairs, clocks)
@@ -181,7 +181,7 @@ def packet_delays(
     reverse = _reverse(sender, receiver, transfer.sender_address, transfer.receiver_address)
     if not len(pairs) or not len(reverse):
         return None
-    clocks = estimate(StampPairs.joined((pairs, _others(sender, receiver, transfer))), reverse)
+    clocks = estimate(StampPairs.concatenated((pairs, _others(sender, receiver, transfer))), reverse)
     return None if clocks is None else _delays_s(pairs, clocks)
 
 

@@ -167,11 +167,11 @@ def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
     chosen = frames.where(relevant)
     _, pieces = ranges.cut(chosen.where(slice(0, 0)), chosen)
     no_frame = len(chosen)
-    count = int(pieces.stretch.max(initial=-1)) + 1
+    count = int(pieces.range_id.max(initial=-1)) + 1
     first, size_bytes = np.full(count, no_frame), np.zeros(count, dtype=np.int64)
     # If an index occurs several times, numpy stores the last value: here that of the earliest frame.
-    first[pieces.stretch[::-1]] = pieces.frame[::-1]
-    size_bytes[pieces.stretch] = pieces.size_bytes
+    first[pieces.range_id[::-1]] = pieces.frame[::-1]
+    size_bytes[pieces.range_id] = pieces.size_bytes
     reached = np.maximum.accumulate(first)
     reached = reached[reached < no_frame]
     last_of_frame = np.flatnonzero(np.diff(reached, append=no_frame))
