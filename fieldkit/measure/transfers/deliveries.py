@@ -162,7 +162,6 @@ def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
         EvidenceError: As for `ranges.cut`.
     """
     # SYN frames are included, because they define the position of the first byte. The number in an RST is arbitrary.
-    # Where SYN is, it says where the first byte has its place; an RST may have any number.
     relevant = np.flatnonzero((frames.tcp_payload_bytes > 0) | (frames.tcp_flags & SYN != 0))
     chosen = frames.where(relevant)
     _, pieces = ranges.cut(chosen.where(slice(0, 0)), chosen)
