@@ -123,7 +123,7 @@ def read(path: Path) -> Accounts:
     except JSON_ERRORS as error:
         raise EvidenceError("is not a valid list of position sources", where=str(path)) from error
     if data or not isinstance(heights, bool):
-        raise EvidenceError("has unknown keys besides the position sources", where=str(path))
+        raise EvidenceError("is not a valid list of position sources: it has unknown keys", where=str(path))
     return Accounts(robots, clocks, heights)
 
 

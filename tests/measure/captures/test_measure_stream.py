@@ -13,7 +13,7 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.packets import Packets
 from tests.helpers.captures import TCPDUMP, file_bytes, segment, timed
 from tests.helpers.dissected import rows
-from tests.measure.captures.test_measure_pcapng import SOUND as BLOCKS
+from tests.measure.captures.test_measure_pcapng import VALID as BLOCKS
 
 FRAMES = timed([segment(index, 100)[: 24 + index] for index in range(9)])
 FILES = {

@@ -134,9 +134,9 @@ def test_a_subscribers_log_with_one_wrong_field_is_noticed(
     ("change", "why"),
     [
         (other_numbers, "does not number its samples from 0 on"),
-        (other_sizes, "the publisher's log has 1 sample of another size"),
+        (other_sizes, "the publisher's log has 1 sample with a size other"),
         (lambda place, row: None if place % 2 else row, "does not number its samples from 0 on"),
-        (lambda place, row: row if place < 30 else None, "accounts for 30 of 40 samples"),
+        (lambda place, row: row if place < 30 else None, "accounts for 30 instead of 40 samples"),
     ],
 )
 def test_a_publishers_log_with_one_wrong_field_is_noticed(
@@ -186,9 +186,9 @@ def test_a_record_from_outside_the_attempt_is_noticed(tmp_path: Path) -> None:
     assert not list(topic_checks.of_window({role: log}, {role: (first, last)}))
     assert not list(topic_checks.of_window({role: log}, {}))
     (early,) = topic_checks.of_window({role: log}, {role: (first + SECOND, last)})
-    assert "a record of 1.000 s before the attempt" in early
+    assert "a record from 1.000 s before the attempt" in early
     (late,) = topic_checks.of_window({role: log}, {role: (first, last - SECOND)})
-    assert "a record of 1.000 s after the attempt" in late
+    assert "a record from 1.000 s after the attempt" in late
 
 
 @pytest.mark.parametrize("kind", KINDS)

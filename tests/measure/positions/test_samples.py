@@ -126,8 +126,8 @@ def test_gpx_tracks_are_read(tmp_path: Path) -> None:
         ("<time>2026-11-22T12:00:01.250Z</time>", "", "1 of 3 points have no time"),
         ("12:00:01.250Z", "12:00:00Z", "point 2: a time occurs twice"),
         ("12:00:01.250Z", "12:00:04Z", "point 3: a time is earlier than the previous one"),
-        ('lat="48.137500"', 'lat="95"', "no place|cannot be read as GPX"),
-        ('lat="48.137500"', 'lat="nan"', "no place|cannot be read as GPX"),
+        ('lat="48.137500"', 'lat="95"', "invalid coordinates|cannot be read as GPX"),
+        ('lat="48.137500"', 'lat="nan"', "invalid coordinates|cannot be read as GPX"),
         ("trkpt", "rtept", "cannot be read as GPX|has no position with a time"),
     ],
 )

@@ -130,5 +130,5 @@ def test_times_are_read_as_they_were_written(began_ns: int, ended_ns: int | None
 )
 def test_a_truncated_file_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "times.txt").write_text(text, encoding="ascii")
-    with pytest.raises(EvidenceError, match="the start of the fault is unknown"):
+    with pytest.raises(EvidenceError, match="does not contain the start and end of the fault"):
         fault_times.read(tmp_path / "times.txt")
