@@ -1,1 +1,1 @@
-"""From raw evidence to numbers: pure functions of files that a repeat left behind."""
+"""Measurements: pure functions that compute numbers from the evidence files of a repeat."""

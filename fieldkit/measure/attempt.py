@@ -1,4 +1,4 @@
-"""The evidence of one attempt: a folder of files, each read when it is first asked for, and once."""
+"""The evidence of one attempt: a folder whose files are read on first use and cached."""
 
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
@@ -16,9 +16,9 @@ T = TypeVar("T")
 
 
 class AttemptEvidence:
-    """Evidence of one attempt; gates, measures, reports and exports read through it.
+    """Evidence of one attempt. Gates, measurements, reports and exports read the files through it.
 
-    A file that is missing, unreadable or damaged is so for everybody: what reading it raised is kept too.
+    Errors are cached as well: each further read of a missing, unreadable or damaged file raises the same error.
 
     Args:
         folder: The attempt's folder.
@@ -28,83 +28,85 @@ class AttemptEvidence:
         self.folder = folder
         self._read: dict[Hashable, Any] = {}
         self._failed: dict[Hashable, EvidenceError] = {}
-        self._found: dict[Hashable, Any] = {}
+        self._cached: dict[Hashable, Any] = {}
 
-    def read(self, parse: Callable[Concatenate[Path, P], T], name: str, *options: P.args, **none: P.kwargs) -> T:
-        """Return a piece of evidence.
+    def read(self, parse: Callable[Concatenate[Path, P], T], name: str, *options: P.args, **keywords: P.kwargs) -> T:
+        """Return the parsed content of a file.
 
         Args:
-            parse: Reads it; called once for each file and its options.
-            name: Its file, empty for one that reads several of the folder.
-            options: Handed to `parse` behind the path.
-            none: Nothing: a call has one form, so that it is known again.
+            parse: Reads the file; called once for each combination of file and options.
+            name: The file's name; empty if `parse` reads several files of the folder.
+            options: Passed to `parse` after the path.
+            keywords: Must be empty, because only the positional options are part of the cache key.
 
         Raises:
-            EvidenceError: It is missing, or not what it must be.
-            MemoryError: This machine has too little.
+            EvidenceError: The file is missing or invalid.
+            MemoryError: This machine has too little memory.
         """
         key = parse, name, options
         if key in self._failed:
             raise self._failed[key]
         if key not in self._read:
             try:
-                self._read[key] = parse(self.folder / name, *options, **none)
+                self._read[key] = parse(self.folder / name, *options, **keywords)
             except EvidenceError as error:
                 self._failed[key] = error
                 raise
-            except MemoryError:  # of this machine: elsewhere the same file can be read
+            except MemoryError:  # not cached: the file may be readable on another machine
                 raise
-            except Exception as error:  # whatever a reader did not foresee, the file made it
-                what = f"cannot be read: {type(error).__name__}: {error}"
-                self._failed[key] = EvidenceError(what, where=str(self.folder / name))
+            except Exception as error:  # a reader's unexpected error is caused by the file's content
+                reason = f"cannot be read: {type(error).__name__}: {error}"
+                self._failed[key] = EvidenceError(reason, where=str(self.folder / name))
                 raise self._failed[key] from error
-        found: T = self._read[key]
-        return found
+        content: T = self._read[key]
+        return content
 
     def read_or_none(
-        self, parse: Callable[Concatenate[Path, P], T], name: str, *options: P.args, **none: P.kwargs
+        self, parse: Callable[Concatenate[Path, P], T], name: str, *options: P.args, **keywords: P.kwargs
     ) -> T | None:
-        """Return a piece of evidence, None when it is missing or not what it must be."""
+        """Return the parsed content of a file, or None if it is missing or invalid."""
         try:
-            return self.read(parse, name, *options, **none)
+            return self.read(parse, name, *options, **keywords)
         except EvidenceError:
             return None
 
-    def cached(self, find: "Callable[Concatenate[AttemptEvidence, P], T]", *options: P.args, **none: P.kwargs) -> T:
-        """Return what `find` finds in the evidence, by `options`; it looks once, whoever asks.
+    def cached(
+        self, compute: "Callable[Concatenate[AttemptEvidence, P], T]", *options: P.args, **keywords: P.kwargs
+    ) -> T:
+        """Return the result of `compute` for this evidence and the options; it is called once for each combination.
 
-        What it raises is not kept.
+        Its exceptions are not cached.
         """
-        key = find, options
-        if key not in self._found:
-            self._found[key] = find(self, *options, **none)
-        found: T = self._found[key]
-        return found
+        key = compute, options
+        if key not in self._cached:
+            self._cached[key] = compute(self, *options, **keywords)
+        result: T = self._cached[key]
+        return result
 
     def has(self, name: str) -> bool:
-        """Return whether there is a file of this name."""
+        """Return True if the folder has a file of this name."""
         return (self.folder / name).is_file()
 
     def links(self, role: Role) -> Sequence[LinkSample]:
-        """Return what a robot's radio told of its links, in the order of time: a testbed's samples, else its own."""
+        """Return a robot's link samples in order of time: the testbed's if there are any, else the robot's."""
         modelled = self.read_or_none(link_samples.read, link_samples.FILE) or {}
         return modelled.get(role) or self.read_or_none(link_samples.read_own, "", role) or ()
 
     def counters(self, role: Role) -> Counters:
-        """Return how the counters of a robot's kernel moved during the attempt; None in each that is not known."""
+        """Return the increments of a robot's kernel counters during the attempt; an unknown one is None."""
         before, after = (self.read_or_none(host.read, file(role)) for file in (host.before, host.after))
         return host.difference(before or Counters(None, None), after or Counters(None, None))
 
     def interface_bytes(self, role: Role, interface: str) -> int | None:
-        """Return how many bytes an interface received during the attempt; None if its kernel does not say."""
+        """Return the number of bytes that an interface received during the attempt, or None if unknown."""
         files = (file(role) for file in (host.before, host.after))
         before, after = (self.read_or_none(host.received_bytes, file, interface) for file in files)
         return None if before is None or after is None or after < before else after - before
 
     def whole_capture(self, name: str | None) -> Capture | None:
-        """Return the capture in a file; None where it is missing or damaged, or there is to be none.
+        """Return a capture, or None if there is no file name, or the file is missing or damaged.
 
-        Counts from a damaged one would be guesses.
+        A damaged capture would give wrong counts.
         """
         capture = None if name is None else self.read_or_none(pcap.read, name)
         return None if capture is None or capture.damage else capture

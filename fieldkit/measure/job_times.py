@@ -1,4 +1,4 @@
-"""End of a job by its robot's clock: the robot notes it in seconds since boot, and its clock beside these."""
+"""End times of jobs by the robot's clock, from the time since boot that the robot recorded."""
 
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
@@ -6,14 +6,14 @@ from fieldkit.measure.evidence import clock, host
 
 
 def ended_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
-    """Return when a job ended, nanoseconds since 1970 UTC by its robot's clock, known to some 20 ms.
+    """Return the time at which a job ended, in nanoseconds since 1970 UTC by the robot's clock, to about 20 ms.
 
-    None if the robot did not note it, booted meanwhile, or had its clock set during the attempt.
+    None if the robot did not record it, rebooted, or had its clock set during the attempt.
 
     Args:
         evidence: The attempt.
-        role: Whose robot ran it.
-        job: Its name.
+        role: Role of the robot that ran the job.
+        job: The job's name.
     """
     before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
     if before is None or after is None or before.boot != after.boot:

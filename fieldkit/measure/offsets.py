@@ -1,4 +1,4 @@
-"""The offset of a robot's clock against the laptop's, with the most that it can be wrong."""
+"""The offset of a robot's clock from the laptop's, with its maximum error."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Exchange:
-    """One question for the time, as in RFC 5905, section 8, with a robot that takes no time to answer.
+    """One exchange of timestamps as in RFC 5905, section 8, with no processing time on the robot.
 
     Attributes:
-        asked_ns: The laptop's clock before it asked, nanoseconds since 1970 UTC.
+        asked_ns: The laptop's clock before the request, nanoseconds since 1970 UTC.
         robot_ns: The robot's clock at some moment in between.
-        answered_ns: The laptop's clock when it had the answer.
-        resolution_ns: The robot's clock was between `robot_ns` and so much later; 0 for a clock that tells all.
+        answered_ns: The laptop's clock when the answer had arrived.
+        resolution_ns: Resolution of `robot_ns`: the robot's clock was at most this much later. 0 if it is exact.
     """
 
     asked_ns: int
@@ -22,17 +22,17 @@ class Exchange:
 
     @property
     def width_ns(self) -> int:
-        """Width of the interval that the offset is in."""
+        """Width of the interval that contains the offset."""
         return self.answered_ns - self.asked_ns + self.resolution_ns
 
 
 @dataclass(frozen=True)
 class Offset:
-    """Offset of a robot's clock, ahead of the laptop's.
+    """Offset of a robot's clock from the laptop's.
 
     Attributes:
-        offset_s: The best estimate, in seconds; negative when the robot's clock is behind.
-        error_s: The most that the estimate can be wrong, however the round trip was divided.
+        offset_s: Best estimate in seconds; positive if the robot's clock is ahead.
+        error_s: Maximum error of the estimate, whatever the delays of request and answer were.
     """
 
     offset_s: float
@@ -40,23 +40,23 @@ class Offset:
 
 
 def offset(exchanges: Sequence[Exchange]) -> Offset:
-    """Return the offset by the exchange that took the least time: its midpoint, and half its width as the error.
+    """Return the offset from the exchange with the narrowest interval: its midpoint, and half its width as the error.
 
-    The robot read its clock somewhere between question and answer, so its offset lies between `robot - answered` and
-    `robot + resolution - asked`.
+    The robot read its clock at some moment between request and answer, so its offset lies between
+    `robot - answered` and `robot + resolution - asked`.
 
     Raises:
         ValueError: There is no exchange.
     """
-    best = min(exchanges, key=lambda one: one.width_ns)
+    best = min(exchanges, key=lambda exchange: exchange.width_ns)
     middle_ns = best.robot_ns + best.resolution_ns / 2 - best.asked_ns - (best.answered_ns - best.asked_ns) / 2
     return Offset(offset_s=middle_ns / 1e9, error_s=best.width_ns / 2e9)
 
 
 def parse_date(text: str) -> tuple[int, int] | None:
-    """Return what `date -u +%s.%N` said as nanoseconds since 1970 and their resolution; None when it said no time.
+    """Return the time printed by `date -u +%s.%N` and its resolution, in nanoseconds since 1970, or None if invalid.
 
-    busybox knows no `%N` and prints it, or nothing, so that its seconds stand for the whole second after them.
+    busybox does not support `%N` and prints it literally or omits it; the resolution is then one second.
     """
     seconds, _, fraction = text.strip().partition(".")
     if not (seconds.isascii() and seconds.isdigit() and len(seconds) <= 11):

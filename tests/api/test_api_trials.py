@@ -187,7 +187,7 @@ trials.repeats.to_pandas()
     ("repeat", "error", "what"),
     [
         ("udp-02", ConfigurationError, "there is no repeat 'udp-02'"),
-        ("udp-01.void1", EvidenceError, "there are no whole captures of both ends"),
+        ("udp-01.void1", EvidenceError, "there are no complete captures of both ends"),
     ],
 )
 def test_packets_that_nobody_can_tell_are_refused(

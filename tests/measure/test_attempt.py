@@ -1,4 +1,4 @@
-"""Evidence of an attempt: each file is read once, whatever comes of it and whoever asks."""
+"""Evidence of an attempt: each file is read once, with its result or error, for all callers."""
 
 import struct
 from pathlib import Path
@@ -14,7 +14,7 @@ from tests.helpers.captures import datagram, file_bytes, timed
 
 
 class Parser:
-    """Reads words, and counts how often it was called."""
+    """Parser of words that counts its calls."""
 
     def __init__(self) -> None:
         self.called: list[tuple[str, int]] = []
@@ -22,15 +22,15 @@ class Parser:
     def words(self, path: Path, at_least: int = 0) -> list[str]:
         self.called.append((path.name, at_least))
         try:
-            found = path.read_text(encoding="utf-8").split()
+            words = path.read_text(encoding="utf-8").split()
         except OSError as error:
             raise EvidenceError("cannot be read", where=str(path)) from error
-        if len(found) < at_least:
+        if len(words) < at_least:
             raise EvidenceError("too short", where=str(path))
-        return found
+        return words
 
 
-def test_a_file_is_parsed_once_whoever_asks(tmp_path: Path) -> None:
+def test_a_file_is_parsed_once_for_all_callers(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("one two", encoding="utf-8")
     evidence, parser = AttemptEvidence(tmp_path), Parser()
     first = evidence.read(parser.words, "a.txt")
@@ -40,7 +40,7 @@ def test_a_file_is_parsed_once_whoever_asks(tmp_path: Path) -> None:
     assert parser.called == [("a.txt", 0)]
 
 
-def test_another_file_other_options_and_another_attempt_are_read_for_themselves(tmp_path: Path) -> None:
+def test_other_files_options_and_attempts_are_read_separately(tmp_path: Path) -> None:
     for name in ("a.txt", "b.txt"):
         (tmp_path / name).write_text(name, encoding="utf-8")
     evidence, parser = AttemptEvidence(tmp_path), Parser()
@@ -51,7 +51,7 @@ def test_another_file_other_options_and_another_attempt_are_read_for_themselves(
     assert parser.called == [("a.txt", 0), ("b.txt", 0), ("a.txt", 1), ("a.txt", 0)]
 
 
-def test_an_error_is_raised_again_and_not_looked_for_again(tmp_path: Path) -> None:
+def test_an_error_is_raised_again_without_another_read(tmp_path: Path) -> None:
     evidence, parser = AttemptEvidence(tmp_path), Parser()
     with pytest.raises(EvidenceError) as first:
         evidence.read(parser.words, "a.txt")
@@ -63,7 +63,7 @@ def test_an_error_is_raised_again_and_not_looked_for_again(tmp_path: Path) -> No
     assert parser.called == [("a.txt", 0)]
 
 
-def test_an_error_that_was_passed_over_is_raised_where_it_matters(tmp_path: Path) -> None:
+def test_an_error_that_was_ignored_once_is_raised_by_read(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("one", encoding="utf-8")
     evidence, parser = AttemptEvidence(tmp_path), Parser()
     assert evidence.read_or_none(parser.words, "a.txt", 2) is None
@@ -72,15 +72,15 @@ def test_an_error_that_was_passed_over_is_raised_where_it_matters(tmp_path: Path
     assert parser.called == [("a.txt", 2)]
 
 
-def test_what_is_found_in_evidence_is_looked_for_once(tmp_path: Path) -> None:
+def test_a_cached_result_is_computed_once(tmp_path: Path) -> None:
     looked: list[tuple[Path, int]] = []
 
-    def find(evidence: AttemptEvidence, number: int) -> None:
+    def compute(evidence: AttemptEvidence, number: int) -> None:
         looked.append((evidence.folder, number))
 
     evidence = AttemptEvidence(tmp_path)
     for number in (1, 1, 2, 1):
-        assert evidence.cached(find, number) is None
+        assert evidence.cached(compute, number) is None
     assert looked == [(tmp_path, 1), (tmp_path, 2)]
 
 
@@ -91,7 +91,7 @@ def test_only_a_file_is_evidence(tmp_path: Path) -> None:
     assert [evidence.has(name) for name in ("file", "folder", "none")] == [True, False, False]
 
 
-def test_a_capture_counts_only_where_it_is_whole(tmp_path: Path) -> None:
+def test_a_damaged_capture_is_not_counted(tmp_path: Path) -> None:
     data = file_bytes(timed(datagram(1, 4000)))
     (tmp_path / capture_file(Role.SENDER)).write_bytes(data)
     (tmp_path / capture_file(Role.RECEIVER)).write_bytes(data[:-1])
@@ -104,7 +104,7 @@ def test_a_capture_counts_only_where_it_is_whole(tmp_path: Path) -> None:
         is whole
         is evidence.read(pcap.read, capture_file(Role.SENDER))
     )
-    # It is there for who asks for it, with its damage; for counts it is not.
+    # The damaged capture can still be read explicitly, but not with `whole_capture`.
     assert evidence.whole_capture(capture_file(Role.RECEIVER)) is None
     assert evidence.read(pcap.read, capture_file(Role.RECEIVER)).damage
     assert evidence.whole_capture(capture_file(Role.RELAY)) is None
@@ -112,7 +112,7 @@ def test_a_capture_counts_only_where_it_is_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [RecursionError, OverflowError, struct.error, KeyError])
-def test_whatever_a_reader_raises_is_evidence_that_cannot_be_read(tmp_path: Path, error: type[Exception]) -> None:
+def test_any_error_of_a_reader_becomes_an_evidence_error(tmp_path: Path, error: type[Exception]) -> None:
     def raises(path: Path) -> None:
         raise error("no such number")
 
@@ -123,7 +123,7 @@ def test_whatever_a_reader_raises_is_evidence_that_cannot_be_read(tmp_path: Path
     assert caught.value.where == str(tmp_path / "a.txt")
 
 
-def test_too_little_memory_says_nothing_of_the_evidence(tmp_path: Path) -> None:
+def test_a_memory_error_is_not_an_evidence_error(tmp_path: Path) -> None:
     def raises(path: Path) -> None:
         raise MemoryError
 

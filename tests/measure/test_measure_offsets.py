@@ -8,30 +8,28 @@ from fieldkit.measure.offsets import Exchange, offset, parse_date
 
 S = 10**9
 OFFSET_S = st.floats(min_value=-1e5, max_value=1e5)
-# There, the way of the question, and back: each in nanoseconds.
-WAYS_NS = st.lists(st.tuples(st.integers(0, 2 * S), st.integers(0, 2 * S)), min_size=1, max_size=8)
+# Delay of the request, processing on the robot, and delay of the answer, each in nanoseconds.
+DELAYS_NS = st.lists(st.tuples(st.integers(0, 2 * S), st.integers(0, 2 * S)), min_size=1, max_size=8)
 
 
 def test_the_fastest_exchange_gives_midpoint_and_half_its_round_trip() -> None:
     slow = Exchange(asked_ns=0, robot_ns=3 * S, answered_ns=2 * S)
-    # Asked at 10 s, answered at 10.4 s; at the midpoint, 10.2 s, the robot's clock said 15 s.
+    # Asked at 10 s, answered at 10.4 s; at the midpoint, 10.2 s, the robot's clock showed 15 s.
     fast = Exchange(asked_ns=10 * S, robot_ns=15 * S, answered_ns=10 * S + 4 * S // 10)
-    found = offset([slow, fast])
-    assert found.offset_s == pytest.approx(4.8)
-    assert found.error_s == pytest.approx(0.2)
+    estimate = offset([slow, fast])
+    assert estimate.offset_s == pytest.approx(4.8)
+    assert estimate.error_s == pytest.approx(0.2)
 
 
-def test_a_clock_that_tells_seconds_only_stands_for_the_second_after_it() -> None:
+def test_a_clock_with_a_resolution_of_seconds_adds_a_second_of_uncertainty() -> None:
     # The robot's clock was between 100 and 101 s when the laptop's was between 90 and 90.2 s.
-    found = offset([Exchange(90 * S, 100 * S, 90 * S + S // 5, resolution_ns=S)])
-    assert found.offset_s == pytest.approx(10.4)
-    assert found.error_s == pytest.approx(0.6)
+    estimate = offset([Exchange(90 * S, 100 * S, 90 * S + S // 5, resolution_ns=S)])
+    assert estimate.offset_s == pytest.approx(10.4)
+    assert estimate.error_s == pytest.approx(0.6)
 
 
-@given(true_s=OFFSET_S, ways=WAYS_NS, whole_seconds=st.booleans())
-def test_the_true_offset_is_never_further_away_than_the_error(
-    true_s: float, ways: list[tuple[int, int]], whole_seconds: bool
-) -> None:
+@given(true_s=OFFSET_S, ways=DELAYS_NS, whole_seconds=st.booleans())
+def test_the_true_offset_is_within_the_error(true_s: float, ways: list[tuple[int, int]], whole_seconds: bool) -> None:
     true_ns = round(true_s * S)
     exchanges = []
     asked_ns = 1_700_000_000 * S
@@ -40,12 +38,12 @@ def test_the_true_offset_is_never_further_away_than_the_error(
         robot_ns, resolution_ns = (read // S * S, S) if whole_seconds else (read, 0)
         exchanges.append(Exchange(asked_ns, robot_ns, asked_ns + there + back, resolution_ns))
         asked_ns += there + back
-    found = offset(exchanges)
-    assert abs(found.offset_s - true_ns / S) <= found.error_s + 1e-6
+    estimate = offset(exchanges)
+    assert abs(estimate.offset_s - true_ns / S) <= estimate.error_s + 1e-6
 
 
 @pytest.mark.parametrize(
-    ("said", "read"),
+    ("text", "expected"),
     [
         ("1795216652.775015827\n", (1_795_216_652_775_015_827, 0)),
         ("1795216652.%N\n", (1_795_216_652 * S, S)),  # busybox 1.35
@@ -56,14 +54,14 @@ def test_the_true_offset_is_never_further_away_than_the_error(
         ("99999999999999999999.1", None),
     ],
 )
-def test_what_date_says(said: str, read: tuple[int, int] | None) -> None:
-    assert parse_date(said) == read
+def test_output_of_date(text: str, expected: tuple[int, int] | None) -> None:
+    assert parse_date(text) == expected
 
 
 @given(st.text())
-def test_any_text_is_a_time_or_none(said: str) -> None:
-    read = parse_date(said)
-    assert read is None or read[0] >= 0
+def test_any_text_is_a_valid_time_or_none(text: str) -> None:
+    parsed = parse_date(text)
+    assert parsed is None or parsed[0] >= 0
 
 
 def test_no_exchange_is_an_error() -> None:

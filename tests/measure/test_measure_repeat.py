@@ -1,4 +1,4 @@
-"""One repeat's folder in, one row of measures out; and the figures of the paper."""
+"""The columns measured from the folder of one repeat, and the figures of the paper."""
 
 import random
 import struct
@@ -40,7 +40,7 @@ def _ping(payload_bytes: int, times_ms: list[float], sent: int) -> str:
 
 
 def _folder(folder: Path, sent: list[Frame], received: list[Frame], ping: str, taken: bytes = BAG) -> Path:
-    """A repeat with all its evidence; the sent file is no bag."""
+    """A repeat with all its evidence; the sent file is not a bag."""
     (folder / "scan.bag").write_bytes(BAG)
     (folder / "recv.bag").write_bytes(taken)
     (folder / "sender.pcap").write_bytes(file_bytes(sent))
@@ -54,8 +54,8 @@ def _folder(folder: Path, sent: list[Frame], received: list[Frame], ping: str, t
 
 
 def _udp_folder(folder: Path) -> Path:
-    """36 datagrams of six fragments; the receiver misses the first fragment of one and the last of another."""
-    sent = timed([one for number in range(36) for one in datagram(number, 8192)])
+    """36 datagrams of six fragments; the receiver lacks the first fragment of one and the last of another."""
+    sent = timed([packet for number in range(36) for packet in datagram(number, 8192)])
     received = [frame for index, frame in enumerate(sent) if index not in {6, 17}]
     times_ms = [14.0, 15.0, 16.0, 17.0, 18.0]
     return _folder(folder, sent, received, _ping(8192, times_ms, sent=10), taken=BAG[:-2560])
@@ -119,25 +119,29 @@ def test_a_tcp_repeat(tmp_path: Path) -> None:
     isn = 2**32 - 2000
     sent = timed([segment(isn, 0, flags=2, mss=900), *(segment(isn + 1 + at, 1000) for at in (0, 1000, 2000, 1000))])
     received = [frame for index, frame in enumerate(sent) if index != 2]
-    found = measure(_folder(tmp_path, sent, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
-    assert found.hash_match is True
-    assert (found.ip_packets_sent, found.ip_packets_received) == (5, 4)
-    assert (found.tcp_sent_bytes, found.tcp_unique_bytes, found.tcp_received_bytes) == (4000, 3000, 3000)
-    assert (found.tcp_byte_loss, found.byte_loss, found.tcp_retransmitted_segments) == (0.25, 0.0, 1)
-    # Sent twice within 2 ms and received once: nothing tells which of the two it was.
-    assert (found.tcp_spurious_segments, found.tcp_duplicated_bytes, found.tcp_reordered_segments) == (None, 0, None)
-    assert (found.tcp_doubtful_segments, found.tcp_superframes) == (2, 4 + 3)
-    assert found.ip_loss_bursts is found.ip_packets_reordered is None
-    assert found.ip_loss is found.datagrams_sent is found.datagram_loss is None
-    assert found.transfer_s == 0.004
-    assert (found.paper_packets, found.paper_received, found.paper_window_bytes) == (5, 4, 502)
-    assert found.paper_transfer_s == 5 * 0.005
+    measures = measure(_folder(tmp_path, sent, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    assert measures.hash_match is True
+    assert (measures.ip_packets_sent, measures.ip_packets_received) == (5, 4)
+    assert (measures.tcp_sent_bytes, measures.tcp_unique_bytes, measures.tcp_received_bytes) == (4000, 3000, 3000)
+    assert (measures.tcp_byte_loss, measures.byte_loss, measures.tcp_retransmitted_segments) == (0.25, 0.0, 1)
+    # Sent twice within 2 ms and received once: it is ambiguous which of the two arrived.
+    assert (measures.tcp_spurious_segments, measures.tcp_duplicated_bytes, measures.tcp_reordered_segments) == (
+        None,
+        0,
+        None,
+    )
+    assert (measures.tcp_doubtful_segments, measures.tcp_superframes) == (2, 4 + 3)
+    assert measures.ip_loss_bursts is measures.ip_packets_reordered is None
+    assert measures.ip_loss is measures.datagrams_sent is measures.datagram_loss is None
+    assert measures.transfer_s == 0.004
+    assert (measures.paper_packets, measures.paper_received, measures.paper_window_bytes) == (5, 4, 502)
+    assert measures.paper_transfer_s == 5 * 0.005
 
 
 def test_the_papers_delay_needs_the_papers_payload(tmp_path: Path) -> None:
     folder = _folder(tmp_path, [], [], _ping(56, [5.0], sent=1))
-    found = measure(folder, transfer(Protocol.TCP))
-    assert (found.rtt_mean_s, found.paper_delay_s, found.paper_transfer_s) == (0.005, None, None)
+    measures = measure(folder, transfer(Protocol.TCP))
+    assert (measures.rtt_mean_s, measures.paper_delay_s, measures.paper_transfer_s) == (0.005, None, None)
 
 
 PIECES = {
@@ -150,7 +154,7 @@ PIECES = {
 }
 RATES = ("throughput_bit_s", "completion_s", "goodput_bit_s")
 FROM_BOTH = ("ip_", "datagram", "byte_", "transfer", "one_way_withheld", "delay_variation", "jitter", *RATES)
-# The pings here have no time stamps, so the track says of the transfer alone how far apart the robots were.
+# The pings here have no time stamps, so only the transfer has distances from the track.
 FROM_TRACK = {name for name in COLUMNS if "_distance_" in name or "_speed_" in name}
 PIECES["track.csv"] = {name for name in FROM_TRACK if name.startswith("transfer_")}
 # Every stall of this transfer ended.
@@ -166,38 +170,44 @@ PIECES["ping.txt"] = {
 
 
 @pytest.mark.parametrize("missing", PIECES)
-def test_missing_evidence_empties_what_rests_on_it_and_nothing_else(tmp_path: Path, missing: str) -> None:
+def test_missing_evidence_empties_only_the_columns_that_depend_on_it(tmp_path: Path, missing: str) -> None:
     folder = _udp_folder(tmp_path)
     track_text = track.text(Whereabouts(0, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER))
     (folder / "track.csv").write_text(track_text, encoding="ascii")
-    whole = every(measure(folder, transfer(Protocol.UDP)))
+    complete = every(measure(folder, transfer(Protocol.UDP)))
     (folder / missing).unlink()
-    left = every(measure(folder, transfer(Protocol.UDP)))
-    assert {name for name in whole if whole[name] != left[name]} == PIECES[missing]
-    assert all(left[name] is None for name in PIECES[missing])
+    remaining = every(measure(folder, transfer(Protocol.UDP)))
+    assert {name for name in complete if complete[name] != remaining[name]} == PIECES[missing]
+    assert all(remaining[name] is None for name in PIECES[missing])
 
 
 @pytest.mark.parametrize("protocol", Protocol)
-def test_captures_of_something_else_tell_nothing_of_a_transfer(tmp_path: Path, protocol: Protocol) -> None:
-    """As those around a ping behind it: what they hold and lack is nothing that this transfer left."""
+def test_captures_around_another_step_are_not_used_for_a_transfer(tmp_path: Path, protocol: Protocol) -> None:
+    """The captures belong to a ping after the transfer, so their content shows nothing about the transfer."""
     _udp_folder(tmp_path)
     (tmp_path / "receiver.pcap").write_bytes(file_bytes([]))
-    found = figures.measure(AttemptEvidence(tmp_path), replace(transfer(protocol), captures=(None, None)))
-    of_captures = {name for name in LAYERS if name in found.missing}
-    assert found.values.keys().isdisjoint(LAYERS | {"paper_packets", "paper_received"})
-    assert {found.missing[name] for name in of_captures} == {"there are no whole captures of both ends"}
-    assert (found.values["sent_bytes"], found.values["received_bytes"]) == (10240, 7680)
+    measures = figures.measure(AttemptEvidence(tmp_path), replace(transfer(protocol), captures=(None, None)))
+    of_captures = {name for name in LAYERS if name in measures.missing}
+    assert measures.values.keys().isdisjoint(LAYERS | {"paper_packets", "paper_received"})
+    assert {measures.missing[name] for name in of_captures} == {"there are no complete captures of both ends"}
+    assert (measures.values["sent_bytes"], measures.values["received_bytes"]) == (10240, 7680)
 
 
-def test_a_damaged_capture_counts_nothing(tmp_path: Path) -> None:
+def test_a_damaged_capture_is_not_counted(tmp_path: Path) -> None:
     folder = _udp_folder(tmp_path)
     path = folder / "receiver.pcap"
     path.write_bytes(path.read_bytes()[:-1])
-    found = measure(folder, transfer(Protocol.UDP))
-    assert found.ip_packets_received is found.ip_loss is found.receiver_captured is found.paper_received is None
+    measures = measure(folder, transfer(Protocol.UDP))
+    assert (
+        measures.ip_packets_received
+        is measures.ip_loss
+        is measures.receiver_captured
+        is measures.paper_received
+        is None
+    )
 
 
-def test_an_empty_folder_says_nothing_but_the_papers_window(tmp_path: Path) -> None:
+def test_an_empty_folder_gives_only_the_papers_window(tmp_path: Path) -> None:
     assert measure(tmp_path, transfer(Protocol.TCP)) == Measures(paper_window_bytes=502)
 
 
@@ -205,73 +215,77 @@ def test_an_interrupted_ping_gives_times_but_no_loss(tmp_path: Path) -> None:
     folder = _udp_folder(tmp_path)
     path = folder / "ping.txt"
     path.write_text("\n".join(path.read_text(encoding="utf-8").split("\n")[:-1]), encoding="utf-8")
-    found = measure(folder, transfer(Protocol.UDP))
-    assert (found.rtt_sent, found.rtt_loss) == (None, None)
-    assert (found.rtt_received, found.rtt_median_s) == (5, 0.016)
+    measures = measure(folder, transfer(Protocol.UDP))
+    assert (measures.rtt_sent, measures.rtt_loss) == (None, None)
+    assert (measures.rtt_received, measures.rtt_median_s) == (5, 0.016)
 
 
 @pytest.mark.parametrize(
     ("packets", "delay_s", "transfer_s"),
     [(36, 0.016, 0.576), (207, 0.005, 1.035), (36, 0.013, 0.468), (207, 0.0045, 0.9315)],
 )
-def test_the_papers_own_figures(packets: int, delay_s: float, transfer_s: float) -> None:
+def test_figures_printed_in_the_paper(packets: int, delay_s: float, transfer_s: float) -> None:
     assert paper.transfer_s(packets, delay_s) == pytest.approx(transfer_s)
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("seed", range(3))
-def test_the_papers_filters_count_what_tcpdump_counts(tmp_path: Path, seed: int) -> None:
+def test_the_papers_filters_count_as_tcpdump(tmp_path: Path, seed: int) -> None:
     draw = random.Random(seed)
-    data = [one for number in range(5) for one in datagram(number, 8192)]
+    data = [packet for number in range(5) for packet in datagram(number, 8192)]
     data += [
         segment(0, size, sport=sport, port=port) for size, sport, port in ((0, 9, PORT), (5, PORT, 9), (5, 9, 9))
     ]
-    mirrored = [one[:12] + one[16:20] + one[12:16] + one[20:] for one in data]
+    mirrored = [packet[:12] + packet[16:20] + packet[12:16] + packet[20:] for packet in data]
     frames = timed(draw.sample([*data, *mirrored], 50))
     path = tmp_path / "x.pcap"
     path.write_bytes(file_bytes(frames))
-    found = measure(_folder(tmp_path, frames, frames, ""), transfer(Protocol.UDP))
+    measures = measure(_folder(tmp_path, frames, frames, ""), transfer(Protocol.UDP))
     for count, expression in (
-        (found.paper_packets, f"src {SENDER} and port {PORT}"),
-        (found.paper_received, f"dst {RECEIVER} and port {PORT}"),
+        (measures.paper_packets, f"src {SENDER} and port {PORT}"),
+        (measures.paper_received, f"dst {RECEIVER} and port {PORT}"),
     ):
         command = ["tcpdump", "-n", "-r", str(path), expression]
         printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         assert count == len(printed.splitlines()) > 0
 
 
-def test_real_captures_of_the_papers_file_at_no_loss(tmp_path: Path) -> None:
+def test_real_captures_of_the_papers_file_without_loss(tmp_path: Path) -> None:
     for protocol in Protocol:
         data = (TCPDUMP / f"nc-{protocol}.pcap").read_bytes()
         (tmp_path / "sender.pcap").write_bytes(data)
         (tmp_path / "receiver.pcap").write_bytes(data)
         loopback = replace(transfer(protocol), sender_address="127.0.0.1", receiver_address="127.0.0.1", port=1234)
-        found = measure(tmp_path, loopback)
-        assert found.byte_loss == 0
+        measures = measure(tmp_path, loopback)
+        assert measures.byte_loss == 0
         if protocol is Protocol.UDP:
-            assert (found.ip_packets_received, found.datagrams_received, found.paper_packets) == (215, 36, 36)
+            assert (measures.ip_packets_received, measures.datagrams_received, measures.paper_packets) == (
+                215,
+                36,
+                36,
+            )
         else:
-            assert (found.tcp_unique_bytes, found.tcp_byte_loss) == (293_797, 0)
+            assert (measures.tcp_unique_bytes, measures.tcp_byte_loss) == (293_797, 0)
 
 
-def test_a_forged_capture_tells_nothing_of_the_transfer_and_the_rest_stands(tmp_path: Path) -> None:
+def test_a_forged_capture_empties_only_the_columns_of_the_transfer(tmp_path: Path) -> None:
     forged = timed([segment(index, 60_000 * (index > 0), flags=0x02 * (index == 0)) for index in range(3000)])
-    found = measure(_folder(tmp_path, forged, forged[:1], _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
-    assert (found.tcp_sent_bytes, found.ip_packets_sent) == (None, None)
-    assert (found.rtt_received, found.sender_captured) == (1, 3000)
+    measures = measure(_folder(tmp_path, forged, forged[:1], _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    assert (measures.tcp_sent_bytes, measures.ip_packets_sent) == (None, None)
+    assert (measures.rtt_received, measures.sender_captured) == (1, 3000)
 
 
-def test_a_clock_that_was_set_meanwhile_leaves_no_time_to_tell(tmp_path: Path) -> None:
-    """The receiver's goes ahead by an hour in the middle: a transfer of 30 ms would take 3600 s."""
+def test_a_clock_that_was_set_empties_all_times(tmp_path: Path) -> None:
+    """The receiver's clock is set ahead by an hour in the middle: a transfer of 30 ms would take 3600 s."""
     sent = timed([segment(0, 0, flags=2), *(segment(1 + 1000 * at, 1000, ip_id=at) for at in range(20))])
     ack = struct.pack(">HHIIBBHHH", PORT, 40000, 1, 1, 5 << 4, 0x10, 502, 0, 0)
     answers = [
-        Frame(one.time_ns + 500_000, ipv4(ack, protocol=6, ip_id=number, src=RECEIVER, dst=SENDER))
-        for number, one in enumerate(sent)
+        Frame(frame.time_ns + 500_000, ipv4(ack, protocol=6, ip_id=number, src=RECEIVER, dst=SENDER))
+        for number, frame in enumerate(sent)
     ]
     frames = sorted([*sent, *answers], key=lambda frame: frame.time_ns)
     hour_ns = 3600 * 10**9
-    received = [replace(one, time_ns=one.time_ns + hour_ns * (index > 20)) for index, one in enumerate(frames)]
+    received = [replace(frame, time_ns=frame.time_ns + hour_ns * (index > 20)) for index, frame in enumerate(frames)]
     steady = measure(_folder(tmp_path, frames, frames, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
     assert steady.transfer_s == pytest.approx(0.02)
     set_ahead = measure(_folder(tmp_path, frames, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))

@@ -102,7 +102,7 @@ def test_they_void_where_they_waited_on_the_sender_and_left_in_this_one(tmp_path
     for role in ("sender", "receiver"):
         attempt.capture(role, lambda packets: [*waiting, *packets])
     (reason,) = attempt.problems()
-    assert reason == f"{EARLIER}: 1 packet left for the transfer's port before its sender began"
+    assert reason == f"{EARLIER}: 1 packet left for the transfer's port before its sender started"
 
 
 def test_fragments_of_which_the_first_came_before_the_capture_void(tmp_path: Path) -> None:

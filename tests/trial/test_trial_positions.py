@@ -68,7 +68,7 @@ def test_what_is_given_fills_the_columns_is_summed_and_can_be_forgotten(
     assert [float(metres) for metres in means_m(trial)] == pytest.approx([one + 3 for one in found])
     said(capsys, "receiver=again.CSV", "sender=0m,0m")
     assert means_m(trial) == [""] * len(found)
-    assert "has a gap of" in said(capsys)[1]
+    assert "have a gap of" in said(capsys)[1]
 
     assert said(capsys, "--clear")[0] == 0
     assert {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
@@ -85,7 +85,7 @@ def test_what_is_given_fills_the_columns_is_summed_and_can_be_forgotten(
         (["receiver=91,0"], 2, "there is no such file"),
         (["receiver=trial"], 2, "there is no such file"),
         (["receiver=walk.txt"], 4, "neither GPX nor CSV"),
-        (["receiver=bad.csv"], 4, "bad.csv:2: 'noon' is no time"),
+        (["receiver=bad.csv"], 4, "bad.csv:2: 'noon' is not a time"),
         (["receiver=huge.gpx"], 2, "huge.gpx: has 67 MB"),
         (["receiver=walk.csv", "--offset", "3"], 2, "has no unit"),
         (["receiver=walk.csv", "--gap", "soon"], 2, "is not a duration"),

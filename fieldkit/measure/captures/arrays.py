@@ -1,4 +1,4 @@
-"""Tables of numpy columns, and integers read out of a file's bytes at one position per row."""
+"""Tables of numpy columns, and integers read from a file's bytes at one position per row."""
 
 import math
 from collections.abc import Iterable
@@ -18,15 +18,15 @@ Buffer = bytes | mmap
 BIG: Final = ">"
 LITTLE: Final = "<"
 Order = Literal["<", ">"]
-"""Byte order, as `struct` and numpy write it."""
+"""Byte order in the notation of `struct` and numpy."""
 
 
-# Any odd number with well spread bits multiplies without loss; this one is 2**64 over the golden ratio.
-_SPREAD: Final = np.uint64(0x9E3779B97F4A7C15)
+# Multiplication by an odd number is invertible modulo 2**64; this one is 2**64 divided by the golden ratio.
+_MULTIPLIER: Final = np.uint64(0x9E3779B97F4A7C15)
 
 
 def layout(order: Order, size_bytes: int, **fields: tuple[int, int]) -> np.dtype[np.void]:
-    """Return the form of a header of `size_bytes`, its fields unsigned integers: offset and size in bytes of each."""
+    """Return the data type of a header of unsigned integers; each field is given as (offset, size) in bytes."""
     return np.dtype(
         {
             "names": list(fields),
@@ -39,25 +39,25 @@ def layout(order: Order, size_bytes: int, **fields: tuple[int, int]) -> np.dtype
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Columns of one length; a subclass declares them as its fields."""
+    """Columns of equal length, which a subclass declares as its fields."""
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
 
     def where(self, chosen: Mask | Ints | slice) -> Self:
-        """Return the rows of a mask, or those of an index in its order."""
+        """Return the rows that a mask or a slice selects, or those of an index array in its order."""
         if not isinstance(chosen, slice) and chosen.dtype == np.bool_ and chosen.all():
             return self
         return type(self)(**{name: column[chosen] for name, column in vars(self).items()})
 
-    def room(self, rows: int) -> Self:
-        """Return so many rows of the same columns, to be written.
+    def allocate(self, rows: int) -> Self:
+        """Return an uninitialized table with the same columns and this number of rows.
 
-        They are one block of memory, for which the system has large pages.
+        All columns share one block of memory, so that the operating system can use large pages.
         """
         columns: dict[str, NDArray[Any]] = vars(self)
         sizes = [rows * column.dtype.itemsize * math.prod(column.shape[1:]) for column in columns.values()]
-        # Each column begins where a number may.
+        # Each column starts at a multiple of 8 bytes for alignment.
         starts = np.cumsum([0, *((size + 7) // 8 * 8 for size in sizes)])
         block = np.empty(starts[-1], dtype=np.uint8)
         return type(self)(
@@ -68,61 +68,61 @@ class Table:
         )
 
     def write(self, at: int, rows: Self) -> None:
-        """Write rows from row `at` on."""
+        """Overwrite the rows from row `at` on."""
         for name, column in vars(rows).items():
             vars(self)[name][at : at + len(rows)] = column
 
     @classmethod
-    def joined(cls, parts: Iterable[Self]) -> Self:
-        """Return the rows of all parts, of which there is at least one, in their order."""
+    def concatenated(cls, parts: Iterable[Self]) -> Self:
+        """Return the rows of all parts in order; there must be at least one part."""
         parts = list(parts)
         if len(parts) == 1:
             return parts[0]
-        found, at = parts[0].room(sum(map(len, parts))), 0
+        table, at = parts[0].allocate(sum(map(len, parts))), 0
         for part in parts:
-            found.write(at, part)
+            table.write(at, part)
             at += len(part)
-        return found
+        return table
 
 
 class Narrow:
-    """Column of a `Table` that takes few bytes in memory and is read as 64-bit integers.
+    """Column of a `Table` that is stored in few bytes and read as 64-bit integers.
 
-    Whoever reads it can add and subtract without an overflow. A table holds above twenty columns of millions of
-    packets, of which a computation reads a few.
+    Reading as 64-bit integers avoids overflows in additions and subtractions. A table has more than twenty columns of
+    millions of packets, and a computation reads only a few of them.
 
     Args:
-        kind: Type in memory, which holds every value that the column can have.
+        storage_type: Integer type in memory; must hold every value of the column.
     """
 
-    def __init__(self, kind: type[np.integer[Any]]) -> None:
-        self._kind = kind
+    def __init__(self, storage_type: type[np.integer[Any]]) -> None:
+        self._storage_type = storage_type
         self._name = ""
 
     def __set_name__(self, owner: type, name: str) -> None:
-        """Take the name of the column."""
+        """Store the name of the column."""
         self._name = name
 
     def __get__(self, table: object, owner: type | None = None) -> Ints:
-        """Return the column, a copy.
+        """Return a copy of the column.
 
         Raises:
-            AttributeError: The class is asked, whose field has no default.
+            AttributeError: Accessed on the class: the field has no default.
         """
         if table is None:
             raise AttributeError(self._name)
         return np.asarray(vars(table)[self._name], dtype=np.int64)
 
     def __set__(self, table: object, values: Ints) -> None:
-        """Keep values, which fit."""
-        vars(table)[self._name] = np.asarray(values, dtype=self._kind)
+        """Store the values, which must fit into the storage type."""
+        vars(table)[self._name] = np.asarray(values, dtype=self._storage_type)
 
 
 class Integers:
     """Unsigned integers in a buffer, at any position.
 
-    A position too near to the end of the buffer reads the last integer that is whole: headers of a packet that was
-    cut short may reach beyond the file, and whoever reads them masks what was not kept.
+    A position too close to the end of the buffer reads the last complete integer: the headers of a truncated packet
+    may extend beyond the file, and the caller masks the bytes that were not captured.
     """
 
     def __init__(self, data: Buffer, order: Order = BIG) -> None:
@@ -132,7 +132,7 @@ class Integers:
             for size in (1, 2, 4, 8)
         }
 
-    def in_order(self, order: Order) -> "Integers":
+    def with_order(self, order: Order) -> "Integers":
         """Return the integers of the same buffer in another byte order."""
         return Integers(self._data, order)
 
@@ -141,50 +141,50 @@ class Integers:
         return self._read(1, at).astype(np.int64)
 
     def u16(self, at: Ints) -> Ints:
-        """Return the two bytes from each position on."""
+        """Return the two-byte integer at each position."""
         return self._read(2, at).astype(np.int64)
 
     def u32(self, at: Ints) -> Ints:
-        """Return the four bytes from each position on."""
+        """Return the four-byte integer at each position."""
         return self._read(4, at).astype(np.int64)
 
     def u64(self, at: Ints) -> NDArray[np.uint64]:
-        """Return the eight bytes from each position on."""
+        """Return the eight-byte integer at each position."""
         return self._read(8, at).astype(np.uint64)
 
     def fields(self, form: np.dtype[np.void], at: Ints) -> "Fields":
-        """Return the headers from each position on: one look into the buffer for all of their fields.
+        """Return the headers at these positions, read with one access to the buffer for all fields.
 
-        Where the buffer ends inside a header, the rest of it is zeros.
+        If the buffer ends inside a header, the missing bytes are zeros.
         """
         size = form.itemsize
         inside = at <= len(self._data) - size
-        every = np.ndarray(max(len(self._data) - size + 1, 0), f"V{size}", buffer=self._data, strides=(1,))
+        headers = np.ndarray(max(len(self._data) - size + 1, 0), f"V{size}", buffer=self._data, strides=(1,))
         if inside.all():
-            return Fields(every[at].view(form))
-        found = np.zeros(len(at), every.dtype)
-        found[inside] = every[at[inside]]
+            return Fields(headers[at].view(form))
+        rows = np.zeros(len(at), headers.dtype)
+        rows[inside] = headers[at[inside]]
         for index in np.flatnonzero(~inside):
-            found[index] = np.void(bytes(self._data[at[index] : at[index] + size]).ljust(size, b"\0"))
-        return Fields(found.view(form))
+            rows[index] = np.void(bytes(self._data[at[index] : at[index] + size]).ljust(size, b"\0"))
+        return Fields(rows.view(form))
 
     def _read(self, size: int, at: Ints) -> NDArray[Any]:
         view = self._views[size]
         return view[np.minimum(at, len(view) - 1)]
 
 
-def mixed(*columns: Ints | Keys) -> Keys:
-    """Return a number per row: equal for equal rows, and for others by a chance of one in 2**64."""
-    found = np.zeros(len(columns[0]), dtype=np.uint64)
+def row_hashes(*columns: Ints | Keys) -> Keys:
+    """Return a hash per row. Equal rows have equal hashes; the chance of a collision is 1 in 2**64."""
+    hashes = np.zeros(len(columns[0]), dtype=np.uint64)
     for column in columns:
-        found ^= column.view(np.uint64)
-        found *= _SPREAD
-        found ^= found >> np.uint64(29)
-    return found
+        hashes ^= column.view(np.uint64)
+        hashes *= _MULTIPLIER
+        hashes ^= hashes >> np.uint64(29)
+    return hashes
 
 
 class Fields:
-    """Fields of headers, as `Integers.fields` found them."""
+    """Fields of the headers that `Integers.fields` read."""
 
     def __init__(self, rows: NDArray[np.void]) -> None:
         self._rows = rows
@@ -194,7 +194,7 @@ class Fields:
 
 
 NO_TIME: Final = -1
-"""Time of a frame of which the file tells none."""
+"""Time of a frame for which the file has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,11 +202,11 @@ class Frames(Table):
     """Frames in the order of the file.
 
     Attributes:
-        start: Index of the first byte of each.
-        captured_bytes: How much of it was kept.
-        wire_bytes: Its length on the link.
-        time_ns: Time of capture, nanoseconds since 1970 UTC; `NO_TIME` where the file tells none.
-        link_type: How it begins, by number (https://www.tcpdump.org/linktypes.html).
+        start: Index of the frame's first byte in the file.
+        captured_bytes: Number of captured bytes.
+        wire_bytes: Length on the link.
+        time_ns: Time of capture, nanoseconds since 1970 UTC, or `NO_TIME`.
+        link_type: Link type number (https://www.tcpdump.org/linktypes.html).
     """
 
     start: Ints
@@ -218,11 +218,11 @@ class Frames(Table):
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some frames that follow each other in a file.
+    """Consecutive frames of a file.
 
     Attributes:
-        frames: They.
-        damage: Where and how the file is damaged after them, so that this chunk is the last; None when it is not.
+        frames: The frames.
+        damage: Position and kind of damage after the frames, in which case this chunk is the last; None if undamaged.
     """
 
     frames: Frames

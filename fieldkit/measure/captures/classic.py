@@ -1,4 +1,4 @@
-"""Classic pcap files: record boundaries by a scan, their headers all at once.
+"""Classic pcap files: a scan for the record boundaries, then all headers are read together.
 
 File format: draft-ietf-opsawg-pcap.
 """
@@ -23,23 +23,23 @@ MAGIC: Final[dict[bytes, tuple[Order, int]]] = {
 
 _FILE_HEADER_BYTES: Final = 24
 _RECORD_HEADER_BYTES: Final = 16
-# So many equally long records in a row make it likely that the next is, too.
-_ALIKE: Final = 16
-# libpcap's MAXIMUM_SNAPLEN: no record of a sound file is longer.
+# After this many records of equal length the next is probably as long.
+_MIN_RUN: Final = 16
+# libpcap's MAXIMUM_SNAPLEN: no record of a valid file is longer.
 _MAX_CAPTURED_BYTES: Final = 262_144
 
 
 def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
-    """Yield the frames of a file, at least one chunk, each of about `chunk_bytes` of it.
+    """Yield the frames of a file in chunks of about `chunk_bytes`; at least one chunk.
 
     Raises:
-        EvidenceError: The file ends in its header, or has an unknown link type.
+        EvidenceError: The file ends inside its header, or has an unknown link type.
     """
     size = len(data)
     if size < _FILE_HEADER_BYTES:
         raise EvidenceError("ends inside its header", where=where, remedy="repeat the measurement")
     order, ticks_per_s = MAGIC[bytes(data[:4])]
-    # The upper bits of the field say how long the frame check sequence is.
+    # The upper bits of this field are the length of the frame check sequence.
     link_type = struct.unpack_from(f"{order}I", data, 20)[0] & 0xFFFF
     check_link_type(link_type, where=where)
     integers = Integers(data, order)
@@ -47,9 +47,9 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
     at, count, damage = _FILE_HEADER_BYTES, 0, None
     while True:
         starts, at = _scan(data, order, at, min(at + chunk_bytes, size - _RECORD_HEADER_BYTES + 1))
-        frames, sound = _frames(integers, form, starts, link_type, ticks_per_s)
-        if not sound.all():
-            frames = frames.where(slice(0, int(sound.argmin())))
+        frames, valid = _frames(integers, form, starts, link_type, ticks_per_s)
+        if not valid.all():
+            frames = frames.where(slice(0, int(valid.argmin())))
             damage = f"no packet header at byte {starts[len(frames)]}, after packet {count + len(frames)}"
         elif at > size:
             frames = frames.where(slice(0, len(frames) - 1))
@@ -63,30 +63,30 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
 
 
 def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[Ints, int]:
-    """Return where the records from `at` to before `stop` start, and where the next one would.
+    """Return the start positions of the records from `at` to before `stop`, and the position of the next record.
 
-    A snap length makes most records equally long: a run of such is looked through all at once, in ever greater leaps.
+    A snap length gives most records the same length. Runs of such records are checked together, in growing leaps.
     """
     captured = struct.Struct(f"{order}I").unpack_from
     parts: list[Ints] = []
     starts: list[int] = []
-    step, alike = 0, 0
+    step, run_length = 0, 0
     while at < stop:
         starts.append(at)
-        last, step = step, _RECORD_HEADER_BYTES + captured(data, at + 8)[0]
+        previous_step, step = step, _RECORD_HEADER_BYTES + captured(data, at + 8)[0]
         at += step
-        alike = alike + 1 if step == last else 0
-        if alike >= _ALIKE and at < stop:
-            leap = _alike(data, order, at, step, min(4 * alike, (stop - at + step - 1) // step))
+        run_length = run_length + 1 if step == previous_step else 0
+        if run_length >= _MIN_RUN and at < stop:
+            leap = _equal_length_run(data, order, at, step, min(4 * run_length, (stop - at + step - 1) // step))
             parts += [np.array(starts, dtype=np.int64), np.arange(leap) * step + at]
             starts = []
             at += leap * step
-            alike += leap
+            run_length += leap
     return np.concatenate([*parts, np.array(starts, dtype=np.int64)]), at
 
 
-def _alike(data: Buffer, order: Order, at: int, step: int, count: int) -> int:
-    """Return how many of `count` records from `at` on are followed by the next one after `step` bytes."""
+def _equal_length_run(data: Buffer, order: Order, at: int, step: int, count: int) -> int:
+    """Return the number of consecutive records of `step` bytes from `at` on, at most `count`."""
     captured = np.ndarray(count, f"{order}u4", buffer=data, offset=at + 8, strides=(step,))
     differ = captured != step - _RECORD_HEADER_BYTES
     return int(differ.argmax()) if differ.any() else len(differ)
@@ -95,7 +95,7 @@ def _alike(data: Buffer, order: Order, at: int, step: int, count: int) -> int:
 def _frames(
     integers: Integers, form: np.dtype[np.void], start: Ints, link_type: int, ticks_per_s: int
 ) -> tuple[Frames, Mask]:
-    """Return the frames of the records that start at `start`, and which of them have a sound header."""
+    """Return the frames of the records at the positions `start`, and a mask of valid record headers."""
     head = integers.fields(form, start)
     ticks, captured, wire = head["ticks"], head["captured"], head["wire"]
     frames = Frames(
@@ -105,6 +105,6 @@ def _frames(
         time_ns=head["seconds"] * 1_000_000_000 + ticks * (1_000_000_000 // ticks_per_s),
         link_type=np.full(len(start), link_type),
     )
-    # Zeros, as a power cut leaves them, are a header of nothing: no link has frames of no bytes.
-    sound = (ticks < ticks_per_s) & (captured <= np.minimum(wire, _MAX_CAPTURED_BYTES)) & (wire > 0)
-    return frames, sound
+    # A wire length of 0 is invalid: no link has empty frames, and a power failure leaves zeros in the file.
+    valid = (ticks < ticks_per_s) & (captured <= np.minimum(wire, _MAX_CAPTURED_BYTES)) & (wire > 0)
+    return frames, valid

@@ -1,4 +1,4 @@
-"""IPv4 and IPv6 headers as columns, extension headers followed.
+"""IPv4 and IPv6 headers as columns; extension headers are skipped.
 
 Headers: RFC 791 (IPv4), RFC 8200 (IPv6 and its extension headers), RFC 4302 (authentication), RFC 2675 (jumbograms).
 """
@@ -39,8 +39,8 @@ _HOP_BY_HOP: Final = 0
 _FRAGMENT: Final = 44
 _AUTHENTICATION: Final = 51
 _JUMBO_OPTION: Final = 0xC204
-# Hop-by-hop, routing, fragment, authentication, destination, mobility, host identity, shim6: all of one form, but for
-# how their length is told.
+# Hop-by-hop, routing, fragment, authentication, destination, mobility, host identity, shim6: one format, except for
+# the encoding of the length.
 _IS_EXTENSION: Final = np.isin(np.arange(256), (_HOP_BY_HOP, 43, _FRAGMENT, _AUTHENTICATION, 60, 135, 139, 140))
 
 
@@ -49,16 +49,16 @@ class Headers(Table):
     """IP headers.
 
     Attributes:
-        frame: Index of the frame that holds it.
+        frame: Index of the frame that contains the header.
         src: Source address.
         dst: Destination address.
-        protocol: What follows it and its extension headers.
-        ip_id: Identification, 0 in an IPv6 packet that is no fragment.
-        fragment_offset: Offset in bytes.
-        more_fragments: Whether fragments follow.
-        header_bytes: Its own bytes, extension headers included.
-        payload_at: Index in the file of the first byte after it and its extension headers.
-        payload_bytes: Bytes from there, by the header (not by what was kept).
+        protocol: Protocol number after the extension headers.
+        ip_id: Identification; 0 in an IPv6 packet that is not a fragment.
+        fragment_offset: Fragment offset in bytes.
+        more_fragments: True if more fragments follow.
+        header_bytes: Length of the header and its extension headers.
+        payload_at: Index of the first byte after the header and its extension headers in the file.
+        payload_bytes: Length of the payload by the header, even if fewer bytes were captured.
     """
 
     frame: Ints
@@ -75,40 +75,40 @@ class Headers(Table):
 
 @lru_cache(maxsize=64)
 def address(text: str) -> tuple[int, int]:
-    """Return the two halves of an IPv4 or IPv6 address, as in `Addresses`."""
-    found = ip_address(text)
-    value = _MAPPED | int(found) if isinstance(found, IPv4Address) else int(found)
+    """Return the two halves of an IPv4 or IPv6 address as in `Addresses`."""
+    parsed = ip_address(text)
+    value = _MAPPED | int(parsed) if isinstance(parsed, IPv4Address) else int(parsed)
     return value >> 64, value & (1 << 64) - 1
 
 
 @lru_cache(maxsize=1024)
 def written(upper: int, lower: int) -> str:
-    """Return the text that `address` makes these two halves of, as people write it."""
-    found = IPv6Address(upper << 64 | lower)
-    return str(found.ipv4_mapped or found)
+    """Return the usual text of an address whose two halves are given."""
+    ipv6 = IPv6Address(upper << 64 | lower)
+    return str(ipv6.ipv4_mapped or ipv6)
 
 
 def headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
-    """Return the IP headers that start at `at` in `frames`, those that are whole and sound; none where it is < 0."""
+    """Return the complete and valid IP headers at the positions `at` in `frames`; a negative position has none."""
     kept = np.where(at < 0, 0, frames.start + frames.captured_bytes - at)
     version = integers.u8(np.maximum(at, 0)) >> 4
     four = np.flatnonzero((version == 4) & (kept >= _IPV4_HEADER_BYTES))
     six = np.flatnonzero((version == 6) & (kept >= _IPV6_HEADER_BYTES))
     wire = frames.wire_bytes - (at - frames.start)
-    found = [_ipv4(integers, four, at[four], kept[four], wire[four])]
+    parts = [_ipv4(integers, four, at[four], kept[four], wire[four])]
     if not len(six):
-        return found[0]
-    both = Headers.joined([*found, _ipv6(integers, six, at[six], kept[six], wire[six])])
+        return parts[0]
+    both = Headers.concatenated([*parts, _ipv6(integers, six, at[six], kept[six], wire[six])])
     return both.where(np.argsort(both.frame))
 
 
 def _ipv4(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> Headers:
     head = integers.fields(_IPV4, at)
     header = (head["length"] & 0xF) * 4
-    # Segmentation offload leaves the total length 0 in frames above 64 KiB: the wire length then tells it.
+    # Segmentation offload leaves the total length 0 in frames above 64 KiB; the wire length is used instead.
     total = np.where(head["total"] == 0, wire, head["total"])
     fragment = head["fragment"]
-    found = Headers(
+    ipv4 = Headers(
         frame=frame,
         src=_mapped(head["src"]),
         dst=_mapped(head["dst"]),
@@ -120,8 +120,8 @@ def _ipv4(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> 
         payload_at=at + header,
         payload_bytes=total - header,
     )
-    sound = (header >= _IPV4_HEADER_BYTES) & (header <= kept) & (total >= header)
-    return found if sound.all() else found.where(sound)
+    valid = (header >= _IPV4_HEADER_BYTES) & (header <= kept) & (total >= header)
+    return ipv4 if valid.all() else ipv4.where(valid)
 
 
 def _mapped(value: Ints) -> Addresses:
@@ -148,9 +148,9 @@ def _ipv6(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> 
         ip_id[inside[fragmented]] = integers.u32(here[fragmented] + 4)
         protocol[inside] = integers.u8(here)
         payload_at[inside] = here + size
-        # What follows the fragment header of a later fragment is payload.
-        going_on = _IS_EXTENSION[protocol[inside]] & (here + size + 8 <= end[inside]) & (fragment[inside] < 8)
-        inside = inside[going_on]
+        # In a fragment other than the first, the data after the fragment header is payload.
+        continues = _IS_EXTENSION[protocol[inside]] & (here + size + 8 <= end[inside]) & (fragment[inside] < 8)
+        inside = inside[continues]
     return Headers(
         frame=frame,
         src=_halves(integers, at + 8),
@@ -166,12 +166,16 @@ def _ipv6(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> 
 
 
 def _ipv6_payload_bytes(integers: Integers, at: Ints, kept: Ints, protocol: Ints, wire: Ints) -> Ints:
-    """Return what follows the fixed header, of super-frames too: by their jumbo option, else by the wire length."""
-    told = integers.u16(at + 4)
+    """Return the payload length after the fixed header.
+
+    If the header has 0, the length is that of the jumbo option or, for frames from segmentation offload, follows from
+    the wire length.
+    """
+    payload_length = integers.u16(at + 4)
     jumbo = (protocol == _HOP_BY_HOP) & (kept >= 48) & (integers.u16(at + 42) == _JUMBO_OPTION)
-    unknown = (protocol == TCP) | (protocol == UDP)
-    longer = np.where(jumbo, integers.u32(at + 44), np.where(unknown, wire - _IPV6_HEADER_BYTES, 0))
-    return np.where(told == 0, longer, told)
+    may_be_offloaded = (protocol == TCP) | (protocol == UDP)
+    longer = np.where(jumbo, integers.u32(at + 44), np.where(may_be_offloaded, wire - _IPV6_HEADER_BYTES, 0))
+    return np.where(payload_length == 0, longer, payload_length)
 
 
 def _halves(integers: Integers, at: Ints) -> Addresses:

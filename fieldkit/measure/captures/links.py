@@ -1,4 +1,4 @@
-"""Find the IP header of a frame, by link type.
+"""Positions of the IP headers in frames, by link type.
 
 Headers: https://www.tcpdump.org/linktypes.html, https://www.radiotap.org, IEEE 802.1Q, IEEE 802.11-2020 section 9.
 """
@@ -12,8 +12,8 @@ import numpy as np
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.arrays import LITTLE, Frames, Integers, Ints, Mask
 
-NOWHERE: Final = -1
-"""Where the IP header of a frame without one starts."""
+NO_HEADER: Final = -1
+"""Position for a frame without an IP header."""
 
 Finder = Callable[[Integers, Frames], Ints]
 
@@ -25,30 +25,37 @@ _SNAP: Final = 0xAAAA0300
 _RADIOTAP_HEADER_BYTES: Final = 8
 
 
-def _typed(integers: Integers, frames: Frames, type_at: Ints, network: Ints) -> Ints:
-    """Follow a stack of VLAN tags from a frame's EtherType, and where what it tells of starts."""
+def _after_ethertype(integers: Integers, frames: Frames, type_at: Ints, network: Ints) -> Ints:
+    """Return the position of the IP header after an EtherType, skipping VLAN tags.
+
+    Args:
+        integers: The file.
+        frames: Its frames.
+        type_at: Positions of the EtherTypes.
+        network: Positions of the bytes that the EtherTypes describe.
+    """
     type_at, network = type_at.copy(), network.copy()
     kind = integers.u16(type_at)
     end = frames.start + frames.captured_bytes
-    tagged = np.flatnonzero(_is_one_of(kind, _TAG_TYPES))
+    tagged = np.flatnonzero(_is_in(kind, _TAG_TYPES))
     while len(tagged):
         type_at[tagged] = network[tagged] + 2
         network[tagged] += 4
         kind[tagged] = integers.u16(type_at[tagged])
-        tagged = tagged[_is_one_of(kind[tagged], _TAG_TYPES) & (network[tagged] < end[tagged])]
-    return np.where(_is_one_of(kind, _IP_TYPES), network, NOWHERE)
+        tagged = tagged[_is_in(kind[tagged], _TAG_TYPES) & (network[tagged] < end[tagged])]
+    return np.where(_is_in(kind, _IP_TYPES), network, NO_HEADER)
 
 
 def _ethernet(integers: Integers, frames: Frames) -> Ints:
-    return _typed(integers, frames, frames.start + 12, frames.start + 14)
+    return _after_ethertype(integers, frames, frames.start + 12, frames.start + 14)
 
 
 def _cooked(integers: Integers, frames: Frames) -> Ints:
-    return _typed(integers, frames, frames.start + 14, frames.start + 16)
+    return _after_ethertype(integers, frames, frames.start + 14, frames.start + 16)
 
 
 def _cooked_v2(integers: Integers, frames: Frames) -> Ints:
-    return _typed(integers, frames, frames.start, frames.start + 20)
+    return _after_ethertype(integers, frames, frames.start, frames.start + 20)
 
 
 def _raw(_: Integers, frames: Frames) -> Ints:
@@ -56,15 +63,15 @@ def _raw(_: Integers, frames: Frames) -> Ints:
 
 
 def _null(integers: Integers, frames: Frames) -> Ints:
-    """The address family is in the byte order of the machine that captured, whatever the file's."""
+    """The address family is in the byte order of the capturing machine, which may differ from the file's."""
     family = integers.u32(frames.start)
-    known = _is_one_of(family, _IP_FAMILIES) | _is_one_of(family, [one << 24 for one in _IP_FAMILIES])
-    return np.where(known, frames.start + 4, NOWHERE)
+    is_ip = _is_in(family, _IP_FAMILIES) | _is_in(family, [number << 24 for number in _IP_FAMILIES])
+    return np.where(is_ip, frames.start + 4, NO_HEADER)
 
 
 def _radiotap(integers: Integers, frames: Frames) -> Ints:
-    """Skip the radio's own header; a frame that it says was received wrongly is none."""
-    little = integers.in_order(LITTLE)
+    """Skip the radiotap header. A frame with a bad checksum (FCS) counts as a frame without an IP header."""
+    little = integers.with_order(LITTLE)
     length = little.u16(frames.start + 2)
     end = frames.start + np.minimum(length, frames.captured_bytes)
     present = little.u32(frames.start + 4)
@@ -74,12 +81,12 @@ def _radiotap(integers: Integers, frames: Frames) -> Ints:
         more = little.u32(after[extended]) >> 31 == 1
         after[extended] += 4
         extended = extended[more & (after[extended] < end[extended])]
-    # The flags follow the time stamp, which is aligned to its eight bytes.
+    # The flags follow the time stamp, which is aligned to 8 bytes.
     stamped = present & 1 == 1
     flags_at = np.where(stamped, frames.start + (after - frames.start + 7) // 8 * 8 + 8, after)
     flags = np.where((present & 2 == 2) & (flags_at < end), integers.u8(flags_at), 0)
     network = _from_80211(integers, frames, frames.start + length, padded=flags & 0x20 != 0)
-    return np.where((integers.u8(frames.start) == 0) & (flags & 0x40 == 0), network, NOWHERE)
+    return np.where((integers.u8(frames.start) == 0) & (flags & 0x40 == 0), network, NO_HEADER)
 
 
 def _80211(integers: Integers, frames: Frames) -> Ints:
@@ -87,13 +94,13 @@ def _80211(integers: Integers, frames: Frames) -> Ints:
 
 
 def _from_80211(integers: Integers, frames: Frames, mac: Ints, *, padded: Mask) -> Ints:
-    """Return where IP starts in data frames whose MAC header starts at `mac`.
+    """Return the positions of the IP headers in data frames.
 
     Args:
         integers: The file.
         frames: Its frames.
-        mac: Where their MAC headers start.
-        padded: Which of these are followed by bytes up to a multiple of four.
+        mac: Positions of their MAC headers.
+        padded: Mask of frames whose MAC header is padded to a multiple of four bytes.
     """
     kind, flags = integers.u8(mac), integers.u8(mac + 1)
     qos = kind & 0x80 != 0
@@ -102,17 +109,17 @@ def _from_80211(integers: Integers, frames: Frames, mac: Ints, *, padded: Mask) 
     aggregated = qos & (integers.u8(mac + header - 2) & 0x80 != 0)
     header += 4 * (qos & (flags & 0x80 != 0))  # HT control
     llc = mac + np.where(padded, (header + 3) // 4 * 4, header)
-    # Data of version 0, not a null frame, not encrypted, no later fragment, not several frames in one.
+    # Data of version 0; not a null frame, not encrypted, not a later fragment, and not an aggregate (A-MSDU).
     clear = (kind & 0x4F == 0x08) & (flags & 0x40 == 0) & (integers.u8(mac + 22) & 0x0F == 0) & ~aggregated
     clear &= (integers.u32(llc) == _SNAP) & (integers.u16(llc + 4) == 0)
-    return np.where(clear, _typed(integers, frames, llc + 6, llc + 8), NOWHERE)
+    return np.where(clear, _after_ethertype(integers, frames, llc + 6, llc + 8), NO_HEADER)
 
 
-def _is_one_of(values: Ints, wanted: tuple[int, ...] | list[int]) -> Mask:
-    found: Mask = values == wanted[0]
-    for kind in wanted[1:]:
-        found |= values == kind
-    return found
+def _is_in(values: Ints, allowed: tuple[int, ...] | list[int]) -> Mask:
+    mask: Mask = values == allowed[0]
+    for value in allowed[1:]:
+        mask |= values == value
+    return mask
 
 
 LINKS: Final[Mapping[int, Finder]] = MappingProxyType(
@@ -131,14 +138,14 @@ LINKS: Final[Mapping[int, Finder]] = MappingProxyType(
         276: _cooked_v2,
     }
 )
-"""By number, as capture files give it."""
+"""Functions by link type number."""
 
 
 def check_link_type(*link_types: int, where: str) -> None:
-    """Check that frames of at least one of these link types can be read.
+    """Check that at least one of these link types is supported.
 
     Raises:
-        EvidenceError: They cannot.
+        EvidenceError: None is supported.
     """
     if not LINKS.keys() & set(link_types):
         raise EvidenceError(
@@ -149,10 +156,10 @@ def check_link_type(*link_types: int, where: str) -> None:
 
 
 def network(integers: Integers, frames: Frames) -> Ints:
-    """Return where each frame's IP header starts in the file, `NOWHERE` where it has none or its link is unknown."""
-    found = np.full(len(frames), NOWHERE)
+    """Return the position of each frame's IP header in the file; `NO_HEADER` if it has none or is unknown."""
+    header_at = np.full(len(frames), NO_HEADER)
     for link_type in np.flatnonzero(np.bincount(frames.link_type)).tolist():
         if link_type in LINKS:
             chosen = np.flatnonzero(frames.link_type == link_type)
-            found[chosen] = LINKS[link_type](integers, frames.where(chosen))
-    return found
+            header_at[chosen] = LINKS[link_type](integers, frames.where(chosen))
+    return header_at

@@ -1,4 +1,4 @@
-"""IP packets as numpy columns: every field of all packets at once, from where each frame starts.
+"""IP packets as numpy columns: each field is decoded for all packets together.
 
 Headers: RFC 9293 (TCP), RFC 7323 (its time stamps), RFC 768 (UDP), RFC 792 (ICMP).
 """
@@ -10,7 +10,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from fieldkit.measure.captures.arrays import BIG, LITTLE, Frames, Integers, Ints, Mask, Narrow, Table, layout, mixed
+from fieldkit.measure.captures.arrays import (
+    BIG,
+    LITTLE,
+    Frames,
+    Integers,
+    Ints,
+    Mask,
+    Narrow,
+    Table,
+    layout,
+    row_hashes,
+)
 from fieldkit.measure.captures.ip import ICMP, SCTP, TCP, UDP, Addresses, address, headers
 from fieldkit.measure.captures.links import network
 
@@ -26,22 +37,23 @@ _TRANSPORT: Final = layout(
 )
 
 NO_PORT: Final = -1
-"""Port of a packet that carries none: a later fragment, or another protocol."""
+"""Port of a packet without one: a later fragment, or another protocol."""
 
 NO_STAMP: Final = -1
-"""TCP time stamp of a packet that carries none, or was cut before it."""
+"""TCP time stamp of a packet without one, or truncated before it."""
 
 NO_ECHO: Final = -1
-"""Identifier of a packet that is no ICMP echo, or was cut before it."""
+"""Identifier of a packet that is not an ICMP echo, or was truncated before it."""
 
 ECHO_REPLY: Final = 1 << 16
 """Added to the identifier of an echo that is a reply."""
 
-NOT_KEPT: Final = -1
-"""Content of a packet that was cut before `CONTENT_BYTES` of it."""
+NOT_CAPTURED: Final = -1
+"""Content hash of a packet that was truncated before `CONTENT_BYTES` of content."""
 
 CONTENT_BYTES: Final = 32
-"""How much of a packet's content is compared: fieldkit's captures keep more behind any headers, 128 bytes in all."""
+"""Number of content bytes that are compared. fieldkit's captures have at least this many after any headers: they
+capture 128 bytes of each packet."""
 
 _CONTENT: Final = layout(LITTLE, CONTENT_BYTES, **{str(at): (at, 8) for at in range(0, CONTENT_BYTES, 8)})
 _FIRST_BYTES: Final = np.array([(1 << 8 * count) - 1 for count in range(9)], dtype=np.uint64).astype(np.int64)
@@ -49,7 +61,7 @@ _REPLY: Final = 0
 _REQUEST: Final = 8
 _MSS_OPTION: Final = 2
 _STAMP_OPTION: Final = 8
-# Two that do nothing, then the time stamp: how most systems write it, so that it is aligned (RFC 7323, appendix A).
+# Two no-operation options before the time stamp: most systems align it this way (RFC 7323, appendix A).
 _ALIGNED_STAMP: Final = 0x0101080A
 
 
@@ -58,31 +70,32 @@ class Packets(Table):
     """IP packets in the order of the capture, one numpy column per field.
 
     Attributes:
-        time_ns: Time of capture, nanoseconds since 1970 UTC; `frames.NO_TIME` where the file tells none.
-        wire_bytes: Length of the whole frame on the link, not only of what was kept.
+        time_ns: Time of capture, nanoseconds since 1970 UTC, or `frames.NO_TIME`.
+        wire_bytes: Length of the whole frame on the link, even if fewer bytes were captured.
         src: Source address.
         dst: Destination address.
-        protocol: IP protocol number, the one after IPv6 extension headers.
-        ip_id: Identification; fragments of one datagram share it. 0 in an IPv6 packet that is no fragment.
-        fragment_offset: Offset of the payload in its datagram, in bytes; 0 unless a later fragment.
-        more_fragments: Whether fragments follow.
-        ip_header_bytes: Bytes of the IP header and its extensions.
-        ip_payload_bytes: Bytes after the IP header and its extensions, by the header (not by what was kept).
-        sport: Source port of TCP, UDP and SCTP; `NO_PORT` where the packet carries none.
-        dport: Destination port, likewise.
+        protocol: IP protocol number after IPv6 extension headers.
+        ip_id: Identification, which the fragments of a datagram share; 0 in an IPv6 packet that is not a fragment.
+        fragment_offset: Offset of the payload in its datagram in bytes; 0 except for later fragments.
+        more_fragments: True if more fragments follow.
+        ip_header_bytes: Length of the IP header and its extensions.
+        ip_payload_bytes: Length after the IP header and its extensions, by the header, even if fewer bytes were
+            captured.
+        sport: Source port of TCP, UDP and SCTP, or `NO_PORT`.
+        dport: Destination port, or `NO_PORT`.
         tcp_seq: TCP sequence number; 0 without a TCP header.
         tcp_ack: TCP acknowledgment number; 0 without a TCP header.
         tcp_flags: TCP flags; 0 without a TCP header.
-        tcp_stamp: Value of TCP's time stamp (TSval, which a retransmission has later); `NO_STAMP` without one.
-        tcp_mss: Largest segment that a SYN announces as its sender's limit; 0 in all others, and where it tells none.
-        tcp_payload_bytes: Bytes after the TCP header; 0 without one.
-        udp_bytes: Length in the UDP header, itself included; 0 without one.
-        echo: Identifier of an ICMP echo request, which each ping has for itself, and of a reply, plus `ECHO_REPLY`;
-            `NO_ECHO` without one.
-        echo_seq: Sequence number of an ICMP echo request or reply; `NO_ECHO` without one.
-        content: A number for the first `CONTENT_BYTES` behind the TCP or UDP header, else behind the IP header (so
-            that a checksum, which offload leaves for later, is not in it): other numbers are other bytes. `NOT_KEPT`
-            where so many are not there to be read.
+        tcp_stamp: TSval of the TCP time stamp option, which is later in a retransmission; `NO_STAMP` without one.
+        tcp_mss: Maximum segment size option of a SYN; 0 without one.
+        tcp_payload_bytes: Length after the TCP header; 0 without one.
+        udp_bytes: Length field of the UDP header, which includes the header; 0 without one.
+        echo: Identifier of an ICMP echo request, which differs between ping processes; `ECHO_REPLY` is added in a
+            reply. `NO_ECHO` for other packets.
+        echo_seq: Sequence number of an ICMP echo request or reply; `NO_ECHO` for other packets.
+        content: Hash of the first `CONTENT_BYTES` after the TCP or UDP header, else after the IP header. The
+            transport checksum is not included, because offload computes it later. `NOT_CAPTURED` if one is
+            missing.
     """
 
     time_ns: Ints
@@ -109,15 +122,15 @@ class Packets(Table):
     content: Ints
 
     def are_from(self, text: str) -> Mask:
-        """Return which packets have this IPv4 or IPv6 source address."""
+        """Return a mask of the packets with this IPv4 or IPv6 source address."""
         return _equals(self.src, text)
 
     def are_to(self, text: str) -> Mask:
-        """Return which packets have this IPv4 or IPv6 destination address."""
+        """Return a mask of the packets with this IPv4 or IPv6 destination address."""
         return _equals(self.dst, text)
 
 
-_KEPT_AS: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
+_STORAGE_TYPES: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
     {
         **dict.fromkeys(("protocol", "tcp_flags"), np.uint8),
         **dict.fromkeys(("fragment_offset", "tcp_mss", "udp_bytes"), np.uint16),
@@ -126,32 +139,32 @@ _KEPT_AS: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
         **dict.fromkeys(("sport", "dport", "echo", "echo_seq"), np.int32),
     }
 )
-"""Columns that need fewer than eight bytes: what their header fields hold, and the marks below 0."""
+"""Columns stored in fewer than eight bytes: the type holds the header field and the special values below 0."""
 
-for _name, _kind in _KEPT_AS.items():
-    _column = Narrow(_kind)
+for _name, _storage_type in _STORAGE_TYPES.items():
+    _column = Narrow(_storage_type)
     _column.__set_name__(Packets, _name)
     setattr(Packets, _name, _column)
 
 
 def decode(integers: Integers, frames: Frames) -> Packets:
-    """Return the IP packets among `frames`; others, and ones cut within the IP header, are left out."""
+    """Return the IP packets among `frames`; frames of other protocols or truncated in the IP header are omitted."""
     ip = headers(integers, frames, network(integers, frames))
     if len(ip) < len(frames):
         frames = frames.where(ip.frame)
     transport, payload, protocol = ip.payload_at, ip.payload_bytes, ip.protocol
-    # Ethernet pads short frames: what was kept may be more than the packet.
-    kept = np.minimum(frames.start + frames.captured_bytes - transport, payload)
+    # Ethernet pads short frames, so more bytes than the packet's may have been captured.
+    captured = np.minimum(frames.start + frames.captured_bytes - transport, payload)
 
     first = ip.fragment_offset == 0
     is_tcp, is_udp = first & (protocol == TCP), first & (protocol == UDP)
-    ports = (is_tcp | is_udp | first & (protocol == SCTP)) & (kept >= 4)
-    tcp, udp = is_tcp & (kept >= 20), is_udp & (kept >= UDP_HEADER_BYTES)
+    ports = (is_tcp | is_udp | first & (protocol == SCTP)) & (captured >= 4)
+    tcp, udp = is_tcp & (captured >= 20), is_udp & (captured >= UDP_HEADER_BYTES)
     head = integers.fields(_TRANSPORT, transport)
     tcp_header = (head["length"] >> 4) * 4
     tcp_flags = np.where(tcp, head["flags"], 0)
-    options_end = transport + np.minimum(kept, tcp_header)
-    echo = _echoes(integers, first & (protocol == ICMP) & (kept >= 8), transport)
+    options_end = transport + np.minimum(captured, tcp_header)
+    echo = _echoes(integers, first & (protocol == ICMP) & (captured >= 8), transport)
     skipped = np.where(tcp, tcp_header, np.where(udp, UDP_HEADER_BYTES, 0))
     return Packets(
         time_ns=frames.time_ns,
@@ -175,69 +188,69 @@ def decode(integers: Integers, frames: Frames) -> Packets:
         udp_bytes=np.where(udp, head["udp_bytes"], 0),
         echo=echo,
         echo_seq=np.where(echo == NO_ECHO, NO_ECHO, integers.u16(np.where(echo == NO_ECHO, 0, transport + 6))),
-        content=_contents(integers, transport + skipped, kept - skipped, payload - skipped),
+        content=_contents(integers, transport + skipped, captured - skipped, payload - skipped),
     )
 
 
 def _stamps(integers: Integers, tcp: Mask, transport: Ints, end: Ints) -> Ints:
-    """Return TSval of the packets `tcp`, of which headers start at `transport` and options end at `end`."""
-    found = np.full_like(transport, NO_STAMP)
+    """Return the TSval of the packets in the mask `tcp`; their options end at `end`."""
+    stamps = np.full_like(transport, NO_STAMP)
     if not tcp.any():
-        return found
+        return stamps
     aligned = tcp & (transport + 32 <= end)
     aligned[aligned] = integers.u32(transport[aligned] + 20) == _ALIGNED_STAMP
-    found[aligned] = integers.u32(transport[aligned] + 24)
+    stamps[aligned] = integers.u32(transport[aligned] + 24)
     others = np.flatnonzero(tcp & ~aligned & (transport + 30 <= end))
-    return np.where(aligned, found, _option(integers, others, transport, end, _STAMP_OPTION, missing=NO_STAMP))
+    return np.where(aligned, stamps, _option(integers, others, transport, end, _STAMP_OPTION, missing=NO_STAMP))
 
 
-def _option(integers: Integers, chosen: Ints, transport: Ints, end: Ints, wanted: int, *, missing: int) -> Ints:
-    """Return what a TCP option says (RFC 9293, section 3.2; RFC 7323, section 3.2), `missing` where it is not there.
+def _option(integers: Integers, chosen: Ints, transport: Ints, end: Ints, option: int, *, missing: int) -> Ints:
+    """Return the value of a TCP option (RFC 9293, section 3.2; RFC 7323, section 3.2), or `missing`.
 
     Args:
         integers: The file.
-        chosen: Index of the packets to look into.
-        transport: Where the header of each packet starts.
-        end: Where what was kept of its options ends.
-        wanted: `_MSS_OPTION` or `_STAMP_OPTION`.
-        missing: What to return for all other packets.
+        chosen: Indices of the packets to read.
+        transport: Position of each packet's TCP header.
+        end: Position of the end of each packet's captured options.
+        option: `_MSS_OPTION` or `_STAMP_OPTION`.
+        missing: Value for packets without the option.
     """
-    found = np.full_like(transport, missing)
-    size, read = (4, integers.u16) if wanted == _MSS_OPTION else (10, integers.u32)
+    values = np.full_like(transport, missing)
+    size, read = (4, integers.u16) if option == _MSS_OPTION else (10, integers.u32)
     at, end = transport[chosen] + 20, end[chosen]
-    going_on = at + size <= end
-    while going_on.any():
-        chosen, at, end = chosen[going_on], at[going_on], end[going_on]
+    has_more = at + size <= end
+    while has_more.any():
+        chosen, at, end = chosen[has_more], at[has_more], end[has_more]
         kind = integers.u8(at)
         step = np.where(kind == 1, 1, integers.u8(at + 1))
-        told = (kind == wanted) & (step == size)
-        found[chosen[told]] = read(at[told] + 2)
+        matches = (kind == option) & (step == size)
+        values[chosen[matches]] = read(at[matches] + 2)
         at = at + step
-        going_on = ~told & (kind != 0) & (step > 0) & (at + size <= end)
-    return found
+        has_more = ~matches & (kind != 0) & (step > 0) & (at + size <= end)
+    return values
 
 
 def _echoes(integers: Integers, icmp: Mask, transport: Ints) -> Ints:
-    """Return the identifiers of echoes among the packets `icmp`, of which headers start at `transport`."""
-    found = np.full_like(transport, NO_ECHO)
+    """Return the identifiers of the echo packets in the mask `icmp`."""
+    identifiers = np.full_like(transport, NO_ECHO)
     at = transport[icmp]
     kind, identifier = integers.u8(at), integers.u16(at + 4)
-    found[icmp] = np.select([kind == _REQUEST, kind == _REPLY], [identifier, identifier + ECHO_REPLY], NO_ECHO)
-    return found
+    identifiers[icmp] = np.select([kind == _REQUEST, kind == _REPLY], [identifier, identifier + ECHO_REPLY], NO_ECHO)
+    return identifiers
 
 
-def _contents(integers: Integers, at: Ints, kept: Ints, content_bytes: Ints) -> Ints:
-    """Return a number for the content of packets that starts at `at`."""
+def _contents(integers: Integers, at: Ints, captured: Ints, content_bytes: Ints) -> Ints:
+    """Return a hash of the content at the positions `at`."""
     words = integers.fields(_CONTENT, at)
-    wanted = np.clip(content_bytes, 0, CONTENT_BYTES)
-    short = np.flatnonzero(wanted < CONTENT_BYTES)
+    hashed = np.clip(content_bytes, 0, CONTENT_BYTES)
+    short = np.flatnonzero(hashed < CONTENT_BYTES)
     columns = [words[str(start)] for start in range(0, CONTENT_BYTES, 8)]
     for number, word in enumerate(columns):
-        # What follows a short packet in the file is none of it: of eight bytes the first are the lowest.
-        word[short] &= _FIRST_BYTES[np.clip(wanted[short] - 8 * number, 0, 8)]
-    found = (mixed(*columns) >> np.uint64(1)).astype(np.int64)
-    found[kept < wanted] = NOT_KEPT
-    return found
+        # Zero the bytes after the end of a short packet. The words are little-endian: the first bytes are the lowest.
+        word[short] &= _FIRST_BYTES[np.clip(hashed[short] - 8 * number, 0, 8)]
+    hashes = (row_hashes(*columns) >> np.uint64(1)).astype(np.int64)
+    hashes[captured < hashed] = NOT_CAPTURED
+    return hashes
 
 
 def _equals(column: Addresses, text: str) -> Mask:

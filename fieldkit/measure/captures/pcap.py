@@ -1,4 +1,4 @@
-"""Capture files, pcap and pcapng: their IP packets as columns, whole or chunk by chunk."""
+"""Capture files, pcap and pcapng: their IP packets as columns, for the whole file or in chunks."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -13,23 +13,24 @@ from fieldkit.measure.captures.packets import Packets, decode
 from fieldkit.measure.evidence import reading
 
 CHUNK_BYTES: Final = 1 << 22
-"""How much of a file is decoded at once: some MB more than the columns are then all the memory that it takes."""
+"""Number of file bytes that are decoded together; the memory needed besides the columns is a few times as much."""
 
-_SPARE: Final = 8
-"""Beside the rows that are expected there is room for one more in so many."""
+_SPARE_DIVISOR: Final = 8
+"""One row in this many is allocated in addition to the expected number of rows."""
 
 READERS: Final = dict.fromkeys(classic.MAGIC, classic.chunks) | {pcapng.MAGIC: pcapng.chunks}
-"""Readers of a file's frames, by the first four bytes of the file."""
+"""Readers of frames, by the first four bytes of the file."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Packets of a capture file, or of a chunk of it.
+    """Packets of a capture file or of a chunk of it.
 
     Attributes:
-        packets: Its IP packets.
-        frames: Number of frames, also those that show no IP packet: too short, encrypted, of an unknown link type.
-        damage: Where and how the file is damaged, None when it is whole; `packets` are those before.
+        packets: IP packets.
+        frames: Number of frames, including those without a decodable IP packet: too short, encrypted, or of an
+            unknown link type.
+        damage: Position and kind of damage after `packets`, or None if the file is undamaged.
     """
 
     packets: Packets
@@ -41,37 +42,37 @@ def read(path: Path) -> Capture:
     """Return the packets of a capture file.
 
     Raises:
-        EvidenceError: The file is missing, no pcap or pcapng, or of an unknown link type.
+        EvidenceError: The file is missing, not pcap or pcapng, or has an unknown link type.
     """
-    return _joined(stream(path), reading.size(path))
+    return _concatenate(stream(path), reading.size(path))
 
 
 def parse(data: bytes, *, where: str) -> Capture:
-    """Return the packets of a capture file's bytes; `where` names it in messages.
+    """Return the packets in the bytes of a capture file; `where` is its name for messages.
 
     Raises:
-        EvidenceError: Neither pcap nor pcapng, or of an unknown link type.
+        EvidenceError: The bytes are not pcap or pcapng, or have an unknown link type.
     """
-    return _joined(_captures(data, where, CHUNK_BYTES), len(data))
+    return _concatenate(_captures(data, where, CHUNK_BYTES), len(data))
 
 
 def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
     """Yield the packets of a capture file in chunks, at least one, for files whose columns do not fit into memory.
 
-    Only the last chunk can tell of damage. A large file must not shrink meanwhile, see `reading.mapped`.
+    Only the last chunk can have damage. A large file must not be truncated while it is read, see `reading.mapped`.
 
     Args:
         path: The file.
-        chunk_bytes: How much of it goes into a chunk, in bytes; the packet that reaches beyond is the last.
+        chunk_bytes: Size of a chunk in the file, in bytes; the packet that crosses the boundary is the chunk's last.
 
     Raises:
-        EvidenceError: As `read`, for an unknown link type of a later section in the midst of the chunks.
+        EvidenceError: As for `read`. An unknown link type in a later section is only found after earlier chunks.
     """
     data = reading.mapped(path)
     for capture in _captures(data, str(path), chunk_bytes):
         yield capture
         if isinstance(data, mmap):
-            # Pages once read count as this process's memory until they are given back.
+            # Pages of the mapping count as this process's memory until they are released.
             data.madvise(MADV_DONTNEED)
 
 
@@ -79,20 +80,20 @@ def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
     magic = bytes(data[:4])
     if magic not in READERS:
         raise EvidenceError(
-            "is no pcap or pcapng file" if data else "is empty",
+            "is not a pcap or pcapng file" if data else "is empty",
             where=where,
-            remedy="read the capture's log: did tcpdump start, and was it ended by a signal that it can catch?",
+            remedy="read the capture's log: tcpdump must have started, and must be stopped with SIGINT or SIGTERM",
         )
     integers = Integers(data)
     for chunk in READERS[magic](data, where=where, chunk_bytes=chunk_bytes):
         yield Capture(decode(integers, chunk.frames), len(chunk.frames), chunk.damage)
 
 
-def _joined(captures: Iterable[Capture], size_bytes: int) -> Capture:
-    """Return all of a file's packets, in hardly more memory than they take: what is joined is let go of at once.
+def _concatenate(captures: Iterable[Capture], size_bytes: int) -> Capture:
+    """Return all packets of a file. Each chunk is freed after it was copied, so little additional memory is needed.
 
-    There is room for as many as there will be if the file goes on as it begins, and some more: rows that are never
-    written take no memory.
+    The number of rows is estimated from the packets so far, with a margin. Rows that are never written occupy no
+    physical memory.
     """
     chunks = -(-size_bytes // CHUNK_BYTES)
     joined: Packets | None = None
@@ -100,10 +101,12 @@ def _joined(captures: Iterable[Capture], size_bytes: int) -> Capture:
     for capture in captures:
         stop = rows + len(capture.packets)
         if joined is None or stop > len(joined):
-            longer = capture.packets.room(stop + max(stop * (chunks - 1), rows) * (_SPARE + 1) // _SPARE)
+            larger = capture.packets.allocate(
+                stop + max(stop * (chunks - 1), rows) * (_SPARE_DIVISOR + 1) // _SPARE_DIVISOR
+            )
             if joined is not None:
-                longer.write(0, joined.where(slice(0, rows)))
-            joined = longer
+                larger.write(0, joined.where(slice(0, rows)))
+            joined = larger
         joined.write(rows, capture.packets)
         rows, frames, damage = stop, frames + capture.frames, capture.damage
     if joined is None:

@@ -1,4 +1,4 @@
-"""pcapng files: block boundaries by a scan, the packets of all blocks that hold one at once.
+"""pcapng files: a scan for the block boundaries, then the packets of all packet blocks are read together.
 
 File format: draft-ietf-opsawg-pcapng. A section has its own byte order and its own interfaces.
 """
@@ -16,7 +16,7 @@ from fieldkit.measure.captures.arrays import BIG, LITTLE, NO_TIME, Buffer, Chunk
 from fieldkit.measure.captures.links import check_link_type
 
 MAGIC: Final = b"\x0a\x0d\x0d\x0a"
-"""The first four bytes of a file, in either byte order: the type of a section's header."""
+"""First four bytes of a file in either byte order: the block type of a section header."""
 
 _SECTION: Final = 0x0A0D0D0A
 _INTERFACE: Final = 1
@@ -30,31 +30,31 @@ _SECTION_BYTES: Final = 28
 _INTERFACE_BYTES: Final = 20
 _SMALLEST_BLOCK_BYTES: Final = 12
 _NO_LIMIT: Final = 1 << 32
-# Wireshark's WTAP_MAX_PACKET_SIZE_STANDARD, which is libpcap's MAXIMUM_SNAPLEN too.
+# Wireshark's WTAP_MAX_PACKET_SIZE_STANDARD, which equals libpcap's MAXIMUM_SNAPLEN.
 _MAX_CAPTURED_BYTES: Final = 262_144
-# Each is a chunk of its own. Merged files have a few; so many short ones take 1 s, and more ever longer.
-_MOST_DEFINITIONS: Final = 1_000
+# Each definition starts a new chunk. Merged files have a few; this many short chunks take 1 s to read.
+_MAX_DEFINITIONS: Final = 1_000
 
 
 @dataclass(frozen=True)
 class _Section:
-    """What holds for the packets of a section, up to its next interface description."""
+    """Byte order and interfaces of a section's packets up to its next interface description."""
 
     order: Order
     interfaces: tuple["Interface", ...] = ()
 
 
 def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
-    """Yield the frames of a file, at least one chunk, each of about `chunk_bytes` of it and one set of interfaces.
+    """Yield the frames of a file in chunks of about `chunk_bytes` with the same interfaces; at least one chunk.
 
-    Frames of interfaces whose link type is unknown are among them where another interface's is known.
+    Frames of unknown link types are included if another interface of the section has a known one.
 
     Raises:
-        EvidenceError: It does not begin with a whole section header, has packets where no interface of the section is
-            of a known link type, or more sections and interfaces than a file of captures.
+        EvidenceError: The file does not start with a complete section header, a section with packets has no interface
+            of a known link type, or the file has more sections and interfaces than a capture has.
     """
-    if _redefined(_Section(LITTLE), data, 0) is None:
-        raise EvidenceError("has no whole section header", where=where, remedy="repeat the measurement")
+    if _next_definition(_Section(LITTLE), data, 0) is None:
+        raise EvidenceError("has no complete section header", where=where, remedy="repeat the measurement")
     size = len(data)
     section, at, count, damage = _Section(LITTLE), 0, 0, None
     definitions = 0
@@ -63,31 +63,31 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
         starts, at = _scan(data, section.order, at, min(end, size - _SMALLEST_BLOCK_BYTES + 1))
         if at > size:
             at = starts.pop()
-        frames, sound = _frames(data, section, np.array(starts, dtype=np.int64))
-        if not sound.all():
-            frames = frames.where(slice(0, int(sound.argmin())))
+        frames, valid = _frames(data, section, np.array(starts, dtype=np.int64))
+        if not valid.all():
+            frames = frames.where(slice(0, int(valid.argmin())))
             damage = f"no packet block at byte {starts[len(frames)]}"
         if len(frames):
             check_link_type(*(interface.link_type for interface in section.interfaces), where=where)
         if at < end and not damage:
-            after = _redefined(section, data, at)
-            if after is None:
+            definition = _next_definition(section, data, at)
+            if definition is None:
                 damage = _damage(data, section.order, at)
             else:
-                section, at = after
+                section, at = definition
                 definitions += 1
-        if definitions > _MOST_DEFINITIONS:
-            what = f"has more than {_MOST_DEFINITIONS} sections and interfaces"
-            raise EvidenceError(what, where=where, remedy="repeat the measurement")
+        if definitions > _MAX_DEFINITIONS:
+            reason = f"has more than {_MAX_DEFINITIONS} sections and interfaces"
+            raise EvidenceError(reason, where=where, remedy="repeat the measurement")
         count += len(frames)
         if len(frames) or damage or at == size:
             yield Chunk(frames, damage and f"{damage}, after packet {count}")
 
 
 def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[list[int], int]:
-    """Return where the packet blocks from `at` to before `stop` start, and where it ended.
+    """Return the positions of the packet blocks from `at` to before `stop`, and the position where the scan stopped.
 
-    It ends earlier at a section header, at an interface description, and at what is no block.
+    It stops early at a section header, an interface description or an invalid block.
     """
     header = struct.Struct(f"{order}2I").unpack_from
     starts: list[int] = []
@@ -102,7 +102,7 @@ def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[list[int], in
 
 
 def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]:
-    """Return the frames of the blocks that start at `start`, and which of them are sound."""
+    """Return the frames of the blocks at the positions `start`, and a mask of valid blocks."""
     integers = Integers(data, section.order)
     kind, length = integers.u32(start), integers.u32(start + 4)
     simple = kind == _SIMPLE_PACKET
@@ -113,9 +113,9 @@ def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]
     link_type, time_ns = np.zeros_like(start), np.zeros_like(start)
     high, low = integers.u32(start + 12).astype(np.uint64), integers.u32(start + 16).astype(np.uint64)
     for interface in np.flatnonzero(np.bincount(number[number < len(section.interfaces)])).tolist():
-        its = np.flatnonzero(number == interface)
-        link_type[its] = section.interfaces[interface].link_type
-        time_ns[its] = section.interfaces[interface].time_ns(high[its] << np.uint64(32) | low[its])
+        rows = np.flatnonzero(number == interface)
+        link_type[rows] = section.interfaces[interface].link_type
+        time_ns[rows] = section.interfaces[interface].time_ns(high[rows] << np.uint64(32) | low[rows])
     time_ns[simple] = NO_TIME
     frames = Frames(
         start=start + np.where(simple, 12, 28),
@@ -124,32 +124,32 @@ def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]
         time_ns=time_ns,
         link_type=link_type,
     )
-    sound = (number < len(section.interfaces)) & (captured <= np.minimum(wire, _MAX_CAPTURED_BYTES))
-    sound &= (captured <= length - np.where(simple, 16, 32)) & (length % 4 == 0)
-    return frames, sound & (integers.u32(start + length - 4) == length)
+    valid = (number < len(section.interfaces)) & (captured <= np.minimum(wire, _MAX_CAPTURED_BYTES))
+    valid &= (captured <= length - np.where(simple, 16, 32)) & (length % 4 == 0)
+    return frames, valid & (integers.u32(start + length - 4) == length)
 
 
 def _snap_bytes(section: _Section) -> int:
-    """Return how much a simple packet block kept at most: it is of the first interface."""
+    """Return the snap length of simple packet blocks, which is that of the first interface."""
     return section.interfaces[0].snap_bytes or _NO_LIMIT if section.interfaces else 0
 
 
-def _redefined(section: _Section, data: Buffer, at: int) -> tuple[_Section, int] | None:
-    """Return what holds after the section header or interface description at `at`, and where that ends.
+def _next_definition(section: _Section, data: Buffer, at: int) -> tuple[_Section, int] | None:
+    """Return the section state after the section header or interface description at `at`, and the end of that block.
 
-    None when neither stands there, or not a whole and sound one.
+    None if there is neither, or if the block is incomplete or invalid.
     """
     order = section.order
     kind = bytes(data[at : at + 4])
     if kind == MAGIC:
-        found = _ORDERS.get(bytes(data[at + 8 : at + 12]))
-        if found is None or not _is_whole(data, found, at, least=_SECTION_BYTES):
+        new_order = _ORDERS.get(bytes(data[at + 8 : at + 12]))
+        if new_order is None or not _is_whole(data, new_order, at, min_bytes=_SECTION_BYTES):
             return None
-        return _Section(found), at + _length(data, found, at)
-    if kind != struct.pack(f"{order}I", _INTERFACE) or not _is_whole(data, order, at, least=_INTERFACE_BYTES):
+        return _Section(new_order), at + _length(data, new_order, at)
+    if kind != struct.pack(f"{order}I", _INTERFACE) or not _is_whole(data, order, at, min_bytes=_INTERFACE_BYTES):
         return None
     end = at + _length(data, order, at)
-    interface = described(bytes(data[at + 8 : end - 4]), order)
+    interface = parse_interface(bytes(data[at + 8 : end - 4]), order)
     return None if interface is None else (_Section(order, (*section.interfaces, interface)), end)
 
 
@@ -158,23 +158,23 @@ def _length(data: Buffer, order: Order, at: int) -> int:
     return length
 
 
-def _is_whole(data: Buffer, order: Order, at: int, *, least: int = _SMALLEST_BLOCK_BYTES) -> bool:
-    """Return whether a block stands at `at`, at least so long, with the same length at both its ends."""
-    if len(data) - at < least:
+def _is_whole(data: Buffer, order: Order, at: int, *, min_bytes: int = _SMALLEST_BLOCK_BYTES) -> bool:
+    """Return True if there is a block at `at` of at least `min_bytes`, with the same length at its start and end."""
+    if len(data) - at < min_bytes:
         return False
     length = _length(data, order, at)
-    if length < least or length % 4 or at + length > len(data):
+    if length < min_bytes or length % 4 or at + length > len(data):
         return False
     return bytes(data[at + 4 : at + 8]) == bytes(data[at + length - 4 : at + length])
 
 
 def _damage(data: Buffer, order: Order, at: int) -> str:
-    """Return what is wrong at `at`, where no whole block stands."""
-    left = len(data) - at
-    known: Order | None = order
+    """Return a description of the damage at `at`, where there is no complete block."""
+    remaining = len(data) - at
+    block_order: Order | None = order
     if bytes(data[at : at + 4]) == MAGIC:
-        known = _ORDERS.get(bytes(data[at + 8 : at + 12]))
-    if left < _SMALLEST_BLOCK_BYTES or (known and left < _length(data, known, at)):
+        block_order = _ORDERS.get(bytes(data[at + 8 : at + 12]))
+    if remaining < _SMALLEST_BLOCK_BYTES or (block_order and remaining < _length(data, block_order, at)):
         return f"ends inside the block at byte {at}"
     return f"no block at byte {at}"
 
@@ -183,7 +183,7 @@ _END_OF_OPTIONS: Final = 0
 _RESOLUTION: Final = 9
 _OFFSET: Final = 14
 _NS: Final = 1_000_000_000
-# Up to here the ticks within a second, in nanoseconds, need no more than 64 bits.
+# With at most this many ticks per second, the ticks of one second times 10**9 fit into 64 bits.
 _MAX_TICKS_PER_S: Final = 1 << 34
 
 
@@ -192,10 +192,10 @@ class Interface:
     """One interface of a section.
 
     Attributes:
-        link_type: How its frames begin (https://www.tcpdump.org/linktypes.html).
-        snap_bytes: How much of each frame was kept at most; 0 for all.
-        ticks_per_s: Unit of its time stamps.
-        offset_s: What to add to them, in seconds.
+        link_type: Link type number (https://www.tcpdump.org/linktypes.html).
+        snap_bytes: Snap length; 0 for no limit.
+        ticks_per_s: Unit of the time stamps.
+        offset_s: Added to the time stamps, in seconds.
     """
 
     link_type: int
@@ -204,7 +204,7 @@ class Interface:
     offset_s: int = 0
 
     def time_ns(self, ticks: NDArray[np.uint64]) -> Ints:
-        """Return time stamps in nanoseconds since 1970 UTC, rounded down."""
+        """Convert time stamps to nanoseconds since 1970 UTC, rounded down."""
         ticks_per_s = self.ticks_per_s
         if ticks_per_s > _MAX_TICKS_PER_S:
             ticks = np.array([tick * _NS // ticks_per_s for tick in ticks.tolist()], dtype=np.uint64)
@@ -214,8 +214,8 @@ class Interface:
         return (seconds.astype(np.int64) + self.offset_s) * _NS + rest_ns.astype(np.int64)
 
 
-def described(body: bytes, order: Order) -> Interface | None:
-    """Return the interface that the body of a block describes, None when it describes none."""
+def parse_interface(body: bytes, order: Order) -> Interface | None:
+    """Return the interface described by the body of an interface description block, or None if it is invalid."""
     link_type, _, snap_bytes = struct.unpack_from(f"{order}HHI", body)
     ticks_per_s, offset_s = 1_000_000, 0
     at = 8

@@ -1,4 +1,4 @@
-"""Find bytes in the packets of a capture: where each occurrence is, and what follows it."""
+"""Search for a byte pattern in the packets of a capture."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +20,10 @@ class Occurrences(Table):
     """Occurrences of a pattern in the order of the capture.
 
     Attributes:
-        packet: Index of the packet, as `pcap.read` counts them.
-        offset: Position of the pattern behind the IP header of its packet, in bytes.
-        first: The little-endian integer of 8 bytes behind the pattern.
-        second: The next one.
+        packet: Index of the packet in the result of `pcap.read`.
+        offset: Position of the pattern in the packet's IP payload, in bytes.
+        first: Little-endian integer in the 8 bytes after the pattern.
+        second: Integer in the next 8 bytes.
     """
 
     packet: Ints
@@ -33,39 +33,39 @@ class Occurrences(Table):
 
 
 def find(path: Path, pattern: bytes) -> Occurrences:
-    """Return each occurrence of a pattern that a capture kept with the two integers behind it.
+    """Return each captured occurrence of a pattern with the two integers after it.
 
-    An occurrence that begins in a later IP fragment, or that the snap length cut, is not found.
+    Occurrences that start in a later IP fragment, or that the snap length truncated, are not found.
 
     Raises:
-        EvidenceError: As `pcap.read`.
+        EvidenceError: As for `pcap.read`.
     """
     data = reading.mapped(path)
     integers = Integers(data)
     reader = READERS.get(bytes(data[:4]))
-    parts, packets = [_none()], 0
+    parts, packets = [_no_occurrences()], 0
     for chunk in reader(data, where=str(path), chunk_bytes=CHUNK_BYTES) if reader else ():
         ip = headers(integers, chunk.frames, network(integers, chunk.frames))
         frames = chunk.frames.where(ip.frame)
-        found = _positions(data, frames, pattern)
-        row = np.searchsorted(frames.start, found, side="right") - 1
+        matches = _positions(data, frames, pattern)
+        row = np.searchsorted(frames.start, matches, side="right") - 1
         ends = frames.start[row] + frames.captured_bytes[row]
-        inside = (found >= ip.payload_at[row]) & (found + len(pattern) + 2 * _WORD_BYTES <= ends)
+        inside = (matches >= ip.payload_at[row]) & (matches + len(pattern) + 2 * _WORD_BYTES <= ends)
         inside &= ip.fragment_offset[row] == 0
-        found, row = found[inside], row[inside]
-        little, after = integers.in_order(LITTLE), found + len(pattern)
+        matches, row = matches[inside], row[inside]
+        little, after = integers.with_order(LITTLE), matches + len(pattern)
         numbers = (little.u64(after + at).astype(np.int64) for at in (0, _WORD_BYTES))
-        parts.append(Occurrences(packets + row, found - ip.payload_at[row], *numbers))
+        parts.append(Occurrences(packets + row, matches - ip.payload_at[row], *numbers))
         packets += len(frames)
-    return Occurrences.joined(parts)
+    return Occurrences.concatenated(parts)
 
 
-def _none() -> Occurrences:
+def _no_occurrences() -> Occurrences:
     return Occurrences(*(np.empty(0, dtype=np.int64) for _ in range(4)))
 
 
 def _positions(data: Buffer, frames: Frames, pattern: bytes) -> Ints:
-    """Return where the pattern begins in the file, between the first frame and the end of the last."""
+    """Return the positions of the pattern in the file, between the first frame and the end of the last."""
     positions: list[int] = []
     if len(frames):
         at, end = int(frames.start[0]), int(frames.start[-1] + frames.captured_bytes[-1])

@@ -1,6 +1,6 @@
-"""Contradictions between what two captures and two files say of one transfer: one of them is not whole.
+"""Contradictions between the two captures and the two files of one transfer, which show that one is incomplete.
 
-Each is one whatever the link loses, copies or reorders, and whatever the two clocks say.
+They are contradictions whatever the link loses, duplicates or reorders, and for any clock offset.
 """
 
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ import numpy as np
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.captures.arrays import Keys, mixed
+from fieldkit.measure.captures.arrays import Keys, row_hashes
 from fieldkit.measure.captures.packets import NO_PORT, RST, SYN, UDP_HEADER_BYTES, Packets
 from fieldkit.measure.checks import udp_file
 from fieldkit.measure.evidence import reading
@@ -21,37 +21,37 @@ from fieldkit.measure.transfers.transfer import Transfer
 
 @dataclass(frozen=True)
 class _Files:
-    """Sizes of both files of a transfer, and how many bytes they have in common from the beginning on."""
+    """Sizes of both files of a transfer, and the length of their common prefix."""
 
     sent_bytes: int
     received_bytes: int
-    alike_bytes: int
+    common_bytes: int
 
     @property
-    def whole(self) -> bool:
-        return self.sent_bytes == self.received_bytes == self.alike_bytes
+    def are_equal(self) -> bool:
+        return self.sent_bytes == self.received_bytes == self.common_bytes
 
 
 def find(evidence: AttemptEvidence, transfer: Transfer, *, finished: bool, cut: bool = False) -> Iterator[str]:
-    """Yield what cannot be true together, a sentence each; evidence that is not whole contradicts nothing.
+    """Yield each contradiction as a sentence. Incomplete evidence contradicts nothing.
 
     Args:
-        evidence: What the attempt left.
-        transfer: What was sent from where to where.
-        finished: Whether the listener is known to have ended by itself.
-        cut: Whether it is known to have been ended before it was done.
+        evidence: The attempt's evidence.
+        transfer: The transfer.
+        finished: True if the listener is known to have ended without being stopped.
+        cut: True if the listener is known to have been stopped before it was finished.
     """
     files = _files(evidence, transfer)
-    if files and transfer.protocol is Protocol.TCP and files.alike_bytes < files.received_bytes:
-        yield f"{transfer.received_file} is no beginning of {transfer.sent_file}, and TCP changes no byte"
+    if files and transfer.protocol is Protocol.TCP and files.common_bytes < files.received_bytes:
+        yield f"{transfer.received_file} is not a prefix of {transfer.sent_file}, although TCP changes no byte"
     sender, receiver = map(evidence.whole_capture, transfer.captures)
     if sender is None or receiver is None:
         return
-    if earlier := _earlier(sender.packets, receiver.packets, transfer):
-        yield f"packets of an earlier attempt were still on the way: {earlier}"
+    if earlier_packets := _earlier_traffic(sender.packets, receiver.packets, transfer):
+        yield f"packets of an earlier attempt were still on the way: {earlier_packets}"
     elif transfer.protocol is Protocol.UDP:
-        amounts = list(_udp(sender.packets, receiver.packets, files, transfer))
-        yield from amounts or udp_file.find(evidence, transfer, sender.packets, receiver.packets, cut=cut)
+        size_problems = list(_udp(sender.packets, receiver.packets, files, transfer))
+        yield from size_problems or udp_file.find(evidence, transfer, sender.packets, receiver.packets, cut=cut)
     elif files is None or max(files.sent_bytes, files.received_bytes) < LONGEST_BYTES:
         yield from _tcp(sender.packets, receiver.packets, files, transfer, finished=finished)
 
@@ -59,124 +59,128 @@ def find(evidence: AttemptEvidence, transfer: Transfer, *, finished: bool, cut: 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
     sent = evidence.read_or_none(reading.size, transfer.sent_file)
     received = evidence.read_or_none(reading.size, transfer.received_file)
-    alike = evidence.read_or_none(reading.alike_bytes, "", transfer.sent_file, transfer.received_file)
-    return None if sent is None or received is None or alike is None else _Files(sent, received, alike)
+    common = evidence.read_or_none(reading.alike_bytes, "", transfer.sent_file, transfer.received_file)
+    return None if sent is None or received is None or common is None else _Files(sent, received, common)
 
 
-def _earlier(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
-    """Return which packets are of an earlier transfer, None where none are: of one transfer each netcat has one port.
+def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
+    """Return a description of packets of an earlier transfer, or None; in one transfer each netcat has one port.
 
-    They came with payload from a port from which nothing left; or they had waited on the sender, and left from
-    another port than the last that began. What a kernel still repeats of a connection that broke off begins none.
+    Such packets arrive with payload from a port from which nothing was sent; or they were delayed in the sender, and
+    are sent from another port than that of the last start. Retransmissions of an aborted connection are no start.
     """
-    left, came = (
+    sent, received = (
         packets.where(packets.dport == transfer.port) for packets in map(transfer.forward, (sender, receiver))
     )
-    carries = (came.tcp_payload_bytes > 0) | (came.udp_bytes > 0)
-    if on_the_way := int((carries & ~np.isin(came.sport, left.sport)).sum()):
-        return f"{format_count(on_the_way, 'packet')} of the transfer's port came from another than any that left"
-    begun = left if transfer.protocol is Protocol.UDP else left.where(left.tcp_flags & SYN != 0)
-    ports, first = np.unique(begun.sport, return_index=True)
+    has_payload = (received.tcp_payload_bytes > 0) | (received.udp_bytes > 0)
+    if stray := int((has_payload & ~np.isin(received.sport, sent.sport)).sum()):
+        return f"{format_count(stray, 'packet')} to the transfer's port came from a port from which none was sent"
+    starts = sent if transfer.protocol is Protocol.UDP else sent.where(sent.tcp_flags & SYN != 0)
+    ports, first = np.unique(starts.sport, return_index=True)
     if len(ports) > 1:
-        waited = int((begun.sport != ports[first.argmax()]).sum())
-        return f"{format_count(waited, 'packet')} left for the transfer's port before its sender began"
+        delayed = int((starts.sport != ports[first.argmax()]).sum())
+        return f"{format_count(delayed, 'packet')} left for the transfer's port before its sender started"
     return None
 
 
-def _amounts(files: _Files, left_bytes: int, arrived_bytes: int, transfer: Transfer) -> Iterator[str]:
-    """Yield where captures hold more than was sent, or less than was received."""
-    if left_bytes > files.sent_bytes:
-        yield f"{left_bytes} bytes left the {transfer.source}, and {transfer.sent_file} has {files.sent_bytes}"
+def _amounts(files: _Files, captured_bytes: int, arrived_bytes: int, transfer: Transfer) -> Iterator[str]:
+    """Yield contradictions if captures contain more bytes than were sent, or fewer than were received."""
+    if captured_bytes > files.sent_bytes:
+        yield f"{captured_bytes} bytes left the {transfer.source}, but {transfer.sent_file} has {files.sent_bytes}"
     if files.received_bytes > arrived_bytes:
-        held = f"holds {arrived_bytes} bytes of the transfer"
+        captured = f"contains {arrived_bytes} bytes of the transfer"
         file = f"{transfer.received_file} has {files.received_bytes}"
-        yield f"the {transfer.destination}'s capture {held}, and {file}"
+        yield f"the {transfer.destination}'s capture {captured}, but {file}"
 
 
 def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer) -> Iterator[str]:
     both = transfer.forward(sender), transfer.forward(receiver)
-    # A capture also holds later fragments of what other programs send.
+    # A capture also contains later fragments of other programs' datagrams.
     ids = np.concatenate([packets.ip_id[packets.dport == transfer.port] for packets in both])
     sent, received = (
         packets.where((packets.dport == transfer.port) | (packets.dport == NO_PORT) & np.isin(packets.ip_id, ids))
         for packets in both
     )
     first, first_received = sent.dport == transfer.port, received.dport == transfer.port
-    keys, keys_received = _keys(sent), _keys(received)
-    if strange := int((~np.isin(keys_received[first_received], keys[first])).sum()):
-        yield f"{format_count(strange, 'datagram')} arrived that the {transfer.source}'s capture did not see leave"
+    keys, keys_received = _packet_keys(sent), _packet_keys(received)
+    if unsent := int((~np.isin(keys_received[first_received], keys[first])).sum()):
+        yield f"{format_count(unsent, 'datagram')} arrived without being in the {transfer.source}'s capture"
     if files is None:
         return
-    # What arrived is neither more than the first fragments announce, nor more than all of them carry.
+    # The arrived bytes are at most those announced by the first fragments, and at most those in all fragments.
     announced = received.udp_bytes[first_received]
     arrived_bytes = min(int(announced.sum()), int(received.ip_payload_bytes.sum())) - UDP_HEADER_BYTES * len(
         announced
     )
-    left_bytes = int((sent.udp_bytes[first] - UDP_HEADER_BYTES).sum())
-    yield from _amounts(files, left_bytes, arrived_bytes, transfer)
-    # Copies can make up for what is missing in sum, but not packet by packet. Of a fragment whose id is another
-    # transfer's, too, nobody says whose it is.
+    sent_bytes = int((sent.udp_bytes[first] - UDP_HEADER_BYTES).sum())
+    yield from _amounts(files, sent_bytes, arrived_bytes, transfer)
+    # Copies can compensate for missing packets in the sum, but not packet by packet. A later fragment whose id
+    # another transfer uses too cannot be assigned.
     others = np.concatenate(
         [packets.ip_id[(packets.dport != transfer.port) & (packets.dport != NO_PORT)] for packets in both]
     )
     certain = first | ~np.isin(sent.ip_id, others)
     missing = int((~np.isin(keys[certain], keys_received)).sum())
-    if missing and files.whole and files.received_bytes <= arrived_bytes:
-        lack = f"lacks {format_count(missing, 'packet')} of it"
-        yield f"{transfer.received_file} is whole, and the {transfer.destination}'s capture {lack}"
+    if missing and files.are_equal and files.received_bytes <= arrived_bytes:
+        missing_text = f"lacks {format_count(missing, 'packet')} of it"
+        yield f"{transfer.received_file} is complete, but the {transfer.destination}'s capture {missing_text}"
 
 
-def _keys(packets: Packets) -> Keys:
-    """Return a number of each packet that both ends see alike, and hardly in another one."""
-    return mixed(packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes, packets.sport + 1)
+def _packet_keys(packets: Packets) -> Keys:
+    """Return a key per packet that is equal at both ends and practically unique."""
+    return row_hashes(packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes, packets.sport + 1)
 
 
 def _tcp(
     sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer, *, finished: bool
 ) -> Iterator[str]:
-    left, came = (
+    sent, received = (
         packets.where(packets.dport == transfer.port)
         for packets in (transfer.forward(sender), transfer.forward(receiver))
     )
-    answered, answered_there = (
+    answers_received, answers_sent = (
         packets.where(packets.sport == transfer.port)
         for packets in (transfer.backward(sender), transfer.backward(receiver))
     )
-    if _refused(left, answered):
-        yield f"the {transfer.destination} refused the connection: nobody listened when the {transfer.source} began"
+    if _is_refused(sent, answers_received):
+        what = f"the {transfer.destination} refused the connection"
+        yield f"{what}: no program listened when the {transfer.source} started"
         return
-    begun = {transfer.source: Connections.begun(left), transfer.destination: Connections.begun(came)}
-    loaded = np.unique(came.sport[came.tcp_payload_bytes > 0])
-    seen = {role: connections.have(loaded) for role, connections in begun.items()}
-    for role, mask in seen.items():
-        # What neither saw begin is what the kernel still repeats of an earlier transfer.
-        if (~mask & np.logical_or(*seen.values())).any():
-            yield f"bytes arrived by a connection whose beginning is not in the {role}'s capture"
+    connections_by_role = {
+        transfer.source: Connections.from_syn(sent),
+        transfer.destination: Connections.from_syn(received),
+    }
+    data_ports = np.unique(received.sport[received.tcp_payload_bytes > 0])
+    has_syn = {role: connections.includes(data_ports) for role, connections in connections_by_role.items()}
+    for role, mask in has_syn.items():
+        # If the SYN is in neither capture, these are retransmissions of an earlier transfer.
+        if (~mask & np.logical_or(*has_syn.values())).any():
+            yield f"bytes arrived on a connection whose SYN is not in the {role}'s capture"
             return
-    connections = begun[transfer.source]
-    if strange := connections.payload(came).beyond(connections.payload(left)):
-        yield f"{format_count(strange, 'byte')} arrived that the {transfer.source}'s capture did not see leave"
-    answers = Packets.joined((answered, answered_there))
+    connections = connections_by_role[transfer.source]
+    if unsent := connections.payload(received).bytes_not_in(connections.payload(sent)):
+        yield f"{format_count(unsent, 'byte')} arrived without being in the {transfer.source}'s capture"
+    answers = Packets.concatenated((answers_received, answers_sent))
     acknowledged = connections.acknowledged(answers)
-    for frames, role in ((left, transfer.source), (came, transfer.destination)):
-        if missing := acknowledged.beyond(connections.numbers(frames)):
+    for frames, role in ((sent, transfer.source), (received, transfer.destination)):
+        if missing := acknowledged.bytes_not_in(connections.numbers(frames)):
             yield f"{format_count(missing, 'byte')} were acknowledged that are not in the {role}'s capture"
     if files is None:
         return
-    arrived_bytes = connections.payload(came).size_bytes
-    yield from _amounts(files, connections.payload(left).size_bytes, arrived_bytes, transfer)
-    ended = not connections.numbers(left).beyond(acknowledged)
-    # A kernel refuses the rest with a reset where a program stops reading before the end.
+    arrived_bytes = connections.payload(received).size_bytes
+    yield from _amounts(files, connections.payload(sent).size_bytes, arrived_bytes, transfer)
+    ended = not connections.numbers(sent).bytes_not_in(acknowledged)
+    # If a program stops reading before the end, the kernel rejects the rest with a reset.
     refused = (answers.tcp_flags & RST != 0).any()
     if finished and (ended or refused) and files.received_bytes < arrived_bytes:
-        what = f"{arrived_bytes} bytes arrived, and {transfer.received_file} has {files.received_bytes}"
-        yield f"{what}, though its listener ended as if it had them all"
+        arrived = f"{arrived_bytes} bytes arrived, but {transfer.received_file} has {files.received_bytes}"
+        yield f"{arrived}, although its listener ended normally"
 
 
-def _refused(left: Packets, answers: Packets) -> bool:
-    """Return whether the first call of a sender was refused, and none accepted; a lost one is the link's work."""
+def _is_refused(sent: Packets, answers: Packets) -> bool:
+    """Return True if the sender's only SYN was refused and none accepted; a repeated SYN may be due to the link."""
     resets = answers.where(answers.tcp_flags & RST != 0)
     if not len(resets) or (answers.tcp_flags & SYN != 0).any():
         return False
-    calls = left.where((left.tcp_flags & SYN != 0) & (left.time_ns <= resets.time_ns.min()))
-    return len(calls) == 1
+    syn_packets = sent.where((sent.tcp_flags & SYN != 0) & (sent.time_ns <= resets.time_ns.min()))
+    return len(syn_packets) == 1

@@ -1,7 +1,8 @@
-"""Contradictions within the output of ping, and between it and captures around it.
+"""Contradictions within the output of ping, and between the output and captures.
 
 Round-trip times of iputils' ping differed from captured ones by -0.03 to 0.9 ms, the median by less than 0.1 ms, on a
-busy machine with 2 cores. busybox takes the time of a reply when it wakes up, iputils has it from the kernel.
+busy machine with 2 cores. busybox reads the time of a reply when its process resumes, iputils gets it from the
+kernel.
 """
 
 from collections.abc import Iterator
@@ -14,43 +15,43 @@ from fieldkit.measure.evidence.ping import Ping, Reply
 from fieldkit.measure.transfers.echoes import CapturedPing
 
 _ROUNDING: Final = 0.006
-"""ping prints three digits."""
-_EARLIER_S: Final = 0.000_2
-_LATER_S: Final = 0.020
-"""One reply: how much longer than in the capture, because something kept ping from running."""
-_MEDIAN_LATER_S: Final = 0.001
-_BUSYBOX_TIMES: Final = 5
-"""How much more busybox may be late."""
-_PRINTED_S: Final = 1.0
-_MEDIAN_PRINTED_S: Final = 0.05
-_WRAPS: Final = 0xFFFF
-_STILL_THERE: Final = 0.9
-"""After its last request ping waits for its interval at least, less what a timer may be early."""
+"""Rounding error: ping prints three digits."""
+_MAX_EARLIER_S: Final = 0.000_2
+_MAX_LATER_S: Final = 0.020
+"""Limit of the excess of a single round-trip time over the captured one: ping's process may be delayed."""
+_MAX_MEDIAN_LATER_S: Final = 0.001
+_BUSYBOX_FACTOR: Final = 5
+"""busybox's ping may be later by this factor."""
+_MAX_PRINT_DELAY_S: Final = 1.0
+_MAX_MEDIAN_PRINT_DELAY_S: Final = 0.05
+_MAX_SEQUENCE: Final = 0xFFFF
+_WAIT_SHARE: Final = 0.9
+"""Share of the interval that ping waits after its last request: a timer may fire early."""
 _UNREAD_S: Final = 0.1
-"""It may end before it reads a reply that came, if something kept it from running."""
-_CLOCK_S: Final = 1.0
+"""ping may end before it reads a reply that arrived within this time."""
+_CLOCK_SLACK_S: Final = 1.0
 
 CROSS_CHECKS: Final = (
     CrossCheck(
         "requests and replies",
         ("rtt_sent", "rtt_received", "rtt_loss", "rtt_gap_lost*"),
         "`ping.txt`: reply lines and summary",
-        ("the procedure: count", "each capture: echoes by sequence number", "the same file: summary beside lines"),
+        ("the procedure: count", "each capture: echoes by sequence number", "the same file: summary and lines"),
         "a reply in the last 0.1 s of ping, or later than one interval after the last request",
     ),
     CrossCheck(
         "round-trip time of each reply",
         ("rtt_*_s", "paper_delay_s", "paper_transfer_s"),
         "`ping.txt`: `time=`",
-        ("sender's capture: request to whole reply", "the same file: min/avg/max"),
-        "0.6 % (3 digits) and 20 ms in one reply, 1 ms in the median (busybox 5 times as much): a busy robot",
+        ("sender's capture: request to complete reply", "the same file: min/avg/max"),
+        "0.6 % (3 digits), and 20 ms for one reply, 1 ms for the median (5 times that for busybox): a busy robot",
     ),
     CrossCheck(
-        "moment of each reply",
+        "time of each reply",
         ("rtt_gap_s", "rtt_gap_at_least_s", "rtt_distance_*", "rtt_*_speed_m_s"),
         "`ping.txt`: time stamps in brackets",
         ("sender's capture: time of the reply", "the robot's clock before and after"),
-        "1 s for one reply, 50 ms in the median, because ping stamps what it prints",
+        "1 s for one reply, 50 ms for the median, because ping prints the time of printing",
     ),
     CrossCheck(
         "payload of a request",
@@ -62,102 +63,108 @@ CROSS_CHECKS: Final = (
 )
 
 
-def within(said: Ping, count: int, payload_bytes: int, window: tuple[int, int] | None) -> Iterator[str]:
-    """Yield the contradictions within the output, and with what was asked.
+def within(output: Ping, count: int, payload_bytes: int, window: tuple[int, int] | None) -> Iterator[str]:
+    """Yield the contradictions within the output and its differences from the procedure.
 
     Args:
-        said: The output.
-        count: Requests that the procedure asks for.
-        payload_bytes: Payload that it asks for.
+        output: The output.
+        count: Number of requests in the procedure.
+        payload_bytes: Payload in the procedure.
         window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
     """
-    if said.transmitted is not None and said.transmitted > count:
-        yield f"ping sent {said.transmitted} requests of {count}"
-    if said.payload_bytes is not None and said.payload_bytes != payload_bytes:
-        yield f"ping sent {said.payload_bytes} bytes, and {payload_bytes} were asked for"
-    last = None if said.transmitted is None else said.first_seq + said.transmitted - 1
-    strange = [reply.seq for reply in said.replies if last is not None and not said.first_seq <= reply.seq <= last]
-    if strange and last is not None and last <= _WRAPS:
-        yield f"ping has an answer to request {strange[0]} of {said.transmitted}"
-    yield from _summary(said)
-    moments = [reply.at_utc_ns for reply in said.replies if reply.at_utc_ns is not None]
+    if output.transmitted is not None and output.transmitted > count:
+        yield f"ping sent {output.transmitted} requests instead of {count}"
+    if output.payload_bytes is not None and output.payload_bytes != payload_bytes:
+        yield f"ping sent {output.payload_bytes} bytes instead of {payload_bytes}"
+    last = None if output.transmitted is None else output.first_seq + output.transmitted - 1
+    unexpected = [
+        reply.seq for reply in output.replies if last is not None and not output.first_seq <= reply.seq <= last
+    ]
+    if unexpected and last is not None and last <= _MAX_SEQUENCE:
+        yield f"ping has a reply to request {unexpected[0]} of {output.transmitted}"
+    yield from _summary(output)
+    moments = [reply.at_utc_ns for reply in output.replies if reply.at_utc_ns is not None]
     if window is not None and moments:
-        slack_ns = round(1e9 * _CLOCK_S)
+        slack_ns = round(1e9 * _CLOCK_SLACK_S)
         if min(moments) < window[0] - slack_ns or max(moments) > window[1] + slack_ns:
-            yield "ping has an answer from before or after the attempt, by the robot's clock"
+            yield "ping has a reply from before or after the attempt, by the robot's clock"
 
 
-def _summary(said: Ping) -> Iterator[str]:
-    times_s = [reply.rtt_s for reply in said.replies if reply.rtt_s is not None and not reply.damaged]
-    if said.summary_s is None or not times_s:
+def _summary(output: Ping) -> Iterator[str]:
+    times_s = [reply.rtt_s for reply in output.replies if reply.rtt_s is not None and not reply.damaged]
+    if output.summary_s is None or not times_s:
         return
-    of_lines = min(times_s), sum(times_s) / len(times_s), max(times_s)
-    for name, summed_s, printed_s in zip(("shortest", "mean", "longest"), said.summary_s, of_lines, strict=True):
+    line_times_s = min(times_s), sum(times_s) / len(times_s), max(times_s)
+    for name, summed_s, printed_s in zip(
+        ("shortest", "mean", "longest"), output.summary_s, line_times_s, strict=True
+    ):
         if abs(summed_s - printed_s) > _ROUNDING * max(summed_s, printed_s) + 2e-6:
-            beside = f"and its lines {1e3 * printed_s:.3f} ms"
-            yield f"ping's summary has {1e3 * summed_s:g} ms as the {name} time, {beside}"
+            in_lines = f"but its lines {1e3 * printed_s:.3f} ms"
+            yield f"ping's summary has {1e3 * summed_s:g} ms as the {name} time, {in_lines}"
 
 
-def beside(said: Ping, captured: CapturedPing, interval_s: float, role: str, *, asks: bool) -> Iterator[str]:
+def beside(output: Ping, captured: CapturedPing, interval_s: float, role: str, *, asks: bool) -> Iterator[str]:
     """Yield the contradictions between the output and one ping in a capture.
 
     Args:
-        said: The output.
+        output: The output.
         captured: The echoes of one identifier.
-        interval_s: Time from one request to the next.
-        role: Whose capture.
-        asks: Whether this robot pings; else it answers, and sees when replies leave.
+        interval_s: Time between requests.
+        role: Role of the capturing robot.
+        asks: True if this robot sends the requests; otherwise its capture has the replies as it sends them.
     """
-    if said.transmitted is None or said.transmitted > _WRAPS:
+    if output.transmitted is None or output.transmitted > _MAX_SEQUENCE:
         return
-    if len(captured.requested_ns) > said.transmitted:
-        yield f"ping sent {said.transmitted} requests, and the {role}'s capture holds {len(captured.requested_ns)}"
-    answers = {reply.seq: reply for reply in said.answers}
-    unseen = sorted(answers.keys() - (captured.requested_ns.keys() & captured.replied_ns.keys()))
-    if unseen:
-        yield f"ping has an answer to request {unseen[0]}, and the {role}'s capture does not hold both"
+    if len(captured.requested_ns) > output.transmitted:
+        yield f"ping sent {output.transmitted} requests, but the {role}'s capture has {len(captured.requested_ns)}"
+    answers = {reply.seq: reply for reply in output.answers}
+    not_captured = sorted(answers.keys() - (captured.requested_ns.keys() & captured.replied_ns.keys()))
+    if not_captured:
+        yield f"ping has a reply to request {not_captured[0]}, but the {role}'s capture lacks request or reply"
     if not asks:
         return
-    yield from _unprinted(said, captured, interval_s, role)
-    both = [reply for seq, reply in answers.items() if seq not in unseen]
-    yield from _times(said, both, captured, role)
+    yield from _unprinted_replies(output, captured, interval_s, role)
+    captured_replies = [reply for seq, reply in answers.items() if seq not in not_captured]
+    yield from _time_problems(output, captured_replies, captured, role)
 
 
-def _unprinted(said: Ping, captured: CapturedPing, interval_s: float, role: str) -> Iterator[str]:
-    """Yield whether replies reached the robot while its ping ran, and it did not print them."""
+def _unprinted_replies(output: Ping, captured: CapturedPing, interval_s: float, role: str) -> Iterator[str]:
+    """Yield a contradiction if replies reached the robot while its ping ran, and are not in the output."""
     if not captured.requested_ns:
         return
-    until_ns = max(captured.requested_ns.values()) + round(1e9 * (_STILL_THERE * interval_s - _UNREAD_S))
-    printed = {reply.seq for reply in said.replies}
+    until_ns = max(captured.requested_ns.values()) + round(1e9 * (_WAIT_SHARE * interval_s - _UNREAD_S))
+    printed = {reply.seq for reply in output.replies}
     missing = [
         seq
         for seq, at_ns in captured.replied_ns.items()
         if seq not in printed and seq in captured.requested_ns and at_ns <= until_ns
     ]
     if missing:
-        what = format_count(len(missing), "answer")
-        yield f"the {role}'s capture holds {what} that ping did not print, to request {min(missing)} first"
+        replies = format_count(len(missing), "answer")
+        yield f"the {role}'s capture has {replies} that ping did not print, the first to request {min(missing)}"
 
 
-def _times(said: Ping, answers: list[Reply], captured: CapturedPing, role: str) -> Iterator[str]:
-    later_s, printed_s = [], []
-    busy = _BUSYBOX_TIMES if said.first_seq == 0 else 1
+def _time_problems(output: Ping, answers: list[Reply], captured: CapturedPing, role: str) -> Iterator[str]:
+    excess_s, print_delay_s = [], []
+    factor = _BUSYBOX_FACTOR if output.first_seq == 0 else 1
     for reply in answers:
         replied_ns = captured.replied_ns[reply.seq]
         if reply.rtt_s is not None:
-            seen_s = (replied_ns - captured.requested_ns[reply.seq]) / 1e9
-            more_s, rounding_s = reply.rtt_s - seen_s, _ROUNDING * seen_s
-            if not -_EARLIER_S - rounding_s <= more_s <= busy * _LATER_S + rounding_s:
-                took = f"took {1e3 * reply.rtt_s:g} ms, and in the {role}'s capture {1e3 * seen_s:.3f} ms"
-                yield f"answer {reply.seq} {took}"
+            captured_s = (replied_ns - captured.requested_ns[reply.seq]) / 1e9
+            difference_s, rounding_s = reply.rtt_s - captured_s, _ROUNDING * captured_s
+            if not -_MAX_EARLIER_S - rounding_s <= difference_s <= factor * _MAX_LATER_S + rounding_s:
+                times = f"took {1e3 * reply.rtt_s:g} ms, but {1e3 * captured_s:.3f} ms in the {role}'s capture"
+                yield f"reply {reply.seq} {times}"
                 return
-            later_s.append(more_s - rounding_s)
+            excess_s.append(difference_s - rounding_s)
         if reply.at_utc_ns is not None:
-            printed_s.append((reply.at_utc_ns - replied_ns) / 1e9)
-    if later_s and median(later_s) > busy * _MEDIAN_LATER_S:
-        yield f"its times are {1e3 * median(later_s):.1f} ms longer than in the {role}'s capture, in the median"
-    if printed_s and (min(printed_s) < -_EARLIER_S or max(printed_s) > _PRINTED_S):
-        worst_s = min(printed_s) if min(printed_s) < -_EARLIER_S else max(printed_s)
-        yield f"an answer has a time stamp {worst_s:.3f} s after it came, by the {role}'s capture"
-    elif printed_s and median(printed_s) > _MEDIAN_PRINTED_S:
-        yield f"its time stamps are {median(printed_s):.3f} s after the answers came, by the {role}'s capture"
+            print_delay_s.append((reply.at_utc_ns - replied_ns) / 1e9)
+    if excess_s and median(excess_s) > factor * _MAX_MEDIAN_LATER_S:
+        median_ms = 1e3 * median(excess_s)
+        yield f"the median of its times is {median_ms:.1f} ms longer than in the {role}'s capture"
+    if print_delay_s and (min(print_delay_s) < -_MAX_EARLIER_S or max(print_delay_s) > _MAX_PRINT_DELAY_S):
+        worst_s = min(print_delay_s) if min(print_delay_s) < -_MAX_EARLIER_S else max(print_delay_s)
+        yield f"a reply has a time stamp {worst_s:.3f} s after its arrival in the {role}'s capture"
+    elif print_delay_s and median(print_delay_s) > _MAX_MEDIAN_PRINT_DELAY_S:
+        median_s = median(print_delay_s)
+        yield f"its time stamps are {median_s:.3f} s later than in the {role}'s capture, in the median"

@@ -1,4 +1,4 @@
-"""Contradictions in the logs of a topic: with the procedure, with the time of the attempt, and between the two ends.
+"""Contradictions between the logs of a topic and the procedure, the time of the attempt, and each other.
 
 `topic_captures` compares the same logs with the captures.
 """
@@ -15,31 +15,31 @@ from fieldkit.core.units import format_count
 from fieldkit.measure.transfers import topic_log
 from fieldkit.measure.transfers.topic_log import TopicLog
 
-SLEW_NS: Final = 1_000_000
-"""Difference of two times that one program took one after the other and that a slewed clock may show reversed."""
+MAX_SLEW_NS: Final = 1_000_000
+"""Largest difference by which two consecutive times of one program may be reversed by a slewed clock."""
 
 SETTLES_NS: Final = 500_000_000
-"""Least time between the record of the match and the first sample (`fieldkit.agent.stream.SETTLES_S`)."""
+"""Minimum time between the record of the match and the first sample (`fieldkit.agent.stream.SETTLES_S`)."""
 
 PADDING_BYTES: Final = 3
-"""DDS fills a sample to words of 4 bytes, and some implementations do not say so."""
+"""DDS pads a sample to a multiple of 4 bytes, and some implementations do not report this."""
 
 _NAMES: Final = {topic_log.PUBLISHER: "publisher", topic_log.SUBSCRIBER: "subscriber"}
 
 
 @dataclass(frozen=True)
 class TopicPlan:
-    """What a procedure asks of a topic.
+    """Settings of a topic in a procedure.
 
     Attributes:
         topic: Its name.
-        samples: Samples that the publisher offers, skipped ones included.
-        size_bytes: Data of a sample.
-        envelope_bytes: What serialization adds to the data.
-        reliable: Whether samples are sent again until they arrive.
-        depth: Samples that a subscriber keeps until its program takes them; None for all.
-        in_order: Whether one thread of the subscriber's program takes all samples.
-        on_ports: Whether all packets of the topic have the ports that the procedure expects.
+        samples: Number of samples that the publisher offers, including skipped ones.
+        size_bytes: Data bytes of a sample.
+        envelope_bytes: Bytes that serialization adds to the data.
+        reliable: True if samples are retransmitted until they arrive.
+        depth: Number of samples that a subscriber queues until its program reads them; None for all.
+        in_order: True if one thread of the subscriber's program reads all samples.
+        on_ports: True if all packets of the topic use the ports that the procedure expects.
     """
 
     topic: str
@@ -52,36 +52,36 @@ class TopicPlan:
     on_ports: bool
 
 
-def of_logs(plan: TopicPlan, sent: TopicLog, came: TopicLog) -> Iterator[str]:
-    """Yield what cannot be true of the two logs of one stream, a sentence each.
+def of_logs(plan: TopicPlan, sent: TopicLog, received: TopicLog) -> Iterator[str]:
+    """Yield each contradiction in the two logs of one stream as a sentence.
 
     Args:
-        plan: What was asked for.
-        sent: What the publisher wrote down, whole.
-        came: What the subscriber wrote down, whole.
+        plan: Settings of the procedure.
+        sent: Complete log of the publisher.
+        received: Complete log of the subscriber.
     """
-    yield from _of_the_end(plan, sent, topic_log.PUBLISHER)
-    yield from _of_the_end(plan, came, topic_log.SUBSCRIBER)
-    yield from _of_publisher(plan, sent)
-    yield from _of_sizes(plan, came, PADDING_BYTES, "subscriber")
-    if plan.in_order and (back_s := _back_s(came)):
-        yield f"a sample in the subscriber's log is {back_s:.3f} s earlier than the one before it"
-    samples, arrived = sent.samples, came.samples
+    yield from _wrong_end(plan, sent, topic_log.PUBLISHER)
+    yield from _wrong_end(plan, received, topic_log.SUBSCRIBER)
+    yield from _publisher_problems(plan, sent)
+    yield from _wrong_sizes(plan, received, PADDING_BYTES, "subscriber")
+    if plan.in_order and (reversed_s := _reversed_s(received)):
+        yield f"a sample in the subscriber's log is {reversed_s:.3f} s earlier than the previous one"
+    samples, arrived = sent.samples, received.samples
     if unsent := int((~np.isin(arrived.sequence, sent.numbers)).sum()):
         yield f"{format_count(unsent, 'sample')} arrived with numbers that the publisher's log does not have"
-    _, left, index = np.intersect1d(samples.sequence, arrived.sequence, return_indices=True)
-    if (samples.sent_ns[left] != arrived.sent_ns[index]).any():
+    _, sent_index, received_index = np.intersect1d(samples.sequence, arrived.sequence, return_indices=True)
+    if (samples.sent_ns[sent_index] != arrived.sent_ns[received_index]).any():
         yield "samples arrived that the publisher did not send: another stream has the same topic and domain"
-    if len(left) > 1 and (samples.at_ns[left] == arrived.at_ns[index]).all():
+    if len(sent_index) > 1 and (samples.at_ns[sent_index] == arrived.at_ns[received_index]).all():
         yield "the subscriber's log is a copy of the publisher's"
 
 
 def of_window(logs: Mapping[Role, TopicLog], windows: Mapping[Role, tuple[int, int] | None]) -> Iterator[str]:
-    """Yield which log has records from before the attempt or after it, by the clock of its robot.
+    """Yield the logs with records from before or after the attempt, by the clock of the robot.
 
     Args:
-        logs: By role.
-        windows: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if it is not known.
+        logs: Logs by role.
+        windows: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
     """
     for role, log in logs.items():
         window = windows.get(role)
@@ -90,57 +90,57 @@ def of_window(logs: Mapping[Role, TopicLog], windows: Mapping[Role, tuple[int, i
         early_s = (window[0] - int(log.times_ns.min())) / 1e9
         late_s = (int(log.times_ns.max()) - window[1]) / 1e9
         if early_s > 0:
-            yield f"the {role}'s topic log has a record of {early_s:.3f} s before the attempt, by the robot's clock"
+            yield f"the {role}'s topic log has a record from {early_s:.3f} s before the attempt, by the robot's clock"
         if late_s > 0:
-            yield f"the {role}'s topic log has a record of {late_s:.3f} s after the attempt, by the robot's clock"
+            yield f"the {role}'s topic log has a record from {late_s:.3f} s after the attempt, by the robot's clock"
 
 
-def _of_the_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
-    """Yield why a log is of another end of a topic, or of another topic."""
+def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
+    """Yield a contradiction if a log is from the other end of the topic, or from another topic."""
     name = _NAMES[end]
     if log.end is not None and log.end != end:
         yield f"the {name}'s log was written by the {_NAMES.get(log.end, 'unknown end')} of the topic"
     if log.topic_sum is not None and log.topic_sum != zlib.crc32(plan.topic.encode()):
         yield f"the {name}'s log is of another topic than {plan.topic}"
-    once = (log.kinds.get(topic_log.BEGUN) == 1, log.kinds.get(topic_log.MATCHED, 0) <= 1)
-    foreign = (topic_log.FOREIGN,) if end == topic_log.PUBLISHER else (topic_log.REFUSED, topic_log.SKIPPED)
-    if not all(once) or any(log.kinds.get(kind) for kind in foreign):
+    has_valid_count = (log.kinds.get(topic_log.BEGUN) == 1, log.kinds.get(topic_log.MATCHED, 0) <= 1)
+    unexpected_kinds = (topic_log.FOREIGN,) if end == topic_log.PUBLISHER else (topic_log.REFUSED, topic_log.SKIPPED)
+    if not all(has_valid_count) or any(log.kinds.get(kind) for kind in unexpected_kinds):
         yield f"the {name}'s log has records that no {name} writes"
     times_ns = log.times_ns
-    if len(times_ns) and (times_ns.min() < times_ns[0] - SLEW_NS or times_ns.max() > times_ns[-1] + SLEW_NS):
-        yield f"the {name}'s log has records from before its beginning or after its end"
+    if len(times_ns) and (times_ns.min() < times_ns[0] - MAX_SLEW_NS or times_ns.max() > times_ns[-1] + MAX_SLEW_NS):
+        yield f"the {name}'s log has records from before its start or after its end"
     if len(log.samples) and log.matched_ns is None:
-        yield f"the {name}'s log has samples, and the other end was never known"
+        yield f"the {name}'s log has samples, but the other end was never discovered"
 
 
-def _of_publisher(plan: TopicPlan, sent: TopicLog) -> Iterator[str]:
-    """Yield what no publisher writes."""
+def _publisher_problems(plan: TopicPlan, sent: TopicLog) -> Iterator[str]:
+    """Yield properties of a log that no publisher writes."""
     samples, numbers = sent.samples, sent.numbers
     if (numbers != np.arange(len(numbers))).any():
         yield "the publisher's log does not number its samples from 0 on without a gap"
     offered = len(numbers) + sent.skipped
     if sent.matched_ns is not None and offered != plan.samples:
-        yield f"the publisher's log accounts for {offered} of {format_count(plan.samples, 'sample')}"
-    yield from _of_sizes(plan, sent, 0, "publisher")
-    if len(samples) and (samples.at_ns < samples.sent_ns - SLEW_NS).any():
-        yield "the publisher's log has a sample that the middleware took before it was made"
-    if (np.diff(sent.times_ns) < -SLEW_NS).any() or (np.diff(samples.sent_ns) < -SLEW_NS).any():
+        yield f"the publisher's log accounts for {offered} instead of {format_count(plan.samples, 'sample')}"
+    yield from _wrong_sizes(plan, sent, 0, "publisher")
+    if len(samples) and (samples.at_ns < samples.sent_ns - MAX_SLEW_NS).any():
+        yield "the publisher's log has a sample that the middleware accepted before it was created"
+    if (np.diff(sent.times_ns) < -MAX_SLEW_NS).any() or (np.diff(samples.sent_ns) < -MAX_SLEW_NS).any():
         yield "the records of the publisher's log are not in the order of time"
     if len(samples) and sent.matched_ns is not None:
         early_ns = sent.matched_ns + SETTLES_NS - int(samples.sent_ns[0])
-        if early_ns > SLEW_NS:
-            yield f"the publisher's log has its first sample {early_ns / 1e9:.3f} s too soon after the subscription"
+        if early_ns > MAX_SLEW_NS:
+            yield f"the publisher's log has its first sample {early_ns / 1e9:.3f} s too early after the subscription"
 
 
-def _of_sizes(plan: TopicPlan, log: TopicLog, padding_bytes: int, name: str) -> Iterator[str]:
+def _wrong_sizes(plan: TopicPlan, log: TopicLog, padding_bytes: int, name: str) -> Iterator[str]:
     size_bytes = plan.size_bytes + plan.envelope_bytes
     sizes = log.samples.size_bytes
-    if wrong := int(((sizes < size_bytes) | (sizes > size_bytes + padding_bytes)).sum()):
-        what = f"{format_count(wrong, 'sample')} of another size than {size_bytes} bytes"
-        yield f"the {name}'s log has {what}"
+    if count := int(((sizes < size_bytes) | (sizes > size_bytes + padding_bytes)).sum()):
+        samples = f"{format_count(count, 'sample')} with a size other than {size_bytes} bytes"
+        yield f"the {name}'s log has {samples}"
 
 
-def _back_s(log: TopicLog) -> float:
-    """Return by how much a sample is earlier than the one before it at most; 0 if none is."""
-    back_ns = -int(np.diff(log.samples.at_ns).min(initial=0))
-    return back_ns / 1e9 if back_ns > SLEW_NS else 0.0
+def _reversed_s(log: TopicLog) -> float:
+    """Return the largest time by which a sample is earlier than the previous one; 0 if none is."""
+    reversed_ns = -int(np.diff(log.samples.at_ns).min(initial=0))
+    return reversed_ns / 1e9 if reversed_ns > MAX_SLEW_NS else 0.0

@@ -1,17 +1,17 @@
-"""Sources of the quantities of a topic, and the checks between them."""
+"""Sources of the columns of a topic, and the checks between them."""
 
 from typing import Final
 
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 
-_OWN_FILE: Final = "its own checksum and count of samples"
+_SAME_FILE: Final = "the same file: checksum and count of samples"
 
 CROSS_CHECKS: Final = (
     CrossCheck(
         "samples sent",
         ("topic_sent", "topic_refused", "topic_skipped", "topic_loss"),
         "`ROLE-topic.bin` of the publisher: samples",
-        ("the rate and duration of the procedure", "the publisher's capture: heads of samples", _OWN_FILE),
+        ("the rate and duration of the procedure", "the publisher's capture: heads of samples", _SAME_FILE),
         "none: every number from 0 on is sent, refused or skipped; a sample in the capture is in the log",
     ),
     CrossCheck(
@@ -21,10 +21,10 @@ CROSS_CHECKS: Final = (
         (
             "the publisher's log: numbers, sizes and times of sending",
             "the subscriber's capture: heads, packets and bytes of samples",
-            _OWN_FILE,
+            _SAME_FILE,
         ),
-        "a sample that arrived may be missing if the subscriber's queue overflowed, if one before it is missing and "
-        "the middleware keeps the order, or within 0.3 s of the match or of the end",
+        "a sample that arrived may be missing if the subscriber's queue overflowed, if an earlier one is missing and "
+        "the middleware preserves the order, or within 0.3 s of the match or of the end",
     ),
     CrossCheck(
         "time of sending of each sample",
@@ -41,26 +41,26 @@ CROSS_CHECKS: Final = (
         "no record is earlier than its packet; the fastest is at most 5 ms later (20 ms if there are fewer than 20)",
     ),
     CrossCheck(
-        "share of the subscriber's program in the delay",
+        "delay added by the subscriber's program",
         ("topic_delay_*", "topic_age_*", "topic_jitter_s", "topic_deadline_misses"),
         "`ROLE-topic.bin` of the subscriber: time of the record",
         ("the subscriber's capture: time of the packet with the sample",),
-        "up to 20 ms, or a tenth of the figure: a busy robot holds single samples back",
+        "up to 20 ms, or a tenth of the figure: a busy robot delays single samples",
         CheckOutcome.WITHHELD,
     ),
     CrossCheck(
         "discovery",
         ("topic_discovered", "topic_discovery_s"),
-        "`ROLE-topic.bin` of the publisher: begin and match",
+        "`ROLE-topic.bin` of the publisher: start and match",
         ("the robot's clock around the attempt", "the first sample, 0.5 s after the match"),
-        "a first sample up to 0.1 s late, as a busy robot may be; later, the time of discovery is withheld",
+        "a first sample that is up to 0.1 s late, as on a busy robot; if it is later, the discovery time is withheld",
     ),
     CrossCheck(
-        "completeness of the captures of a topic",
+        "completeness of a topic's captures",
         ("topic_capture_withheld",),
         "`ROLE-capture.log`: packets dropped before tcpdump",
-        ("`ROLE.pcap`: number of packets, which the log counts, too",),
-        "none: with a packet dropped, all columns that need the captures are empty; those of the logs are kept",
+        ("`ROLE.pcap`: number of packets, which is in the log too",),
+        "none: if a packet was dropped, all columns that need the captures are empty; those of the logs remain",
         CheckOutcome.WITHHELD,
     ),
     CrossCheck(
@@ -68,7 +68,7 @@ CROSS_CHECKS: Final = (
         ("topic_data_*", "topic_discovery_packets", "topic_discovery_bytes", "topic_packet_loss"),
         "the captures: packets of its ports",
         (),
-        "the logs bound the packets of data from below; discovery is seen by the captures alone",
+        "the logs give a lower bound of the data packets; only the captures contain discovery",
         CheckOutcome.UNCHECKED,
     ),
 )

@@ -1,1 +1,1 @@
-"""Positions of robots as they really were: who told them, paths over time, columns."""
+"""True positions of robots: their sources, trajectories over time, and the columns computed from them."""

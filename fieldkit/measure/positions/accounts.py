@@ -1,6 +1,7 @@
-"""Accounts of where robots were: who tells it of each, as `positions.json` of an attempt or of a whole trial says.
+"""Sources of robots' positions, as stored in `positions.json` of an attempt or of a whole trial.
 
-Steps that follow robots write the former, `fieldkit positions` the latter, which counts where both tell of one robot.
+Steps that follow robots write the attempt's file, `fieldkit positions` the trial's. If both have the position of one
+robot, the trial's file takes precedence.
 """
 
 import json
@@ -21,30 +22,30 @@ from fieldkit.measure.positions.samples import PLACED
 
 FILE: Final = laptop_files.POSITIONS
 Place = tuple[float, float, float | None]
-"""Metres along three axes, or degrees north and east and metres up; None where no height is told."""
+"""Metres along three axes, or latitude and longitude in degrees and height in metres; the height may be None."""
 GAP_S: Final = 3.0
-"""Between samples further apart nobody knows where a robot was, unless somebody says another bound: a receiver of
-satellites that tells its place once a second has missed two."""
+"""Default for the longest time between two samples over which a position is interpolated. A satellite receiver that
+reports once a second has then missed two positions."""
 
 
 @dataclass(frozen=True)
 class Account:
-    """Who tells where one robot was: a place in which it stood, or a file.
+    """Source of one robot's position: a fixed place or a file.
 
     Attributes:
-        place: Where it stood; None where a file tells.
-        frame: What the place is in.
-        file: Beside `positions.json`: a bag, GPX, or CSV.
-        topic: In a bag, what tells.
-        child: In a tree of transforms, the robot's frame.
-        stamps: `header`, messages say when they were true; `received`, they were when the recorder had them.
-        offset_s: Added to the times of the file it makes them the laptop's; of a bag the robot's clock tells.
-        gap_s: Longest time between two samples in which the robot went straight.
-        start: Of odometry, where the robot was when it began.
-        heading_rad: And where it faced, from the frame's first axis towards its second; None where nobody says.
-        began_utc_ns: And when that was, by the laptop's clock.
-        clock: Role of the robot by whose clock the times are; empty for the robot itself.
-        system: In a telemetry log, the system id of the autopilot that tells; 0 for the only one.
+        place: Fixed place; None if a file is the source.
+        frame: Frame of the place.
+        file: Path next to `positions.json`: a bag, telemetry log, GPX or CSV file.
+        topic: Topic in a bag, or message type in a telemetry log.
+        child: Child frame of the robot in a tree of transforms.
+        stamps: `header` for the time stamps in messages, `received` for the recorder's times of reception.
+        offset_s: Added to the times of a GPX or CSV file to get the laptop's; times in a bag are the robot's.
+        gap_s: Longest time between two samples over which the position is interpolated.
+        start: Place of the robot at the start of odometry.
+        heading_rad: Heading at the start of odometry, from the frame's first axis towards its second; may be None.
+        began_utc_ns: Start of odometry by the laptop's clock.
+        clock: Role of the robot whose clock gives the times; empty for the robot itself.
+        system: MAVLink system id of the autopilot in a telemetry log; 0 if the log has only one.
     """
 
     place: Place | None = None
@@ -62,8 +63,8 @@ class Account:
     system: int = 0
 
     @property
-    def in_words(self) -> str:
-        """Who tells it: `/odom`, `positions-receiver.gpx`, `48.1, 11.5 in WGS 84`, `as placed`."""
+    def description(self) -> str:
+        """Short text for reports: `/odom`, `positions-receiver.gpx`, `48.1, 11.5 in WGS 84`, `as placed`."""
         if self.place is None:
             return self.topic or self.file
         return (
@@ -75,12 +76,12 @@ class Account:
 
 @dataclass(frozen=True)
 class Accounts:
-    """Accounts of robots.
+    """Sources of the positions of several robots.
 
     Attributes:
-        robots: By role.
-        clocks: How far clocks of robots were ahead of the laptop's, where that was asked.
-        heights: Whether heights over the ellipsoid count; they are often wrong by 10 m.
+        robots: Sources by role.
+        clocks: Offsets of the robots' clocks from the laptop's, if they were measured.
+        heights: True if heights above the ellipsoid are used; they are often wrong by 10 m.
     """
 
     robots: Mapping[Role, Account] = field(default_factory=lambda: MappingProxyType({}))
@@ -88,20 +89,20 @@ class Accounts:
     heights: bool = False
 
 
-def merged(one: Accounts, other: Accounts) -> Accounts:
-    """Return both together; of a robot of which both tell, the plan's placement counts least, and `other` most."""
-    robots = {**one.robots}
-    for role, account in other.robots.items():
+def merged(base: Accounts, override: Accounts) -> Accounts:
+    """Combine two sets of sources. `override` takes precedence, except if it only has the planned placement."""
+    robots = {**base.robots}
+    for role, account in override.robots.items():
         if role not in robots or account.frame != PLACED or account.place is None:
             robots[role] = account
-    return Accounts(robots, {**one.clocks, **other.clocks}, one.heights or other.heights)
+    return Accounts(robots, {**base.clocks, **override.clocks}, base.heights or override.heights)
 
 
 def text(accounts: Accounts) -> str:
-    """Return accounts as `read` reads them."""
-    usual = asdict(Account())
+    """Return the sources as JSON for `read`."""
+    defaults = asdict(Account())
     robots = {
-        role: {name: value for name, value in asdict(account).items() if value != usual[name]}
+        role: {name: value for name, value in asdict(account).items() if value != defaults[name]}
         for role, account in accounts.robots.items()
     }
     clocks = {role: asdict(offset) for role, offset in accounts.clocks.items()}
@@ -109,41 +110,41 @@ def text(accounts: Accounts) -> str:
 
 
 def read(path: Path) -> Accounts:
-    """Return the accounts in a file.
+    """Return the sources in a file.
 
     Raises:
-        EvidenceError: It is missing, or not what `text` writes.
+        EvidenceError: The file is missing or was not written by `text`.
     """
     try:
         data = json.loads(reading.text(path))
-        robots = {Role(role): _made(Account, account) for role, account in data.pop("robots").items()}
-        clocks = {Role(role): _made(Offset, offset) for role, offset in data.pop("clocks").items()}
+        robots = {Role(role): _record_from_json(Account, account) for role, account in data.pop("robots").items()}
+        clocks = {Role(role): _record_from_json(Offset, offset) for role, offset in data.pop("clocks").items()}
         heights = data.pop("heights")
     except JSON_ERRORS as error:
-        raise EvidenceError("does not say who tells where robots were", where=str(path)) from error
+        raise EvidenceError("is not a valid list of position sources", where=str(path)) from error
     if data or not isinstance(heights, bool):
-        raise EvidenceError("says more than who tells where robots were", where=str(path))
+        raise EvidenceError("is not a valid list of position sources: it has unknown keys", where=str(path))
     return Accounts(robots, clocks, heights)
 
 
-def _made(record: type[Any], values: Mapping[str, Any]) -> Any:  # noqa: ANN401 (an instance of the type)
-    """Return a record of plain JSON values.
+def _record_from_json(record: type[Any], values: Mapping[str, Any]) -> Any:  # noqa: ANN401 (an instance of the type)
+    """Return an instance of the data class `record` from JSON values.
 
     Raises:
-        ValueError: They are not its own.
-        TypeError: They lack one.
+        ValueError: A value or key is invalid.
+        TypeError: A value is missing.
     """
-    made = {field.name: _value(field.type, values[field.name]) for field in fields(record) if field.name in values}
-    parts = PurePosixPath(made.get("file", "")).parts  # of ROS 2, a bag is a folder
-    if len(made) < len(values) or len(parts) > 2 or {"..", "/"} & {*parts}:
+    checked = {field.name: _value(field.type, values[field.name]) for field in fields(record) if field.name in values}
+    parts = PurePosixPath(checked.get("file", "")).parts  # two parts are allowed: a ROS 2 bag is a folder
+    if len(checked) < len(values) or len(parts) > 2 or {"..", "/"} & {*parts}:
         raise ValueError
-    if clock := made.get("clock"):
-        Role(clock)  # or it raises
-    return record(**made)
+    if clock := checked.get("clock"):
+        Role(clock)  # raises ValueError if it is not a role
+    return record(**checked)
 
 
 def _value(kind: Any, value: Any) -> Any:  # noqa: ANN401 (any JSON value)
-    """Return a value of a type, or raise `ValueError`."""
+    """Return a JSON value converted to the type `kind`, or raise `ValueError`."""
     if kind is str and isinstance(value, str):
         return value
     if kind is int and type(value) is int and 0 <= value < 2**62:

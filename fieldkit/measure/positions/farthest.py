@@ -1,4 +1,4 @@
-"""How far a robot went by its own odometry, beside how far other sources of its position have it."""
+"""Check of the distance that a robot travelled by its odometry against other sources of its position."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -14,46 +14,47 @@ from fieldkit.measure.positions import geodesy, where
 from fieldkit.measure.positions.samples import WGS84
 
 DRIFT: Final = 0.1
-"""Share of a way by which odometry drifts at most, on wheels that do not slip."""
+"""Upper limit of odometry drift as a share of the path, for wheels that do not slip."""
 PLACE_M: Final = 0.5
 SATELLITE_M: Final = 10.0
-"""What other sources are off by: a lab's robot that moves between two of its places, and a receiver of satellites,
-5 m at each end of the way."""
+"""Position errors of other sources: a lab's robot that moves between two places, and a satellite receiver (5 m at
+each end of the path)."""
 _AROUND_NS: Final = 1_000_000_000
 
 
 def contradiction(
     evidence: AttemptEvidence, role: Role, farthest_m: float, speed_m_s: float, during_ns: tuple[int, int] | None
 ) -> str | None:
-    """Return why a robot cannot have been so far from its place; None if it can.
+    """Return the reason why a robot cannot have been that far from its place, or None if it can.
 
     Args:
-        evidence: What the attempt left.
+        evidence: The attempt's evidence.
         role: The robot.
-        farthest_m: Its distance by its own log.
-        speed_m_s: How fast it went.
-        during_ns: First and last time of that log, by the robot's clock; None if it has no times.
+        farthest_m: Its largest distance by its log.
+        speed_m_s: Its speed.
+        during_ns: First and last time of that log by the robot's clock; None if it has no times.
     """
-    known_m = evidence.read_or_none(track.read, track.FILE) if evidence.has(track.FILE) else None
-    if known_m is not None and during_ns is not None:
+    track_samples = evidence.read_or_none(track.read, track.FILE) if evidence.has(track.FILE) else None
+    if track_samples is not None and during_ns is not None:
         places_m = [
-            whereabouts.position_m
-            for whereabouts in known_m
-            if whereabouts.role is role
-            and whereabouts.position_m is not None
-            and during_ns[0] - _AROUND_NS <= whereabouts.utc_ns <= during_ns[1] + _AROUND_NS
+            sample.position_m
+            for sample in track_samples
+            if sample.role is role
+            and sample.position_m is not None
+            and during_ns[0] - _AROUND_NS <= sample.utc_ns <= during_ns[1] + _AROUND_NS
         ]
         other_m = _from_first_m(np.array(places_m, dtype=float)) if len(places_m) > 1 else None
-        least_m = PLACE_M + DRIFT * farthest_m + speed_m_s
-        if other_m is not None and abs(other_m - farthest_m) > least_m:
+        tolerance_m = PLACE_M + DRIFT * farthest_m + speed_m_s
+        if other_m is not None and abs(other_m - farthest_m) > tolerance_m:
             return f"it was {farthest_m:.1f} m from its place by its odometry, and {other_m:.1f} m by {track.FILE}"
-    return _recorded(evidence, role, farthest_m)
+    return _recorded_contradiction(evidence, role, farthest_m)
 
 
-def _recorded(evidence: AttemptEvidence, role: Role, farthest_m: float) -> str | None:
-    """Return why what steps or people recorded of a robot's positions cannot be of such a way.
+def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: float) -> str | None:
+    """Return the reason why recorded positions of a robot contradict the distance, or None.
 
-    It may be of more of the attempt than the way, so it may have the robot farther away, and not nearer.
+    The recording may cover more of the attempt than the movement does. A larger recorded distance is therefore valid,
+    a smaller one is not.
     """
     try:
         account = where.given(evidence).robots.get(role)
@@ -67,11 +68,13 @@ def _recorded(evidence: AttemptEvidence, role: Role, farthest_m: float) -> str |
     places_m = geodesy.ecef_m(north, east, np.zeros(len(up_m))) if on_earth else samples.values
     other_m = _from_first_m(places_m)
     if farthest_m - other_m > (SATELLITE_M if on_earth else PLACE_M) + DRIFT * farthest_m:
-        return f"it was {farthest_m:.1f} m from its place by its odometry, and {other_m:.1f} m by {account.in_words}"
+        return (
+            f"it was {farthest_m:.1f} m from its place by its odometry, and {other_m:.1f} m by {account.description}"
+        )
     return None
 
 
 def _from_first_m(places_m: Floats | Sequence[Sequence[float]]) -> float:
-    """Return the largest distance from the first place, over the ground. Shape (n, 3)."""
+    """Return the largest distance from the first place. Shape (n, 3)."""
     ground_m = np.asarray(places_m)
     return float(np.linalg.norm(ground_m - ground_m[0], axis=1).max())

@@ -1,4 +1,4 @@
-"""Places on the earth in metres, by the ellipsoid that satellites and maps use, WGS 84."""
+"""Conversion of WGS 84 coordinates to metres."""
 
 from typing import Final
 
@@ -7,23 +7,23 @@ import numpy as np
 from fieldkit.measure.captures.arrays import Floats
 
 SEMI_MAJOR_M: Final = 6_378_137.0
-"""Half of the ellipsoid's longest diameter (NIMA TR8350.2, table 3.1)."""
+"""Semi-major axis of the ellipsoid (NIMA TR8350.2, table 3.1)."""
 FLATTENING: Final = 1 / 298.257223563
-"""Of the ellipsoid (the same table)."""
+"""Flattening of the ellipsoid (the same table)."""
 
 _ECCENTRICITY_2: Final = FLATTENING * (2 - FLATTENING)
 
 
 def ecef_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
-    """Return places in metres from the centre of the earth, turning with it (ECEF; TR8350.2, equation 4-14).
+    """Return earth-centred, earth-fixed coordinates in metres (ECEF; TR8350.2, equation 4-14).
 
-    Between two of them the straight line has its true length. Over 1 km that is 1 um less than the way along the
-    ground, d^3 / 24 R^2.
+    The straight line between two such points has its true length. Over 1 km it is 1 um shorter than the path along
+    the ground: d^3 / 24 R^2.
 
     Args:
         latitude_deg: Degrees north. Shape (n,).
         longitude_deg: Degrees east. Shape (n,).
-        height_m: Metres over the ellipsoid. Shape (n,).
+        height_m: Metres above the ellipsoid. Shape (n,).
 
     Returns:
         Shape (n, 3).

@@ -1,4 +1,4 @@
-"""Read GPX with gpxpy; run by `recorded` in a process of its own. The only module that imports gpxpy."""
+"""Reader of GPX files with gpxpy, run by `recorded` in a separate process. The only module that imports gpxpy."""
 
 from pathlib import Path
 
@@ -9,17 +9,17 @@ from fieldkit.measure.evidence.confined import Json
 from fieldkit.measure.positions.samples import utc_ns
 
 
-def answer(question: Json) -> Json:
-    """Return the points of all tracks in the file at `path`: time, latitude, longitude, and height where it has one.
+def answer(request: Json) -> Json:
+    """Return the points of all tracks in the file at `path`: time, latitude, longitude, and height or None.
 
     Raises:
-        Exception: It cannot be read; any, as gpxpy and what it is built on raise for bytes that are no GPX.
+        Exception: The file cannot be read. gpxpy and its XML parser raise many types of errors for invalid content.
     """
-    with Path(question["path"]).open(encoding="utf-8-sig") as file:
-        told = gpxpy.parse(file)
-    points = [point for track in told.tracks for segment in track.segments for point in segment.points]
+    with Path(request["path"]).open(encoding="utf-8-sig") as file:
+        gpx = gpxpy.parse(file)
+    points = [point for track in gpx.tracks for segment in track.segments for point in segment.points]
     if any(point.time is not None and point.time.tzinfo is None for point in points):
-        raise ValueError("a time has no zone; GPX writes them in UTC, 2026-11-22T10:00:00Z")
+        raise ValueError("a time has no time zone; GPX uses UTC, 2026-11-22T10:00:00Z")
     timed = [point for point in points if point.time is not None]
     if len(timed) < len(points):
         raise ValueError(f"{len(points) - len(timed)} of {len(points)} points have no time")

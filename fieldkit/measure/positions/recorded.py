@@ -1,4 +1,4 @@
-"""Samples of one robot out of what an account names: the messages of a bag or a telemetry log, GPX, or CSV."""
+"""Position samples of one robot from a bag, a telemetry log, a GPX file or a CSV file."""
 
 import math
 from dataclasses import replace
@@ -16,22 +16,22 @@ from fieldkit.measure.positions.samples import (
     PLACED,
     WGS84,
     Samples,
-    demand_rising,
     read_csv,
+    require_increasing,
 )
 
 MOST_STALE_S: Final = 10.0
-"""A message that was stamped longer before or after it came has another clock's time."""
+"""If stamps and reception times differ by more than this, the stamps are from another clock."""
 
 _TLOG: Final = ".tlog"
 _GPX_READER: Final = Confined("fieldkit.measure.positions.gpx_reader")
 
 
 def read_file(path: Path) -> Samples:
-    """Return what stands in GPX or CSV, told apart by how the name ends; times are the file's own.
+    """Return the samples in a GPX or CSV file, distinguished by the file name's suffix. Times are the file's.
 
     Raises:
-        EvidenceError: It is neither, or not whole.
+        EvidenceError: The file has another suffix or is invalid.
     """
     match path.suffix.lower():
         case ".csv":
@@ -49,7 +49,9 @@ def _read_gpx(path: Path) -> Samples:
     if len(points) > MOST_SAMPLES:
         raise EvidenceError(f"has more than {MOST_SAMPLES} points", where=str(path), remedy="cut it to the trial")
     try:
-        demand_rising([at_ns for at_ns, *_ in points], [f"point {number}" for number in range(1, len(points) + 1)])
+        require_increasing(
+            [at_ns for at_ns, *_ in points], [f"point {number}" for number in range(1, len(points) + 1)]
+        )
     except EvidenceError as error:
         where = ", ".join(filter(None, (str(path), error.where)))
         raise EvidenceError(error.what, where=where, remedy=error.remedy) from error
@@ -57,71 +59,78 @@ def _read_gpx(path: Path) -> Samples:
         [[math.nan if value is None else value for value in point[1:]] for point in points], dtype=float
     )
     if not (np.isfinite(values[:, :2]).all() and (abs(values[:, :2]) <= (90, 180)).all()):
-        raise EvidenceError("has a point that is no place", where=str(path), remedy="export the track again")
+        raise EvidenceError("has a point with invalid coordinates", where=str(path), remedy="export the track again")
     return Samples(np.array([at_ns for at_ns, *_ in points]), values, WGS84)
 
 
 def read_topic(path: Path, account: Account) -> Samples:
-    """Return what a topic of a bag tells, or a kind of message in a telemetry log; times are the recorder's.
+    """Return the samples in a topic of a bag, or of a message type in a telemetry log. Times are the recorder's.
 
     Raises:
-        EvidenceError: It cannot be read, or tells no places.
+        EvidenceError: The file cannot be read or has no positions.
     """
     return read_tlog(path, account) if path.suffix == _TLOG else read_bag(path, account)
 
 
 def read_tlog(path: Path, account: Account) -> Samples:
-    """Return what messages of a telemetry log tell; times are the recorder's.
+    """Return the samples of a message type in a telemetry log. Times are the recorder's.
 
-    With stamps, a message was true as long before it came as the autopilot's own time says, by the one that came
-    soonest: a radio may hold others back.
+    With `stamps` set to `header`, the differences between times are those of the autopilot's time since boot. The
+    message with the lowest delay aligns them with the recorder's clock, because a radio may delay other messages.
 
     Raises:
-        EvidenceError: The log cannot be read, has no such message, or the autopilot was started anew meanwhile.
+        EvidenceError: The log cannot be read, has no such message, or the autopilot restarted during the recording.
     """
-    from fieldkit.measure.motion import tlog  # noqa: PLC0415 (its columns take 2 ms to make, and few have one)
+    from fieldkit.measure.motion import tlog  # noqa: PLC0415 (its import takes 2 ms, and few attempts need it)
 
     rows = tlog.positions(path, account.system, account.topic)
     if not rows:
-        raise EvidenceError(f"no {account.topic}", where=str(path), remedy="ask for it in rates, in the step mavlink")
-    came_ns = np.array([row[0] for row in rows], dtype=np.int64) * 1_000
-    times_ns = came_ns
+        raise EvidenceError(
+            f"no {account.topic}", where=str(path), remedy="request it: set `rates` in the step mavlink"
+        )
+    received_ns = np.array([row[0] for row in rows], dtype=np.int64) * 1_000
+    times_ns = received_ns
     if account.stamps == "header":
         boot_ns = np.array([row[1] for row in rows], dtype=np.int64) * 1_000_000
         if (np.diff(boot_ns) < -MOST_STALE_S * 1e9).any():
-            raise EvidenceError("the autopilot was started anew", where=str(path), remedy="write times: received")
-        times_ns = boot_ns + (came_ns - boot_ns).min()
+            raise EvidenceError("the autopilot restarted", where=str(path), remedy="write times: received")
+        times_ns = boot_ns + (received_ns - boot_ns).min()
     times_ns, first = np.unique(times_ns, return_index=True)
-    demand_rising([int(times_ns[0]), int(times_ns[-1])][: len(times_ns)], [str(path)] * 2)
+    require_increasing([int(times_ns[0]), int(times_ns[-1])][: len(times_ns)], [str(path)] * 2)
     values = np.array([row[2:] for row in rows], dtype=float)[first]
     is_local = account.topic == tlog.LOCAL
     return Samples(times_ns, values[:, :3], PLACED if is_local else WGS84, values[:, 3] if is_local else None)
 
 
 def read_bag(path: Path, account: Account) -> Samples:
-    """Return what a topic of a bag tells; times are the robot's.
+    """Return the samples in a topic of a bag. Times are the robot's.
 
-    Of messages of one time the first counts.
+    If several messages have the same time, the first is used.
 
     Raises:
-        EvidenceError: The bag cannot be read, or the topic tells no places, or in other frames or by another clock.
+        EvidenceError: The bag cannot be read; the topic has no positions, or several frames or types; or its stamps
+            are from another clock.
     """
     topic = account.topic
-    told = bag.positions(path, topic, account.child)
-    if not told["rows"]:
-        raise EvidenceError(f"no position of {topic}", where=str(path), remedy="does the topic publish?")
-    ((kind, *other_kinds), (frame, *other_frames)) = told["types"], told["frames"]
+    topic_data = bag.positions(path, topic, account.child)
+    if not topic_data["rows"]:
+        raise EvidenceError(
+            f"no position in {topic}", where=str(path), remedy="check that a node publishes the topic"
+        )
+    ((kind, *other_kinds), (frame, *other_frames)) = topic_data["types"], topic_data["frames"]
     if other_kinds or other_frames:
         raise EvidenceError(
-            f"{topic} tells places in {', '.join(told['frames'])}", where=str(path), remedy="name the child frame"
+            f"{topic} has positions in several frames: {', '.join(topic_data['frames'])}",
+            where=str(path),
+            remedy="name the child frame",
         )
-    times = np.array([row[:2] for row in told["rows"]], dtype=np.int64)
-    values = np.array([row[2:] for row in told["rows"]], dtype=float)
+    times = np.array([row[:2] for row in topic_data["rows"]], dtype=np.int64)
+    values = np.array([row[2:] for row in topic_data["rows"]], dtype=float)
     stamped = account.stamps == "header"
     stale_s = abs(np.median(times[:, 0] - times[:, 1])) / 1e9
     if stamped and stale_s > MOST_STALE_S:
         raise EvidenceError(
-            f"the stamps of {topic} are {stale_s:.0f} s from when its messages came",
+            f"the stamps of {topic} differ by {stale_s:.0f} s from the times of reception",
             where=str(path),
             remedy="write times: received, in the step",
         )
@@ -133,24 +142,22 @@ def read_bag(path: Path, account: Account) -> Samples:
 
 
 def from_start(samples: Samples, account: Account) -> Samples:
-    """Return odometry in the frame of the placement: from where its robot stood, and faced, when the step began.
+    """Transform odometry to the frame of the placement, with the robot's place and heading at the start of the step.
 
     Args:
-        samples: Odometry, its times by the laptop's clock.
-        account: Says from where and when.
+        samples: Odometry with times by the laptop's clock.
+        account: Has the start time, place and heading.
 
     Raises:
-        EvidenceError: It does not tell where the robot stood then.
+        EvidenceError: The heading is unknown, or odometry has no sample at the start.
     """
     assert samples.yaws_rad is not None
     if account.heading_rad is None:
-        raise EvidenceError(
-            f"{account.topic} tells no direction on the ground, and nobody says where its robot faced"
-        )
+        raise EvidenceError(f"{account.topic} has no absolute direction, and the robot's initial heading is unknown")
     at = int(np.searchsorted(samples.times_ns, account.began_utc_ns, side="right")) - 1
     if at < 0:
         late_s = (int(samples.times_ns[0]) - account.began_utc_ns) / 1e9
-        raise EvidenceError(f"{account.topic} begins {late_s:.1f} s after the robot may have moved")
+        raise EvidenceError(f"{account.topic} begins {late_s:.1f} s after the step started, so the start is unknown")
     turn_rad = account.heading_rad - float(samples.yaws_rad[at])
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
     from_start_m = samples.values - samples.values[at]

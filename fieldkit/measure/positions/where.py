@@ -1,6 +1,6 @@
-"""Positions of robots while something was measured, as columns, by whoever tells them best.
+"""Columns of robots' positions during a measurement, from the best source.
 
-What `fieldkit positions` gave counts before what steps recorded, and that before what the testbed knows.
+Sources from `fieldkit positions` take precedence over those that steps recorded, and those over the testbed's.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -23,7 +23,7 @@ from fieldkit.measure.positions.samples import WGS84, Samples
 from fieldkit.measure.positions.trajectories import Trajectory
 
 _ATTEMPTS: Final = "repeats"
-"""Attempts' folders lie in the one of this name in their trial's."""
+"""Name of the folder in a trial that contains the attempts' folders."""
 
 
 def measure(
@@ -32,162 +32,167 @@ def measure(
     ends: tuple[Role, Role],
     times_ns: Collection[int],
 ) -> Measured:
-    """Return the columns that say how far two robots were apart from the first of some times to the last.
+    """Return the columns for the distance of two robots between the first and the last of the given times.
 
     Args:
-        evidence: What the attempt left.
+        evidence: The attempt's evidence.
         declared: The columns, `PREFIX_distance_start_m` and so on.
-        ends: Who sends, by whose clock the times are, and who receives.
+        ends: The sender, whose clock gives the times, and the receiver.
         times_ns: The times, nanoseconds since 1970 UTC.
     """
     try:
-        told = given(evidence)
-        if not told.robots.keys() & set(ends):
+        sources = given(evidence)
+        if not sources.robots.keys() & set(ends):
             return track.measure(evidence.read_or_none(track.read, track.FILE), declared, ends, times_ns)
         source, destination = of_two(evidence, ends)
     except EvidenceError as error:
         return Measured.nothing(declared, error.what)
     if not len(times_ns):
         return Measured.nothing(declared, "no packet has a time")
-    ahead_ns = _ahead_ns(told, ends[0])
+    ahead_ns = _ahead_ns(sources, ends[0])
     start_ns, end_ns = int(min(times_ns)) - ahead_ns, int(max(times_ns)) - ahead_ns
     for role, trajectory in zip(ends, (source, destination), strict=True):
-        if why := trajectory.unknown(start_ns, end_ns):
-            what = f"what {told.robots[role].in_words} tells of the {role} {why}"
-            return Measured.nothing(declared, what)
-    found = trajectories.apart(source, destination, start_ns, end_ns)
-    return Measured.of({column.name: getattr(found, column.name.partition("_")[2]) for column in declared}, "")
+        if problem := trajectory.coverage_problem(start_ns, end_ns):
+            reason = f"the positions of the {role} from {sources.robots[role].description} {problem}"
+            return Measured.nothing(declared, reason)
+    separation = trajectories.apart(source, destination, start_ns, end_ns)
+    return Measured.of({column.name: getattr(separation, column.name.partition("_")[2]) for column in declared}, "")
 
 
 def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[tuple[int, float | None]]:
-    """Return how far two robots were apart, and from when on by the clock of the first, in ns since 1970 UTC.
+    """Return the distance of two robots over time, as (time, distance) pairs.
 
-    None where nobody knows: in a gap, or out of reach; empty where nobody knows at all.
+    Times are nanoseconds since 1970 UTC by the first robot's clock. The distance is None from the start of a gap in
+    the positions. The list is empty if no distance is known.
     """
     try:
-        told = given(evidence)
-        if not told.robots.keys() & set(ends):
+        sources = given(evidence)
+        if not sources.robots.keys() & set(ends):
             return list(track.distances_m(evidence.read_or_none(track.read, track.FILE) or (), *ends))
         source, destination = of_two(evidence, ends)
     except EvidenceError:
         return ()
-    ahead_ns, found = _ahead_ns(told, ends[0]), list[tuple[int, float | None]]()
+    ahead_ns, distances = _ahead_ns(sources, ends[0]), list[tuple[int, float | None]]()
     for at_ns, metres in zip(*trajectories.distances_m(source, destination), strict=True):
-        since_ns = found[-1][0] - ahead_ns if found else int(at_ns)
-        if any(trajectory.unknown(since_ns, int(at_ns)) for trajectory in (source, destination)):
-            found.append((since_ns + ahead_ns + 1, None))
-        found.append((int(at_ns) + ahead_ns, float(metres)))
-    return found
+        since_ns = distances[-1][0] - ahead_ns if distances else int(at_ns)
+        if any(trajectory.coverage_problem(since_ns, int(at_ns)) for trajectory in (source, destination)):
+            distances.append((since_ns + ahead_ns + 1, None))
+        distances.append((int(at_ns) + ahead_ns, float(metres)))
+    return distances
 
 
 def given(evidence: AttemptEvidence) -> Accounts:
-    """Return who tells where robots were, beside the testbed: nobody, most often.
+    """Return the sources of positions besides the testbed; most attempts have none.
 
     Raises:
-        EvidenceError: A file that says so is damaged.
+        EvidenceError: A file that lists them is damaged.
     """
     return evidence.cached(_given)
 
 
 def _given(evidence: AttemptEvidence) -> Accounts:
-    own = evidence.read(accounts.read, accounts.FILE) if evidence.has(accounts.FILE) else Accounts()
-    later = _trial(evidence)
-    after = accounts.read(later / accounts.FILE) if later and (later / accounts.FILE).is_file() else Accounts()
-    return Accounts({**own.robots, **after.robots}, own.clocks, own.heights or after.heights)
+    of_attempt = evidence.read(accounts.read, accounts.FILE) if evidence.has(accounts.FILE) else Accounts()
+    trial = _trial_folder(evidence)
+    of_trial = accounts.read(trial / accounts.FILE) if trial and (trial / accounts.FILE).is_file() else Accounts()
+    return Accounts(
+        {**of_attempt.robots, **of_trial.robots}, of_attempt.clocks, of_attempt.heights or of_trial.heights
+    )
 
 
-def _trial(evidence: AttemptEvidence) -> Path | None:
-    """Return the folder of the trial that the attempt is of, None where it lies in none."""
+def _trial_folder(evidence: AttemptEvidence) -> Path | None:
+    """Return the folder of the attempt's trial, or None if the attempt is not in a trial."""
     parent = evidence.folder.absolute().parent
     return parent.parent if parent.name == _ATTEMPTS else None
 
 
 def in_words(evidence: AttemptEvidence) -> str | None:
-    """Return who tells where robots were: `sender as placed, receiver /odom`; None where nobody does."""
-    told = given(evidence).robots
-    return ", ".join(f"{role} {told[role].in_words}" for role in in_order(told)) or None
+    """Return the sources as text, `sender as placed, receiver /odom`, or None if there are none."""
+    robots = given(evidence).robots
+    return ", ".join(f"{role} {robots[role].description}" for role in in_order(robots)) or None
 
 
 def of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
-    """Return the trajectories of two robots, by the laptop's clock, in one frame.
+    """Return the trajectories of two robots by the laptop's clock, in one frame.
 
     Raises:
-        EvidenceError: Nobody tells of one of them, what does cannot be read, or both are told in different frames.
+        EvidenceError: A robot has no source, a source cannot be read, or the frames differ.
     """
     return evidence.cached(_of_two, ends)
 
 
 def _of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
-    told = given(evidence)
-    one, other = (samples_of(evidence, role) for role in ends)
-    if one.frame != other.frame:
-        what = f"the {ends[0]} {one.frame}, the {ends[1]} {other.frame}"
-        raise EvidenceError(f"robots are not told of in one frame: {what}")
-    if one.frame == WGS84:
-        one_m, other_m = _on_earth_m(one, other, heights=told.heights)
+    sources = given(evidence)
+    source, destination = (samples_of(evidence, role) for role in ends)
+    if source.frame != destination.frame:
+        frames = f"the {ends[0]} {source.frame}, the {ends[1]} {destination.frame}"
+        raise EvidenceError(f"the positions of the robots are in different frames: {frames}")
+    if source.frame == WGS84:
+        source_m, destination_m = _ecef_m(source, destination, heights=sources.heights)
     else:
-        one_m, other_m = one.values, other.values
-    return _trajectory(one, one_m, told.robots[ends[0]]), _trajectory(other, other_m, told.robots[ends[1]])
+        source_m, destination_m = source.values, destination.values
+    return _trajectory(source, source_m, sources.robots[ends[0]]), _trajectory(
+        destination, destination_m, sources.robots[ends[1]]
+    )
 
 
 def _trajectory(samples: Samples, places_m: Floats, account: Account) -> Trajectory:
     if account.place is not None:
-        return trajectories.standing(places_m[0])
+        return trajectories.stationary(places_m[0])
     return Trajectory(samples.times_ns, places_m, round(account.gap_s * 1e9))
 
 
 def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
-    """Return what is known of one robot, its times by the laptop's clock.
+    """Return the samples of one robot, with times by the laptop's clock.
 
     Raises:
-        EvidenceError: Nobody tells of it, or what does cannot be read.
+        EvidenceError: The robot has no source, or the source cannot be read.
     """
-    told = given(evidence)
-    if (account := told.robots.get(role)) is None:
-        raise EvidenceError(f"nobody tells where the {role} was")
+    sources = given(evidence)
+    if (account := sources.robots.get(role)) is None:
+        raise EvidenceError(f"no source has the position of the {role}")
     if account.place is not None:
         place = np.array([account.place], dtype=float)  # NaN for None
         return Samples(np.zeros(1, dtype=np.int64), place, account.frame)
     if account.topic:
-        read = evidence.read(recorded.read_topic, account.file, account)
-        moved = _shifted(read, -_ahead_ns(told, Role(account.clock) if account.clock else role))
-        return moved if moved.yaws_rad is None else recorded.from_start(moved, account)
-    folder = _trial(evidence)
-    assert folder is not None  # such an account is a trial's
-    return _shifted(_of_trial(folder / account.file), round(account.offset_s * 1e9))
+        recorded_samples = evidence.read(recorded.read_topic, account.file, account)
+        samples = _shifted(recorded_samples, -_ahead_ns(sources, Role(account.clock) if account.clock else role))
+        return samples if samples.yaws_rad is None else recorded.from_start(samples, account)
+    folder = _trial_folder(evidence)
+    assert folder is not None  # only the sources of a trial have neither a place nor a topic
+    return _shifted(_samples_in_trial(folder / account.file), round(account.offset_s * 1e9))
 
 
 def told_of(evidence: AttemptEvidence) -> Mapping[Role, Samples]:
-    """Return what is known of each robot that somebody tells of beside the testbed, as far as it can be read."""
-    found: dict[Role, Samples] = {}
+    """Return the samples of each robot with a readable source besides the testbed."""
+    samples_by_role: dict[Role, Samples] = {}
     with suppress(EvidenceError):
         for role in given(evidence).robots:
             with suppress(EvidenceError):
-                found[role] = samples_of(evidence, role)
-    return found
+                samples_by_role[role] = samples_of(evidence, role)
+    return samples_by_role
 
 
 def _shifted(samples: Samples, by_ns: int) -> Samples:
     return Samples(samples.times_ns + by_ns, samples.values, samples.frame, samples.yaws_rad)
 
 
-def _of_trial(path: Path) -> Samples:
-    """Return what a file of a trial tells, which all of its attempts ask."""
+def _samples_in_trial(path: Path) -> Samples:
+    """Return the samples in a file of a trial; cached, because all of the trial's attempts use it."""
     try:
         status = path.stat()
     except OSError as error:
         raise EvidenceError(f"{path.name} cannot be read: {error.strerror}", where=str(path)) from error
-    return _read(path, status.st_mtime_ns, status.st_size)
+    return _read_cached(path, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=4)
-def _read(path: Path, _mtime_ns: int, _size_bytes: int) -> Samples:
+def _read_cached(path: Path, _mtime_ns: int, _size_bytes: int) -> Samples:
     return recorded.read_file(path)
 
 
-def _ahead_ns(told: Accounts, role: Role) -> int:
-    """Return how far a robot's clock was ahead of the laptop's: not at all, where nobody asked."""
-    return round(told.clocks[role].offset_s * 1e9) if role in told.clocks else 0
+def _ahead_ns(sources: Accounts, role: Role) -> int:
+    """Return how far a robot's clock was ahead of the laptop's; 0 if that was not measured."""
+    return round(sources.clocks[role].offset_s * 1e9) if role in sources.clocks else 0
 
 
 def ahead_ns(evidence: AttemptEvidence, role: Role) -> int:
@@ -196,25 +201,25 @@ def ahead_ns(evidence: AttemptEvidence, role: Role) -> int:
 
 
 def clock_error_s(evidence: AttemptEvidence) -> float | None:
-    """Return the most that times of two robots can be wrong against each other; None where nobody asked for them."""
+    """Return the maximum error between the times of two robots, or None if no clock offset was measured."""
     errors = sorted(offset.error_s for offset in given(evidence).clocks.values())
     return sum(errors[-2:]) if errors else None
 
 
-def _on_earth_m(one: Samples, other: Samples, *, heights: bool) -> tuple[Floats, Floats]:
-    """Return places of two robots in metres; where heights do not count, or are not told, both are at the middle one.
+def _ecef_m(source: Samples, destination: Samples, *, heights: bool) -> tuple[Floats, Floats]:
+    """Return positions of two robots in metres. Unless `heights` is set, both are at the median height.
 
     Raises:
-        EvidenceError: Heights are to count, and are not told.
+        EvidenceError: `heights` is set and some are unknown.
     """
-    told_m = np.concatenate((one.values[:, 2], other.values[:, 2]))
-    known_m = told_m[np.isfinite(told_m)]
-    if heights and len(known_m) < len(told_m):
-        raise EvidenceError("heights are to count, and are not told everywhere")
-    middle_m = float(np.median(known_m)) if len(known_m) else 0.0
+    heights_m = np.concatenate((source.values[:, 2], destination.values[:, 2]))
+    known_heights_m = heights_m[np.isfinite(heights_m)]
+    if heights and len(known_heights_m) < len(heights_m):
+        raise EvidenceError("heights are required, but some positions have none")
+    median_m = float(np.median(known_heights_m)) if len(known_heights_m) else 0.0
 
-    def on_earth_m(samples: Samples) -> Floats:
+    def place_m(samples: Samples) -> Floats:
         north, east, up_m = samples.values.T
-        return geodesy.ecef_m(north, east, up_m if heights else np.full(len(up_m), middle_m))
+        return geodesy.ecef_m(north, east, up_m if heights else np.full(len(up_m), median_m))
 
-    return on_earth_m(one), on_earth_m(other)
+    return place_m(source), place_m(destination)

@@ -1,1 +1,1 @@
-"""From the packets of two captures to losses, delays and times of a transfer."""
+"""Losses, delays and times of a transfer, computed from the packets of two captures."""

@@ -1,4 +1,4 @@
-"""The columns of one transfer: what it lost on each layer, how long it took, and how the paper counts."""
+"""Columns of one transfer: loss on each layer, duration, delay, and the paper's figures."""
 
 from typing import Final
 
@@ -13,11 +13,11 @@ FILES: Final = columns(
     (
         "file_loss",
         "share",
-        "1 - received_bytes/sent_bytes, what the application missed.",
+        "1 - received_bytes/sent_bytes, the bytes that the application missed.",
         Figure("file loss", Kind.MEAN, rank=14),
         OVERCOUNTED,
     ),
-    ("hash_match", "bool", "Whether the received file equals the bag, byte for byte."),
+    ("hash_match", "bool", "True if the received file equals the bag byte for byte."),
     ("bag_messages", "count", "Messages in the bag."),
     ("bag_duration_s", "s", "Time from the bag's first message to its last."),
 )
@@ -26,12 +26,12 @@ LAYERS: Final = columns(
     (
         "ip_packets_sent",
         "count",
-        "IP packets of the transfer, fragments counted singly, that left the sender (its capture).",
+        "IP packets of the transfer that left the sender (its capture), each fragment separately.",
     ),
     (
         "ip_packets_received",
         "count",
-        "Of these, the ones in the receiver's capture, matched by IP id and offset; TCP: all frames captured.",
+        "ip_packets_sent that are in the receiver's capture, matched by IP id and offset; TCP: all frames captured.",
     ),
     (
         "ip_loss",
@@ -48,32 +48,32 @@ LAYERS: Final = columns(
         "ip_packets_reordered",
         "count",
         (
-            "Of ip_packets_received, those that arrived after a packet that was sent later (RFC 4737, section 3)."
-            " Empty where packets are doubtful, and for TCP: see tcp_reordered_segments."
+            "ip_packets_received that arrived after a packet that was sent later (RFC 4737, section 3)."
+            " Empty if packets are ambiguous, and for TCP: see tcp_reordered_segments."
         ),
     ),
     (
         "ip_packets_doubtful",
         "count",
         (
-            "Of ip_packets_sent, those of which some arrived that look alike, in their bytes too, and were sent so"
-            " close to each other that nothing tells which. Empty for TCP."
+            "ip_packets_sent that are ambiguous: equal in headers and content to others that were sent at nearly the"
+            " same time, and only some of which arrived. Empty for TCP."
         ),
     ),
     (
         "ip_loss_bursts",
         "count",
         (
-            "Runs of lost packets among ip_packets_sent, in the order of sending. Empty for TCP, and where packets"
-            " are doubtful and some were lost."
+            "Runs of lost packets among ip_packets_sent, in the order of sending. Empty for TCP, and if packets"
+            " are ambiguous and some were lost."
         ),
     ),
-    ("ip_loss_longest_burst", "count", "Packets in the longest of these runs, likewise."),
+    ("ip_loss_longest_burst", "count", "Packets in the longest of these runs; empty in the same cases."),
     ("datagrams_sent", "count", "UDP datagrams that left the sender. Empty for TCP."),
     (
         "datagrams_received",
         "count",
-        "UDP datagrams of which every fragment reached the receiver's interface. Empty for TCP.",
+        "UDP datagrams all of whose fragments reached the receiver's interface. Empty for TCP.",
     ),
     (
         "datagram_loss",
@@ -84,7 +84,7 @@ LAYERS: Final = columns(
     (
         "byte_loss",
         "share",
-        "Share of payload bytes of the transfer that never reached the receiver's interface.",
+        "Share of the transfer's payload bytes that never reached the receiver's interface.",
         Figure("payload byte loss", Kind.MEAN, rank=13),
     ),
     ("tcp_sent_bytes", "B", "TCP payload bytes sent, retransmissions included. Empty for UDP."),
@@ -93,27 +93,27 @@ LAYERS: Final = columns(
         "tcp_received_bytes",
         "B",
         (
-            "Of tcp_sent_bytes, those in the receiver's capture; what arrived more often than it was sent counts "
-            "no further. Empty where a copy may hide a loss, and for UDP."
+            "tcp_sent_bytes that are in the receiver's capture; further copies of bytes that were sent fewer times "
+            "do not count. Empty if a copy may hide a loss, and for UDP."
         ),
     ),
     (
         "tcp_byte_loss",
         "share",
-        "1 - tcp_received_bytes/tcp_sent_bytes: what the radio lost and TCP repaired. Empty for UDP.",
+        "1 - tcp_received_bytes/tcp_sent_bytes: the loss on the radio, repaired by TCP. Empty for UDP.",
         Figure("TCP byte loss before retransmission", Kind.MEAN, rank=12),
     ),
     (
         "tcp_retransmitted_segments",
         "count",
-        "Data frames sent whose sequence range had been sent before, wholly or in part. Empty for UDP.",
+        "Data frames sent whose sequence range had been sent before, completely or partly. Empty for UDP.",
     ),
     (
         "tcp_spurious_segments",
         "count",
         (
-            "Of tcp_retransmitted_segments, those of which an earlier copy of every byte reached the receiver's "
-            "interface, before or after. Empty where segments are doubtful, and for UDP."
+            "tcp_retransmitted_segments that were not needed: an earlier copy of every byte reached the receiver's "
+            "interface, before or after. Empty if segments are ambiguous, and for UDP."
         ),
     ),
     (
@@ -125,42 +125,42 @@ LAYERS: Final = columns(
         "tcp_reordered_segments",
         "count",
         (
-            "Data frames received whose first byte was sent before one that had arrived; a retransmission is as "
-            "late as it was sent. Empty where segments are doubtful, and for UDP."
+            "Data frames received whose first byte was sent before one that had arrived; a retransmission counts as "
+            "sent when it was retransmitted. Empty if segments are ambiguous, and for UDP."
         ),
     ),
     (
         "tcp_doubtful_segments",
         "count",
         (
-            "Data frames sent with bytes that were sent several times and arrived, where neither time stamps nor IP "
-            "ids nor the time between them tell which copy did. Empty for UDP."
+            "Data frames sent with bytes that were sent several times and arrived, if neither time stamps nor IP "
+            "ids nor the time between them show which copy arrived. Empty for UDP."
         ),
     ),
     (
         "tcp_superframes",
         "count",
         (
-            "Data frames in either capture with more payload than the largest MSS that a SYN announced: offload "
-            "made several segments one. Empty for UDP, and when no SYN says it."
+            "Data frames in either capture with more payload than the largest MSS in a SYN: offload joined several "
+            "segments. Empty for UDP, and if no SYN has an MSS."
         ),
     ),
     (
         "transfer_s",
         "s",
-        "First frame of the transfer to its last with payload, both in the capture that transfer_from names.",
+        "Time from the first frame of the transfer to its last with payload, both in the capture of transfer_from.",
         Figure("transfer time", Kind.MEDIAN, rank=35),
     ),
-    ("transfer_from", "text", "Whose capture transfer_s is from: receiver."),
+    ("transfer_from", "text", "Robot whose capture gives transfer_s: receiver."),
 )
-WAY: Final = columns(
+DISTANCE: Final = columns(
     35,
     (
         "transfer_distance_start_m",
         "m",
         (
             "Distance between sender and receiver when the transfer's first packet was sent. This and the next "
-            "eleven are empty where the lab does not say where robots are, as in the field."
+            "eleven are empty if no positions are known, as in the field."
         ),
     ),
     ("transfer_distance_min_m", "m", "Smallest distance from that packet to the last one sent."),
@@ -170,7 +170,7 @@ WAY: Final = columns(
     (
         "transfer_relative_speed_m_s",
         "m/s",
-        "Mean magnitude of the sender's velocity less the receiver's over that time.",
+        "Mean magnitude of the sender's velocity relative to the receiver over that time.",
     ),
 )
 PAPER: Final = columns(
@@ -178,20 +178,20 @@ PAPER: Final = columns(
     (
         "paper_packets",
         "count",
-        "Frames that the paper's filter, src and port of the transfer, counts at the sender.",
+        "Frames counted at the sender by the paper's filter, src and port of the transfer.",
     ),
     (
         "paper_received",
         "count",
-        "Frames that the paper's filter, dst and port of the transfer, counts at the receiver.",
+        "Frames counted at the receiver by the paper's filter, dst and port of the transfer.",
     ),
-    ("paper_window_bytes", "B", "Ping payload that the paper takes for the protocol: TCP 502, UDP 8192."),
-    ("paper_delay_s", "s", "Mean RTT with that payload; empty when the ping had another."),
+    ("paper_window_bytes", "B", "Ping payload that the paper uses for the protocol: TCP 502, UDP 8192."),
+    ("paper_delay_s", "s", "Mean RTT with that payload; empty if the ping had another."),
     ("paper_transfer_s", "s", "paper_packets * paper_delay_s."),
     (
         "paper_loss",
         "share",
-        "1 - paper_received/paper_packets; sees first fragments only.",
+        "1 - paper_received/paper_packets; counts first fragments only.",
         Figure("paper's loss (eq. 1)", Kind.COUNTED, "paper_received", "paper_packets", rank=15),
         OVERCOUNTED,
     ),
@@ -203,7 +203,7 @@ COLUMNS: Final[tuple[Column, ...]] = (
     *LAYERS,
     *delay.COLUMNS,
     *medium.COLUMNS,
-    *WAY,
+    *DISTANCE,
     *PAPER,
     *host.COLUMNS,
     *host.SYSTEM,
@@ -213,7 +213,7 @@ COLUMNS: Final[tuple[Column, ...]] = (
 )
 
 TIMES: Final = [column for column in LAYERS if column.name in {"transfer_s", "transfer_from"}]
-"""What is told by one clock, the receiver's."""
+"""Columns that depend on one clock only, the receiver's."""
 
 OF_TCP: Final = frozenset(column.name for column in LAYERS if column.name.startswith("tcp_"))
 OF_UDP: Final = frozenset(

@@ -1,4 +1,4 @@
-"""Each packet of one transfer as a row: when it left, when it arrived, how long it took."""
+"""The packets of one transfer as rows: time of sending and arrival, loss and delay of each."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -17,41 +17,41 @@ from fieldkit.measure.transfers.transfer import Transfer
 
 COLUMNS: Final = columns(
     0,
-    ("sent_ns", "ns", "When it left, by the sender's clock, since 1970 UTC."),
+    ("sent_ns", "ns", "Time of sending by the sender's clock, since 1970 UTC."),
     (
         "received_ns",
         "ns",
         (
-            "When its first copy arrived, by the receiver's clock; of a frame of TCP its last byte. Empty where it"
-            " was lost, where nothing tells it from others, and where offload joined it to others."
+            "Time at which its first copy arrived, by the receiver's clock; for a TCP frame the last byte's. Empty if"
+            " it was lost, if it is ambiguous, and if offload joined it to others."
         ),
     ),
     (
         "lost",
         "bool",
-        "Whether it, or of a frame of TCP any of its bytes, did not arrive; empty where nothing tells.",
+        "True if it did not arrive, or for a TCP frame if any byte did not; empty if ambiguous.",
     ),
-    ("sent_again", "bool", "Whether any of its bytes had been sent before. Empty for UDP."),
+    ("sent_again", "bool", "True if any of its bytes had been sent before. Empty for UDP."),
     ("wire_bytes", "B", "Length of the frame at the sender."),
-    ("payload_bytes", "B", "Bytes after the IP header."),
+    ("payload_bytes", "B", "Length after the IP header."),
     (
         "delay_s",
         "s",
-        "One-way delay by the estimated offset of the clocks; empty where received_ns or that offset is not known.",
+        "One-way delay by the estimated clock offset; empty if received_ns or that offset is unknown.",
     ),
     (
         "delay_error_s",
         "s",
-        "The most that delay_s can be wrong by the two clocks, the same of all packets that have one.",
+        "Maximum error of delay_s from the clocks, equal for all packets that have one.",
     ),
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """The packets of a transfer that were sent, in the order of the sender's capture; the fields are `COLUMNS`.
+    """Packets that a transfer sent, in the order of the sender's capture; the fields are those of `COLUMNS`.
 
-    Of TCP they are the frames with payload. All are of shape (n,); what is empty is masked.
+    For TCP, only frames with payload are included. All arrays have shape (n,); empty values are masked.
     """
 
     sent_ns: MaskedArray
@@ -65,23 +65,23 @@ class Crossings:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """What both captures say of packets sent, shape (n,), and received.
+class _MatchedPackets:
+    """Packets sent, shape (n,), and received, with their matches.
 
     Attributes:
-        sent: In the sender's capture.
-        received: In the receiver's.
-        chosen: Which of those sent are the transfer's.
-        lost: As `Crossings`.
-        again: As `Crossings.sent_again`.
-        copies: Index of packets among those sent, and of their copies among those received.
+        sent: Packets in the sender's capture.
+        received: Packets in the receiver's capture.
+        chosen: Mask of the sent packets that belong to the transfer.
+        lost: As `Crossings.lost`.
+        sent_again: As `Crossings.sent_again`.
+        copies: Indices of matched sent packets, and of their copies among the received packets.
     """
 
     sent: Packets
     received: Packets
     chosen: Mask
     lost: MaskedArray
-    again: MaskedArray
+    sent_again: MaskedArray
     copies: tuple[Ints, Ints]
 
 
@@ -89,30 +89,30 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Crossings:
     """Return the packets of a transfer.
 
     Args:
-        evidence: What the attempt left.
-        transfer: What tells its packets from others.
+        evidence: The attempt's evidence.
+        transfer: Identifies the packets of the transfer.
 
     Raises:
-        EvidenceError: As `fates.ends` and `ranges.cut`.
+        EvidenceError: As for `fates.both_packets` and `ranges.cut`.
     """
-    sender, receiver = fates.ends(evidence, transfer)
-    seen = {Protocol.UDP: _udp, Protocol.TCP: _tcp}[transfer.protocol](sender, receiver, transfer)
-    left, came = seen.copies
-    own = StampPairs(seen.sent.time_ns[left], seen.received.time_ns[came])
-    received_ns = _empty(len(seen.sent), np.int64)
-    delay_s, error_s = (_empty(len(seen.sent), np.float64) for _ in range(2))
-    received_ns[left] = own.receiver_ns
-    if (told := delay.of_each(own, sender, receiver, transfer)) is not None:
-        delay_s[left], error_s[left] = told
+    sender, receiver = fates.both_packets(evidence, transfer)
+    packets = {Protocol.UDP: _udp, Protocol.TCP: _tcp}[transfer.protocol](sender, receiver, transfer)
+    sent_index, received_index = packets.copies
+    pairs = StampPairs(packets.sent.time_ns[sent_index], packets.received.time_ns[received_index])
+    received_ns = _empty(len(packets.sent), np.int64)
+    delay_s, error_s = (_empty(len(packets.sent), np.float64) for _ in range(2))
+    received_ns[sent_index] = pairs.receiver_ns
+    if (delays := delay.packet_delays(pairs, sender, receiver, transfer)) is not None:
+        delay_s[sent_index], error_s[sent_index] = delays
     return Crossings(
-        sent_ns=np.ma.array(seen.sent.time_ns[seen.chosen]),
-        received_ns=received_ns[seen.chosen],
-        lost=seen.lost[seen.chosen],
-        sent_again=seen.again[seen.chosen],
-        wire_bytes=np.ma.array(seen.sent.wire_bytes[seen.chosen]),
-        payload_bytes=np.ma.array(seen.sent.ip_payload_bytes[seen.chosen]),
-        delay_s=delay_s[seen.chosen],
-        delay_error_s=error_s[seen.chosen],
+        sent_ns=np.ma.array(packets.sent.time_ns[packets.chosen]),
+        received_ns=received_ns[packets.chosen],
+        lost=packets.lost[packets.chosen],
+        sent_again=packets.sent_again[packets.chosen],
+        wire_bytes=np.ma.array(packets.sent.wire_bytes[packets.chosen]),
+        payload_bytes=np.ma.array(packets.sent.ip_payload_bytes[packets.chosen]),
+        delay_s=delay_s[packets.chosen],
+        delay_error_s=error_s[packets.chosen],
     )
 
 
@@ -120,31 +120,31 @@ def _empty(rows: int, kind: type[np.generic]) -> MaskedArray:
     return np.ma.array(np.zeros(rows, kind), mask=True)
 
 
-def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> _Seen:
-    found = udp.cross(sender, receiver, transfer)
-    # As many losses may hide behind copies that cannot be told from packets that were sent.
-    hidden = np.append(found.chosen, False)[found.match.sent_index] & found.match.dubious
-    return _Seen(
-        sent=found.sent,
-        received=found.received,
-        chosen=found.chosen,
-        lost=np.ma.array(~found.match.arrived, mask=found.match.doubtful | hidden.any()),
-        again=_empty(len(found.sent), np.bool_),
-        copies=delay.udp_copies(found),
+def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
+    crossing = udp.cross(sender, receiver, transfer)
+    # Each received packet that may be a copy may hide the loss of another packet.
+    hidden = np.append(crossing.chosen, False)[crossing.match.sent_index] & crossing.match.possible_copy
+    return _MatchedPackets(
+        sent=crossing.sent,
+        received=crossing.received,
+        chosen=crossing.chosen,
+        lost=np.ma.array(~crossing.match.arrived, mask=crossing.match.doubtful | hidden.any()),
+        sent_again=_empty(len(crossing.sent), np.bool_),
+        copies=delay.udp_copies(crossing),
     )
 
 
-def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> _Seen:
-    found = tcp.cross(sender, receiver, transfer)
-    pieces, match = found.payload.sent, found.payload.match
-    lost, doubtful = np.zeros((2, len(found.sent)), dtype=np.bool_)
+def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
+    crossing = tcp.cross(sender, receiver, transfer)
+    pieces, match = crossing.payload.sent, crossing.payload.match
+    lost, ambiguous = np.zeros((2, len(crossing.sent)), dtype=np.bool_)
     lost[pieces.frame[~match.arrived]] = True
-    doubtful[pieces.frame[match.doubtful]] = True
-    return _Seen(
-        sent=found.sent,
-        received=found.received,
-        chosen=found.sent.tcp_payload_bytes > 0,
-        lost=np.ma.array(lost, mask=doubtful | match.dubious.any()),
-        again=np.ma.array(tcp.sent_again(found)),
-        copies=delay.tcp_copies(found),
+    ambiguous[pieces.frame[match.doubtful]] = True
+    return _MatchedPackets(
+        sent=crossing.sent,
+        received=crossing.received,
+        chosen=crossing.sent.tcp_payload_bytes > 0,
+        lost=np.ma.array(lost, mask=ambiguous | match.possible_copy.any()),
+        sent_again=np.ma.array(tcp.sent_again(crossing)),
+        copies=delay.tcp_copies(crossing),
     )

@@ -1,7 +1,7 @@
-"""Datagrams and their fragments.
+"""Assignment of IP fragments to datagrams.
 
-Only the first fragment of a datagram carries ports; the others belong to it by their IP id, which has 16 bits and
-comes again in a long transfer, or at once in packets that are never fragmented (RFC 6864, section 4).
+Only the first fragment of a datagram has ports. The others are assigned by IP id. The id has 16 bits and repeats in a
+long transfer, or immediately in packets that are never fragmented (RFC 6864, section 4).
 """
 
 from dataclasses import replace
@@ -9,22 +9,22 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.measure.captures.arrays import Ints, mixed
+from fieldkit.measure.captures.arrays import Ints, row_hashes
 from fieldkit.measure.captures.packets import NO_PORT, Packets
 
 NO_DATAGRAM: Final = -1
 
 
 def datagrams(packets: Packets) -> tuple[Ints, Ints]:
-    """Return the index of each datagram's first packet, and each packet's datagram.
+    """Return the index of each datagram's first packet, and the datagram of each packet.
 
-    A later fragment belongs to the latest first fragment between its ends with its id; one seen before any, to the
-    next. It is of `NO_DATAGRAM` where there is none.
+    A later fragment belongs to the latest first fragment with the same addresses and id, or to the next one if there
+    is none before it. Its datagram is `NO_DATAGRAM` if there is none at all.
     """
     is_fragment = packets.more_fragments | (packets.fragment_offset > 0)
-    # A packet that is whole has no fragments, whatever its id.
+    # An unfragmented packet has no other fragments, whatever its id.
     kind = packets.protocol << 1 | is_fragment
-    key = mixed(*packets.src.T, *packets.dst.T, kind, packets.ip_id)
+    key = row_hashes(*packets.src.T, *packets.dst.T, kind, packets.ip_id)
     order = np.lexsort((packets.time_ns, key))
     key, is_first = key[order], packets.fragment_offset[order] == 0
     firsts_until = np.append(0, np.cumsum(is_first))
@@ -38,7 +38,7 @@ def datagrams(packets: Packets) -> tuple[Ints, Ints]:
 
 
 def with_ports(packets: Packets) -> Packets:
-    """Return packets in which every fragment has the ports of its first one; `NO_PORT` where that is not there."""
+    """Return the packets with each later fragment's ports set to those of its first fragment, or `NO_PORT`."""
     first, datagram = datagrams(packets)
     sport, dport = (np.append(ports[first], NO_PORT)[datagram] for ports in (packets.sport, packets.dport))
     return replace(packets, sport=sport, dport=dport)

@@ -1,4 +1,4 @@
-"""One-way delay and jitter of a transfer's packets, each seen in both captures."""
+"""One-way delay and jitter of a transfer's packets, from packets in both captures."""
 
 from typing import Final
 
@@ -23,7 +23,7 @@ COLUMNS: Final = columns(
         "s",
         (
             "Smallest delay of the transfer's packets from one capture to the other (TCP: frames with payload). "
-            "This and the next three are empty when one_way_error_s is above a tenth of them."
+            "This and the next three are empty if one_way_error_s is above a tenth of them."
         ),
     ),
     (
@@ -34,12 +34,12 @@ COLUMNS: Final = columns(
     ),
     ("one_way_mean_s", "s", "Mean of that delay."),
     ("one_way_p95_s", "s", "95th percentile of that delay."),
-    ("one_way_error_s", "s", "The most that each of these can be wrong by the two clocks."),
-    ("one_way_withheld", "text", "Why some or all of them are empty; empty when none is."),
+    ("one_way_error_s", "s", "Maximum error of each of these from the clocks."),
+    ("one_way_withheld", "text", "Reason why some or all of them are empty; empty if none is."),
     (
         "delay_variation_median_s",
         "s",
-        "Median of the same packets' delay less that of the fastest, which needs no common clock (RFC 5481).",
+        "Median delay of the same packets relative to the fastest, which needs no common clock (RFC 5481).",
         Figure("delay variation", Kind.MEDIAN, rank=32),
     ),
     ("delay_variation_p95_s", "s", "95th percentile of that."),
@@ -52,16 +52,16 @@ COLUMNS: Final = columns(
     (
         "clock_offset_s",
         "s",
-        "Receiver's clock less sender's in the middle of the captures; empty without packets in both directions.",
+        "Receiver's clock minus sender's in the middle of the captures; empty without packets in both directions.",
         EITHER_WAY_S,
     ),
-    ("clock_offset_error_s", "s", "The most that clock_offset_s can be wrong."),
+    ("clock_offset_error_s", "s", "Maximum error of clock_offset_s."),
     (
         "clock_skew_ppm",
         "ppm",
-        "How much faster the receiver's clock goes; empty when it can be wrong by more than 100.",
+        "How much faster the receiver's clock runs than the sender's; empty if it can be wrong by more than 100 ppm.",
     ),
-    ("clock_skew_error_ppm", "ppm", "The most that clock_skew_ppm can be wrong."),
+    ("clock_skew_error_ppm", "ppm", "Maximum error of clock_skew_ppm."),
 )
 SENT_COLUMNS: Final = columns(
     110,
@@ -69,131 +69,135 @@ SENT_COLUMNS: Final = columns(
         "one_way_median_sent_s",
         "s",
         (
-            "Median one-way delay over all of the transfer's packets that were sent, one without a known arrival as "
-            "later than all others; empty where that is half of them or more, and where one_way_median_s is empty."
+            "Median one-way delay of all packets sent; a packet without a known arrival counts as later than all "
+            "others. Empty if half of the packets or more have none, and if one_way_median_s is empty."
         ),
     ),
 )
 
 LARGEST_ERROR: Final = 0.1
-"""How large the error of a one-way delay may be, as a share of it: above that the delay is withheld."""
+"""Maximum error of a one-way delay as a share of the delay; with a larger error the delay is withheld."""
 
-UNSTEADY: Final = "no offset and drift fit: a clock was set meanwhile, or goes wrong by more than 500 ppm"
-"""Why no time of a transfer can be told, not even by one clock: nobody knows which of the two it is."""
+UNSTEADY: Final = "no offset and drift fit: a clock was set during the attempt, or drifts by more than 500 ppm"
+"""Reason why no times of a transfer are known, not even by one clock: either clock may be the wrong one."""
 
 _JITTER_GAIN: Final = 1 / 16
-_REMEMBERED: Final = 1000
+_WEIGHTED_STEPS: Final = 1000
 
 
-def udp_packets(crossing: udp.UdpPackets) -> StampPairs:
-    """Return the packets of a UDP transfer that both captures hold, each fragment by itself."""
-    sent, received = udp_copies(crossing)
-    return StampPairs(crossing.sent.time_ns[sent], crossing.received.time_ns[received])
+def udp_packets(packets: udp.UdpPackets) -> StampPairs:
+    """Return the times of a UDP transfer's packets that are in both captures, each fragment separately."""
+    sent, received = udp_copies(packets)
+    return StampPairs(packets.sent.time_ns[sent], packets.received.time_ns[received])
 
 
-def udp_copies(crossing: udp.UdpPackets) -> tuple[Ints, Ints]:
-    """Return the index of each packet of `udp_packets` among those sent, and among those received."""
-    return _copies(crossing.match, crossing.chosen)
+def udp_copies(packets: udp.UdpPackets) -> tuple[Ints, Ints]:
+    """Return the indices of the packets of `udp_packets` among the sent and among the received packets."""
+    return _copies(packets.match, packets.chosen)
 
 
-def tcp_frames(crossing: tcp.TcpFrames) -> StampPairs:
-    """Return the frames with payload of a TCP transfer that both captures hold."""
-    sent, received = tcp_copies(crossing)
-    return StampPairs(crossing.sent.time_ns[sent], crossing.received.time_ns[received])
+def tcp_frames(frames: tcp.TcpFrames) -> StampPairs:
+    """Return the times of a TCP transfer's frames with payload that are in both captures."""
+    sent, received = tcp_copies(frames)
+    return StampPairs(frames.sent.time_ns[sent], frames.received.time_ns[received])
 
 
-def tcp_copies(crossing: tcp.TcpFrames) -> tuple[Ints, Ints]:
-    """Return the index of each frame of `tcp_frames` among those sent, and among those received.
+def tcp_copies(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
+    """Return the indices of the frames of `tcp_frames` among the sent and among the received frames.
 
-    A frame arrives with its last byte, and what offload joined of several with that of the last.
+    A frame arrives with its last byte. If offload joined several frames, the joined frame matches the last of them.
     """
-    left, came, matched = crossing.payload.sent, crossing.payload.received, crossing.payload.match
-    certain = matched.arrived & ~matched.doubtful & _ends(left)
-    certain[certain] = _ends(came)[matched.received_index[certain]]
-    return left.frame[certain], came.frame[matched.received_index[certain]]
+    sent_pieces, received_pieces, matched = frames.payload.sent, frames.payload.received, frames.payload.match
+    certain = matched.arrived & ~matched.doubtful & _is_last_piece(sent_pieces)
+    certain[certain] = _is_last_piece(received_pieces)[matched.received_index[certain]]
+    return sent_pieces.frame[certain], received_pieces.frame[matched.received_index[certain]]
 
 
-def tcp_sent(crossing: tcp.TcpFrames) -> int:
-    """Return how many frames with payload were sent, of which `tcp_frames` are those that arrived."""
-    return int(_ends(crossing.payload.sent).sum())
+def tcp_sent(frames: tcp.TcpFrames) -> int:
+    """Return the number of frames with payload that were sent, including those that did not arrive."""
+    return int(_is_last_piece(frames.payload.sent).sum())
 
 
-def _ends(pieces: Pieces) -> Mask:
-    """Return which pieces are the last of their frame."""
+def _is_last_piece(pieces: Pieces) -> Mask:
+    """Return a mask of the pieces that are the last of their frame."""
     last: Mask = np.diff(pieces.frame, append=-1) != 0
     return last
 
 
 def measure(
-    own: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer, *, sent: int, alike: bool = False
+    pairs: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer, *, sent: int, ambiguous: bool = False
 ) -> Measured:
-    """Return what both captures say of the transfer's delay, and of the receiver's clock against the sender's.
+    """Return the columns of the transfer's delay and of the clock offset.
 
     Args:
-        own: The transfer's packets, by `udp_packets` or `tcp_frames`.
+        pairs: The transfer's packets, from `udp_packets` or `tcp_frames`.
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.
-        transfer: What tells the transfer's packets.
-        sent: How many of them were sent.
-        alike: Whether some of these are left out of `own`, since nothing tells them apart.
+        transfer: Identifies the transfer's packets.
+        sent: Number of packets that the transfer sent.
+        ambiguous: True if some packets are missing in `pairs` because they are ambiguous.
     """
     others = _others(sender, receiver, transfer)
     reverse = _reverse(sender, receiver, transfer.sender_address, transfer.receiver_address)
-    if not len(own):
+    if not len(pairs):
         return _withheld(
-            "the packets of the transfer look alike" if alike else "no packet of the transfer is in both captures"
+            "the packets of the transfer cannot be distinguished"
+            if ambiguous
+            else "no packet of the transfer is in both captures"
         )
     if any(
         (times == NO_TIME).any()
-        for stamps in (own, others, reverse)
+        for stamps in (pairs, others, reverse)
         for times in (stamps.sender_ns, stamps.receiver_ns)
     ):
         return _withheld("a capture lacks times")
-    own = own.where(np.argsort(own.receiver_ns, kind="stable"))
-    transit_ns = own.receiver_ns - own.sender_ns
+    pairs = pairs.where(np.argsort(pairs.receiver_ns, kind="stable"))
+    transit_ns = pairs.receiver_ns - pairs.sender_ns
     jitter = Measured.of({"jitter_s": jitter_s(transit_ns)}, "a single packet has none")
     if not len(reverse):
         variation = _variation((transit_ns - transit_ns.min()) / 1e9)
         return jitter | variation | _withheld("no packet from receiver to sender is in both captures")
-    clocks = estimate(StampPairs.joined((own, others)), reverse)
+    clocks = estimate(StampPairs.concatenated((pairs, others)), reverse)
     if clocks is None:
         return _withheld(UNSTEADY)
-    delay_s, error_s = _delays_s(own, clocks)
+    delay_s, error_s = _delays_s(pairs, clocks)
     one_way = _one_way(delay_s, error_s, sent)
     return jitter | _clock(clocks) | one_way | _variation(delay_s)
 
 
-def of_each(own: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer) -> tuple[Floats, float] | None:
-    """Return the one-way delay of each packet, and the most that each can be wrong by the clocks, in seconds.
+def packet_delays(
+    pairs: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer
+) -> tuple[Floats, float] | None:
+    """Return the one-way delay of each packet, and the maximum error from the clocks, in seconds.
 
-    None where the captures do not tell one clock from the other.
+    None if the clock offset cannot be estimated.
 
     Args:
-        own: The transfer's packets, all with times, as of `measure`.
-        sender: Packets of the sender's capture, likewise.
-        receiver: Packets of the receiver's capture, likewise.
-        transfer: What tells the transfer's packets.
+        pairs: The transfer's packets as for `measure`; all must have times.
+        sender: Packets of the sender's capture, all with times.
+        receiver: Packets of the receiver's capture, all with times.
+        transfer: Identifies the transfer's packets.
     """
     reverse = _reverse(sender, receiver, transfer.sender_address, transfer.receiver_address)
-    if not len(own) or not len(reverse):
+    if not len(pairs) or not len(reverse):
         return None
-    clocks = estimate(StampPairs.joined((own, _others(sender, receiver, transfer))), reverse)
-    return None if clocks is None else _delays_s(own, clocks)
+    clocks = estimate(StampPairs.concatenated((pairs, _others(sender, receiver, transfer))), reverse)
+    return None if clocks is None else _delays_s(pairs, clocks)
 
 
-def between(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> Clocks | None:
-    """Return the receiver's clock against the sender's by every packet between the two, of whatever protocol.
+def clocks_between(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> Clocks | None:
+    """Return the offset between two robots' clocks, estimated from all packets between them, of any protocol.
 
-    None where the captures do not tell: they lack times, or packets in a direction, or a clock was set meanwhile.
+    None if a capture lacks times, there are no packets in one direction, or a clock was set.
 
     Args:
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.
-        sender_address: Of the sender on the link under test.
-        receiver_address: Of the receiver.
+        sender_address: Address of the sender on the link under test.
+        receiver_address: Address of the receiver on it.
     """
-    forward = _seen(
-        *(packets.where(_is_way(packets, sender_address, receiver_address)) for packets in (sender, receiver))
+    forward = _matched_pairs(
+        *(packets.where(_goes(packets, sender_address, receiver_address)) for packets in (sender, receiver))
     )
     reverse = _reverse(sender, receiver, sender_address, receiver_address)
     times = (forward.sender_ns, forward.receiver_ns, reverse.sender_ns, reverse.receiver_ns)
@@ -202,46 +206,47 @@ def between(sender: Packets, receiver: Packets, sender_address: str, receiver_ad
     return estimate(forward, reverse)
 
 
-def _delays_s(own: StampPairs, clocks: Clocks) -> tuple[Floats, float]:
-    """Return as `of_each`."""
-    return clocks.delays_s(own.sender_ns, own.receiver_ns), clocks.error_s(own.receiver_ns) + STAMP_S
+def _delays_s(pairs: StampPairs, clocks: Clocks) -> tuple[Floats, float]:
+    """Return delays and maximum error as for `packet_delays`."""
+    return clocks.delays_s(pairs.sender_ns, pairs.receiver_ns), clocks.error_s(pairs.receiver_ns) + STAMP_S
 
 
 def _withheld(reason: str) -> Measured:
-    """Return that no delay can be told, and why."""
+    """Return empty columns with the reason."""
     return Measured({"one_way_withheld": reason}) | Measured.nothing((*COLUMNS, *SENT_COLUMNS), reason)
 
 
 def jitter_s(transit_ns: Ints) -> float | None:
-    """Return the interarrival jitter of RFC 3550, section 6.4.1, after the last packet; None for a single one.
+    """Return the interarrival jitter of RFC 3550, section 6.4.1, after the last packet; None for a single packet.
 
     Args:
-        transit_ns: Time received less time sent of each packet, in the order of arrival, by any two clocks.
+        transit_ns: Time of reception minus time of sending of each packet, in the order of arrival, by any two
+            clocks.
     """
     if len(transit_ns) < 2:
         return None
-    # J += (|D| - J) / 16 from J = 0, written out; what is older weighs less than a float can tell.
-    recent_s = np.abs(np.diff(transit_ns[-_REMEMBERED:])) / 1e9
+    # J += (|D| - J) / 16 from J = 0, in closed form; older steps have weights below the precision of a float.
+    recent_s = np.abs(np.diff(transit_ns[-_WEIGHTED_STEPS:])) / 1e9
     return float(_JITTER_GAIN * (1 - _JITTER_GAIN) ** np.arange(len(recent_s))[::-1] @ recent_s)
 
 
 def mean_jitter_s(transit_ns: Ints) -> float | None:
-    """Return the mean of `jitter_s` after each packet from the second on; arguments as of `jitter_s`."""
+    """Return the mean of `jitter_s` after each packet from the second on; argument as for `jitter_s`."""
     if len(transit_ns) < 2:
         return None
-    # Each |D| counts in J after it and after all later packets: the sum of its weights is a geometric series.
+    # Each |D| contributes to J after it and after all later packets: its total weight is a geometric series.
     steps_s = np.abs(np.diff(transit_ns)) / 1e9
     weights = 1 - (1 - _JITTER_GAIN) ** np.arange(len(steps_s), 0, -1)
     return float(weights @ steps_s) / len(steps_s)
 
 
 def _variation(delay_s: Floats) -> Measured:
-    """Return the packet delay variation of RFC 5481, section 4.2: over the fastest packet."""
-    over_s = delay_s - delay_s.min()
+    """Return the packet delay variation of RFC 5481, section 4.2, relative to the fastest packet."""
+    variation_s = delay_s - delay_s.min()
     return Measured(
         {
-            "delay_variation_median_s": float(np.median(over_s)),
-            "delay_variation_p95_s": float(np.percentile(over_s, 95)),
+            "delay_variation_median_s": float(np.median(variation_s)),
+            "delay_variation_p95_s": float(np.percentile(variation_s, 95)),
         }
     )
 
@@ -264,8 +269,8 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
         "one_way_p95_s": float(np.percentile(delay_s, 95)),
     }
     shown = {name: value if error_s <= LARGEST_ERROR * value else None for name, value in figures.items()}
-    withheld = ", ".join(name.split("_")[2] for name, value in shown.items() if value is None)
-    reason = f"the error is above a tenth of: {withheld}" if withheld else None
+    withheld_names = ", ".join(name.split("_")[2] for name, value in shown.items() if value is None)
+    reason = f"the error is above a tenth of: {withheld_names}" if withheld_names else None
     of_sent = None if shown["one_way_median_s"] is None else quantile_of_sent(delay_s, sent, 0.5)
     return (
         Measured({"one_way_error_s": error_s})
@@ -276,43 +281,46 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
 
 
 def _others(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
-    """Return what else went from sender to receiver: packets without payload, and ping's."""
+    """Return the other packets from sender to receiver: those without payload, and ping's."""
     ends = transfer.sender_address, transfer.receiver_address
-    return _seen(
-        *(packets.where(_is_way(packets, *ends) & ~_is_own(packets, transfer)) for packets in (sender, receiver))
+    return _matched_pairs(
+        *(
+            packets.where(_goes(packets, *ends) & ~_may_be_transfer(packets, transfer))
+            for packets in (sender, receiver)
+        )
     )
 
 
 def _reverse(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> StampPairs:
-    """Return what went from receiver to sender."""
-    back = _seen(
-        *(packets.where(_is_way(packets, receiver_address, sender_address)) for packets in (receiver, sender))
+    """Return the packets from receiver to sender."""
+    pairs = _matched_pairs(
+        *(packets.where(_goes(packets, receiver_address, sender_address)) for packets in (receiver, sender))
     )
-    return StampPairs(sender_ns=back.receiver_ns, receiver_ns=back.sender_ns)
+    return StampPairs(sender_ns=pairs.receiver_ns, receiver_ns=pairs.sender_ns)
 
 
-def _is_way(packets: Packets, source: str, destination: str) -> Mask:
+def _goes(packets: Packets, source: str, destination: str) -> Mask:
     return packets.are_from(source) & packets.are_to(destination)
 
 
-def _is_own(packets: Packets, transfer: Transfer) -> Mask:
-    """Return which packets may be the transfer's; of a later fragment only its datagram tells."""
-    own: Mask = (
+def _may_be_transfer(packets: Packets, transfer: Transfer) -> Mask:
+    """Return a mask of the packets that may be the transfer's; a later UDP fragment has no port."""
+    mask: Mask = (
         packets.protocol == UDP
         if transfer.protocol is Protocol.UDP
         else (packets.dport == transfer.port) & (packets.tcp_payload_bytes > 0)
     )
-    return own
+    return mask
 
 
-def _seen(sent: Packets, received: Packets) -> StampPairs:
-    """Return when packets were sent and received."""
-    left, came = _copies(match(sent, received))
-    return StampPairs(sent.time_ns[left], received.time_ns[came])
+def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
+    """Return the times of the packets that are in both lists."""
+    sent_index, received_index = _copies(match(sent, received))
+    return StampPairs(sent.time_ns[sent_index], received.time_ns[received_index])
 
 
 def _copies(matched: Match, chosen: Mask | None = None) -> tuple[Ints, Ints]:
-    """Return where packets are among those sent and received, but for ones of which nobody can say which arrived."""
+    """Return the indices of matched packets among those sent and those received, without ambiguous ones."""
     certain = matched.arrived & ~matched.doubtful
     index = np.flatnonzero(certain if chosen is None else certain & chosen)
     return index, matched.received_index[index]

@@ -1,11 +1,11 @@
-"""New payload of a flow at its receiver: from when on it was due, and when it arrived.
+"""Deliveries of new payload of a flow at its receiver, and the time from which each was due.
 
-TCP delivers bytes in order, each once (RFC 9293, section 3.10.7.4): a frame is a delivery if it makes the run of
-bytes without a hole longer. UDP delivers whole datagrams. A retransmitted copy, a duplicate, a fragment and a segment
-behind a hole deliver nothing by themselves, so segmentation offload changes no time by more than one frame.
+TCP delivers bytes in order, each once (RFC 9293, section 3.10.7.4): a frame is a delivery if it extends the
+contiguous received bytes. UDP delivers complete datagrams. A retransmitted copy, a duplicate, a fragment and a
+segment after a gap deliver nothing alone, so segmentation offload changes no time by more than one frame.
 
-All times are those of the receiver's capture. Times of the sender are moved there by the fastest packet of the flow
-that both captures hold, so that a packet sent then would have arrived at the earliest.
+All times are those of the receiver's capture. The sender's times are converted with the fastest packet of the flow
+that is in both captures, so that a converted time is the earliest possible arrival.
 """
 
 from dataclasses import dataclass, replace
@@ -22,33 +22,36 @@ from fieldkit.measure.transfers.datagrams import NO_DATAGRAM
 from fieldkit.measure.transfers.tcp import TcpFrames
 from fieldkit.measure.transfers.udp import UdpPackets
 
-LEAST_STALL_S: Final = 0.2
-"""Least length of a stall: the least retransmission time-out of Linux (TCP_RTO_MIN), so what TCP repairs by a fast
-retransmission is not a stall."""
+MIN_STALL_S: Final = 0.2
+"""Minimum length of a stall: the minimum retransmission timeout of Linux (TCP_RTO_MIN). A loss that TCP repairs by a
+fast retransmission is therefore not a stall."""
 
-_RTTS: Final = 2
-"""A fast retransmission delivers a lost segment one round trip late, and a queue may double that."""
+_MIN_RTTS: Final = 2
+"""A stall is longer than this many round trips: a fast retransmission delivers a lost segment one round trip late,
+and a queue may double that."""
 
-_INTERVALS: Final = 3
-"""Of a flow at a rate: one or two payloads lost in a row are a loss, and no stall."""
+_MIN_INTERVALS: Final = 3
+"""A stall of a flow with a fixed rate is longer than this many sending intervals: one or two payloads lost in a row
+are a loss, not a stall."""
 
-_NEIGHBOURS: Final = 100
-"""Packets at either end of a flow of which the fastest moves times of the sender: within them clocks do not drift."""
+_EDGE_PACKETS: Final = 100
+"""Number of packets at each end of a flow from which the sender's clock offset is taken; drift is negligible within
+them."""
 
-BACK_NS: Final = 100_000_000
-"""Packets that two processors took in may be in another order by less; by more the clock was set back."""
+REORDERING_NS: Final = 100_000_000
+"""Packets handled by two processors may be out of order by less than this; by more, the clock was set back."""
 
 
 @dataclass(frozen=True)
 class FlowSchedule:
-    """What is known of a flow before it is captured.
+    """Properties of a flow that are known without its capture.
 
     Attributes:
-        interval_s: Time between two payloads where they are sent at a rate; 0 where the sender always has more.
-        lasts_s: How long it sends, from its first payload on; None if it ends when all is sent.
-        size_bytes: Payload of a TCP flow; None if only its capture shows it.
-        until_ns: When the receiving program ended, by the receiver's clock; None if that is unknown.
-        head_bytes: Bytes at the beginning of a TCP flow that belong to its setup.
+        interval_s: Sending interval of a flow with a fixed rate; 0 if the sender always has more to send.
+        lasts_s: Sending duration from the first payload on; None if the flow ends when everything is sent.
+        size_bytes: Payload of a TCP flow; None if it is not known in advance.
+        until_ns: Time at which the receiving program ended, by the receiver's clock; None if unknown.
+        head_bytes: Bytes at the start of a TCP flow that belong to its setup.
     """
 
     interval_s: float = 0.0
@@ -60,54 +63,54 @@ class FlowSchedule:
 
 @dataclass(frozen=True, eq=False)
 class Delivery:
-    """New payload of one stream; times in nanoseconds since 1970 UTC by the receiver's clock.
+    """Deliveries of one stream; times in nanoseconds since 1970 UTC by the receiver's clock.
 
     Attributes:
-        at_ns: When each new payload arrived, in order. Shape (n,).
-        begin_ns: When the stream began: its first packet, of TCP its SYN. By the sender's clock if nothing arrived.
-        end_ns: Until when payload was due; None if all of it arrived. By the sender's clock if nothing arrived.
+        at_ns: Time of arrival of each new payload, ascending. Shape (n,).
+        begin_ns: Start of the stream: its first packet, for TCP its SYN. By the sender's clock if nothing arrived.
+        end_ns: Time until which payload was due; None if all of it arrived. By the sender's clock if nothing arrived.
         interval_s: As `FlowSchedule.interval_s`.
-        least_s: Payload that is overdue for longer is a stall.
+        min_stall_s: If payload is overdue for longer than this, it is a stall.
     """
 
     at_ns: Ints
     begin_ns: int
     end_ns: int | None
     interval_s: float
-    least_s: float
+    min_stall_s: float
 
 
-def of_udp(crossing: UdpPackets, chosen: Mask, expected: FlowSchedule) -> Delivery:
+def of_udp(packets: UdpPackets, chosen: Mask, expected: FlowSchedule) -> Delivery:
     """Return the deliveries of datagrams.
 
     Args:
-        crossing: UDP packets of both captures.
-        chosen: Which datagrams sent are of the stream. Shape (k,).
-        expected: What is known of it.
+        packets: UDP packets of both captures.
+        chosen: Mask of the sent datagrams that belong to the stream. Shape (k,).
+        expected: Known properties of the stream.
 
     Raises:
-        EvidenceError: The captures do not show it.
+        EvidenceError: The deliveries cannot be determined from the captures.
     """
-    matched = crossing.match
-    mine = np.append(chosen, False)[crossing.datagram]  # the last entry is that of NO_DATAGRAM
-    came = np.append(mine, False)[matched.sent_index]  # that of match.NONE
-    if (came & matched.dubious).any():
-        raise EvidenceError("packets of it look alike, and some that arrived may be copies")
-    sent_ns = crossing.sent.time_ns[mine]
-    _demand_times(sent_ns, crossing.received.time_ns[came])
-    whole_ns = arrivals_ns(crossing)[chosen]
-    at_ns = np.sort(whole_ns[whole_ns != NO_TIME])
-    index = np.flatnonzero(mine & matched.arrived)
-    pairs = StampPairs(crossing.sent.time_ns[index], crossing.received.time_ns[matched.received_index[index]])
-    return of_stream(at_ns, (int(sent_ns.min()), int(sent_ns.min()), int(sent_ns.max())), pairs, expected)
+    matched = packets.match
+    chosen_packets = np.append(chosen, False)[packets.datagram]  # the last entry is that of NO_DATAGRAM
+    received_packets = np.append(chosen_packets, False)[matched.sent_index]  # that of match.NONE
+    if (received_packets & matched.possible_copy).any():
+        raise EvidenceError("its packets cannot be distinguished, and some that arrived may be copies")
+    sent_ns = packets.sent.time_ns[chosen_packets]
+    _require_times(sent_ns, packets.received.time_ns[received_packets])
+    complete_ns = arrivals_ns(packets)[chosen]
+    at_ns = np.sort(complete_ns[complete_ns != NO_TIME])
+    index = np.flatnonzero(chosen_packets & matched.arrived)
+    pairs = StampPairs(packets.sent.time_ns[index], packets.received.time_ns[matched.received_index[index]])
+    return stream_delivery(at_ns, (int(sent_ns.min()), int(sent_ns.min()), int(sent_ns.max())), pairs, expected)
 
 
-def arrivals_ns(crossing: UdpPackets) -> Ints:
-    """Return when the last fragment of each datagram sent arrived; `NO_TIME` where not all did. Shape (k,)."""
-    index = np.flatnonzero((crossing.datagram != NO_DATAGRAM) & crossing.match.arrived)
-    last_ns = np.full(len(crossing.first), NO_TIME)
-    np.maximum.at(last_ns, crossing.datagram[index], crossing.received.time_ns[crossing.match.received_index[index]])
-    return np.where(udp.whole(crossing)[:-1], last_ns, NO_TIME)
+def arrivals_ns(packets: UdpPackets) -> Ints:
+    """Return the arrival of the last fragment of each sent datagram, or `NO_TIME` if it is incomplete. Shape (k,)."""
+    index = np.flatnonzero((packets.datagram != NO_DATAGRAM) & packets.match.arrived)
+    last_ns = np.full(len(packets.first), NO_TIME)
+    np.maximum.at(last_ns, packets.datagram[index], packets.received.time_ns[packets.match.received_index[index]])
+    return np.where(udp.complete(packets)[:-1], last_ns, NO_TIME)
 
 
 def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Delivery:
@@ -116,119 +119,119 @@ def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Deliv
     Args:
         frames: Its frames in both captures.
         answers: Packets of the other direction in the sender's capture.
-        expected: What is known of it.
+        expected: Known properties of the connection.
 
     Raises:
-        EvidenceError: The captures do not show it.
+        EvidenceError: The deliveries cannot be determined from the captures.
     """
     sent, received = frames.sent, frames.received
-    _demand_times(sent.time_ns, received.time_ns)
-    place, reached = in_order(received)
-    _, offered = in_order(sent)
-    beyond = reached > expected.head_bytes
-    # Two processors may have taken in two packets in another order.
-    at_ns = np.maximum.accumulate(received.time_ns[place])[beyond]
-    delivered, left = (int(bytes_[-1]) if len(bytes_) else 0 for bytes_ in (reached, offered))
-    whole = delivered >= max(left, expected.size_bytes or 0, expected.head_bytes + 1)
+    _require_times(sent.time_ns, received.time_ns)
+    advancing, received_run = advancing_frames(received)
+    _, sent_run = advancing_frames(sent)
+    has_payload = received_run > expected.head_bytes
+    # Two processors may have captured two packets in the wrong order.
+    at_ns = np.maximum.accumulate(received.time_ns[advancing])[has_payload]
+    delivered_bytes, sent_bytes = (int(bytes_[-1]) if len(bytes_) else 0 for bytes_ in (received_run, sent_run))
+    is_complete = delivered_bytes >= max(sent_bytes, expected.size_bytes or 0, expected.head_bytes + 1)
     data = sent.tcp_payload_bytes > expected.head_bytes
     first_ns = int(sent.time_ns.min())
     data_ns = int(sent.time_ns[data].min()) if data.any() else first_ns
-    last_ns = max(int(sent.time_ns[sent.tcp_payload_bytes > 0].max(initial=first_ns)), _syn_ns(sent, first_ns))
-    left_index, came_index = delay.tcp_copies(frames)
-    pairs = StampPairs(sent.time_ns[left_index], received.time_ns[came_index])
-    found = of_stream(at_ns, (first_ns, data_ns, last_ns), pairs, expected, rtt_s=_rtt_s(sent, answers))
+    last_ns = max(int(sent.time_ns[sent.tcp_payload_bytes > 0].max(initial=first_ns)), _last_syn_ns(sent, first_ns))
+    sent_index, received_index = delay.tcp_copies(frames)
+    pairs = StampPairs(sent.time_ns[sent_index], received.time_ns[received_index])
+    delivery = stream_delivery(at_ns, (first_ns, data_ns, last_ns), pairs, expected, rtt_s=_rtt_s(sent, answers))
     if expected.lasts_s is not None or not len(at_ns):
-        return found
-    if whole:
-        return replace(found, end_ns=None)
-    # A receiver that knows how much is to come waits for it until it is ended.
+        return delivery
+    if is_complete:
+        return replace(delivery, end_ns=None)
+    # A receiver that knows the size waits for the rest until it is terminated.
     return (
-        found
+        delivery
         if expected.size_bytes is None or expected.until_ns is None
-        else replace(found, end_ns=expected.until_ns)
+        else replace(delivery, end_ns=expected.until_ns)
     )
 
 
-def in_order(frames: Packets) -> tuple[Ints, Ints]:
-    """Return which frames make the run of bytes without a hole longer, and how long it is with each.
+def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
+    """Return the frames that extend the contiguous bytes of a connection, and the number of these bytes after each.
 
     Args:
-        frames: Those of one TCP connection in one direction, in the order of the capture.
+        frames: Frames of one TCP connection in one direction, in the order of the capture.
 
     Raises:
-        EvidenceError: See `ranges.cut`.
+        EvidenceError: As for `ranges.cut`.
     """
-    # Where SYN is, it says where the first byte has its place; an RST may have any number.
-    mine = np.flatnonzero((frames.tcp_payload_bytes > 0) | (frames.tcp_flags & SYN != 0))
-    chosen = frames.where(mine)
+    # SYN frames are included, because they define the position of the first byte. The number in an RST is arbitrary.
+    relevant = np.flatnonzero((frames.tcp_payload_bytes > 0) | (frames.tcp_flags & SYN != 0))
+    chosen = frames.where(relevant)
     _, pieces = ranges.cut(chosen.where(slice(0, 0)), chosen)
-    never = len(chosen)
-    count = int(pieces.stretch.max(initial=-1)) + 1
-    first, size_bytes = np.full(count, never), np.zeros(count, dtype=np.int64)
-    # Of several values for one place numpy keeps the last, here that of the earliest frame.
-    first[pieces.stretch[::-1]] = pieces.frame[::-1]
-    size_bytes[pieces.stretch] = pieces.size_bytes
+    no_frame = len(chosen)
+    count = int(pieces.range_id.max(initial=-1)) + 1
+    first, size_bytes = np.full(count, no_frame), np.zeros(count, dtype=np.int64)
+    # If an index occurs several times, numpy stores the last value: here that of the earliest frame.
+    first[pieces.range_id[::-1]] = pieces.frame[::-1]
+    size_bytes[pieces.range_id] = pieces.size_bytes
     reached = np.maximum.accumulate(first)
-    reached = reached[reached < never]
-    last_of_frame = np.flatnonzero(np.diff(reached, append=never))
-    return mine[reached[last_of_frame]], np.cumsum(size_bytes[: len(reached)])[last_of_frame]
+    reached = reached[reached < no_frame]
+    last_of_frame = np.flatnonzero(np.diff(reached, append=no_frame))
+    return relevant[reached[last_of_frame]], np.cumsum(size_bytes[: len(reached)])[last_of_frame]
 
 
-def of_stream(
+def stream_delivery(
     at_ns: Ints, sent_ns: tuple[int, int, int], pairs: StampPairs, expected: FlowSchedule, *, rtt_s: float = 0.0
 ) -> Delivery:
-    """Return the deliveries of a stream that was due until its last payload was, or until its time was over.
+    """Return the deliveries of a stream that was due until its last payload was sent, or for its duration.
 
     Args:
         at_ns: Times of delivery.
-        sent_ns: When its sender sent its first packet, its first payload and its last one.
-        pairs: Its packets that both captures hold.
-        expected: What is known of it.
-        rtt_s: Round-trip time of a stream that sends again what was lost.
+        sent_ns: Times at which its sender sent the first packet, the first payload and the last payload.
+        pairs: Its packets that are in both captures.
+        expected: Known properties of the stream.
+        rtt_s: Round-trip time if the stream retransmits lost data, else 0.
     """
-    least_s = max(LEAST_STALL_S, _RTTS * rtt_s, _INTERVALS * expected.interval_s)
+    min_stall_s = max(MIN_STALL_S, _MIN_RTTS * rtt_s, _MIN_INTERVALS * expected.interval_s)
     first_ns, data_ns, last_ns = sent_ns
     if expected.lasts_s is not None:
         last_ns = data_ns + round(1e9 * expected.lasts_s)
     if not len(at_ns):
-        return Delivery(at_ns, first_ns, last_ns, expected.interval_s, least_s)
-    early_ns, late_ns = _ahead_ns(pairs)
-    end_ns = last_ns + late_ns
+        return Delivery(at_ns, first_ns, last_ns, expected.interval_s, min_stall_s)
+    start_offset_ns, end_offset_ns = _sender_to_receiver_ns(pairs)
+    end_ns = last_ns + end_offset_ns
     if expected.lasts_s is not None and expected.until_ns is not None:
         end_ns = min(end_ns, expected.until_ns)
-    return Delivery(at_ns, first_ns + early_ns, end_ns, expected.interval_s, least_s)
+    return Delivery(at_ns, first_ns + start_offset_ns, end_ns, expected.interval_s, min_stall_s)
 
 
-def _ahead_ns(pairs: StampPairs) -> tuple[int, int]:
-    """Return what to add to times of the sender at the beginning and at the end of a flow."""
+def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
+    """Return the values to add to the sender's times at the start and at the end of a flow."""
     if not len(pairs):
-        raise EvidenceError("nothing shows which of its packets arrived when")
+        raise EvidenceError("no packet of it is known to be in both captures")
     order = np.argsort(pairs.receiver_ns, kind="stable")
-    ends = pairs.where(order[:_NEIGHBOURS]), pairs.where(order[-_NEIGHBOURS:])
-    early_ns, late_ns = (int((part.receiver_ns - part.sender_ns).min()) for part in ends)
-    return early_ns, late_ns
+    first_and_last = pairs.where(order[:_EDGE_PACKETS]), pairs.where(order[-_EDGE_PACKETS:])
+    start_offset_ns, end_offset_ns = (int((part.receiver_ns - part.sender_ns).min()) for part in first_and_last)
+    return start_offset_ns, end_offset_ns
 
 
-def _demand_times(sent_ns: Ints, received_ns: Ints) -> None:
-    """Refuse captures that do not tell how much time passed."""
+def _require_times(sent_ns: Ints, received_ns: Ints) -> None:
+    """Raise an error for captures from which durations cannot be computed."""
     if not len(sent_ns):
         raise EvidenceError("no packet of it is in the sender's capture")
     for times_ns in (sent_ns, received_ns):
         if (times_ns == NO_TIME).any():
             raise EvidenceError("a capture lacks times")
-        if (np.diff(times_ns) < -BACK_NS).any():
+        if (np.diff(times_ns) < -REORDERING_NS).any():
             raise EvidenceError("a packet is earlier than the one before it: a clock was set back")
 
 
-def _syn_ns(sent: Packets, first_ns: int) -> int:
-    """Return when the last SYN was sent, of a connection that may never have been made."""
+def _last_syn_ns(sent: Packets, first_ns: int) -> int:
+    """Return the time of the last SYN, which the sender repeats if the connection is not established."""
     return int(sent.time_ns[sent.tcp_flags & SYN != 0].max(initial=first_ns))
 
 
 def _rtt_s(sent: Packets, answers: Packets) -> float:
-    """Return the round-trip time of the handshake at the sender; 0 where its capture does not have it."""
-    acknowledges = answers.time_ns[answers.tcp_flags & ACK != 0]
-    opens_ns = sent.time_ns[sent.tcp_flags & SYN != 0]
-    if not len(acknowledges) or not (before := opens_ns[opens_ns <= acknowledges[0]]).size:
+    """Return the round-trip time of the handshake at the sender, or 0 if its capture does not have it."""
+    acknowledged_ns = answers.time_ns[answers.tcp_flags & ACK != 0]
+    syn_ns = sent.time_ns[sent.tcp_flags & SYN != 0]
+    if not len(acknowledged_ns) or not (before := syn_ns[syn_ns <= acknowledged_ns[0]]).size:
         return 0.0
-    return float(acknowledges[0] - before[-1]) / 1e9
+    return float(acknowledged_ns[0] - before[-1]) / 1e9

@@ -1,4 +1,4 @@
-"""What a capture at the end that pings holds of each echo: when the request left, and when the reply was whole."""
+"""Pings in a capture of the pinging robot: times of echo requests and of complete replies."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,37 +15,37 @@ HEADER_BYTES: Final = 8
 
 @dataclass(frozen=True)
 class CapturedPing:
-    """The echoes of one identifier in one capture; times in nanoseconds since 1970 UTC, by sequence number.
+    """Echoes of one ICMP identifier in one capture; times in nanoseconds since 1970 UTC, by sequence number.
 
     Attributes:
-        requested_ns: First request with this number; of a fragmented one its first fragment.
-        replied_ns: First reply that is whole: its last fragment.
+        requested_ns: Time of the first request; if fragmented, of its first fragment.
+        replied_ns: Time of the first complete reply; if fragmented, of its last fragment.
     """
 
     requested_ns: Mapping[int, int]
     replied_ns: Mapping[int, int]
 
 
-def of_each_ping(packets: Packets, asks: str, answers: str, payload_bytes: int) -> Iterator[CapturedPing]:
+def of_each_ping(packets: Packets, source: str, destination: str, payload_bytes: int) -> Iterator[CapturedPing]:
     """Yield the echoes of each identifier that has a request.
 
     Args:
         packets: A capture.
-        asks: Address that the requests come from.
-        answers: Address that they go to.
-        payload_bytes: Payload of a request; echoes of another size are another ping's.
+        source: Source address of the requests.
+        destination: Destination address of the requests.
+        payload_bytes: Payload of a request; echoes of another size belong to another ping.
     """
-    there, back = _icmp(packets, asks, answers), _icmp(packets, answers, asks)
-    requests = there.where((there.echo != NO_ECHO) & (there.echo < ECHO_REPLY))
-    requests = requests.where(_sizes(there, requests) == payload_bytes + HEADER_BYTES)
-    replies = back.where(back.echo >= ECHO_REPLY)
-    whole_ns = _whole_ns(back, replies, payload_bytes + HEADER_BYTES)
+    outgoing, returning = _icmp(packets, source, destination), _icmp(packets, destination, source)
+    requests = outgoing.where((outgoing.echo != NO_ECHO) & (outgoing.echo < ECHO_REPLY))
+    requests = requests.where(_sizes(outgoing, requests) == payload_bytes + HEADER_BYTES)
+    replies = returning.where(returning.echo >= ECHO_REPLY)
+    complete_ns = _complete_ns(returning, replies, payload_bytes + HEADER_BYTES)
     for identifier in np.unique(requests.echo).tolist():
-        own = requests.echo == identifier
-        answered = (replies.echo == identifier + ECHO_REPLY) & (whole_ns >= 0)
+        matches = requests.echo == identifier
+        answered = (replies.echo == identifier + ECHO_REPLY) & (complete_ns >= 0)
         yield CapturedPing(
-            _first(requests.echo_seq[own], requests.time_ns[own]),
-            _first(replies.echo_seq[answered], whole_ns[answered]),
+            _first(requests.echo_seq[matches], requests.time_ns[matches]),
+            _first(replies.echo_seq[answered], complete_ns[answered]),
         )
 
 
@@ -54,25 +54,25 @@ def _icmp(packets: Packets, source: str, destination: str) -> Packets:
 
 
 def _sizes(packets: Packets, first: Packets) -> Ints:
-    """Return the size of the datagram that each of these first fragments begins, as far as it was captured."""
+    """Return the captured size of the datagram that starts with each of these first fragments."""
     ends = packets.fragment_offset + packets.ip_payload_bytes
     order = np.lexsort((ends, packets.ip_id))
     ids, last = packets.ip_id[order], ends[order]
-    alone = ~first.more_fragments
-    # Of equal ids the largest end comes last.
+    unfragmented = ~first.more_fragments
+    # Among equal ids the largest end is last.
     at = np.searchsorted(ids, first.ip_id, side="right") - 1
-    return np.where(alone, first.ip_payload_bytes, last[at])
+    return np.where(unfragmented, first.ip_payload_bytes, last[at])
 
 
-def _whole_ns(packets: Packets, first: Packets, size_bytes: int) -> Ints:
-    """Return when each datagram was whole, by its first fragment; -1 if it never was, or has another size."""
-    found = np.where(first.more_fragments, -1, np.where(first.ip_payload_bytes == size_bytes, first.time_ns, -1))
+def _complete_ns(packets: Packets, first: Packets, size_bytes: int) -> Ints:
+    """Return the time at which each datagram was complete; -1 if it never was, or has another size."""
+    times_ns = np.where(first.more_fragments, -1, np.where(first.ip_payload_bytes == size_bytes, first.time_ns, -1))
     for index in np.flatnonzero(first.more_fragments):
         parts = packets.where(packets.ip_id == first.ip_id[index])
-        _, once = np.unique(parts.fragment_offset, return_index=True)
-        if int(parts.ip_payload_bytes[once].sum()) == size_bytes:
-            found[index] = parts.time_ns[once].max()
-    return found
+        _, unique_parts = np.unique(parts.fragment_offset, return_index=True)
+        if int(parts.ip_payload_bytes[unique_parts].sum()) == size_bytes:
+            times_ns[index] = parts.time_ns[unique_parts].max()
+    return times_ns
 
 
 def _first(numbers: Ints, times_ns: Ints) -> dict[int, int]:

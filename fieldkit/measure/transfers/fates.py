@@ -1,4 +1,4 @@
-"""Fate of each packet of one transfer, from the captures of both ends."""
+"""Which packets of one transfer were lost or sent again, from the captures of both ends."""
 
 from dataclasses import dataclass
 
@@ -16,14 +16,14 @@ from fieldkit.measure.transfers.transfer import Transfer
 
 @dataclass(frozen=True, eq=False)
 class Fates:
-    """The packets of a transfer at both ends.
+    """Packets of a transfer at both ends.
 
     Attributes:
-        sent_ns: When each left, by the sender's clock, in the order of the capture. Shape (n,).
-        sent_bytes: Where in the payload it begins, in bytes.
-        marked: Which were lost (UDP), or carry what had been sent before (TCP).
-        received_ns: When each arrived, by the receiver's clock. Shape (m,).
-        received_bytes: Where in the payload it begins.
+        sent_ns: Time of sending by the sender's clock, in the order of the capture. Shape (n,).
+        sent_bytes: Offset of each sent packet in the payload, in bytes.
+        marked: Mask of the sent packets that were lost (UDP), or that repeat bytes sent before (TCP).
+        received_ns: Time of arrival by the receiver's clock. Shape (m,).
+        received_bytes: Offset of each received packet in the payload.
     """
 
     sent_ns: Ints
@@ -33,38 +33,39 @@ class Fates:
     received_bytes: NDArray[np.int64]
 
 
-def ends(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets, Packets]:
-    """Return the packets of the captures of sender and receiver, of which the fates of a transfer's can be told.
+def both_packets(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets, Packets]:
+    """Return the packets of the sender's and the receiver's capture after checks that they can be compared.
 
     Args:
-        evidence: What the attempt left.
-        transfer: What tells its packets from others.
+        evidence: The attempt's evidence.
+        transfer: Identifies the packets of the transfer.
 
     Raises:
-        EvidenceError: A capture is missing, damaged or without times, or the two contradict each other.
+        EvidenceError: A capture is missing, damaged or without times, or the captures contradict each other.
     """
     captures = [evidence.whole_capture(name) for name in transfer.captures]
     if any(capture is None for capture in captures):
-        raise EvidenceError("there are no whole captures of both ends", where=str(evidence.folder))
+        raise EvidenceError("there are no complete captures of both ends", where=str(evidence.folder))
     sender, receiver = (capture.packets for capture in captures if capture is not None)
     if (sender.time_ns == NO_TIME).any() or (receiver.time_ns == NO_TIME).any():
         raise EvidenceError("a capture lacks times", where=str(evidence.folder))
     if why := strangers.reason(sender, receiver, transfer):
-        raise EvidenceError(f"the captures of the transfer do not compare: {why}", where=str(evidence.folder))
+        raise EvidenceError(f"the captures of the transfer cannot be compared: {why}", where=str(evidence.folder))
     return sender, receiver
 
 
 def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
-    """Return the fates of a transfer's packets; None where a capture is missing, damaged, without times, or empty.
+    """Return the fates of a transfer's packets.
 
-    None, too, where its packets contradict each other, or look so much alike that nobody knows which were lost.
+    None if a capture is missing, damaged, without times or empty, if the captures contradict each other, or if it is
+    ambiguous which packets were lost.
 
     Args:
-        evidence: What the attempt left.
-        transfer: What tells its packets from others.
+        evidence: The attempt's evidence.
+        transfer: Identifies the packets of the transfer.
     """
     try:
-        sender, receiver = ends(evidence, transfer)
+        sender, receiver = both_packets(evidence, transfer)
         fates = {Protocol.UDP: _udp, Protocol.TCP: _tcp}[transfer.protocol](sender, receiver, transfer)
     except EvidenceError:
         return None
@@ -72,39 +73,39 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
 
 
 def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None:
-    crossing = udp.cross(sender, receiver, transfer)
-    chosen, sent_index = crossing.chosen, crossing.match.sent_index
-    if (chosen & crossing.match.doubtful).any():
+    packets = udp.cross(sender, receiver, transfer)
+    chosen, sent_index = packets.chosen, packets.match.sent_index
+    if (chosen & packets.match.doubtful).any():
         return None
-    begins = np.cumsum(crossing.sent.ip_payload_bytes * chosen) - crossing.sent.ip_payload_bytes
-    came = np.append(chosen, False)[sent_index]  # the last entry is that of match.NONE
+    offset_bytes = np.cumsum(packets.sent.ip_payload_bytes * chosen) - packets.sent.ip_payload_bytes
+    received = np.append(chosen, False)[sent_index]  # the last entry is that of match.NONE
     return Fates(
-        sent_ns=crossing.sent.time_ns[chosen],
-        sent_bytes=begins[chosen],
-        marked=~crossing.match.arrived[chosen],
-        received_ns=crossing.received.time_ns[came],
-        received_bytes=begins[sent_index[came]],
+        sent_ns=packets.sent.time_ns[chosen],
+        sent_bytes=offset_bytes[chosen],
+        marked=~packets.match.arrived[chosen],
+        received_ns=packets.received.time_ns[received],
+        received_bytes=offset_bytes[sent_index[received]],
     )
 
 
 def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
-    """Offload makes frames of both ends differ, so none is matched: what went again is told by its sequence range."""
+    """Offload makes the frames at the two ends differ, so retransmissions are identified by sequence range."""
     sent, received = (
         packets.where((packets.dport == transfer.port) & (packets.tcp_payload_bytes > 0))
         for packets in (transfer.forward(sender), transfer.forward(receiver))
     )
     base = int(sent.tcp_seq[0]) if len(sent) else 0
-    begins, begins_received = (_since(base, packets.tcp_seq) for packets in (sent, received))
-    reached = np.maximum.accumulate(begins + sent.tcp_payload_bytes)
+    offset_bytes, received_offset_bytes = (_relative_seq(base, packets.tcp_seq) for packets in (sent, received))
+    sent_up_to = np.maximum.accumulate(offset_bytes + sent.tcp_payload_bytes)
     return Fates(
         sent_ns=sent.time_ns,
-        sent_bytes=begins,
-        marked=np.append(np.zeros(min(1, len(sent)), dtype=np.bool_), begins[1:] < reached[:-1]),
+        sent_bytes=offset_bytes,
+        marked=np.append(np.zeros(min(1, len(sent)), dtype=np.bool_), offset_bytes[1:] < sent_up_to[:-1]),
         received_ns=received.time_ns,
-        received_bytes=begins_received,
+        received_bytes=received_offset_bytes,
     )
 
 
-def _since(base: int, tcp_seq: Ints) -> NDArray[np.int64]:
-    """Return how far sequence numbers, of 32 bits, are from `base`, each the shorter way round."""
+def _relative_seq(base: int, tcp_seq: Ints) -> NDArray[np.int64]:
+    """Return 32-bit sequence numbers relative to `base`, between -2**31 and 2**31 - 1."""
     return (tcp_seq - base + 2**31) % 2**32 - 2**31

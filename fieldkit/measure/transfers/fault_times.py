@@ -1,4 +1,4 @@
-"""Begin and end of a fault by the laptop's clock, with the offsets of the robots' clocks: the laptop writes them."""
+"""Start and end of a fault by the laptop's clock, and the offsets of the robots' clocks, in a file of the laptop."""
 
 import re
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ _FILE: Final = re.compile(
 
 
 def file(kind: FaultKind) -> str:
-    """Return the file of the times of a fault."""
+    """Return the name of the file with the times of a fault."""
     return f"fault-{kind}-times.txt"
 
 
@@ -28,9 +28,9 @@ class FaultTimes:
     """Times of a fault.
 
     Attributes:
-        began_ns: When its cause began, nanoseconds since 1970 UTC by the laptop's clock.
-        ended_ns: When its cause was over; None if that is unknown.
-        ahead: By role how far the robot's clock is ahead of the laptop's.
+        began_ns: Start of its cause, nanoseconds since 1970 UTC by the laptop's clock.
+        ended_ns: End of its cause; None if unknown.
+        ahead: Offset of each robot's clock from the laptop's, by role.
     """
 
     began_ns: int
@@ -39,9 +39,9 @@ class FaultTimes:
 
 
 def text(times: FaultTimes) -> str:
-    """Return what `read` reads."""
+    """Return the content of a file that `read` reads."""
     ended = "unknown" if times.ended_ns is None else str(times.ended_ns)
-    lines = (f"ahead_s {role} {one.offset_s:.9f} {one.error_s:.9f}\n" for role, one in times.ahead.items())
+    lines = (f"ahead_s {role} {offset.offset_s:.9f} {offset.error_s:.9f}\n" for role, offset in times.ahead.items())
     return f"began_utc_ns {times.began_ns}\nended_utc_ns {ended}\n{''.join(lines)}"
 
 
@@ -49,7 +49,7 @@ def read(path: Path) -> FaultTimes:
     """Return the times in a file.
 
     Raises:
-        EvidenceError: It is missing or not whole.
+        EvidenceError: The file is missing or incomplete.
     """
     try:
         return parse(reading.text(path))
@@ -61,11 +61,11 @@ def parse(content: str) -> FaultTimes:
     """Return the times in the content of a file.
 
     Raises:
-        EvidenceError: It is not whole.
+        EvidenceError: The content is incomplete.
     """
     match = _FILE.match(content)
     if match is None:
-        raise EvidenceError("does not say when the fault began and ended")
+        raise EvidenceError("does not contain the start and end of the fault")
     words = (line.split() for line in match["ahead"].splitlines())
     ahead = {Role(role): Offset(float(offset_s), float(error_s)) for _, role, offset_s, error_s in words}
     return FaultTimes(int(match["began"]), None if match["ended"] == "unknown" else int(match["ended"]), ahead)

@@ -1,4 +1,4 @@
-"""The figures of one transfer: from files, captures, ping and host to the columns that it declares."""
+"""All columns of one transfer, computed from files, captures, ping and host counters."""
 
 import numpy as np
 
@@ -11,24 +11,24 @@ from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import bag, host, medium, ping, reading
 from fieldkit.measure.positions import where
 from fieldkit.measure.transfers import delay, paper, rates, stalls, strangers, tcp, transfer_stalls, udp
-from fieldkit.measure.transfers.columns import LAYERS, OF_TCP, OF_UDP, STALLS, TIMES, WAY
+from fieldkit.measure.transfers.columns import DISTANCE, LAYERS, OF_TCP, OF_UDP, STALLS, TIMES
 from fieldkit.measure.transfers.deliveries import FlowSchedule
 from fieldkit.measure.transfers.transfer import Transfer
 
 
 def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -> Measured:
-    """Return every figure of a transfer.
+    """Return all columns of a transfer.
 
-    What rests on missing, unreadable or damaged evidence is missing, never a guess; whether the repeat is valid
-    without it is for the gates to say.
+    Columns that depend on missing, unreadable or damaged evidence are missing. The gates decide whether the repeat is
+    valid without them.
 
     Args:
-        evidence: What the attempt left.
-        transfer: What was sent from where to where.
-        listener: Job that received it; empty where that is not known.
+        evidence: The attempt's evidence.
+        transfer: The transfer.
+        listener: Job that received the file; empty if unknown.
     """
-    whole = [evidence.whole_capture(file) for file in transfer.captures]
-    sender, receiver = whole if transfer.captured else (None, None)
+    captures = [evidence.whole_capture(file) for file in transfer.captures]
+    sender, receiver = captures if transfer.captured else (None, None)
     contradiction = incomparable(evidence, transfer)
     pings = evidence.read_or_none(ping.read, prefixed(transfer.name, ping.FILE))
     states = (host.before(transfer.destination), host.after(transfer.destination))
@@ -36,10 +36,14 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
     return (
         files
         | _layers(
-            (sender, receiver), transfer, files, contradiction, transfer_stalls.expected(evidence, transfer, listener)
+            (sender, receiver),
+            transfer,
+            files,
+            contradiction,
+            transfer_stalls.flow_schedule(evidence, transfer, listener),
         )
         | medium.measure(evidence.read_or_none(medium.read, prefixed(transfer.name, medium.FILE)))
-        | where.measure(evidence, WAY, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
+        | where.measure(evidence, DISTANCE, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
         | _paper(sender, None if contradiction else receiver, pings, transfer)
         | host.measure(*(evidence.read_or_none(host.read, name) for name in states))
         | _system(evidence, transfer)
@@ -47,16 +51,16 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
 
 
 def _system(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
-    """Return what is known of the operating systems of both ends."""
+    """Return the columns of the operating systems of both ends."""
     if transfer.protocol is Protocol.UDP:
         return Measured.nothing(host.SYSTEM, "UDP has no congestion control")
     return host.measure_system(evidence.read_or_none(host.congestion_control, host.before(transfer.source)))
 
 
 def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
-    """Return why no loss can be told from two whole captures, None where one can or where there are not both.
+    """Return the reason why no loss can be computed from two undamaged captures, or None if it can.
 
-    They contradict the file, or each other.
+    The captures contradict the file or each other. None as well if there are not two captures.
     """
     return evidence.cached(_incomparable, transfer) if transfer.captured else None
 
@@ -64,19 +68,19 @@ def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
 def _incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     sender, receiver = map(evidence.whole_capture, transfer.captures)
     if sender and receiver and (why := strangers.reason(sender.packets, receiver.packets, transfer)):
-        return f"the captures of the transfer do not compare: {why}"
+        return f"the captures of the transfer cannot be compared: {why}"
     if evidence.read_or_none(reading.size, transfer.received_file):
         for role, capture in ((transfer.source, sender), (transfer.destination, receiver)):
             if capture is not None and not len(transfer.forward(capture.packets)):
                 return (
-                    f"{transfer.received_file} has bytes, and no packet of the transfer is in the capture of {role}:"
-                    " is an address translated on the way?"
+                    f"{transfer.received_file} is not empty, but the capture of {role} has no packet of the transfer:"
+                    " check whether an address is translated (NAT) on the path"
                 )
     return None
 
 
 def loss(arrived: int | None, sent: int | None) -> float | None:
-    """Return 1 - arrived/sent, the loss of the paper's eq. 1; None when nothing was sent."""
+    """Return 1 - arrived/sent, the loss of the paper's eq. 1; None if nothing was sent."""
     return None if arrived is None or not sent else 1 - arrived / sent
 
 
@@ -94,7 +98,7 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
         "bag_messages": contents.messages if contents else None,
         "bag_duration_s": contents.duration_s if contents else None,
     }
-    return Measured.of(files, "the file is not at hand, or empty") | Measured.of(messages, "what was sent is no bag")
+    return Measured.of(files, "the file is missing or empty") | Measured.of(messages, "the sent file is not a bag")
 
 
 def _layers(
@@ -102,52 +106,54 @@ def _layers(
     transfer: Transfer,
     files: Measured,
     contradiction: str | None,
-    expected: FlowSchedule,
+    schedule: FlowSchedule,
 ) -> Measured:
-    """Return what the packets of both captures say of a transfer: losses, delay, stalls, and how fast it was."""
+    """Return the columns that depend on both captures: losses, delay, stalls, and rates."""
     declared = (*LAYERS, *delay.COLUMNS, *delay.SENT_COLUMNS, *rates.COLUMNS, *STALLS)
     sender, receiver = ends
     if contradiction:
         return Measured({"one_way_withheld": contradiction}) | Measured.nothing(declared, contradiction)
     if sender is None or receiver is None:
-        return Measured.nothing(declared, "there are no whole captures of both ends")
+        return Measured.nothing(declared, "there are no complete captures of both ends")
     try:
         if transfer.protocol is Protocol.UDP:
-            crossing = udp.cross(sender.packets, receiver.packets, transfer)
-            packets = udp.count(crossing)
-            own, counts, sent = delay.udp_packets(crossing), _udp(packets), packets.packets_sent
-            speed = rates.of_udp(crossing)
-            stalled = stalls.measure("transfer", lambda: transfer_stalls.of_udp(crossing, expected))
+            udp_packets = udp.cross(sender.packets, receiver.packets, transfer)
+            udp_counts = udp.count(udp_packets)
+            pairs, counts, sent = delay.udp_packets(udp_packets), _udp(udp_counts), udp_counts.packets_sent
+            transfer_rates = rates.of_udp(udp_packets)
+            stall_columns = stalls.measure("transfer", lambda: transfer_stalls.of_udp(udp_packets, schedule))
         else:
             frames = tcp.cross(sender.packets, receiver.packets, transfer)
-            counted = tcp.count(frames)
-            own, counts, sent = delay.tcp_frames(frames), _tcp(counted), delay.tcp_sent(frames)
-            speed = rates.of_tcp(frames, receiver.packets, transfer, counted)
-            back = transfer.backward(sender.packets)
-            stalled = stalls.measure("transfer", lambda: transfer_stalls.of_tcp(frames, back, expected))
-        alike = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
-        delays = delay.measure(own, sender.packets, receiver.packets, transfer, sent=sent or 0, alike=alike)
-    except EvidenceError as error:  # as for a damaged capture
+            tcp_counts = tcp.count(frames)
+            pairs, counts, sent = delay.tcp_frames(frames), _tcp(tcp_counts), delay.tcp_sent(frames)
+            transfer_rates = rates.of_tcp(frames, receiver.packets, transfer, tcp_counts)
+            reverse = transfer.backward(sender.packets)
+            stall_columns = stalls.measure("transfer", lambda: transfer_stalls.of_tcp(frames, reverse, schedule))
+        ambiguous = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
+        delays = delay.measure(pairs, sender.packets, receiver.packets, transfer, sent=sent or 0, ambiguous=ambiguous)
+    except EvidenceError as error:  # handled like a damaged capture
         return Measured.nothing(declared, error.what)
-    fast_values = speed.values(files.values.get("received_bytes"))
+    rate_values = transfer_rates.values(files.values.get("received_bytes"))
     if delays.values.get("one_way_withheld") == delay.UNSTEADY:
         delays |= Measured.nothing((*TIMES, *rates.COLUMNS), delay.UNSTEADY)
-        stalled = Measured.nothing(STALLS, delay.UNSTEADY)
-        counts, fast_values = (
-            {name: value for name, value in told.items() if name not in delays.missing}
-            for told in (counts, fast_values)
+        stall_columns = Measured.nothing(STALLS, delay.UNSTEADY)
+        counts, rate_values = (
+            {name: value for name, value in values.items() if name not in delays.missing}
+            for values in (counts, rate_values)
         )
-    foreign = OF_TCP if transfer.protocol is Protocol.UDP else OF_UDP
-    others = [column for column in LAYERS if column.name in foreign]
-    own_figures = Measured.of(counts, "no such packet was sent, none arrived, or it is in doubt which of them did")
-    fast = Measured.of(fast_values, "no two packets, or not the end, of the transfer were seen")
-    return delays | own_figures | fast | stalled | Measured.nothing(others, f"{transfer.protocol} has none")
+    other_names = OF_TCP if transfer.protocol is Protocol.UDP else OF_UDP
+    other_columns = [column for column in LAYERS if column.name in other_names]
+    reason = "no such packet was sent, none arrived, or it is ambiguous which arrived"
+    count_columns = Measured.of(counts, reason)
+    rate_columns = Measured.of(rate_values, "the captures do not have two packets, or not the end, of the transfer")
+    no_such_count = Measured.nothing(other_columns, f"not applicable to {transfer.protocol}")
+    return delays | count_columns | rate_columns | stall_columns | no_such_count
 
 
 def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:
     sent: dict[str, Value | None] = {
         "ip_packets_sent": counts.packets_sent,
-        "ip_packets_doubtful": counts.packets_doubtful,
+        "ip_packets_doubtful": counts.packets_ambiguous,
         "datagrams_sent": counts.datagrams_sent,
         "transfer_s": counts.transfer_s,
         "transfer_from": None if counts.transfer_s is None else "receiver",
@@ -163,12 +169,12 @@ def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:
         "datagram_loss": loss(counts.datagrams_received, counts.datagrams_sent),
         "byte_loss": loss(counts.bytes_received, counts.bytes_sent),
     }
-    # As many losses may hide behind copies that cannot be told from packets that were sent.
-    return sent | (dict.fromkeys(received) if counts.packets_dubious else received)
+    # Each received packet that may be a copy may hide the loss of another packet.
+    return sent | (dict.fromkeys(received) if counts.possible_copies else received)
 
 
 def _tcp(counts: tcp.TcpCounts) -> dict[str, Value | None]:
-    received_bytes = None if counts.dubious_frames else counts.received_bytes
+    received_bytes = None if counts.possible_copies else counts.received_bytes
     return {
         "ip_packets_sent": counts.frames_sent,
         "ip_packets_received": counts.frames_received,
@@ -181,7 +187,7 @@ def _tcp(counts: tcp.TcpCounts) -> dict[str, Value | None]:
         "tcp_spurious_segments": counts.spurious_frames,
         "tcp_duplicated_bytes": counts.duplicated_bytes,
         "tcp_reordered_segments": counts.reordered_frames,
-        "tcp_doubtful_segments": counts.doubtful_frames,
+        "tcp_doubtful_segments": counts.ambiguous_frames,
         "tcp_superframes": counts.superframes,
         "transfer_s": counts.transfer_s,
         "transfer_from": None if counts.transfer_s is None else "receiver",
@@ -189,7 +195,7 @@ def _tcp(counts: tcp.TcpCounts) -> dict[str, Value | None]:
 
 
 def _sent_ns(sender: Capture | None, transfer: Transfer) -> list[int]:
-    """Return when each packet of the transfer that names its port was sent; none where a time is missing."""
+    """Return the time of sending of each packet with the transfer's port; empty if a time is missing."""
     if sender is None:
         return []
     sent = transfer.forward(sender.packets)
@@ -213,6 +219,6 @@ def _paper(sender: Capture | None, receiver: Capture | None, pings: ping.Ping | 
         "paper_delay_s": delay_s,
         "paper_transfer_s": None if sent is None or delay_s is None else paper.transfer_s(sent, delay_s),
     }
-    return Measured.of(frames, "there are no whole captures of both ends, or nothing was sent") | Measured.of(
+    return Measured.of(frames, "there are no complete captures of both ends, or nothing was sent") | Measured.of(
         times, f"no reply to a ping of {window_bytes} bytes has a time"
     )

@@ -1,4 +1,4 @@
-"""Figures of an iperf3 test by two captures: the independent witness of its own."""
+"""Columns of an iperf3 test from two captures, independent of iperf3's report."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -18,8 +18,8 @@ COLUMNS: Final = columns(
         "iperf3_captured_bit_s",
         "bit/s",
         (
-            "Payload of the test per second in the receiver's capture, each byte once, in the seconds of "
-            "iperf3_throughput_bit_s, with which it is to be compared, from the first packet on."
+            "Payload of the test per second in the receiver's capture, each byte once, during the same seconds as "
+            "iperf3_throughput_bit_s, counted from the first packet; compare the two."
         ),
         Figure("iperf3 throughput, captured", Kind.MEDIAN, rank=65),
     ),
@@ -27,8 +27,8 @@ COLUMNS: Final = columns(
         "iperf3_captured_loss",
         "share",
         (
-            "1 - received/sent of the test in both captures: UDP datagrams, to be compared with iperf3_loss; of TCP "
-            "payload bytes, those sent again too. Empty where datagrams were fragmented."
+            "1 - received/sent of the test in both captures: for UDP datagrams, to be compared with iperf3_loss; for "
+            "TCP payload bytes, retransmissions included. Empty if datagrams were fragmented."
         ),
         Figure("iperf3 loss, captured", Kind.MEAN, rank=66),
         OVERCOUNTED,
@@ -36,20 +36,21 @@ COLUMNS: Final = columns(
 )
 
 _COOKIE_BYTES: Final = 37
-"""With which each TCP connection of a test begins, long before its data (iperf_api.h, COOKIE_SIZE)."""
+"""Length of the cookie at the start of each TCP connection of a test, sent before its data (iperf_api.h,
+COOKIE_SIZE)."""
 
 
 @dataclass(frozen=True)
 class LoadFlow:
-    """The data of one test on the way from one robot to another.
+    """The data of one test from one robot to another.
 
     Attributes:
         protocol: Transport protocol.
-        source_address: Address of who sends.
-        destination_address: Address of who receives.
-        ports: Ports of each stream, the sender's and the receiver's.
-        payload_bytes: Payload of a UDP datagram, by which greetings are told apart.
-        window_s: From when on, and until when, its rate is taken, in seconds from the first packet on.
+        source_address: Address of the sender.
+        destination_address: Address of the receiver.
+        ports: Sender's and receiver's port of each stream.
+        payload_bytes: Payload of a UDP datagram; shorter datagrams belong to the setup.
+        window_s: Start and end of the time over which the rate is computed, in seconds from the first packet.
     """
 
     protocol: Protocol
@@ -60,39 +61,45 @@ class LoadFlow:
     window_s: tuple[float, float]
 
     def streams(self, packets: Packets) -> list[Packets]:
-        """Return the data packets of each stream in a capture; of a UDP datagram its first fragment."""
+        """Return the data packets of each stream in a capture; of a UDP datagram only the first fragment."""
         number = UDP if self.protocol is Protocol.UDP else TCP
         ends = packets.are_from(self.source_address) & packets.are_to(self.destination_address)
-        own = packets.where(ends & (packets.protocol == number))
-        found = [own.where((own.sport == sport) & (own.dport == dport)) for sport, dport in self.ports]
+        packets_between = packets.where(ends & (packets.protocol == number))
+        streams = [
+            packets_between.where((packets_between.sport == sport) & (packets_between.dport == dport))
+            for sport, dport in self.ports
+        ]
         if self.protocol is Protocol.UDP:
-            return [one.where(one.udp_bytes == self.payload_bytes + UDP_HEADER_BYTES) for one in found]
-        return found
+            return [stream.where(stream.udp_bytes == self.payload_bytes + UDP_HEADER_BYTES) for stream in streams]
+        return streams
 
 
 def measure(flow: LoadFlow, sender: Packets | None, receiver: Packets | None) -> Measured:
-    """Return the columns of a test; None for a capture that is not at hand, or not whole."""
+    """Return the columns of a test; a capture that is missing or damaged is None."""
     if sender is None or receiver is None:
-        return Measured.nothing(COLUMNS, "there are no whole captures of both ends")
-    left, came = flow.streams(sender), flow.streams(receiver)
-    values = {"iperf3_captured_bit_s": _rate(flow, came), "iperf3_captured_loss": _loss(flow, left, came)}
+        return Measured.nothing(COLUMNS, "there are no complete captures of both ends")
+    sent, received = flow.streams(sender), flow.streams(receiver)
+    values = {"iperf3_captured_bit_s": _rate(flow, received), "iperf3_captured_loss": _loss(flow, sent, received)}
     return Measured.of(values, "no packet of the test is in a capture, or its datagrams were fragmented")
 
 
-def _loss(flow: LoadFlow, left: list[Packets], came: list[Packets]) -> float | None:
+def _loss(flow: LoadFlow, sent_amount: list[Packets], received_amount: list[Packets]) -> float | None:
     if flow.protocol is Protocol.UDP:
-        if any(packets.more_fragments.any() for packets in left):
+        if any(packets.more_fragments.any() for packets in sent_amount):
             return None
-        sent, received = (sum(map(len, streams)) for streams in (left, came))
+        sent_amount, received_amount = (sum(map(len, streams)) for streams in (sent_amount, received_amount))
     else:
-        sent, received = (sum(int(stream.tcp_payload_bytes.sum()) for stream in streams) for streams in (left, came))
-    return 1 - received / sent if sent else None
+        sent_amount, received_amount = (
+            sum(int(stream.tcp_payload_bytes.sum()) for stream in streams)
+            for streams in (sent_amount, received_amount)
+        )
+    return 1 - received_amount / sent_amount if sent_amount else None
 
 
-def _rate(flow: LoadFlow, came: list[Packets]) -> float | None:
-    """Return the rate at which payload came, each byte once; None where nothing tells it."""
+def _rate(flow: LoadFlow, received: list[Packets]) -> float | None:
+    """Return the rate of received payload, each byte once; None if it cannot be computed."""
     udp = flow.protocol is Protocol.UDP
-    data = [packets if udp else packets.where(packets.tcp_payload_bytes > _COOKIE_BYTES) for packets in came]
+    data = [packets if udp else packets.where(packets.tcp_payload_bytes > _COOKIE_BYTES) for packets in received]
     times_ns: Ints = np.concatenate([packets.time_ns for packets in data]) if data else np.array([], dtype=np.int64)
     start_s, end_s = flow.window_s
     if not len(times_ns) or (times_ns == NO_TIME).any() or end_s <= start_s:
@@ -102,10 +109,10 @@ def _rate(flow: LoadFlow, came: list[Packets]) -> float | None:
     if udp:
         return 8 * flow.payload_bytes * sum(map(len, inside)) / (end_s - start_s)
     total = 0
-    for stream, frames in zip(came, inside, strict=True):
-        # A capture begins before the connections that it is for, so it has their SYN.
-        begun = Connections.begun(stream)
-        if len(frames) and not len(begun.ports):
+    for stream, frames in zip(received, inside, strict=True):
+        # A capture starts before the connections of its test, so it has their SYN.
+        connections = Connections.from_syn(stream)
+        if len(frames) and not len(connections.ports):
             return None
-        total += begun.payload(frames).size_bytes
+        total += connections.payload(frames).size_bytes
     return 8 * total / (end_s - start_s)

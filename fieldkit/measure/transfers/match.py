@@ -1,9 +1,9 @@
-"""Match packets received with packets sent, by what is equal in a packet at both ends.
+"""Matching of received packets with sent packets by the fields that are equal at both ends.
 
-Headers may look alike: 16-bit IP ids come again in a long transfer, or are 0 throughout in packets that are never
-fragmented (RFC 6864, section 4), and a retransmission repeats its sequence numbers. Such packets are told apart by
-their content or by TCP's time stamps, else by time if they were sent far enough from each other; what is left is in
-doubt.
+Headers can be equal in several packets: 16-bit IP ids repeat in a long transfer, or are always 0 in packets that are
+never fragmented (RFC 6864, section 4), and a retransmission repeats its sequence numbers. Such packets are
+distinguished by their content or by TCP time stamps, otherwise by time if they were sent far enough apart. The
+remaining ones are ambiguous.
 """
 
 from dataclasses import dataclass, replace
@@ -11,63 +11,63 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.measure.captures.arrays import Ints, Keys, Mask, mixed
+from fieldkit.measure.captures.arrays import Ints, Keys, Mask, row_hashes
 from fieldkit.measure.captures.ip import TCP
-from fieldkit.measure.captures.packets import NO_STAMP, NOT_KEPT, RST, Packets
+from fieldkit.measure.captures.packets import NO_STAMP, NOT_CAPTURED, RST, Packets
 from fieldkit.measure.transfers import ranges
 from fieldkit.measure.transfers.ranges import Pieces
 
 NONE: Final = -1
-"""Index of a packet that is not there."""
+"""Index that means: no packet."""
 
-APART_NS: Final = 200_000_000
-"""Packets that look alike may be told apart by time if they were sent so far from each other at least.
+MIN_SPACING_NS: Final = 200_000_000
+"""Packets with equal keys may be distinguished by time if they were sent at least this far apart.
 
-What is later than that Linux's TCP takes for lost, too (its least retransmission time-out, TCP_RTO_MIN).
+Linux's TCP also considers a packet lost after this delay (minimum retransmission timeout, TCP_RTO_MIN).
 """
 
-_CLEAR: Final = 4
-"""Time tells which of two was sent if it is off by at most this part of the time between them."""
+_CLEAR_FACTOR: Final = 4
+"""An arrival is clearly nearest to one packet if its offset is at most the distance to the next divided by this."""
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Packets of two captures beside each other, n sent and m received.
+    """Match between the n packets sent and the m packets received in two captures.
 
     Attributes:
-        received_index: Per packet sent, the index of its first copy among those received; `NONE` when lost. Of
-            shape (n,).
-        sent_index: Per packet received, the index of the one sent that it is a copy of; `NONE` when nobody is seen
-            to have sent it. Of shape (m,).
-        duplicates: Packets received that are further copies of what had arrived. Of shape (m,).
-        doubtful: Packets sent that look like others and were sent too close to them: which of them arrived, and in
-            which order, nothing tells. They are matched in the order of sending, so that of n sent and m received
-            min(n, m) arrived. Of shape (n,).
-        dubious: Packets received that count as arrived, and may be copies all the same: of those that look like them
-            some did not come as far from each other as they were sent. Of shape (m,).
+        received_index: For each sent packet the index of its first copy among the received packets; `NONE` if lost.
+            Shape (n,).
+        sent_index: For each received packet the index of the sent packet of which it is a copy; `NONE` if there is no
+            such packet in the sender's capture. Shape (m,).
+        duplicates: Mask of received packets that are further copies of a packet that had arrived. Shape (m,).
+        doubtful: Mask of ambiguous sent packets: others are equal and were sent at nearly the same time, so that it
+            is unknown which of them arrived in which order. They are matched in the order of sending, so that of n
+            sent and m received, min(n, m) arrived. Shape (n,).
+        possible_copy: Mask of received packets that count as arrived but may be copies of another packet, because
+            packets with their key arrived closer together than they were sent. Shape (m,).
     """
 
     received_index: Ints
     sent_index: Ints
     duplicates: Mask
     doubtful: Mask
-    dubious: Mask
+    possible_copy: Mask
 
     @property
     def arrived(self) -> Mask:
-        """Which of the packets sent arrived. Of shape (n,)."""
+        """Mask of the sent packets that arrived. Shape (n,)."""
         arrived: Mask = self.received_index != NONE
         return arrived
 
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """TCP payload of two captures beside each other, in comparable pieces.
+    """TCP payload of two captures in comparable pieces.
 
     Attributes:
         sent: Pieces sent.
         received: Pieces received.
-        match: Which piece received is the copy of which piece sent.
+        match: Match between the pieces.
     """
 
     sent: Pieces
@@ -76,54 +76,55 @@ class Payload:
 
 
 def match(sent: Packets, received: Packets) -> Match:
-    """Return which of the packets received are copies of which sent.
+    """Match received packets with the sent packets of which they are copies.
 
-    Packets are copies of each other when addresses, protocol, IP id, fragment offset, length, ports, and TCP's
-    numbers, flags and time stamp are equal, and content where several of them are.
+    Packets are copies of each other if addresses, protocol, IP id, fragment offset, length, ports, and TCP's numbers,
+    flags and time stamp are equal; if several packets have equal values, their content must be equal as well.
 
-    Segmentation offload lets the two ends see other TCP frames: one that has no equal at the other end belongs to the
-    frame that carries its first byte, and is a duplicate if all of its bytes are.
+    With segmentation offload the two ends capture different TCP frames. A frame without an equal one at the other end
+    is matched with the frame that has its first byte, and is a duplicate if all of its bytes are.
 
     Args:
         sent: Packets captured at the sender.
-        received: Packets captured at the receiver, whose clock may be any.
+        received: Packets captured at the receiver; its clock may have any offset.
 
     Raises:
-        EvidenceError: See `ranges.cut`.
+        EvidenceError: As for `ranges.cut`.
     """
-    frames = _frames(sent, received)
+    frames = _match_frames(sent, received)
     if not sent.tcp_payload_bytes.any() and not received.tcp_payload_bytes.any():
         return frames
-    carried = _payload(sent, received, frames)
-    for mine, theirs, index, piece_index in (
-        (carried.sent, carried.received, frames.received_index, carried.match.received_index),
-        (carried.received, carried.sent, frames.sent_index, carried.match.sent_index),
+    payload = _match_pieces(sent, received, frames)
+    for near, far, index, piece_index in (
+        (payload.sent, payload.received, frames.received_index, payload.match.received_index),
+        (payload.received, payload.sent, frames.sent_index, payload.match.sent_index),
     ):
-        frame, first = np.unique(mine.frame, return_index=True)
-        index[frame] = np.append(theirs.frame, NONE)[piece_index[first]]
-    frames.doubtful[carried.sent.frame[carried.match.doubtful]] = True
-    frames.duplicates[carried.received.frame] = True
-    frames.duplicates[carried.received.frame[~carried.match.duplicates]] = False
+        frame, first = np.unique(near.frame, return_index=True)
+        index[frame] = np.append(far.frame, NONE)[piece_index[first]]
+    frames.doubtful[payload.sent.frame[payload.match.doubtful]] = True
+    frames.duplicates[payload.received.frame] = True
+    frames.duplicates[payload.received.frame[~payload.match.duplicates]] = False
     return frames
 
 
 def match_payload(sent: Packets, received: Packets) -> Payload:
-    """Return which of the TCP payload received is a copy of which sent.
+    """Match received TCP payload with the sent payload of which it is a copy.
 
-    A piece belongs to a piece of the same bytes in a frame with the same time stamp. Where frames have IP ids it
-    belongs to the equal frame at the other end, if there is one: segmentation offload cuts and joins the others.
+    A piece matches a piece with the same bytes in a frame with the same time stamp. If frames have IP ids, a piece
+    matches the piece in the equal frame at the other end, if there is one; the other frames were cut or joined by
+    segmentation offload.
 
     Args:
         sent: Packets captured at the sender.
-        received: Packets captured at the receiver, whose clock may be any.
+        received: Packets captured at the receiver; its clock may have any offset.
 
     Raises:
-        EvidenceError: See `ranges.cut`.
+        EvidenceError: As for `ranges.cut`.
     """
-    return _payload(sent, received, _frames(sent, received))
+    return _match_pieces(sent, received, _match_frames(sent, received))
 
 
-def paired(
+def match_keys(
     key: Keys,
     time_ns: Ints,
     received_key: Keys,
@@ -131,218 +132,232 @@ def paired(
     *,
     contents: tuple[Ints, Ints] | None = None,
 ) -> Match:
-    """Return the match of things sent and received that are copies of each other only if their keys are equal.
+    """Match sent and received items, which are copies of each other only if their keys are equal.
 
     Args:
-        key: Of each thing sent. Shape (n,).
-        time_ns: When it was sent.
-        received_key: Of each thing received. Shape (m,).
-        received_time_ns: When it was received, by any clock.
-        contents: Of each thing sent and received, what tells those of one key apart; `NOT_KEPT` where it is
-            unknown.
+        key: Key of each sent item. Shape (n,).
+        time_ns: Time of sending.
+        received_key: Key of each received item. Shape (m,).
+        received_time_ns: Time of reception, by any clock.
+        contents: Values that distinguish sent and received items with equal keys; `NOT_CAPTURED` if unknown.
     """
-    left, came = np.lexsort((time_ns, key)), np.lexsort((received_time_ns, received_key))
-    keys, group = np.unique(key[left], return_inverse=True)
-    sent = np.bincount(group, minlength=len(keys))
-    if contents is not None and (sent > 1).any():
-        finer = _told_by_content(keys[sent > 1], (key, received_key), contents)
-        return paired(finer[0], time_ns, finer[1], received_time_ns)
-    came_group = np.searchsorted(keys, received_key[came])
-    known = (came_group < len(keys)) & (np.append(keys, np.uint64(0))[came_group] == received_key[came])
-    came, came_group = came[known], came_group[known]
-    received = np.bincount(came_group, minlength=len(keys))
+    sent_order, received_order = np.lexsort((time_ns, key)), np.lexsort((received_time_ns, received_key))
+    keys, group = np.unique(key[sent_order], return_inverse=True)
+    sent_count = np.bincount(group, minlength=len(keys))
+    if contents is not None and (sent_count > 1).any():
+        distinct_keys = _keys_with_content(keys[sent_count > 1], (key, received_key), contents)
+        return match_keys(distinct_keys[0], time_ns, distinct_keys[1], received_time_ns)
+    received_group = np.searchsorted(keys, received_key[received_order])
+    has_match = (received_group < len(keys)) & (
+        np.append(keys, np.uint64(0))[received_group] == received_key[received_order]
+    )
+    received_order, received_group = received_order[has_match], received_group[has_match]
+    received_count = np.bincount(received_group, minlength=len(keys))
 
-    place, told, apart = places(group, time_ns[left], came_group, received_time_ns[came])
+    position, is_clear, no_copy = assign(group, time_ns[sent_order], received_group, received_time_ns[received_order])
     sent_index = np.full(len(received_key), NONE)
-    sent_index[came] = left[(np.cumsum(sent) - sent)[came_group] + place]
+    sent_index[received_order] = sent_order[(np.cumsum(sent_count) - sent_count)[received_group] + position]
     received_index = np.full(len(key), NONE)
-    # Of several values for one place numpy keeps the last, here the earliest copy.
-    received_index[sent_index[came[::-1]]] = came[::-1]
+    # If an index occurs several times, numpy stores the last value: here the earliest copy.
+    received_index[sent_index[received_order[::-1]]] = received_order[::-1]
     duplicates: Mask = sent_index != NONE
     duplicates[received_index[received_index != NONE]] = False
-    doubtful = np.zeros(len(key), dtype=np.bool_)
-    doubtful[left] = (~told & (received > 0))[group]
-    dubious = np.zeros(len(received_key), dtype=np.bool_)
-    # A single one that arrived is the copy of none, whichever it is.
-    dubious[came] = (~told & ~apart & (received > 1))[came_group]
-    dubious &= ~duplicates
-    return Match(received_index, sent_index, duplicates, doubtful, dubious)
+    ambiguous = np.zeros(len(key), dtype=np.bool_)
+    ambiguous[sent_order] = (~is_clear & (received_count > 0))[group]
+    possible_copy = np.zeros(len(received_key), dtype=np.bool_)
+    # If a single one arrived it cannot be a copy of another, whichever it is.
+    possible_copy[received_order] = (~is_clear & ~no_copy & (received_count > 1))[received_group]
+    possible_copy &= ~duplicates
+    return Match(received_index, sent_index, duplicates, ambiguous, possible_copy)
 
 
 def reordered(sent_index: Ints) -> Mask:
-    """Return which arrived after one that was sent later (RFC 4737, section 3).
+    """Return a mask of the items that arrived after one that was sent later (RFC 4737, section 3).
 
     Args:
-        sent_index: Place in the order of sending of each thing received, in the order of arrival.
+        sent_index: Position in the order of sending of each received item, in the order of arrival.
     """
-    late: Mask = sent_index < np.maximum.accumulate(sent_index)
-    return late
+    mask: Mask = sent_index < np.maximum.accumulate(sent_index)
+    return mask
 
 
-def stamps(sent: Packets, received: Packets) -> tuple[Ints, Ints]:
-    """Return TCP's time stamp of packets sent and received, `NO_STAMP` in all of a connection that is without it.
+def usable_stamps(sent: Packets, received: Packets) -> tuple[Ints, Ints]:
+    """Return the TCP time stamps of packets sent and received; `NO_STAMP` for connections where some are missing.
 
-    Where one was agreed upon, every frame but a reset has it (RFC 7323, section 3.2). It is of no use where something
-    on the way took it out, or a capture cut it off.
+    If time stamps were negotiated, every frame except a reset has one (RFC 7323, section 3.2). They cannot be used if
+    a middlebox removed some, or a capture truncated them.
     """
     lacking = [
         (packets.protocol == TCP) & (packets.tcp_stamp == NO_STAMP) & (packets.tcp_flags & RST == 0)
         for packets in (sent, received)
     ]
-    if not any(these.any() for these in lacking):
+    if not any(mask.any() for mask in lacking):
         return sent.tcp_stamp, received.tcp_stamp
-    connections = [connection(packets) for packets in (sent, received)]
-    without = np.concatenate([numbers[these] for numbers, these in zip(connections, lacking, strict=True)])
-    left, came = (
-        np.where(np.isin(these, without), NO_STAMP, packets.tcp_stamp)
-        for packets, these in zip((sent, received), connections, strict=True)
+    connections = [connection_keys(packets) for packets in (sent, received)]
+    without = np.concatenate([numbers[mask] for numbers, mask in zip(connections, lacking, strict=True)])
+    sent_stamps, received_stamps = (
+        np.where(np.isin(numbers, without), NO_STAMP, packets.tcp_stamp)
+        for packets, numbers in zip((sent, received), connections, strict=True)
     )
-    return left, came
+    return sent_stamps, received_stamps
 
 
-def connection(packets: Packets) -> Keys:
-    """Return a number per packet that is equal for equal addresses and ports."""
-    return mixed(*packets.src.T, *packets.dst.T, packets.sport + 1 << 20 | packets.dport + 1)
+def connection_keys(packets: Packets) -> Keys:
+    """Return a key per packet that is equal for equal addresses and ports."""
+    return row_hashes(*packets.src.T, *packets.dst.T, packets.sport + 1 << 20 | packets.dport + 1)
 
 
-def _frames(sent: Packets, received: Packets) -> Match:
-    """Return the match of packets that are equal at both ends."""
-    stamp, came_stamp = stamps(sent, received)
+def _match_frames(sent: Packets, received: Packets) -> Match:
+    """Match packets that are equal at both ends."""
+    stamp, received_stamp = usable_stamps(sent, received)
     contents = sent.content, received.content
-    return paired(_key(sent, stamp), sent.time_ns, _key(received, came_stamp), received.time_ns, contents=contents)
-
-
-def _payload(sent: Packets, received: Packets, frames: Match) -> Payload:
-    left, came = ranges.cut(sent, received)
-    stamp, came_stamp = stamps(sent, received)
-    key, came_key = mixed(left.stretch, stamp[left.frame]), mixed(came.stretch, came_stamp[came.frame])
-    copy, came_copy = _copies(sent, received, frames)
-    copy, came_copy = copy[left.frame], came_copy[came.frame]
-    # Without a time stamp a frame received that offload cut or joined may be a part of any.
-    unknown = (came_copy == 0) & (came_stamp[came.frame] == NO_STAMP)
-    unknown |= ~np.isin(mixed(came_key, came_copy), mixed(key, copy))
-    came_copy = np.where(unknown, NOT_KEPT, came_copy)
-    pieces = paired(
-        key,
-        sent.time_ns[left.frame],
-        came_key,
-        received.time_ns[came.frame],
-        contents=(copy, came_copy),
+    return match_keys(
+        _key(sent, stamp), sent.time_ns, _key(received, received_stamp), received.time_ns, contents=contents
     )
-    doubtful = pieces.doubtful | frames.doubtful[left.frame] & (copy > 0)
-    return Payload(left, came, replace(pieces, doubtful=doubtful))
 
 
-def _copies(sent: Packets, received: Packets, frames: Match) -> tuple[Ints, Ints]:
-    """Return the number of the frame that is equal at the other end, 0 where there is none: told by its IP id."""
-    connections = [connection(packets) for packets in (sent, received)]
-    carries = sent.tcp_payload_bytes > 0
-    _, one_of_each = np.unique(mixed(connections[0][carries], sent.ip_id[carries]), return_index=True)
-    these, ids = np.unique(connections[0][carries][one_of_each], return_counts=True)
-    # Of frames that all have one id any may be a part of another.
-    named, came_named = (~np.isin(numbers, these[ids < 2]) for numbers in connections)
-    copy = np.where(frames.arrived & named, np.arange(len(sent)), NONE) + 1
-    came_copy = np.where(came_named, frames.sent_index, NONE) + 1
-    return copy, came_copy
+def _match_pieces(sent: Packets, received: Packets, frames: Match) -> Payload:
+    sent_pieces, received_pieces = ranges.cut(sent, received)
+    stamp, received_stamp = usable_stamps(sent, received)
+    key = row_hashes(sent_pieces.range_id, stamp[sent_pieces.frame])
+    received_key = row_hashes(received_pieces.range_id, received_stamp[received_pieces.frame])
+    sent_frame, received_frame = _equal_frames(sent, received, frames)
+    sent_frame, received_frame = sent_frame[sent_pieces.frame], received_frame[received_pieces.frame]
+    # Without a time stamp, a received frame that offload cut or joined may be a part of any sent frame.
+    may_be_part = (received_frame == 0) & (received_stamp[received_pieces.frame] == NO_STAMP)
+    may_be_part |= ~np.isin(row_hashes(received_key, received_frame), row_hashes(key, sent_frame))
+    received_frame = np.where(may_be_part, NOT_CAPTURED, received_frame)
+    pieces = match_keys(
+        key,
+        sent.time_ns[sent_pieces.frame],
+        received_key,
+        received.time_ns[received_pieces.frame],
+        contents=(sent_frame, received_frame),
+    )
+    ambiguous = pieces.doubtful | frames.doubtful[sent_pieces.frame] & (sent_frame > 0)
+    return Payload(sent_pieces, received_pieces, replace(pieces, doubtful=ambiguous))
+
+
+def _equal_frames(sent: Packets, received: Packets, frames: Match) -> tuple[Ints, Ints]:
+    """Return the number of each frame that has an equal one at the other end, identified by IP id; 0 for others."""
+    keys = [connection_keys(packets) for packets in (sent, received)]
+    has_payload = sent.tcp_payload_bytes > 0
+    _, first_of_id = np.unique(row_hashes(keys[0][has_payload], sent.ip_id[has_payload]), return_index=True)
+    connections, id_count = np.unique(keys[0][has_payload][first_of_id], return_counts=True)
+    # If all frames of a connection have the same id, each may be a part of another.
+    has_ids, received_has_ids = (~np.isin(numbers, connections[id_count < 2]) for numbers in keys)
+    sent_frame = np.where(frames.arrived & has_ids, np.arange(len(sent)), NONE) + 1
+    received_frame = np.where(received_has_ids, frames.sent_index, NONE) + 1
+    return sent_frame, received_frame
 
 
 def _key(packets: Packets, stamp: Ints) -> Keys:
-    """Return a number that is equal for packets that are alike, and for others by a chance of one in 2**48."""
-    places = (packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes << 8 | packets.protocol)
+    """Return a key that is equal for packets with equal fields; the chance of a collision is 1 in 2**48."""
+    ip = (packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes << 8 | packets.protocol)
     tcp = (packets.tcp_seq << 32 | packets.tcp_ack, packets.tcp_flags << 33 | stamp + 1)
-    key = connection(packets)
-    key = mixed(key, *places, *tcp)
-    # IP ids mostly rise: numbers that rise with them are faster to sort.
+    key = connection_keys(packets)
+    key = row_hashes(key, *ip, *tcp)
+    # IP ids mostly increase, and keys that increase with them sort faster.
     return packets.ip_id.astype(np.uint64) << np.uint64(48) | key >> np.uint64(16)
 
 
-def _told_by_content(alike: Keys, keys: tuple[Keys, Keys], contents: tuple[Ints, Ints]) -> tuple[Keys, Keys]:
-    """Return keys in which content is, of those that are `alike`: where it is known of all that have one key."""
-    unknown = np.concatenate([key[content == NOT_KEPT] for key, content in zip(keys, contents, strict=True)])
-    alike = np.setdiff1d(alike, unknown)
-    left, came = (
-        np.where(np.isin(key, alike), mixed(key, content), key) for key, content in zip(keys, contents, strict=True)
+def _keys_with_content(ambiguous: Keys, keys: tuple[Keys, Keys], contents: tuple[Ints, Ints]) -> tuple[Keys, Keys]:
+    """Return keys that include the content where packets have `ambiguous` keys and all their contents are known."""
+    without_content = np.concatenate(
+        [key[content == NOT_CAPTURED] for key, content in zip(keys, contents, strict=True)]
     )
-    return left, came
+    ambiguous = np.setdiff1d(ambiguous, without_content)
+    sent_keys, received_keys = (
+        np.where(np.isin(key, ambiguous), row_hashes(key, content), key)
+        for key, content in zip(keys, contents, strict=True)
+    )
+    return sent_keys, received_keys
 
 
-def places(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> tuple[Ints, Mask, Mask]:
-    """Return, per thing received, which of those alike it is a copy of; per group, what tells; and what is no copy.
+def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: Ints) -> tuple[Ints, Mask, Mask]:
+    """Assign received items to sent items within groups of items with equal keys.
 
-    Which one is 0 for the first that was sent, and so on. Time tells where those of a group were sent `APART_NS` from
-    each other at least, and each received is nearest to one of them by far: that is the one. In all other groups each
-    is taken for the nearest in time, as far as order allows and as all of the fewer side, sent or received, find one.
-    No copy is in a group of which each received is nearest by far to another one, however close they were sent.
+    If the items of a group were sent at least `MIN_SPACING_NS` apart, and each received item is clearly nearest in
+    time to one of them, it is assigned to that one, and the group is clear. In all other groups, each received item
+    is assigned to the nearest in time, subject to two conditions: the order is kept, and each item of the smaller
+    side, sent or received, is assigned. A group has no copies if each received item is clearly nearest to another
+    sent item, however close they were sent.
 
     Args:
-        group: Group of those alike, of each thing sent, in ascending order.
-        time_ns: When it was sent, in ascending order within its group.
-        came_group: Group of each thing received, likewise.
-        came_time_ns: When it was received, likewise.
+        group: Group of each sent item, ascending.
+        time_ns: Time of sending, ascending within a group.
+        received_group: Group of each received item, ascending.
+        received_time_ns: Time of reception, ascending within a group.
+
+    Returns:
+        For each received item the position of its sent item in the group, from 0 in the order of sending; for each
+        group, whether it is clear; for each group, whether it has no copies.
     """
     groups = int(group.max(initial=-1)) + 1
-    sent, received = (np.bincount(these, minlength=groups) for these in (group, came_group))
-    place = np.zeros(len(came_group), dtype=np.int64)
-    many = sent > 1
-    told = np.ones(groups, dtype=np.bool_)
-    chosen, left = many[came_group], many[group]
+    sent_count, received_count = (np.bincount(groups_of, minlength=groups) for groups_of in (group, received_group))
+    position = np.zeros(len(received_group), dtype=np.int64)
+    has_several = sent_count > 1
+    is_clear_group = np.ones(groups, dtype=np.bool_)
+    chosen, in_several = has_several[received_group], has_several[group]
     if not chosen.any():
-        return place, told, told
-    offset_ns, known = _clock_offset_ns(group, time_ns, came_group, came_time_ns)
-    group, time_ns = group[left], time_ns[left]
-    came_group, came_time_ns = came_group[chosen], came_time_ns[chosen] - offset_ns
-    sent, received = sent * many, received * many
-    nearest = _nearest(group, time_ns, came_group, came_time_ns)
-    index = (np.cumsum(sent) - sent)[came_group] + nearest
-    apart_ns = _apart_ns(group, time_ns)[index]
-    clear = _CLEAR * np.abs(came_time_ns - time_ns[index]) <= apart_ns
-    told[came_group[~(known & clear & (apart_ns >= APART_NS))]] = False
-    apart = np.ones(groups, dtype=np.bool_)
-    apart[came_group[~clear | (np.diff(index, prepend=-1) == 0)]] = False
+        return position, is_clear_group, is_clear_group
+    offset_ns, offset_known = _clock_offset_ns(group, time_ns, received_group, received_time_ns)
+    group, time_ns = group[in_several], time_ns[in_several]
+    received_group, received_time_ns = received_group[chosen], received_time_ns[chosen] - offset_ns
+    sent_count, received_count = sent_count * has_several, received_count * has_several
+    nearest = _nearest(group, time_ns, received_group, received_time_ns)
+    index = (np.cumsum(sent_count) - sent_count)[received_group] + nearest
+    spacing_ns = _spacing_ns(group, time_ns)[index]
+    is_nearest = _CLEAR_FACTOR * np.abs(received_time_ns - time_ns[index]) <= spacing_ns
+    is_clear_group[received_group[~(offset_known & is_nearest & (spacing_ns >= MIN_SPACING_NS))]] = False
+    no_copy = np.ones(groups, dtype=np.bool_)
+    no_copy[received_group[~is_nearest | (np.diff(index, prepend=-1) == 0)]] = False
 
-    rank = np.arange(len(came_group)) - (np.cumsum(received) - received)[came_group]
-    spare = (sent - received)[came_group]
-    # Where fewer came, some of those sent are skipped; where more came, some of those sent have several copies.
-    sign = np.where(spare < 0, -1, 1)
-    skipped = np.clip(sign * (nearest - rank), 0, np.abs(spare))
-    high = came_group * (len(group) + len(came_group))
-    in_order = rank + sign * (np.maximum.accumulate(skipped + high) - high)
-    place[chosen] = np.where(told[came_group], nearest, in_order)
-    return place, told, apart
+    order = np.arange(len(received_group)) - (np.cumsum(received_count) - received_count)[received_group]
+    surplus = (sent_count - received_count)[received_group]
+    # If fewer items were received, some of those sent are skipped; if more, some of those sent have several copies.
+    sign = np.where(surplus < 0, -1, 1)
+    skipped = np.clip(sign * (nearest - order), 0, np.abs(surplus))
+    group_base = received_group * (len(group) + len(received_group))
+    in_order = order + sign * (np.maximum.accumulate(skipped + group_base) - group_base)
+    position[chosen] = np.where(is_clear_group[received_group], nearest, in_order)
+    return position, is_clear_group, no_copy
 
 
-def _apart_ns(group: Ints, time_ns: Ints) -> Ints:
-    """Return how far each thing sent, its group and time in ascending order, is from the nearest of its group."""
+def _spacing_ns(group: Ints, time_ns: Ints) -> Ints:
+    """Return the time from each sent item to the nearest one of its group; input ordered by group, then time."""
     steps_ns = np.where(np.diff(group) == 0, np.diff(time_ns), np.iinfo(np.int64).max)
     edge = np.iinfo(np.int64).max
-    apart_ns: Ints = np.minimum(np.append(edge, steps_ns), np.append(steps_ns, edge))
-    return apart_ns
+    spacing_ns: Ints = np.minimum(np.append(edge, steps_ns), np.append(steps_ns, edge))
+    return spacing_ns
 
 
-def _nearest(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> Ints:
-    """Return, per thing received, the place of the one sent in its group that is nearest in time."""
+def _nearest(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: Ints) -> Ints:
+    """Return, for each received item, the position in its group of the sent item that is nearest in time."""
     sent = np.bincount(group)
-    order = np.lexsort((np.concatenate((time_ns, came_time_ns)), np.concatenate((group, came_group))))
+    order = np.lexsort((np.concatenate((time_ns, received_time_ns)), np.concatenate((group, received_group))))
     is_sent = order < len(group)
-    first, last = (np.cumsum(sent) - sent)[came_group], np.cumsum(sent)[came_group] - 1
+    first, last = (np.cumsum(sent) - sent)[received_group], np.cumsum(sent)[received_group] - 1
     after = np.cumsum(is_sent)[~is_sent]
     earlier, later = np.maximum(after - 1, first), np.minimum(after, last)
-    nearest: Ints = np.where(came_time_ns - time_ns[earlier] < time_ns[later] - came_time_ns, earlier, later) - first
+    nearest: Ints = (
+        np.where(received_time_ns - time_ns[earlier] < time_ns[later] - received_time_ns, earlier, later) - first
+    )
     return nearest
 
 
-def _clock_offset_ns(group: Ints, time_ns: Ints, came_group: Ints, came_time_ns: Ints) -> tuple[int, bool]:
-    """Return the receiver's clock minus the sender's, delay included, and whether that is known or a guess.
+def _clock_offset_ns(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: Ints) -> tuple[int, bool]:
+    """Return the receiver's clock minus the sender's, including the delay, and whether it is known or a guess.
 
-    It is known from what looks like nothing else; without any, from the groups of which all arrived.
+    It is known from items with a unique key or, if there are none, from groups of which all items arrived.
     """
     groups = int(group.max()) + 1
-    sent, received = (np.bincount(these, minlength=groups) for these in (group, came_group))
-    first = np.diff(came_group, prepend=-1) != 0
+    sent, received = (np.bincount(groups_of, minlength=groups) for groups_of in (group, received_group))
+    first = np.diff(received_group, prepend=-1) != 0
     single = (sent == 1) & (received > 0)
     if single.any():
-        return int(np.median(came_time_ns[first & single[came_group]] - time_ns[single[group]])), True
-    even = sent == received
-    if even.any():
-        return int(np.median(came_time_ns[even[came_group]] - time_ns[even[group]])), True
-    return int(came_time_ns.min() - time_ns.min()), False
+        return int(np.median(received_time_ns[first & single[received_group]] - time_ns[single[group]])), True
+    all_arrived = sent == received
+    if all_arrived.any():
+        return int(np.median(received_time_ns[all_arrived[received_group]] - time_ns[all_arrived[group]])), True
+    return int(received_time_ns.min() - time_ns.min()), False

@@ -1,8 +1,8 @@
-"""Samples of a topic in a capture, by the head of each: magic, sequence number and time of sending.
+"""Samples of a topic in a capture, identified by their heads: magic, sequence number and time of sending.
 
-The agent begins each sample with `std_msgs/UInt8MultiArray`'s empty layout and the length of its data, then the head
-(`fieldkit.agent.stream`). A capture shows the head if it kept that part of the packet: always if a sample begins a
-packet, not if TCP or a middleware put it behind another one.
+The agent starts each sample with the empty layout of `std_msgs/UInt8MultiArray` and the length of its data, followed
+by the head (`fieldkit.agent.stream`). The head is visible if that part of the packet was captured: always if a sample
+starts a packet, but not if TCP or a middleware put it after another sample.
 """
 
 import struct
@@ -27,14 +27,14 @@ _LAYOUT: Final = struct.Struct("<III")
 
 @dataclass(frozen=True, eq=False)
 class SampleHeads(Table):
-    """Heads of samples in the order of a capture, also of those that were sent again.
+    """Heads of samples in the order of a capture, including those of retransmitted samples.
 
     Attributes:
-        sequence: Number of each sample.
-        sent_ns: Time of sending in the sample, by the publisher's clock.
+        sequence: Sequence number of the sample.
+        sent_ns: Time of sending stored in the sample, by the publisher's clock.
         at_ns: Time of capture of the packet.
-        whole: Whether the packet holds the whole sample.
-        end: Number of the TCP byte behind the sample, modulo 2**32; 0 over UDP.
+        whole: True if the packet contains the whole sample.
+        end: TCP sequence number after the sample, modulo 2**32; 0 for UDP.
         sport: Source port of the packet.
         dport: Destination port of the packet.
     """
@@ -55,25 +55,25 @@ class SampleHeads(Table):
 
 @dataclass(frozen=True, eq=False)
 class SampleFlow:
-    """A topic in one capture.
+    """Packets of a topic in one capture.
 
     Attributes:
-        heads: Samples from publisher to subscriber whose head the capture shows.
-        packets: All packets of its data from publisher to subscriber, with the ports of their first fragment.
-        back: All packets of its data from subscriber to publisher, likewise.
+        heads: Samples from publisher to subscriber whose head was captured.
+        packets: All packets of the topic's data from publisher to subscriber; fragments have the ports of the first.
+        reverse: All packets of the topic's data from subscriber to publisher; likewise.
     """
 
     heads: SampleHeads
     packets: Packets
-    back: Packets
+    reverse: Packets
 
     @property
     def is_tcp(self) -> bool:
-        """Whether the data go over TCP."""
+        """True if the data are sent over TCP."""
         return bool((self.packets.protocol == TCP).any())
 
     def connection(self) -> tuple[Packets, Packets] | None:
-        """Return the packets with payload of the TCP connection of the samples, and the answers.
+        """Return the packets with payload of the TCP connection of the samples, and the acknowledgements.
 
         None if the samples are in several connections, or in none.
         """
@@ -81,48 +81,50 @@ class SampleFlow:
         if len(ports) != 1:
             return None
         ((sport, dport),) = ports.tolist()
-        packets, back = self.packets, self.back
+        packets, reverse = self.packets, self.reverse
         data = packets.where((packets.sport == sport) & (packets.dport == dport) & (packets.tcp_payload_bytes > 0))
-        return data, back.where((back.sport == dport) & (back.dport == sport) & (back.tcp_flags & ACK != 0))
+        return data, reverse.where(
+            (reverse.sport == dport) & (reverse.dport == sport) & (reverse.tcp_flags & ACK != 0)
+        )
 
 
 def find(path: Path, size_bytes: int) -> Occurrences:
-    """Return where a capture shows heads of samples with so many bytes of data; raises as `search.find`."""
+    """Return the heads of samples with `size_bytes` of data in a capture; raises as `search.find`."""
     return search.find(path, _LAYOUT.pack(0, 0, size_bytes) + MAGIC)
 
 
 def flow(
     packets: Packets,
-    found: Occurrences,
+    occurrences: Occurrences,
     ports: frozenset[int],
     size_bytes: int,
     is_forward: Callable[[Packets], Mask],
 ) -> SampleFlow:
-    """Return a topic in a capture.
+    """Return the packets of a topic in a capture.
 
     Args:
-        packets: Of the capture.
-        found: `find` in the same capture.
+        packets: Packets of the capture.
+        occurrences: Result of `find` for the same capture.
         ports: Ports of the topic's data.
-        size_bytes: Data of a sample.
-        is_forward: Which packets go from publisher to subscriber; the others go back.
+        size_bytes: Data bytes of a sample.
+        is_forward: Returns a mask of the packets from publisher to subscriber.
     """
-    known = with_ports(packets)
-    data = np.isin(known.dport, list(ports)) | np.isin(known.sport, list(ports))
+    packets_with_ports = with_ports(packets)
+    data = np.isin(packets_with_ports.dport, list(ports)) | np.isin(packets_with_ports.sport, list(ports))
     forward = data & is_forward(packets)
-    found = found.where(forward[found.packet])
-    carrier = packets.where(found.packet)
+    occurrences = occurrences.where(forward[occurrences.packet])
+    carrier = packets.where(occurrences.packet)
     tcp_header_bytes = carrier.ip_payload_bytes - carrier.tcp_payload_bytes
     is_tcp = carrier.protocol == TCP
-    begins = found.offset + _LAYOUT.size - np.where(is_tcp, tcp_header_bytes, UDP_HEADER_BYTES)
+    begins = occurrences.offset + _LAYOUT.size - np.where(is_tcp, tcp_header_bytes, UDP_HEADER_BYTES)
     ends = begins + size_bytes
     heads = SampleHeads(
-        sequence=found.first,
-        sent_ns=found.second,
+        sequence=occurrences.first,
+        sent_ns=occurrences.second,
         at_ns=carrier.time_ns,
         whole=np.where(is_tcp, carrier.tcp_payload_bytes, carrier.ip_payload_bytes - UDP_HEADER_BYTES) >= ends,
         end=np.where(is_tcp, (carrier.tcp_seq + ends) % (1 << 32), 0),
         sport=carrier.sport,
         dport=carrier.dport,
     )
-    return SampleFlow(heads, known.where(forward), known.where(data & ~is_forward(packets)))
+    return SampleFlow(heads, packets_with_ports.where(forward), packets_with_ports.where(data & ~is_forward(packets)))

@@ -1,7 +1,7 @@
 """Loss of a TCP transfer, counted by sequence ranges.
 
-A byte is told by its sequence number (RFC 9293, section 3.4), so neither segmentation offload, which lets a capture
-see frames of many segments, nor reordering, duplicates, retransmissions or partial overlaps change what is counted.
+A byte is identified by its sequence number (RFC 9293, section 3.4), so segmentation offload, which joins segments
+into larger frames, reordering, duplicates, retransmissions and partial overlaps do not change the counts.
 """
 
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from fieldkit.measure.transfers.transfer import Transfer, span_s
 
 @dataclass(frozen=True, eq=False)
 class TcpFrames:
-    """Frames of a TCP transfer's connections from sender to receiver in both captures, beside each other.
+    """Frames of a TCP transfer's connections from sender to receiver in both captures.
 
     Attributes:
-        sent: In the sender's capture.
-        received: In the receiver's.
-        payload: Which piece of payload of these is a copy of which of those.
-        mss_bytes: The largest MSS that a SYN of either end announced; 0 when none says it.
+        sent: Frames in the sender's capture.
+        received: Frames in the receiver's capture.
+        payload: Match between their pieces of payload.
+        mss_bytes: Largest MSS in a SYN of either end; 0 if no SYN has one.
     """
 
     sent: Packets
@@ -34,27 +34,28 @@ class TcpFrames:
 
 @dataclass(frozen=True)
 class TcpCounts:
-    """Counts of what left the sender, and of what reached the receiver's interface.
+    """Counts of frames and bytes that left the sender and that reached the receiver's interface.
 
     Attributes:
-        frames_sent: Frames captured at the sender, those without payload too.
-        frames_received: Frames captured at the receiver; offload may make them more or fewer.
+        frames_sent: Frames captured at the sender, including those without payload.
+        frames_received: Frames captured at the receiver; offload may change the number.
         sent_bytes: Payload bytes sent, retransmissions included.
         unique_bytes: Payload bytes sent, each sequence number once.
-        received_bytes: Of the payload bytes sent, those that arrived; a copy that was not sent counts nowhere.
-        lost_bytes: Of the unique bytes, the ones that never reached the receiver.
-        duplicated_bytes: Payload bytes received beyond the first copy of each sequence number.
-        retransmitted_frames: Frames whose range had been sent before, wholly or in part.
-        spurious_frames: Frames of which every byte had been sent before in a frame that reached the receiver, be it
-            before or after. None where frames are doubtful.
-        reordered_frames: Frames received whose first byte was sent before one that had arrived, in whatever frame; of
-            several copies the first counts. None where frames are doubtful.
-        superframes: Frames of either capture with more payload than the largest MSS that a SYN announced: offload
-            made several segments one. None when no SYN says it.
-        doubtful_frames: Frames with bytes that were sent several times and arrived, where neither time stamps nor IP
-            ids nor the time between them tell which of them did.
-        dubious_frames: Frames received that may be copies that hide a loss: see `Match.dubious`.
-        transfer_s: First frame to last payload frame at the receiver, in seconds; None without payload.
+        received_bytes: Payload bytes sent that arrived; a copy that was not sent is not counted.
+        lost_bytes: Unique bytes that never reached the receiver.
+        duplicated_bytes: Payload bytes received in addition to the first copy of each sequence number.
+        retransmitted_frames: Frames whose range had been sent before, completely or partly.
+        spurious_frames: Frames all of whose bytes had been sent before in a frame that reached the receiver, before
+            or after. None if frames are ambiguous.
+        reordered_frames: Frames received whose first byte was sent before a byte that had arrived; only the first of
+            several copies counts. None if frames are ambiguous.
+        superframes: Frames of either capture with more payload than the largest MSS in a SYN: offload joined several
+            segments. None if no SYN has an MSS.
+        ambiguous_frames: Frames with bytes that were sent several times and arrived, if neither time stamps nor IP
+            ids nor the time between them show which copy arrived.
+        possible_copies: Frames received that may be copies and hide a loss: see `Match.possible_copy`.
+        transfer_s: Time from the first frame to the last frame with payload at the receiver, in seconds; None without
+            payload.
     """
 
     frames_sent: int
@@ -68,91 +69,96 @@ class TcpCounts:
     spurious_frames: int | None
     reordered_frames: int | None
     superframes: int | None
-    doubtful_frames: int
-    dubious_frames: int
+    ambiguous_frames: int
+    possible_copies: int
     transfer_s: float | None
 
 
 def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpFrames:
-    """Return the frames of a TCP transfer in both captures beside each other.
+    """Match the frames of a TCP transfer in both captures.
 
-    A connection counts if its SYN left the sender while it captured: what the kernel still repeats of an earlier
-    transfer, for minutes where that one broke off, is not this one's.
+    A connection is included if its SYN is in the sender's capture. This excludes what the kernel still retransmits of
+    an earlier transfer, which may last minutes after that was aborted.
 
     Raises:
-        EvidenceError: See `ranges.cut`.
+        EvidenceError: As for `ranges.cut`.
     """
     sent, received = (
         forward.where(forward.dport == transfer.port)
         for forward in (transfer.forward(sender), transfer.forward(receiver))
     )
-    begun = np.isin(sent.sport, np.unique(sent.sport[sent.tcp_flags & SYN != 0]))
-    sent = sent.where(begun)
+    has_syn = np.isin(sent.sport, np.unique(sent.sport[sent.tcp_flags & SYN != 0]))
+    sent = sent.where(has_syn)
     received = received.where(np.isin(received.sport, sent.sport))
     return TcpFrames(sent, received, match_payload(sent, received), _mss_bytes(sender, receiver, transfer.port))
 
 
-def beside(sent: Packets, received: Packets) -> TcpFrames:
-    """Return TCP frames of one direction in both captures beside each other; errors as `cross`."""
+def match_frames(sent: Packets, received: Packets) -> TcpFrames:
+    """Match TCP frames of one direction in both captures; raises as `cross`."""
     return TcpFrames(sent, received, match_payload(sent, received), 0)
 
 
-def count(crossing: TcpFrames) -> TcpCounts:
-    """Return the counts of a TCP transfer; connections are summed."""
-    sent, received, carried = crossing.sent, crossing.received, crossing.payload
-    left, came = carried.sent, carried.received
-    stretches = max(left.stretch.max(initial=-1), came.stretch.max(initial=-1)) + 1
-    times_sent, times_received = (np.bincount(these.stretch, minlength=stretches) for these in (left, came))
-    doubtful = len(np.unique(left.frame[carried.match.doubtful]))
-    size_bytes = np.zeros(stretches, dtype=np.int64)
-    size_bytes[left.stretch], size_bytes[came.stretch] = left.size_bytes, came.size_bytes
+def count(frames: TcpFrames) -> TcpCounts:
+    """Return the counts of a TCP transfer, summed over its connections."""
+    sent, received, payload = frames.sent, frames.received, frames.payload
+    sent_pieces, received_pieces = payload.sent, payload.received
+    range_count = max(sent_pieces.range_id.max(initial=-1), received_pieces.range_id.max(initial=-1)) + 1
+    times_sent, times_received = (
+        np.bincount(pieces.range_id, minlength=range_count) for pieces in (sent_pieces, received_pieces)
+    )
+    ambiguous = len(np.unique(sent_pieces.frame[payload.match.doubtful]))
+    size_bytes = np.zeros(range_count, dtype=np.int64)
+    size_bytes[sent_pieces.range_id], size_bytes[received_pieces.range_id] = (
+        sent_pieces.size_bytes,
+        received_pieces.size_bytes,
+    )
     return TcpCounts(
         frames_sent=len(sent),
         frames_received=len(received),
-        sent_bytes=int(left.size_bytes.sum()),
+        sent_bytes=int(sent_pieces.size_bytes.sum()),
         unique_bytes=int(size_bytes[times_sent > 0].sum()),
-        received_bytes=int(left.size_bytes[carried.match.arrived].sum()),
+        received_bytes=int(sent_pieces.size_bytes[payload.match.arrived].sum()),
         lost_bytes=int(size_bytes[(times_sent > 0) & (times_received == 0)].sum()),
         duplicated_bytes=int((np.maximum(times_received - 1, 0) * size_bytes).sum()),
-        retransmitted_frames=int(sent_again(crossing).sum()),
-        spurious_frames=None if doubtful else _spurious(carried),
-        reordered_frames=None if doubtful else _reordered(carried),
-        superframes=_superframes(crossing),
-        doubtful_frames=doubtful,
-        dubious_frames=len(np.unique(came.frame[carried.match.dubious])),
+        retransmitted_frames=int(sent_again(frames).sum()),
+        spurious_frames=None if ambiguous else _spurious(payload),
+        reordered_frames=None if ambiguous else _reordered(payload),
+        superframes=_superframes(frames),
+        ambiguous_frames=ambiguous,
+        possible_copies=len(np.unique(received_pieces.frame[payload.match.possible_copy])),
         transfer_s=span_s(received.time_ns, received.tcp_payload_bytes > 0),
     )
 
 
-def _follow(pieces: Pieces, others: Pieces) -> Mask:
-    """Return which pieces are in a later frame than the first of `others` with the same bytes."""
+def _is_repeated(pieces: Pieces, others: Pieces) -> Mask:
+    """Return a mask of the pieces in a later frame than the first of `others` with the same bytes."""
     earliest = np.full(
-        max(pieces.stretch.max(initial=-1), others.stretch.max(initial=-1)) + 1, np.iinfo(np.int64).max
+        max(pieces.range_id.max(initial=-1), others.range_id.max(initial=-1)) + 1, np.iinfo(np.int64).max
     )
-    # Of several values for one place numpy keeps the last, here that of the earliest frame.
-    earliest[others.stretch[::-1]] = others.frame[::-1]
-    follow: Mask = pieces.frame > earliest[pieces.stretch]
-    return follow
+    # If an index occurs several times, numpy stores the last value: here that of the earliest frame.
+    earliest[others.range_id[::-1]] = others.frame[::-1]
+    mask: Mask = pieces.frame > earliest[pieces.range_id]
+    return mask
 
 
-def sent_again(crossing: TcpFrames) -> Mask:
-    """Return which frames sent have bytes that had been sent before. Of the shape of `crossing.sent`."""
-    again = np.zeros(len(crossing.sent), dtype=np.bool_)
-    again[crossing.payload.sent.frame[_follow(crossing.payload.sent, crossing.payload.sent)]] = True
+def sent_again(frames: TcpFrames) -> Mask:
+    """Return a mask of the sent frames with bytes that had been sent before, of the shape of `frames.sent`."""
+    again = np.zeros(len(frames.sent), dtype=np.bool_)
+    again[frames.payload.sent.frame[_is_repeated(frames.payload.sent, frames.payload.sent)]] = True
     return again
 
 
-def _spurious(carried: Payload) -> int:
-    """Return how many frames repeated nothing but what reaches the receiver from earlier ones."""
-    needless = _follow(carried.sent, carried.sent.where(carried.match.arrived))
-    return len(np.unique(carried.sent.frame)) - len(np.unique(carried.sent.frame[~needless]))
+def _spurious(payload: Payload) -> int:
+    """Return the number of frames that repeat only bytes which reach the receiver from earlier frames."""
+    is_needless = _is_repeated(payload.sent, payload.sent.where(payload.match.arrived))
+    return len(np.unique(payload.sent.frame)) - len(np.unique(payload.sent.frame[~is_needless]))
 
 
-def _reordered(carried: Payload) -> int:
-    """Return how many frames received were overtaken by bytes that were sent later."""
-    first_copies = np.flatnonzero((carried.match.sent_index != NONE) & ~carried.match.duplicates)
-    late = first_copies[reordered(carried.match.sent_index[first_copies])]
-    return int(np.isin(np.unique(carried.received.frame, return_index=True)[1], late).sum())
+def _reordered(payload: Payload) -> int:
+    """Return the number of received frames that arrived after bytes that were sent later."""
+    first_copies = np.flatnonzero((payload.match.sent_index != NONE) & ~payload.match.duplicates)
+    is_late = first_copies[reordered(payload.match.sent_index[first_copies])]
+    return int(np.isin(np.unique(payload.received.frame, return_index=True)[1], is_late).sum())
 
 
 def _mss_bytes(sender: Packets, receiver: Packets, port: int) -> int:
@@ -162,7 +168,7 @@ def _mss_bytes(sender: Packets, receiver: Packets, port: int) -> int:
     )
 
 
-def _superframes(crossing: TcpFrames) -> int | None:
-    mss = crossing.mss_bytes
-    both = crossing.sent, crossing.received
+def _superframes(frames: TcpFrames) -> int | None:
+    mss = frames.mss_bytes
+    both = frames.sent, frames.received
     return sum(int((packets.tcp_payload_bytes > mss).sum()) for packets in both) if mss else None

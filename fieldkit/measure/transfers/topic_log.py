@@ -1,6 +1,6 @@
-"""Logs of topics as the agent on a robot writes them (`fieldkit.agent.records`): fixed records behind a magic.
+"""Logs of topics written by the agent on a robot (`fieldkit.agent.records`): fixed-size records after a magic.
 
-Zeros follow the last record of a log whose writer was killed: it grows by pieces.
+A log whose writer was killed ends with zeros, because the file grows by blocks.
 """
 
 import zlib
@@ -27,20 +27,20 @@ _KINDS: Final = range(1, 9)
 _SAMPLE, BEGUN, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN = _KINDS
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
-_CHECKED: Final = 1
-"""In an end whose size is the checksum of the log; logs of fieldkit without an origin have none."""
+_HAS_CHECKSUM: Final = 1
+"""Value in an end record whose size field is a checksum; logs of versions without origin records have no checksum."""
 _SIZE_AT: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Stamped(Table):
-    """Samples in the order in which they were written down; times by the clocks of two robots.
+class TopicSamples(Table):
+    """Samples in the order of the log; times by the clocks of two robots.
 
     Attributes:
-        sequence: Number of each, from 0.
-        size_bytes: Bytes of each, serialized.
-        sent_ns: When its sender sent it, as it says itself, nanoseconds since 1970 UTC.
-        at_ns: When it was taken by the middleware, or arrived, by the clock of who wrote it down.
+        sequence: Sequence number, from 0.
+        size_bytes: Serialized size.
+        sent_ns: Time of sending by the sender's clock, stored in the sample, nanoseconds since 1970 UTC.
+        at_ns: Time at which the middleware accepted it, or at which it arrived, by the clock of the log's robot.
     """
 
     sequence: Ints
@@ -51,24 +51,24 @@ class Stamped(Table):
 
 @dataclass(frozen=True)
 class TopicLog:
-    """What one end wrote down.
+    """Log of one end of a topic.
 
     Attributes:
-        samples: Those that the middleware took, or that arrived.
-        begun_ns: When the middleware began to look for others; None where it is not told.
-        matched_ns: When the other end was known; None where it never was.
-        refused: Samples that the middleware did not take.
-        skipped: Samples whose time passed while one before was being written.
-        foreign: What arrived and is no sample of the stream.
-        whole: Whether the log has its end.
-        kinds: Number of records of each kind, by the number of the kind.
-        times_ns: Time of every record in the order in which they were written, by the writer's clock.
-        numbers: Sequence number of each sample that was offered to the middleware or that arrived, refused ones too.
-        end: `PUBLISHER` or `SUBSCRIBER`; None in a log of fieldkit without an origin, which does not say.
-        topic_sum: CRC-32 of the topic's name; None likewise.
+        samples: Samples that the middleware accepted, or that arrived.
+        begun_ns: Time at which the middleware started discovery; None if it is not recorded.
+        matched_ns: Time at which the other end was discovered; None if it never was.
+        refused: Number of samples that the middleware did not accept.
+        skipped: Number of samples whose time passed while an earlier one was being written.
+        foreign: Number of received messages that are not samples of the stream.
+        whole: True if the log has its end record.
+        kinds: Number of records of each kind.
+        times_ns: Time of every record in the order of the log, by the writer's clock.
+        numbers: Sequence number of each sample that was passed to the middleware or arrived, including refused ones.
+        end: `PUBLISHER` or `SUBSCRIBER`; None in a log of a version without origin records.
+        topic_sum: CRC-32 of the topic's name; None in a log of a version without origin records.
     """
 
-    samples: Stamped
+    samples: TopicSamples
     begun_ns: int | None
     matched_ns: int | None
     refused: int
@@ -83,39 +83,41 @@ class TopicLog:
 
 
 def read(path: Path) -> TopicLog:
-    """Return what an end wrote down; a record that was cut in its midst is passed over, as is one without its time.
+    """Read a log. A record that is truncated or has no time is ignored.
 
     Raises:
-        EvidenceError: The file is missing, is no such log, counts other than its records, or was changed after its
-            end was written.
+        EvidenceError: The file is missing or not such a log, the number of samples in its end record is wrong, or it
+            was changed after the end record was written.
     """
     content = reading.mapped(path)
     if content[: len(MAGIC)] != MAGIC:
-        raise EvidenceError("is no log of a topic", where=str(path), remedy="repeat the measurement")
+        raise EvidenceError("is not a log of a topic", where=str(path), remedy="repeat the measurement")
     count = (len(content) - len(MAGIC)) // RECORD_BYTES
     records = np.frombuffer(content, _RECORD, count, offset=len(MAGIC))
     records = records[records["at_ns"] != 0]
     if len(unknown := np.setdiff1d(records["kind"], _KINDS)):
-        what = f"has a record of kind {unknown[0]}, which no agent writes"
-        raise EvidenceError(what, where=str(path), remedy="repeat the measurement")
+        reason = f"has a record of kind {unknown[0]}, which no agent writes"
+        raise EvidenceError(reason, where=str(path), remedy="repeat the measurement")
 
-    of = {kind: records[records["kind"] == kind] for kind in _KINDS}
-    samples, ends = of[_SAMPLE], of[_END]
+    by_kind = {kind: records[records["kind"] == kind] for kind in _KINDS}
+    samples, ends = by_kind[_SAMPLE], by_kind[_END]
     if len(ends) and (len(ends) > 1 or records["kind"][-1] != _END or ends["sequence"][0] != len(samples)):
-        raise EvidenceError("counts other samples than it has", where=str(path), remedy="repeat the measurement")
-    begun, matched, origin = of[BEGUN], of[MATCHED], of[_ORIGIN]
-    if len(ends) and not _is_intact(content, ends[0], signed=len(origin) > 0):
+        raise EvidenceError(
+            "does not have the number of samples in its end record", where=str(path), remedy="repeat the measurement"
+        )
+    started, matched, origin = by_kind[BEGUN], by_kind[MATCHED], by_kind[_ORIGIN]
+    if len(ends) and not _is_intact(content, ends[0], required=len(origin) > 0):
         raise EvidenceError("was changed: its checksum is wrong", where=str(path), remedy="repeat the measurement")
     offered = records[(records["kind"] == _SAMPLE) | (records["kind"] == REFUSED)]
     return TopicLog(
-        samples=Stamped(*(samples[name].astype(np.int64) for name in ("sequence", "size", "sent_ns", "at_ns"))),
-        begun_ns=int(begun["at_ns"][0]) if len(begun) else None,
+        samples=TopicSamples(*(samples[name].astype(np.int64) for name in ("sequence", "size", "sent_ns", "at_ns"))),
+        begun_ns=int(started["at_ns"][0]) if len(started) else None,
         matched_ns=int(matched["at_ns"][0]) if len(matched) else None,
-        refused=len(of[REFUSED]),
-        skipped=int(of[SKIPPED]["sequence"].sum()),
-        foreign=len(of[FOREIGN]),
+        refused=len(by_kind[REFUSED]),
+        skipped=int(by_kind[SKIPPED]["sequence"].sum()),
+        foreign=len(by_kind[FOREIGN]),
         whole=bool(len(ends)),
-        kinds={kind: len(these) for kind, these in of.items()},
+        kinds={kind: len(records_of_kind) for kind, records_of_kind in by_kind.items()},
         times_ns=records["at_ns"].astype(np.int64),
         numbers=offered["sequence"].astype(np.int64),
         end=int(origin["sequence"][0]) if len(origin) else None,
@@ -123,11 +125,11 @@ def read(path: Path) -> TopicLog:
     )
 
 
-def _is_intact(content: bytes | mmap, end: np.void, *, signed: bool) -> bool:
-    """Return whether the checksum in the end of a log is right; a log without an origin may have none."""
-    if end["sent_ns"] != _CHECKED:
-        return not signed
+def _is_intact(content: bytes | mmap, end: np.void, *, required: bool) -> bool:
+    """Return True if the checksum in the end record is correct, or missing and not required."""
+    if end["sent_ns"] != _HAS_CHECKSUM:
+        return not required
     record = end.tobytes()
-    begins = content.rfind(record)
+    starts_at = content.rfind(record)
     blank = record[:_SIZE_AT] + bytes(4) + record[_SIZE_AT + 4 :]
-    return zlib.crc32(blank, zlib.crc32(memoryview(content)[:begins])) == int(end["size"])
+    return zlib.crc32(blank, zlib.crc32(memoryview(content)[:starts_at])) == int(end["size"])

@@ -1,6 +1,7 @@
-"""Deliveries of a topic, by the logs of its ends: a sample is delivered when the subscriber has it the first time.
+"""Deliveries of a topic by the logs of its ends: a sample is delivered when it first arrives at the subscriber.
 
-In a capture heartbeats, acknowledgements and samples share their ports, so packets do not show what was delivered.
+In a capture, heartbeats, acknowledgements and samples share their ports, so packets do not show which samples
+arrived.
 """
 
 from dataclasses import replace
@@ -17,48 +18,48 @@ from fieldkit.measure.transfers.topic_log import TopicLog
 from fieldkit.measure.transfers.topics import TopicTraffic
 
 COLUMNS = tuple(
-    replace(column, meaning=column.meaning.replace("whole captures", "whole logs"))
+    replace(column, meaning=column.meaning.replace("complete captures", "complete logs"))
     for column in stalls.declared("topic", "the topic", 83)
 )
 
 
-def demand_steady(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> None:
-    """Refuse times of two robots of which one set its clock meanwhile, as far as captures show it.
+def require_steady_clocks(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> None:
+    """Raise an error if the captures show that a robot's clock was set.
 
     Raises:
-        EvidenceError: No clock fits both captures.
+        EvidenceError: No clock offset fits both captures.
     """
     if sender is None or receiver is None:
         return
     ends = flow.sender_address, flow.receiver_address
-    both = (packets.are_from(end).any() for packets in (sender, receiver) for end in ends)
-    if all(both) and delay.between(sender, receiver, *ends) is None:
+    has_packets = (packets.are_from(end).any() for packets in (sender, receiver) for end in ends)
+    if all(has_packets) and delay.clocks_between(sender, receiver, *ends) is None:
         raise EvidenceError(delay.UNSTEADY)
 
 
-def delivery(sent: TopicLog | None, came: TopicLog | None, expected: FlowSchedule) -> Delivery:
+def delivery(sent: TopicLog | None, received: TopicLog | None, expected: FlowSchedule) -> Delivery:
     """Return the deliveries of a topic.
 
     Args:
-        sent: Log of the publisher; None if that is not whole.
-        came: Log of the subscriber, likewise.
-        expected: What is known of the stream.
+        sent: Log of the publisher; None if it is incomplete.
+        received: Log of the subscriber; None if it is incomplete.
+        expected: Known properties of the stream.
 
     Raises:
-        EvidenceError: The logs do not show them.
+        EvidenceError: The deliveries cannot be determined from the logs.
     """
-    if sent is None or came is None:
-        raise EvidenceError("there are no whole logs of both ends")
-    left = sent.samples
-    if not len(left):
+    if sent is None or received is None:
+        raise EvidenceError("there are no complete logs of both ends")
+    samples = sent.samples
+    if not len(samples):
         raise EvidenceError("nothing was sent")
-    _, mine, first = np.intersect1d(left.sequence, came.samples.sequence, return_indices=True)
-    at_ns = came.samples.at_ns[np.sort(first)]
-    if (np.diff(at_ns) < -deliveries.BACK_NS).any():
+    _, sent_index, received_index = np.intersect1d(samples.sequence, received.samples.sequence, return_indices=True)
+    at_ns = received.samples.at_ns[np.sort(received_index)]
+    if (np.diff(at_ns) < -deliveries.REORDERING_NS).any():
         raise EvidenceError("a sample is earlier than the one before it: a clock was set back")
-    pairs = StampPairs(left.sent_ns[mine], came.samples.at_ns[first])
-    first_ns, last_ns = int(left.sent_ns.min()), int(left.sent_ns.max())
-    return deliveries.of_stream(np.sort(at_ns), (first_ns, first_ns, last_ns), pairs, expected)
+    pairs = StampPairs(samples.sent_ns[sent_index], received.samples.at_ns[received_index])
+    first_ns, last_ns = int(samples.sent_ns.min()), int(samples.sent_ns.max())
+    return deliveries.stream_delivery(np.sort(at_ns), (first_ns, first_ns, last_ns), pairs, expected)
 
 
 def measure(
@@ -70,10 +71,10 @@ def measure(
     """Return the columns of the stalls of a topic.
 
     Args:
-        flow: What identifies its packets.
-        logs: As for `delivery`, of publisher and subscriber.
-        captured: What their robots captured meanwhile; None if there is no whole capture.
-        expected: What is known of the stream.
+        flow: Identifies its packets.
+        logs: Logs of publisher and subscriber as for `delivery`.
+        captured: Packets that their robots captured; None without a complete capture.
+        expected: Known properties of the stream.
     """
     return stalls.measure("topic", lambda: read(flow, logs, captured, expected))
 
@@ -84,6 +85,6 @@ def read(
     captured: tuple[Packets | None, Packets | None],
     expected: FlowSchedule,
 ) -> list[Delivery]:
-    """Return the deliveries of a topic; arguments as of `measure`, errors as of `delivery` and `demand_steady`."""
-    demand_steady(flow, *captured)
+    """Return the deliveries of a topic; arguments as for `measure`, raises as `delivery`, `require_steady_clocks`."""
+    require_steady_clocks(flow, *captured)
     return [delivery(*logs, expected)]

@@ -1,4 +1,4 @@
-"""A transfer under test: addresses, port and files, which tell its packets from all others."""
+"""A transfer under test: the addresses, port and files that identify its packets."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -17,15 +17,15 @@ class Transfer:
 
     Attributes:
         protocol: Transport protocol.
-        source: Role of the robot that sends.
-        destination: Role of the one that receives.
+        source: Role of the sending robot.
+        destination: Role of the receiving robot.
         sender_address: Address of the sender on the link under test.
-        receiver_address: Address of the receiver on it.
+        receiver_address: Address of the receiver on the link under test.
         port: Port that the receiver listens on.
         sent_file: Name of the sent file in the attempt's folder.
-        received_file: Name of the file there that the listener wrote.
-        captures: Names of the files there of what sender and receiver captured meanwhile; None of who did not.
-        name: Name of its step, which the names of other files that belong to it begin with; empty without one.
+        received_file: Name of the file that the listener wrote, in the same folder.
+        captures: Names of the sender's and the receiver's capture in the same folder; None without a capture.
+        name: Name of its step, which is the prefix of its other files; empty without one.
     """
 
     protocol: Protocol
@@ -41,11 +41,11 @@ class Transfer:
 
     @property
     def captured(self) -> bool:
-        """Whether both ends captured."""
+        """True if both ends captured."""
         return None not in self.captures
 
     def forward(self, packets: Packets) -> Packets:
-        """Return the packets of the protocol that go from sender to receiver, of any port."""
+        """Return the packets of its protocol from sender to receiver, of any port."""
         return packets.where(
             packets.are_from(self.sender_address)
             & packets.are_to(self.receiver_address)
@@ -53,7 +53,7 @@ class Transfer:
         )
 
     def backward(self, packets: Packets) -> Packets:
-        """Return the packets of the protocol that go from receiver to sender, of any port."""
+        """Return the packets of its protocol from receiver to sender, of any port."""
         return packets.where(
             packets.are_from(self.receiver_address)
             & packets.are_to(self.sender_address)
@@ -62,7 +62,7 @@ class Transfer:
 
 
 def span_s(time_ns: Ints, carries_payload: Mask) -> float | None:
-    """Return seconds from the first frame to the last with payload; None when none has any, or times are missing."""
+    """Return the seconds from the first frame to the last with payload; None without payload or without times."""
     if not carries_payload.any() or (time_ns == NO_TIME).any():
         return None
     return float(time_ns[carries_payload].max() - time_ns.min()) / 1e9

@@ -15,13 +15,13 @@ from fieldkit.measure.transfers.transfer import Transfer
 from fieldkit.measure.transfers.udp import UdpPackets
 
 
-def expected(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> FlowSchedule:
-    """Return what is known of a transfer; its sender always has more to send, until the file ends.
+def flow_schedule(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> FlowSchedule:
+    """Return the known properties of a transfer; its sender always has more to send until the end of the file.
 
     Args:
-        evidence: What the attempt left.
-        transfer: What was sent from where to where.
-        listener: Job that received it; empty where that is not known.
+        evidence: The attempt's evidence.
+        transfer: The transfer.
+        listener: Job that received the file; empty if unknown.
     """
     return FlowSchedule(
         size_bytes=evidence.read_or_none(reading.size, transfer.sent_file),
@@ -30,44 +30,44 @@ def expected(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> Fl
 
 
 def read(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> list[Delivery]:
-    """Return the deliveries of each connection; arguments as of `expected`.
+    """Return the deliveries of each connection; arguments as for `flow_schedule`.
 
     Raises:
-        EvidenceError: The captures do not show them.
+        EvidenceError: They cannot be determined from the captures.
     """
     sender, receiver = (evidence.whole_capture(file) for file in transfer.captures)
     if sender is None or receiver is None:
-        raise EvidenceError("there are no whole captures of both ends")
-    known = expected(evidence, transfer, listener)
+        raise EvidenceError("there are no complete captures of both ends")
+    schedule = flow_schedule(evidence, transfer, listener)
     if transfer.protocol is Protocol.UDP:
-        return of_udp(udp.cross(sender.packets, receiver.packets, transfer), known)
+        return of_udp(udp.cross(sender.packets, receiver.packets, transfer), schedule)
     frames = tcp.cross(sender.packets, receiver.packets, transfer)
-    return of_tcp(frames, transfer.backward(sender.packets), known)
+    return of_tcp(frames, transfer.backward(sender.packets), schedule)
 
 
-def of_udp(crossing: UdpPackets, known: FlowSchedule) -> list[Delivery]:
+def of_udp(packets: UdpPackets, schedule: FlowSchedule) -> list[Delivery]:
     """Return the deliveries of a UDP transfer; errors as `deliveries.of_udp`."""
-    return [deliveries.of_udp(crossing, crossing.ours[:-1], known)]
+    return [deliveries.of_udp(packets, packets.is_transfer[:-1], schedule)]
 
 
-def of_tcp(frames: TcpFrames, answers: Packets, known: FlowSchedule) -> list[Delivery]:
+def of_tcp(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) -> list[Delivery]:
     """Return the deliveries of each connection of a TCP transfer; errors as `deliveries.of_tcp`.
 
     Args:
-        frames: Their frames in both captures.
+        frames: Frames of the connections in both captures.
         answers: Packets from receiver to sender in the sender's capture.
-        known: What is known of the transfer.
+        schedule: Known properties of the transfer.
     """
     ports = np.unique(frames.sent.sport)
     if len(ports) == 1:
-        return [deliveries.of_tcp(frames, answers.where(answers.dport == ports[0]), known)]
+        return [deliveries.of_tcp(frames, answers.where(answers.dport == ports[0]), schedule)]
     return [
         deliveries.of_tcp(
-            tcp.beside(
+            tcp.match_frames(
                 frames.sent.where(frames.sent.sport == port), frames.received.where(frames.received.sport == port)
             ),
             answers.where(answers.dport == port),
-            known,
+            schedule,
         )
         for port in ports
     ]

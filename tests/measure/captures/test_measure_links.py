@@ -1,4 +1,4 @@
-"""Every link type, IPv4 and IPv6 under it, against scapy's dissector, field by field."""
+"""Every link type with IPv4 and IPv6, compared field by field with scapy's dissector."""
 
 import struct
 from pathlib import Path
@@ -103,11 +103,11 @@ def _ipv6_packets() -> list[Packet]:
 @pytest.mark.parametrize("name", LINKS)
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("nano", [False, True])
-def test_every_column_equals_what_scapy_dissects(tmp_path: Path, name: str, order: str, nano: bool) -> None:
+def test_every_column_equals_scapys_dissection(tmp_path: Path, name: str, order: str, nano: bool) -> None:
     link_type, link = LINKS[name]
-    # One of each in turn: the rows of both versions must come in the order of the file.
+    # IPv4 and IPv6 packets alternate: the rows of both versions must be in the order of the file.
     four, six = _ipv4_packets(), _ipv6_packets()
-    turns = [one for pair in zip(four, six, strict=False) for one in pair] + four[len(six) :] + six[len(four) :]
+    turns = [packet for pair in zip(four, six, strict=False) for packet in pair] + four[len(six) :] + six[len(four) :]
     frames = [packet if link is None else link / packet for packet in turns]
     path = tmp_path / "x.pcap"
     write(path, frames, link_type, order, nano=nano)
@@ -121,7 +121,7 @@ def test_every_column_equals_what_scapy_dissects(tmp_path: Path, name: str, orde
 
 @pytest.mark.parametrize(("link_type", "order"), [(0, "<"), (0, ">"), (108, ">")])
 @pytest.mark.parametrize("family", [2, 10, 24, 28, 30])
-def test_loopback_tells_its_family_in_either_byte_order(link_type: int, order: str, family: int) -> None:
+def test_the_address_family_of_loopback_is_read_in_either_byte_order(link_type: int, order: str, family: int) -> None:
     packet = IPv6(src=HERE, dst=THERE) / UDP(sport=4, dport=5)
     data = file_bytes([Frame(0, struct.pack(f"{order}I", family) + bytes(packet))], link_type=link_type)
     assert pcap.parse(data, where="x").packets.dport.tolist() == [5]
@@ -130,7 +130,7 @@ def test_loopback_tells_its_family_in_either_byte_order(link_type: int, order: s
     assert (unknown.frames, len(unknown.packets)) == (1, 0)
 
 
-def test_loopback_equals_what_scapy_dissects(tmp_path: Path) -> None:
+def test_loopback_equals_scapys_dissection(tmp_path: Path) -> None:
     write(tmp_path / "x.pcap", [Loopback(type=2) / packet for packet in _ipv4_packets()], 0)
     assert rows(pcap.read(tmp_path / "x.pcap").packets) == dissected(tmp_path / "x.pcap")
 
@@ -161,7 +161,7 @@ def test_frames_without_a_readable_ip_packet_are_counted_as_others(
     assert (capture.frames, len(capture.packets)) == (1, 0)
 
 
-def test_a_later_80211_fragment_is_another_frame(tmp_path: Path) -> None:
+def test_a_later_80211_fragment_is_not_an_ip_packet(tmp_path: Path) -> None:
     first, later = _dot11(TO_DS | MORE) / PAYLOAD, _dot11(TO_DS) / PAYLOAD
     later.SC = 1
     write(tmp_path / "x.pcap", [first, later], 105)
@@ -179,12 +179,12 @@ QOS_HT = bytes.fromhex("8881 0000") + bytes(20) + bytes(2) + bytes(4)
 
 
 @pytest.mark.parametrize(
-    ("frame", "found"),
+    ("frame", "count"),
     [
         (_radiotap(b"\x00\x00\x00\x00", b"") + PLAIN + SNAP_IPV4, 1),
-        # Two words say what is present; flags come right after them: a bad checksum.
+        # The presence bitmap has two words, followed by the flags: a bad checksum.
         (_radiotap(b"\x02\x00\x00\x80\x00\x00\x00\x00", b"\x40") + PLAIN + SNAP_IPV4, 0),
-        # With two words the time stamp is aligned to byte 16.
+        # After two words the time stamp is aligned to byte 16.
         (_radiotap(b"\x03\x00\x00\x80\x00\x00\x00\x00", bytes(4) + bytes(8) + b"\x40") + PLAIN + SNAP_IPV4, 0),
         (_radiotap(b"\x03\x00\x00\x80\x00\x00\x00\x00", bytes(4) + b"\x40" * 8 + b"\x00") + PLAIN + SNAP_IPV4, 1),
         # HT control: four bytes more.
@@ -193,33 +193,33 @@ QOS_HT = bytes.fromhex("8881 0000") + bytes(20) + bytes(2) + bytes(4)
         (_radiotap(b"\x02\x00\x00\x00", b"\x20") + b"\x88\x01" + bytes(26) + SNAP_IPV4, 1),
         (_radiotap(b"\x00\x00\x00\x00", b"") + b"\x88\x01" + bytes(26) + SNAP_IPV4, 0),
         (b"\x01" + _radiotap(b"\x00\x00\x00\x00", b"")[1:] + PLAIN + SNAP_IPV4, 0),
-        # Bridge-tunnel encapsulation, and another protocol than version 0.
+        # Bridge-tunnel encapsulation, and a protocol version other than 0.
         (_radiotap(b"\x00\x00\x00\x00", b"") + PLAIN + SNAP_IPV4[:3] + b"\x00\x00\xf8" + SNAP_IPV4[6:], 0),
         (_radiotap(b"\x00\x00\x00\x00", b"") + b"\x09" + PLAIN[1:] + SNAP_IPV4, 0),
     ],
 )
-def test_radio_headers_by_their_bytes(frame: bytes, found: int) -> None:
+def test_radio_headers_given_as_bytes(frame: bytes, count: int) -> None:
     packets = pcap.parse(file_bytes([Frame(0, frame)], link_type=127), where="x").packets
-    assert packets.dport.tolist() == [5] * found
+    assert packets.dport.tolist() == [5] * count
 
 
 def _of(frame: bytes, *, link_type: int = 101, wire: int | None = None) -> Packets:
     return pcap.parse(file_bytes([Frame(0, frame, wire_bytes=wire)], link_type=link_type), where="x").packets
 
 
-def test_payload_is_told_by_the_ip_header_not_by_ethernet_padding_or_what_was_kept() -> None:
+def test_payload_length_is_that_of_the_ip_header() -> None:
     ethernet = bytes(12) + b"\x08\x00"
     assert _of(ethernet + segment(5, 1448), link_type=1, wire=14 + 1488).tcp_payload_bytes.tolist() == [1448]
     short = ethernet + ipv4(bytes(12), protocol=17, size=9) + bytes(20)
     assert _of(short, link_type=1).ip_payload_bytes.tolist() == [9]
 
 
-def test_padding_is_not_taken_for_a_transport_header() -> None:
+def test_padding_is_not_decoded_as_a_transport_header() -> None:
     packets = _of(bytes(12) + b"\x08\x00" + ipv4(b"\x04\xd2\x04\xd2", protocol=17) + b"\xff" * 22, link_type=1)
     assert (packets.dport.tolist(), packets.udp_bytes.tolist()) == ([1234], [0])
 
 
-def test_a_super_frame_above_64_kib_takes_its_length_from_the_wire() -> None:
+def test_the_length_of_a_superframe_above_64_kib_is_that_on_the_wire() -> None:
     huge = segment(5, 0)
     huge = huge[:2] + b"\x00\x00" + huge[4:]
     assert _of(huge, wire=40 + 100_000).tcp_payload_bytes.tolist() == [100_000]
@@ -235,7 +235,7 @@ def test_a_super_frame_above_64_kib_takes_its_length_from_the_wire() -> None:
         (59, b"", 60, 0),  # nothing follows, but padding
     ],
 )
-def test_an_ipv6_super_frame_takes_its_length_from_its_option_or_the_wire(
+def test_the_length_of_an_ipv6_superframe_is_from_its_option_or_the_wire(
     next_header: int, extension: bytes, wire: int, payload: int
 ) -> None:
     head = struct.pack(">IHBB", 6 << 28, 0, next_header, 64) + bytes(32)
@@ -245,24 +245,24 @@ def test_an_ipv6_super_frame_takes_its_length_from_its_option_or_the_wire(
     assert packets.ip_payload_bytes.tolist() == [0 if next_header == 59 else payload + 20]
 
 
-def test_a_packet_cut_within_its_headers_has_no_ports() -> None:
+def test_a_packet_truncated_in_its_headers_has_no_ports() -> None:
     whole = segment(5, 0)
-    for kept, found, ported in ((19, 0, 0), (20, 1, 0), (23, 1, 0), (24, 1, 1), (39, 1, 1)):
+    for kept, count, ported in ((19, 0, 0), (20, 1, 0), (23, 1, 0), (24, 1, 1), (39, 1, 1)):
         packets = _of(whole[:kept], wire=40)
-        assert len(packets) == found
+        assert len(packets) == count
         assert (packets.dport != NO_PORT).sum() == ported
         assert not packets.tcp_seq.any()
 
 
-def test_an_authentication_header_counts_its_length_in_words() -> None:
-    """By hand: scapy does not look behind it."""
+def test_the_length_of_an_authentication_header_is_in_words() -> None:
+    """The packet is built by hand, because scapy does not dissect the header after it."""
     authentic = AH(nh=17, payloadlen=4, spi=1, seq=1, icv=bytes(12))
     packets = _of(bytes(IPv6(src=HERE, dst=THERE) / authentic / UDP(sport=6, dport=7) / Raw(b"abcd")))
     assert (packets.protocol.tolist(), packets.dport.tolist(), packets.udp_bytes.tolist()) == ([17], [7], [12])
     assert packets.ip_payload_bytes.tolist() == [12]
 
 
-def test_an_ipv6_packet_cut_within_its_extensions_has_no_ports() -> None:
+def test_an_ipv6_packet_truncated_in_its_extension_headers_has_no_ports() -> None:
     hops = IPv6ExtHdrHopByHop(options=[PadN(optdata=bytes(10))])
     whole = bytes(IPv6(src=HERE, dst=THERE) / hops / UDP(sport=4, dport=5))
     for kept in range(len(whole)):
@@ -272,8 +272,8 @@ def test_an_ipv6_packet_cut_within_its_extensions_has_no_ports() -> None:
         assert packets.dport.tolist() == ([] if kept < 40 else [5 if kept >= 60 else NO_PORT])
 
 
-def test_headers_at_the_very_end_of_a_file_read_nothing_beyond() -> None:
-    """A tag, a radio header or an extension may promise more than the file has."""
+def test_headers_at_the_end_of_a_file_do_not_read_beyond_it() -> None:
+    """A VLAN tag, a radio header or an extension may announce more bytes than the file has."""
     for link_type in (0, 1, 101, 105, 108, 113, 127, 276):
         for size in range(1, 60):
             for fill in (b"\x00", b"\x81\x00", b"\x60", b"\x45", b"\xff", b"\x88\x01"):

@@ -13,41 +13,41 @@ from tests.helpers.captures import TCPDUMP, file_bytes, segment, timed
 
 
 @pytest.mark.parametrize("link_type", LINKS)
-def test_a_capture_without_packets_is_whole(link_type: int) -> None:
+def test_a_capture_without_packets_is_undamaged(link_type: int) -> None:
     capture = pcap.parse(file_bytes([], link_type=link_type), where="x")
     assert (capture.frames, capture.damage, len(capture.packets)) == (0, None, 0)
 
 
 @pytest.mark.parametrize(
-    ("data", "what"),
+    ("data", "message"),
     [
         (b"", "is empty"),
-        (b"#ROSBAG V2.0\n" + bytes(100), "no pcap or pcapng file"),
-        (file_bytes([])[:3], "no pcap or pcapng file"),
+        (b"#ROSBAG V2.0\n" + bytes(100), "not a pcap or pcapng file"),
+        (file_bytes([])[:3], "not a pcap or pcapng file"),
         (file_bytes([])[:23], "ends inside its header"),
         (file_bytes([], link_type=147), "link type 147"),
     ],
 )
-def test_what_is_no_capture_is_refused_with_a_remedy(data: bytes, what: str) -> None:
-    with pytest.raises(EvidenceError, match=what) as caught:
+def test_a_file_that_is_not_a_capture_is_rejected_with_a_remedy(data: bytes, message: str) -> None:
+    with pytest.raises(EvidenceError, match=message) as caught:
         pcap.parse(data, where="sender.pcap")
     assert caught.value.remedy
     assert caught.value.where == "sender.pcap"
 
 
-def test_a_missing_capture_is_refused(tmp_path: Path) -> None:
+def test_a_missing_capture_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="No such file"):
         pcap.read(tmp_path / "none.pcap")
 
 
 FRAMES = timed([segment(index * 100, 100) for index in range(5)])
-SOUND = file_bytes(FRAMES)
+VALID = file_bytes(FRAMES)
 RECORD = 16 + 40
 
 
 def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
-    for size in range(24, len(SOUND)):
-        capture = pcap.parse(SOUND[:size], where="x")
+    for size in range(24, len(VALID)):
+        capture = pcap.parse(VALID[:size], where="x")
         whole, rest = divmod(size - 24, RECORD)
         assert capture.packets.tcp_seq.tolist() == [index * 100 for index in range(whole)]
         inside = f"ends inside the packet at byte {24 + whole * RECORD}, after packet {whole}"
@@ -63,17 +63,17 @@ def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
         (12, b"\x27\x00\x00\x00"),  # 39 bytes on the wire of which 40 were kept
     ],
 )
-def test_a_broken_record_header_ends_the_packets_and_is_named(at: int, value: bytes) -> None:
+def test_packets_before_a_broken_record_header_are_read_and_it_is_reported(at: int, value: bytes) -> None:
     start = 24 + 2 * RECORD
-    data = SOUND[: start + at] + value + SOUND[start + at + len(value) :]
+    data = VALID[: start + at] + value + VALID[start + at + len(value) :]
     capture = pcap.parse(data, where="x")
     assert capture.packets.tcp_seq.tolist() == [0, 100]
     assert capture.damage == f"no packet header at byte {start}, after packet 2"
 
 
-@given(st.integers(24, len(SOUND) - 1), st.integers(0, 7))
-def test_one_flipped_bit_never_raises_and_leaves_the_packets_before_it(at: int, bit: int) -> None:
-    data = bytearray(SOUND)
+@given(st.integers(24, len(VALID) - 1), st.integers(0, 7))
+def test_a_flipped_bit_never_raises_and_keeps_the_packets_before_it(at: int, bit: int) -> None:
+    data = bytearray(VALID)
     data[at] ^= 1 << bit
     capture = pcap.parse(bytes(data), where="x")
     before = (at - 24) // RECORD

@@ -1,4 +1,4 @@
-"""pcapng: every block that holds a packet, sections, interfaces, clocks; damage anywhere."""
+"""pcapng: every block type with a packet, sections, interfaces, clocks, and damage at any position."""
 
 import struct
 from contextlib import suppress
@@ -26,7 +26,7 @@ def _frame(seq: int, *, pad: int = 0) -> Frame:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_every_block_that_holds_a_packet(order: str) -> None:
+def test_every_block_type_that_contains_a_packet(order: str) -> None:
     ticks = T_NS // 1000
     data = b"".join([
         section(order=order),
@@ -45,7 +45,7 @@ def test_every_block_that_holds_a_packet(order: str) -> None:
     assert capture.packets.time_ns.tolist() == [ticks * 1000, (ticks + 1) * 1000, NO_TIME]
 
 
-def test_a_simple_packet_is_as_long_as_its_interface_keeps() -> None:
+def test_a_simple_packet_has_the_snap_length_of_its_interface() -> None:
     whole = segment(7, 100)
     for snap, kept, ported in ((0, 40, True), (40, 40, True), (24, 24, True), (23, 23, False)):
         data = section() + interface(snap=snap) + simple(Frame(0, whole[:kept], wire_bytes=40))
@@ -55,7 +55,7 @@ def test_a_simple_packet_is_as_long_as_its_interface_keeps() -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_sections_and_interfaces_each_have_their_own(order: str) -> None:
+def test_each_section_and_interface_has_its_own_byte_order_and_clock(order: str) -> None:
     ethernet = Frame(0, bytes(12) + b"\x08\x00" + segment(2, 100))
     other = "<" if order == ">" else ">"
     data = b"".join([
@@ -86,13 +86,13 @@ def test_times_equal_exact_fractions(resolution: int, ticks: int, offset_s: int)
     base = 2 if resolution & 0x80 else 10
     exact = Fraction(ticks, base ** (resolution & 0x7F)) + offset_s
     expected = int(exact * 10**9 // 1)
-    # A moment of another millennium does not fit; what becomes of it is no more than a wrong time.
+    # Times that do not fit into 64 bits may be wrong, but do not raise.
     data = section() + interface(resolution=resolution, offset_s=offset_s) + enhanced(_frame(1), ticks=ticks)
-    found = pcap.parse(data, where="x").packets.time_ns.tolist()
-    assert found == [expected] or abs(expected) >= 2**63
+    times_ns = pcap.parse(data, where="x").packets.time_ns.tolist()
+    assert times_ns == [expected] or abs(expected) >= 2**63
 
 
-def test_a_link_type_that_no_interface_can_be_read_of_is_refused() -> None:
+def test_packets_of_unsupported_link_types_alone_are_rejected() -> None:
     data = section() + interface(147) + interface(148)
     assert pcap.parse(data, where="x").frames == 0
     with pytest.raises(EvidenceError, match="link type 147, 148") as caught:
@@ -112,14 +112,14 @@ BLOCKS = [
     interface(1, order=">"),
     enhanced(_frame(5), ticks=T_NS // 1000, order=">"),
 ]
-SOUND = b"".join(BLOCKS)
+VALID = b"".join(BLOCKS)
 ENDS = list(accumulate(map(len, BLOCKS)))
 PACKET_ENDS = [ENDS[index] for index in (2, 3, 4, 8, 9, 11)]
 
 
 def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
-    for size in range(28, len(SOUND) + 1):
-        capture = pcap.parse(SOUND[:size], where="x")
+    for size in range(28, len(VALID) + 1):
+        capture = pcap.parse(VALID[:size], where="x")
         whole = sum(end <= size for end in PACKET_ENDS)
         assert capture.packets.tcp_seq.tolist() == list(range(whole))
         start = max(end for end in ENDS if end <= size)
@@ -129,11 +129,11 @@ def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
 
 def _damaged(index: int, at: int, value: bytes) -> bytes:
     start = ENDS[index] - len(BLOCKS[index])
-    return SOUND[: start + at] + value + SOUND[start + at + len(value) :]
+    return VALID[: start + at] + value + VALID[start + at + len(value) :]
 
 
 @pytest.mark.parametrize(
-    ("index", "at", "value", "what"),
+    ("index", "at", "value", "damage"),
     [
         (3, 4, b"\x00\x00\x00\x00", "no block"),
         (3, 4, b"\x0b\x00\x00\x00", "no block"),
@@ -148,26 +148,28 @@ def _damaged(index: int, at: int, value: bytes) -> bytes:
         (7, 18, b"\xff\xff", "no block"),  # an option that is longer than its block
     ],
 )
-def test_a_broken_block_ends_the_packets_and_is_named(index: int, at: int, value: bytes, what: str) -> None:
+def test_packets_before_a_broken_block_are_read_and_it_is_reported(
+    index: int, at: int, value: bytes, damage: str
+) -> None:
     capture = pcap.parse(_damaged(index, at, value), where="x")
     start = ENDS[index] - len(BLOCKS[index])
     before = sum(end <= start for end in PACKET_ENDS)
     assert capture.packets.tcp_seq.tolist() == list(range(before))
-    assert capture.damage == f"{what} at byte {start}, after packet {before}"
+    assert capture.damage == f"{damage} at byte {start}, after packet {before}"
 
 
 @pytest.mark.parametrize(
     "head", [b"\x0a\x0d\x0d\x0a", b"\x0a\x0d\x0d\x0a" + bytes(100), section()[:27], section()[:-1] + b"\x01"]
 )
-def test_what_has_no_section_header_is_refused(head: bytes) -> None:
-    with pytest.raises(EvidenceError, match="no whole section header") as caught:
+def test_a_file_without_a_section_header_is_rejected(head: bytes) -> None:
+    with pytest.raises(EvidenceError, match="no complete section header") as caught:
         pcap.parse(head, where="x.pcapng")
     assert caught.value.remedy
 
 
-@given(st.integers(0, len(SOUND) - 1), st.integers(1, 255))
-def test_any_byte_changed_raises_nothing_but_evidence_error(at: int, change: int) -> None:
-    data = bytearray(SOUND)
+@given(st.integers(0, len(VALID) - 1), st.integers(1, 255))
+def test_a_changed_byte_raises_only_evidence_error(at: int, change: int) -> None:
+    data = bytearray(VALID)
     data[at] ^= change
     try:
         capture = pcap.parse(bytes(data), where="x")
@@ -178,30 +180,30 @@ def test_any_byte_changed_raises_nothing_but_evidence_error(at: int, change: int
 
 
 @given(st.binary(max_size=400))
-def test_arbitrary_bytes_after_a_section_raise_nothing_but_evidence_error(data: bytes) -> None:
+def test_arbitrary_bytes_after_a_section_raise_only_evidence_error(data: bytes) -> None:
     with suppress(EvidenceError):
         pcap.parse(section() + interface(1) + data, where="x")
 
 
 @pytest.mark.parametrize("definition", [interface(), section() + interface()])
-def test_a_file_that_goes_on_defining_is_refused(definition: bytes) -> None:
+def test_a_file_with_too_many_definitions_is_rejected(definition: bytes) -> None:
     few = section() + definition * 400 + enhanced(_frame(1), ticks=1)
     assert pcap.parse(few, where="x").frames == 1
     with pytest.raises(EvidenceError, match="more than 1000 sections and interfaces"):
         pcap.parse(few + definition * 1000, where="x")
 
 
-def test_no_packet_is_longer_than_a_capture_program_keeps() -> None:
+def test_a_packet_longer_than_any_snap_length_is_damage() -> None:
     kept = [Frame(T_NS, segment(1, size) + bytes(size), wire_bytes=1 << 20) for size in (262_104, 262_105)]
     for frame, damaged in zip(kept, (False, True), strict=True):
-        found = pcap.parse(section() + interface() + enhanced(frame, ticks=1), where="x")
-        assert (found.frames, found.damage is not None) == (not damaged, damaged)
+        capture = pcap.parse(section() + interface() + enhanced(frame, ticks=1), where="x")
+        assert (capture.frames, capture.damage is not None) == (not damaged, damaged)
 
 
-def test_an_option_of_another_size_is_passed_over() -> None:
+def test_an_option_with_an_invalid_size_is_ignored() -> None:
     options = option(9, b"\x03\x03") + option(14, b"\x01") + option(9, b"\x09")
-    described = block(1, struct.pack("<HHI", 101, 0, 0) + options)
-    assert pcap.parse(section() + described + enhanced(_frame(1), ticks=T_NS), where="x").packets.time_ns == [T_NS]
+    description = block(1, struct.pack("<HHI", 101, 0, 0) + options)
+    assert pcap.parse(section() + description + enhanced(_frame(1), ticks=T_NS), where="x").packets.time_ns == [T_NS]
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**32 * 10**9 - 1), st.integers(0, 60), st.integers(0, 60)), max_size=12))

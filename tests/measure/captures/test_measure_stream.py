@@ -1,4 +1,4 @@
-"""Captures in chunks: equal to the whole file for every chunk size, in bounded memory."""
+"""Captures read in chunks: equal to the whole file for every chunk size, with bounded memory."""
 
 import os
 import resource
@@ -13,7 +13,7 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.packets import Packets
 from tests.helpers.captures import TCPDUMP, file_bytes, segment, timed
 from tests.helpers.dissected import rows
-from tests.measure.captures.test_measure_pcapng import SOUND as BLOCKS
+from tests.measure.captures.test_measure_pcapng import VALID as BLOCKS
 
 FRAMES = timed([segment(index, 100)[: 24 + index] for index in range(9)])
 FILES = {
@@ -30,22 +30,22 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_chunks_of_every_size_equal_the_whole(tmp_path: Path, name: str) -> None:
+def test_chunks_of_every_size_equal_the_whole_file(tmp_path: Path, name: str) -> None:
     path = tmp_path / "x"
     path.write_bytes(FILES[name])
     whole = pcap.parse(FILES[name], where=str(path))
     assert len(whole.packets) == whole.frames == {"empty": 0, "classic, broken": 6}.get(name, whole.frames)
     for chunk_bytes in range(1, len(FILES[name]) + 2):
         chunks = list(pcap.stream(path, chunk_bytes=chunk_bytes))
-        assert rows(Packets.joined(one.packets for one in chunks)) == rows(whole.packets)
-        assert sum(one.frames for one in chunks) == whole.frames
-        assert [one.damage for one in chunks] == [None] * (len(chunks) - 1) + [whole.damage]
+        assert rows(Packets.concatenated(chunk.packets for chunk in chunks)) == rows(whole.packets)
+        assert sum(chunk.frames for chunk in chunks) == whole.frames
+        assert [chunk.damage for chunk in chunks] == [None] * (len(chunks) - 1) + [whole.damage]
         assert chunk_bytes > 1 or name == "empty" or len(chunks) >= whole.frames
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_chunks_joined_are_the_whole(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Files that go on as they begin, and ones with more or fewer packets in a chunk than in the first."""
+def test_concatenated_chunks_equal_the_whole_file(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """The number of packets per chunk is constant, or larger or smaller than in the first chunk."""
     whole = pcap.parse(FILES[name], where="x")
     for chunk_bytes in (1, 100, 200, 1000):
         monkeypatch.setattr(pcap, "CHUNK_BYTES", chunk_bytes)
@@ -57,24 +57,24 @@ def test_chunks_joined_are_the_whole(monkeypatch: pytest.MonkeyPatch, name: str)
 @pytest.mark.parametrize("name", ["nc-udp", "nc-tcp"])
 def test_a_recorded_capture_in_chunks(name: str) -> None:
     path = TCPDUMP / f"{name}.pcap"
-    chunks = [one.packets for one in pcap.stream(path, chunk_bytes=1000)]
+    chunks = [chunk.packets for chunk in pcap.stream(path, chunk_bytes=1000)]
     assert len(chunks) > 5
-    assert rows(Packets.joined(chunks)) == rows(pcap.read(path).packets)
+    assert rows(Packets.concatenated(chunks)) == rows(pcap.read(path).packets)
 
 
-def test_a_capture_that_shrinks_while_it_is_read_ends_no_process(tmp_path: Path) -> None:
-    """Mapped into memory, its missing pages would: SIGBUS."""
+def test_a_capture_truncated_while_it_is_read_does_not_end_the_process(tmp_path: Path) -> None:
+    """If the file were mapped into memory, its missing pages would raise SIGBUS."""
     (path := tmp_path / "sender.pcap").write_bytes(FILES["classic"][:24] + FILES["classic"][24:] * 1000)
     chunks = pcap.stream(path, chunk_bytes=1 << 14)
     frames = next(chunks).frames
     os.truncate(path, 1000)
-    assert frames + sum(one.frames for one in chunks) == 9000
+    assert frames + sum(chunk.frames for chunk in chunks) == 9000
 
 
-def test_a_file_that_is_missing_or_empty_is_refused(tmp_path: Path) -> None:
+def test_a_missing_or_empty_file_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "empty").touch()
-    for name, what in (("none", "No such file"), ("empty", "is empty"), (".", "Is a directory")):
-        with pytest.raises(EvidenceError, match=what):
+    for name, message in (("none", "No such file"), ("empty", "is empty"), (".", "Is a directory")):
+        with pytest.raises(EvidenceError, match=message):
             next(pcap.stream(tmp_path / name))
 
 

@@ -1,4 +1,4 @@
-"""Columns of packets that take few bytes in memory, and are read as 64-bit integers."""
+"""Columns of packets that are stored in few bytes and read as 64-bit integers."""
 
 import numpy as np
 
@@ -9,19 +9,19 @@ from tests.helpers.captures import file_bytes, segment, timed
 PACKETS = pcap.parse(file_bytes(timed([segment(index, 100) for index in range(5)])), where="x").packets
 BYTES_PER_PACKET = 110
 EIGHT_BYTES = {"time_ns", "src", "dst", "tcp_stamp", "content"}
-"""Columns whose numbers need eight bytes each: nanoseconds, addresses in two parts, 32 bits and a mark, a hash."""
+"""Columns that need eight bytes: nanoseconds, halves of addresses, 32 bits and a special value, a hash."""
 WIDE = [np.dtype(kind) for kind in (np.int64, np.uint64, np.bool_)]
 
 
-def test_a_packet_takes_few_bytes_and_is_read_in_many() -> None:
-    kept = sum(column.nbytes for column in vars(PACKETS).values()) / len(PACKETS)
-    assert kept < BYTES_PER_PACKET
+def test_a_packet_needs_few_bytes_and_is_read_as_64_bit_integers() -> None:
+    bytes_per_packet = sum(column.nbytes for column in vars(PACKETS).values()) / len(PACKETS)
+    assert bytes_per_packet < BYTES_PER_PACKET
     assert {name for name, column in vars(PACKETS).items() if column.dtype.itemsize == 8} == EIGHT_BYTES
     for name in vars(PACKETS):
         assert getattr(PACKETS, name).dtype in WIDE, name
 
 
-def test_every_sequence_number_of_an_echo_is_kept() -> None:
+def test_every_sequence_number_of_an_echo_is_stored() -> None:
     columns = {name: getattr(PACKETS, name) for name in vars(PACKETS)}
     numbers = np.array([NO_ECHO, 0, 1, 2**15, 2**16 - 1])
     assert Packets(**columns | {"echo_seq": numbers}).echo_seq.tolist() == numbers.tolist()
@@ -35,7 +35,7 @@ def test_sums_of_columns_do_not_overflow() -> None:
     assert (largest.where(slice(0, 2)).tcp_seq == 2**32 - 1).all()
 
 
-def test_joined_rows_are_those_of_the_parts() -> None:
-    joined = Packets.joined([PACKETS, PACKETS.where(slice(1, 3))])
+def test_concatenated_rows_are_those_of_the_parts() -> None:
+    joined = Packets.concatenated([PACKETS, PACKETS.where(slice(1, 3))])
     assert joined.sport.tolist() == [*PACKETS.sport.tolist(), *PACKETS.sport.tolist()[1:3]]
     assert joined.echo.tolist() == [*PACKETS.echo.tolist(), *PACKETS.echo.tolist()[1:3]]

@@ -1,4 +1,4 @@
-"""JSON of both ends of real tests contradicts nothing in any version; one number changed contradicts another."""
+"""JSON of both ends of real tests has no contradiction in any version; one changed number is a contradiction."""
 
 import copy
 import json
@@ -41,7 +41,7 @@ def contradictions(client: Any, server: Any, test: str) -> list[str]:  # noqa: A
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("test", TESTS)
-def test_both_ends_of_a_real_test_contradict_nothing(version: str, test: str) -> None:
+def test_both_ends_of_a_real_test_have_no_contradiction(version: str, test: str) -> None:
     assert contradictions(document(version, test, "client"), document(version, test, "server"), test) == []
 
 
@@ -51,10 +51,10 @@ def test_both_ends_of_a_real_test_contradict_nothing(version: str, test: str) ->
     end=st.sampled_from(["client", "server"]),
     change=st.tuples(st.integers(0, 10), st.sampled_from(NUMBERS), st.sampled_from([0, 0.5, 1.1, 2, 10])),
 )
-def test_one_number_of_an_interval_that_is_changed_contradicts_another(
+def test_a_changed_number_in_an_interval_is_a_contradiction(
     version: str, test: str, end: str, change: tuple[int, str, float]
 ) -> None:
-    """A number that columns are computed from: the sender's bytes and retransmissions, all of the receiver's."""
+    """The changed number is one from which columns are computed."""
     number, key, factor = change
     ends = {name: document(version, test, name) for name in ("client", "server")}
     intervals = ends[end]["intervals"]
@@ -71,21 +71,21 @@ def test_one_number_of_an_interval_that_is_changed_contradicts_another(
 
 
 @given(version=st.sampled_from(VERSIONS), test=st.sampled_from(TESTS), number=st.integers(0, 10))
-def test_an_interval_that_is_missing(version: str, test: str, number: int) -> None:
+def test_a_missing_interval_is_a_contradiction(version: str, test: str, number: int) -> None:
     ends = {name: document(version, test, name) for name in ("client", "server")}
     receiver = ends["client" if test.endswith("reverse") else "server"]
     removed = receiver["intervals"].pop(number % len(receiver["intervals"]))
-    found = contradictions(ends["client"], ends["server"], test)
-    assert found or removed["sum"]["bytes"] == 0, "an interval in which nothing came changes no column"
+    reasons = contradictions(ends["client"], ends["server"], test)
+    assert reasons or removed["sum"]["bytes"] == 0, "an interval without data changes no column"
 
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("test", TESTS)
 @pytest.mark.parametrize("end", ["client", "server"])
-def test_the_json_of_another_test(version: str, test: str, end: str) -> None:
+def test_the_json_of_another_test_is_a_contradiction(version: str, test: str, end: str) -> None:
     ends = {name: document(version, test, name) for name in ("client", "server")}
-    ends[end] = document(version, next(one for one in TESTS if one != test), end)
-    assert "they are two tests" in " ".join(contradictions(ends["client"], ends["server"], test))
+    ends[end] = document(version, next(other for other in TESTS if other != test), end)
+    assert "they are different tests" in " ".join(contradictions(ends["client"], ends["server"], test))
 
 
 def changes_of_start() -> Iterator[tuple[str, Any, str]]:
@@ -97,17 +97,17 @@ def changes_of_start() -> Iterator[tuple[str, Any, str]]:
 
 @pytest.mark.parametrize(("key", "value", "reason"), changes_of_start())
 @pytest.mark.parametrize("version", VERSIONS)
-def test_a_test_that_nobody_asked_for(version: str, key: str, value: object, reason: str) -> None:
+def test_a_test_with_other_settings_is_a_contradiction(version: str, key: str, value: object, reason: str) -> None:
     ends = {name: document(version, "udp", name) for name in ("client", "server")}
     ends["server"] = copy.deepcopy(ends["server"])
     ends["server"]["start"]["test_start"][key] = value
     assert reason in " ".join(contradictions(ends["client"], ends["server"], "udp"))
 
 
-def test_a_test_that_ended_too_soon_or_is_of_another_time() -> None:
+def test_a_test_that_ended_too_early_or_is_from_another_time() -> None:
     client, server = (iperf3.parse(json.dumps(document("3.12", "tcp", end))) for end in ("client", "server"))
     (reason,) = iperf3_checks.between(client, server, replace(order("tcp"), lasts_s=10.0))
-    assert reason == "the client has intervals of 3.0 s in all, of 10 s"
+    assert reason == "the client's intervals last 3.0 s in total instead of 10 s"
     began_ns = 10**9 * (client.start.began_utc_s or 0)
     assert iperf3_checks.misdated(client, (began_ns - 10**9, began_ns + 5 * 10**9)) is None
     assert iperf3_checks.misdated(client, None) is None

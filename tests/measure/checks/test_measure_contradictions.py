@@ -1,4 +1,4 @@
-"""What no link can do to a transfer: losses, copies, reordering and clocks contradict nothing."""
+"""Losses, copies, reordering and clock offsets of a link are no contradictions; impossible evidence is."""
 
 import random
 import struct
@@ -21,11 +21,11 @@ SPORT = 40_000
 
 SEEDS = st.integers(0, 2**32)
 SHARES = st.sampled_from((0.0, 0.05, 0.3, 0.9))
-"""Of packets that are lost, copied, or late."""
+"""Shares of packets that are lost, copied or delayed."""
 
 
 class Link:
-    """A link that loses, copies and delays, and what is captured at both of its ends."""
+    """A link that loses, copies and delays packets, with captures at both ends."""
 
     def __init__(self, seed: int, lost: float, copied: float, late: float) -> None:
         self.chance = random.Random(seed)
@@ -36,7 +36,7 @@ class Link:
         self.received: list[Frame] = []
 
     def carry(self, data: bytes, *, back: bool = False) -> int:
-        """Send a packet; return how many copies of it arrive."""
+        """Send a packet and return the number of copies that arrive."""
         near, far = (self.received, self.sent) if back else (self.sent, self.received)
         ahead_ns = (self.ahead_ns, 0) if back else (0, self.ahead_ns)
         self.now_ns += 1_000_000
@@ -61,8 +61,8 @@ class Link:
             ):
                 (folder / name).write_bytes(content)
             evidence = AttemptEvidence(folder)
-            told = transfer(protocol) if captured else replace(transfer(protocol), captures=(None, None))
-            return list(contradictions.find(evidence, told, finished=finished))
+            a_transfer = transfer(protocol) if captured else replace(transfer(protocol), captures=(None, None))
+            return list(contradictions.find(evidence, a_transfer, finished=finished))
 
 
 def file_of(frames: Iterable[Frame]) -> bytes:
@@ -77,7 +77,7 @@ def frame(seq: int, ack: int, flags: int, payload_bytes: int = 0, *, back: bool 
 
 
 @given(SEEDS, SHARES, SHARES, SHARES, st.integers(1, 30))
-def test_no_udp_transfer_contradicts_itself(
+def test_no_udp_transfer_over_any_link_has_a_contradiction(
     seed: int, lost: float, copied: float, late: float, datagrams: int
 ) -> None:
     link = Link(seed, lost, copied, late)
@@ -85,15 +85,15 @@ def test_no_udp_transfer_contradicts_itself(
     parts = [chance.randbytes(chance.randrange(1, 9_000)) for _ in range(datagrams)]
     received: list[bytes] = []
     for number, part in enumerate(parts):
-        whole = min([link.carry(one) for one in datagram(number, len(part))])
+        copies = min([link.carry(packet) for packet in datagram(number, len(part))])
         # The socket may have no room for it.
-        received += [part] * chance.randrange(whole + 1)
+        received += [part] * chance.randrange(copies + 1)
     chance.shuffle(received)
     assert link.contradictions(Protocol.UDP, b"".join(parts), b"".join(received), finished=True) == []
 
 
 @given(SEEDS, SHARES, SHARES, SHARES, st.integers(0, 40))
-def test_no_tcp_transfer_contradicts_itself(
+def test_no_tcp_transfer_over_any_link_has_a_contradiction(
     seed: int, lost: float, copied: float, late: float, segments: int
 ) -> None:
     link = Link(seed, lost, copied, late)
@@ -102,9 +102,9 @@ def test_no_tcp_transfer_contradicts_itself(
     sizes = [chance.randrange(1, 3_000) for _ in range(segments)]
     data = chance.randbytes(sum(sizes))
     starts = [sum(sizes[:index]) for index in range(segments)]
-    # A sender gives up at some time; then the transfer broke off.
+    # The sender gives up after some time, and the transfer ends incomplete.
     tries = chance.randrange(1, 500)
-    came, done = set[int](), False
+    arrived, done = set[int](), False
 
     def send(at: int, flags: int, size: int = 0) -> bool:
         nonlocal tries
@@ -123,27 +123,27 @@ def test_no_tcp_transfer_contradicts_itself(
         for index in (*order, *chance.choices(order, k=3)) if order else ():
             if not send(1 + starts[index], ACK, sizes[index]):
                 break
-            came.add(index)
-            reached = next((one for one in range(segments) if one not in came), segments)
+            arrived.add(index)
+            reached = next((number for number in range(segments) if number not in arrived), segments)
             acknowledge(1 + sum(sizes[:reached]))
-        if len(came) == segments and send(1 + len(data), FIN | ACK):
+        if len(arrived) == segments and send(1 + len(data), FIN | ACK):
             done = True
             acknowledge(2 + len(data))
-    reached = next((one for one in range(segments) if one not in came), segments)
+    reached = next((number for number in range(segments) if number not in arrived), segments)
     received = data[: sum(sizes[:reached])]
-    if not done:  # ended at its limit, it may not have read all
+    if not done:  # stopped at its limit, so it may not have read everything
         received = received[: chance.randrange(len(received) + 1)]
     assert link.contradictions(Protocol.TCP, data, received, finished=done) == []
 
 
-def test_a_datagram_that_nobody_saw_leave() -> None:
-    """Where others did, one is no router: it may be of something earlier."""
+def test_a_datagram_that_was_not_captured_at_the_sender() -> None:
+    """A single one among many may belong to earlier traffic; it does not show that a router alters packets."""
     link = Link(0, 0.0, 0.0, 0.0)
     for number in range(3):
         link.carry(datagram(number, 1000)[0])
     del link.sent[1]
-    found = link.contradictions(Protocol.UDP, bytes(3000), bytes(3000), finished=True)
-    assert found == ["1 datagram arrived that the sender's capture did not see leave"]
+    reasons = link.contradictions(Protocol.UDP, bytes(3000), bytes(3000), finished=True)
+    assert reasons == ["1 datagram arrived without being in the sender's capture"]
 
 
 def three_segments() -> Link:
@@ -154,23 +154,23 @@ def three_segments() -> Link:
     return link
 
 
-def test_bytes_that_nobody_saw_leave(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bytes_that_were_not_captured_at_the_sender(monkeypatch: pytest.MonkeyPatch) -> None:
     link = three_segments()
     del link.sent[2]
-    found = link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True)
-    assert found == ["100 bytes arrived that the sender's capture did not see leave"]
+    reasons = link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True)
+    assert reasons == ["100 bytes arrived without being in the sender's capture"]
     assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True, captured=False) == []
     monkeypatch.setattr(contradictions, "LONGEST_BYTES", 300)
     assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True) == [], "numbers went round"
 
 
-def test_what_is_repeated_of_an_earlier_connection_contradicts_nothing() -> None:
+def test_retransmissions_of_an_earlier_connection_are_no_contradiction() -> None:
     link = three_segments()
     link.carry(segment(7_000, 100, sport=SPORT - 1))
     assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True) == []
 
 
-def test_bytes_that_were_acknowledged_and_came_by_neither_capture() -> None:
+def test_acknowledged_bytes_that_are_in_neither_capture() -> None:
     link = three_segments()
     link.carry(frame(77, 301, ACK, back=True), back=True)
     del link.sent[2], link.received[2]
@@ -179,35 +179,35 @@ def test_bytes_that_were_acknowledged_and_came_by_neither_capture() -> None:
     ]
 
 
-def test_bytes_behind_a_hole_are_not_missed_by_the_file() -> None:
-    """The listener left, and the sender never said that it was done: nobody had all."""
+def test_bytes_after_a_gap_may_be_missing_in_the_file() -> None:
+    """The listener stopped early, and the sender did not finish, so no program had everything."""
     link = Link(0, 0.0, 0.0, 0.0)
     link.carry(frame(0, 0, SYN))
     link.carry(frame(0, 1, SYN | ACK, back=True), back=True)
     for number in (0, 2):
         link.carry(frame(1 + 100 * number, 0, ACK, 100))
-    link.carry(segment(9, 0, flags=0x04, port=11_311, back=True), back=True)  # ROS refuses somebody
+    link.carry(segment(9, 0, flags=0x04, port=11_311, back=True), back=True)  # ROS refuses another connection
     assert link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True) == []
     link.carry(segment(9, 0, flags=0x04, back=True), back=True)
-    (found,) = link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True)
-    assert found.endswith("though its listener ended as if it had them all"), "it stopped reading"
+    (reasons,) = link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True)
+    assert reasons.endswith("although its listener ended normally"), "it stopped reading"
 
 
-def test_a_fragment_of_another_program_is_none_of_the_file() -> None:
-    """A capture has every later fragment between the two ends, as those of ROS 2, and the radio may lose them."""
+def test_a_fragment_of_another_program_is_not_part_of_the_transfer() -> None:
+    """A capture has all later fragments between the two robots, such as ROS 2's, and the radio may lose them."""
     link = Link(0, 0.0, 0.0, 0.0)
     for number, port in ((0, PORT), (1, 7400), (2, PORT)):
-        for one in datagram(number, 3000, port=port):
-            link.carry(one)
-    lost = next(at for at, one in enumerate(link.received) if one.data in datagram(1, 3000, port=7400)[1:])
+        for packet in datagram(number, 3000, port=port):
+            link.carry(packet)
+    lost = next(at for at, packet in enumerate(link.received) if packet.data in datagram(1, 3000, port=7400)[1:])
     del link.received[lost]
     assert link.contradictions(Protocol.UDP, bytes(6000), bytes(6000), finished=True) == []
 
 
-def test_what_a_capture_lacks_of_a_whole_file_is_told_once() -> None:
+def test_packets_missing_in_a_capture_of_a_complete_file_are_reported_once() -> None:
     link = Link(0, 0.0, 0.0, 0.0)
     for number in range(3):
         link.carry(datagram(number, 1000)[0])
     del link.received[1]
-    found = link.contradictions(Protocol.UDP, bytes(3000), bytes(3000), finished=True)
-    assert found == ["the receiver's capture holds 2000 bytes of the transfer, and recv.bag has 3000"]
+    reasons = link.contradictions(Protocol.UDP, bytes(3000), bytes(3000), finished=True)
+    assert reasons == ["the receiver's capture contains 2000 bytes of the transfer, but recv.bag has 3000"]

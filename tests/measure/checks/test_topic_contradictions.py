@@ -1,4 +1,4 @@
-"""Logs of a topic against each other and against the captures: each change of one of them shows, and nothing else."""
+"""Logs of a topic compared with each other and with the captures: every change in one of them is noticed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -37,7 +37,7 @@ def is_sample(row: Row) -> bool:
 
 
 def with_samples(rows: Sequence[Row], change: Callable[[int, Row], Row | None]) -> tuple[Row, ...]:
-    """Return rows in which each sample is what `change` makes of its place and itself; None removes it."""
+    """Return rows in which each sample is replaced by `change(index, row)`, or removed if that is None."""
     samples = [row for row in rows if is_sample(row)]
     changed = [change(place, row) for place, row in enumerate(samples)]
     return (*(row for row in rows if not is_sample(row)), *(row for row in changed if row is not None))
@@ -51,12 +51,12 @@ def later(row: Row, by_ns: int) -> Row:
     return (*row[:4], row[4] + by_ns)
 
 
-def demand_noticed(reasons: list[str], found: Measured, before: Measured) -> None:
-    """Demand that an attempt is void, or that all it measures is what it measured before, or withheld."""
+def require_noticed(reasons: list[str], measured: Measured, before: Measured) -> None:
+    """Require that an attempt is void, or that every column is as before or withheld."""
     if reasons:
         return
     for name, value in before.values.items():
-        now = found.values.get(name)
+        now = measured.values.get(name)
         if now is None or now == value:
             continue
         assert isinstance(now, float), f"{name} is {now}, not {value}"
@@ -70,7 +70,7 @@ def demand_noticed(reasons: list[str], found: Measured, before: Measured) -> Non
 def test_a_valid_attempt_has_no_contradiction(kind: str, signed: bool, tmp_path: Path) -> None:
     reasons, measured = topic_attempts.judged(KINDS[kind], tmp_path, signed=signed)
     assert reasons == []
-    # The first packet took 1 ms and the record 0.2 ms, of the slowest 84 us more.
+    # The fastest packet took 1 ms and its record 0.2 ms; the slowest took 84 us more.
     assert measured.values["topic_delay_median_s"] == pytest.approx(1.24e-3, abs=6e-5)
 
 
@@ -86,19 +86,19 @@ def test_a_log_with_shifted_arrivals_is_noticed(kind: str, shift_ns: int, tmp_pa
     reasons, _ = topic_attempts.judged(replace(made, came=came), tmp_path)
     assert reasons
     which = "before their packets" if shift_ns < 0 else "later than its capture for every sample"
-    which = "from before its beginning or after its end" if abs(shift_ns) == HOUR else which
+    which = "from before its start or after its end" if abs(shift_ns) == HOUR else which
     assert which in reasons[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_log_that_lacks_half_of_what_arrived_is_noticed(kind: str, tmp_path: Path) -> None:
+def test_a_log_without_half_of_the_arrivals_is_noticed(kind: str, tmp_path: Path) -> None:
     made = KINDS[kind]
     came = with_samples(made.came, lambda place, row: row if place % 2 else None)
     reasons, _ = topic_attempts.judged(replace(made, came=came), tmp_path)
     if kind == "reliable with samples given up":  # nothing behind a gap need ever be handed over
         assert reasons
         return
-    assert "arrived by the subscriber's capture, and are not in the subscriber's log" in reasons[0]
+    assert "arrived by the subscriber's capture, but are not in the subscriber's log" in reasons[0]
 
 
 def other_numbers(_: int, row: Row) -> Row:
@@ -117,7 +117,7 @@ def other_sending(place: int, row: Row) -> Row:
     ("change", "why"),
     [
         (other_numbers, "numbers that the publisher's log does not have"),
-        (other_sizes, "of another size than 1016 bytes"),
+        (other_sizes, "with a size other than 1016 bytes"),
         (other_sending, "the publisher did not send"),
     ],
 )
@@ -134,9 +134,9 @@ def test_a_subscribers_log_with_one_wrong_field_is_noticed(
     ("change", "why"),
     [
         (other_numbers, "does not number its samples from 0 on"),
-        (other_sizes, "the publisher's log has 1 sample of another size"),
+        (other_sizes, "the publisher's log has 1 sample with a size other"),
         (lambda place, row: None if place % 2 else row, "does not number its samples from 0 on"),
-        (lambda place, row: row if place < 30 else None, "accounts for 30 of 40 samples"),
+        (lambda place, row: row if place < 30 else None, "accounts for 30 instead of 40 samples"),
     ],
 )
 def test_a_publishers_log_with_one_wrong_field_is_noticed(
@@ -150,16 +150,16 @@ def test_a_publishers_log_with_one_wrong_field_is_noticed(
 def test_the_same_change_in_both_logs_is_noticed_by_the_captures(tmp_path: Path) -> None:
     made = KINDS["reliable over UDP"]
 
-    def sooner(_: int, row: Row) -> Row:
+    def earlier(_: int, row: Row) -> Row:
         return (*row[:3], row[3] - 30 * MS, row[4])
 
-    both = replace(made, sent=with_samples(made.sent, sooner), came=with_samples(made.came, sooner))
+    both = replace(made, sent=with_samples(made.sent, earlier), came=with_samples(made.came, earlier))
     reasons, _ = topic_attempts.judged(both, tmp_path)
     assert any("another time of sending than in its capture" in reason for reason in reasons)
 
 
 @pytest.mark.parametrize("signed", [True, False])
-def test_the_publishers_log_is_not_taken_for_the_subscribers(signed: bool, tmp_path: Path) -> None:
+def test_the_publishers_log_is_not_accepted_as_the_subscribers(signed: bool, tmp_path: Path) -> None:
     made = KINDS["reliable over UDP"]
     topic_attempts.write(made, tmp_path, signed=signed)
     sent = (tmp_path / "sender-topic.bin").read_bytes()
@@ -178,7 +178,7 @@ def test_the_log_of_another_topic_is_noticed(tmp_path: Path) -> None:
     assert "subscriber's log is of another topic" in subscriber
 
 
-def test_a_record_outside_of_the_attempt_is_noticed(tmp_path: Path) -> None:
+def test_a_record_from_outside_the_attempt_is_noticed(tmp_path: Path) -> None:
     topic_attempts.write(KINDS["over TCP"], tmp_path)
     log = topic_log.read(tmp_path / "sender-topic.bin")
     role = Role.SENDER
@@ -186,14 +186,14 @@ def test_a_record_outside_of_the_attempt_is_noticed(tmp_path: Path) -> None:
     assert not list(topic_checks.of_window({role: log}, {role: (first, last)}))
     assert not list(topic_checks.of_window({role: log}, {}))
     (early,) = topic_checks.of_window({role: log}, {role: (first + SECOND, last)})
-    assert "a record of 1.000 s before the attempt" in early
+    assert "a record from 1.000 s before the attempt" in early
     (late,) = topic_checks.of_window({role: log}, {role: (first, last - SECOND)})
-    assert "a record of 1.000 s after the attempt" in late
+    assert "a record from 1.000 s after the attempt" in late
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_samples_that_never_arrived_are_not_made_up(kind: str, tmp_path: Path) -> None:
-    """The subscriber's capture lacks ten samples that its log has."""
+def test_samples_in_the_log_that_never_arrived_are_noticed(kind: str, tmp_path: Path) -> None:
+    """The subscriber's capture lacks ten samples that are in its log."""
     made = KINDS[kind]
     few = replace(made, far=tuple(frame for frame in made.far if not is_data(frame) or frame.time_ns % 4))
     sent_again = [row for row in made.sent if is_sample(row)]
@@ -209,8 +209,8 @@ def is_data(frame: Frame) -> bool:
     return len(frame.data) > 200
 
 
-def test_a_queue_that_overflowed_is_no_contradiction(tmp_path: Path) -> None:
-    """The program stood still for 15 samples; its queue of 10 kept the newest."""
+def test_an_overflowed_queue_is_no_contradiction(tmp_path: Path) -> None:
+    """The program stopped for 15 samples; its queue of 10 has the newest."""
     made = KINDS["reliable over UDP"]
     resumed = next(row for place, row in enumerate(filter(is_sample, made.came)) if place == 30)[4]
 
@@ -222,16 +222,16 @@ def test_a_queue_that_overflowed_is_no_contradiction(tmp_path: Path) -> None:
     reasons, measured = topic_attempts.judged(replace(made, came=with_samples(made.came, held)), tmp_path)
     assert reasons == []
     assert measured.values["topic_received"] == SAMPLES - 5
-    assert "its program was held up" in measured.missing["topic_delay_max_s"]
+    assert "its program was delayed" in measured.missing["topic_delay_max_s"]
 
 
-def test_a_capture_that_shows_no_heads_bounds_what_arrived(tmp_path: Path) -> None:
-    """As with the shorter snap length of older captures; Zenoh's heads were behind it."""
+def test_a_capture_without_heads_limits_the_number_of_arrivals(tmp_path: Path) -> None:
+    """As with the shorter snap length of older captures: Zenoh's heads were not captured."""
     made = KINDS["over TCP"]
     cut = replace(made, near=shorter(made.near), far=shorter(made.far))
     assert topic_attempts.judged(cut, tmp_path)[0] == []
     early = with_samples(made.came, lambda _, row: later(row, -20 * MS))
-    assert "before its capture has their bytes" in topic_attempts.judged(replace(cut, came=early), tmp_path)[0][0]
+    assert "before their bytes in its capture" in topic_attempts.judged(replace(cut, came=early), tmp_path)[0][0]
     few = with_samples(made.came, lambda place, row: row if place < 8 else None)
     assert "are not in the subscriber's log" in topic_attempts.judged(replace(cut, came=few), tmp_path)[0][0]
 
@@ -253,7 +253,7 @@ def shorter(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     ),
 )
 @example(kind="over TCP", end="came", field=4, some=(0, 5), by=35 * MS)
-def test_any_range_of_a_field_that_changes_is_noticed(
+def test_a_change_in_any_range_of_a_field_is_noticed(
     kind: str, end: str, field: int, some: tuple[int, int], by: int, *, folder: Path
 ) -> None:
     made, (first, count) = KINDS[kind], some
@@ -264,10 +264,10 @@ def test_any_range_of_a_field_that_changes_is_noticed(
         row[field] = row[field] + by if field else by % 7 + 1
         rows[place] = (row[0], abs(row[1]) % 2**32, row[2], row[3], row[4])
     try:
-        reasons, found = topic_attempts.judged(changed(made, end, rows), folder)
+        reasons, measured = topic_attempts.judged(changed(made, end, rows), folder)
     except EvidenceError:
         return
-    demand_noticed(reasons, found, before)
+    require_noticed(reasons, measured, before)
 
 
 @settings(max_examples=60, deadline=None)
@@ -277,7 +277,7 @@ def test_any_range_of_a_field_that_changes_is_noticed(
     chosen=st.sets(st.integers(0, SAMPLES + 1), min_size=1),
     twice=st.booleans(),
 )
-def test_any_records_that_are_missing_or_twice_are_noticed(
+def test_missing_or_duplicated_records_are_noticed(
     kind: str, end: str, chosen: set[int], twice: bool, folder: Path
 ) -> None:
     made = KINDS[kind]
@@ -289,15 +289,15 @@ def test_any_records_that_are_missing_or_twice_are_noticed(
     kept = tuple(row for row, count in zip(rows, times, strict=True) for _ in range(count))
     if not kept:
         return
-    reasons, found = topic_attempts.judged(changed(made, end, kept), folder)
+    reasons, measured = topic_attempts.judged(changed(made, end, kept), folder)
     if kind == "reliable with samples given up" and end == "came" and not twice:
         return  # behind a gap nothing shows whether the middleware handed a sample over
-    demand_noticed(reasons, found, before)
+    require_noticed(reasons, measured, before)
 
 
 @settings(max_examples=100, deadline=None)
 @given(end=st.sampled_from(["sender", "receiver"]), place=st.integers(0), bit=st.integers(0, 7))
-def test_any_bit_of_a_signed_log_that_flips_is_noticed(end: str, place: int, bit: int, folder: Path) -> None:
+def test_a_flipped_bit_in_a_log_with_a_checksum_is_noticed(end: str, place: int, bit: int, folder: Path) -> None:
     made = KINDS["over TCP"]
     topic_attempts.write(made, folder)
     path = folder / f"{end}-topic.bin"
@@ -311,7 +311,7 @@ def test_any_bit_of_a_signed_log_that_flips_is_noticed(end: str, place: int, bit
     assert not log.whole, "a changed log passes for whole"
 
 
-def test_the_checks_know_what_the_agent_does() -> None:
+def test_constants_equal_those_of_the_agent() -> None:
     assert int(stream.SETTLES_S * 1e9) == topic_checks.SETTLES_NS
     assert (stream.MAGIC, stream.LEAST_BYTES) == (
         sample_heads.MAGIC,
@@ -320,6 +320,6 @@ def test_the_checks_know_what_the_agent_does() -> None:
 
 
 def test_every_time_of_a_topic_is_compared_with_the_capture() -> None:
-    """Also one that is added later."""
+    """Columns added later are included."""
     times = {column.name for column in topics.COLUMNS if column.name.endswith("_s")} - {"topic_discovery_s"}
-    assert times | {"topic_deadline_misses"} == topic_captures.MADE.keys()
+    assert times | {"topic_deadline_misses"} == topic_captures.SHARE_FIGURES.keys()

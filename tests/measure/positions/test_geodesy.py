@@ -1,4 +1,4 @@
-"""Places on the earth against PROJ, which computes with other formulas."""
+"""Conversion of coordinates compared with PROJ, which uses other formulas."""
 
 import numpy as np
 import pytest
@@ -15,15 +15,15 @@ LONGITUDES = st.floats(-180, 180)
 
 
 @given(LATITUDES, LONGITUDES, st.floats(0, 360), st.floats(0, 1000))
-def test_over_a_kilometre_it_is_the_geodesic_to_below_a_millimetre(
-    latitude: float, longitude: float, azimuth: float, far_m: float
+def test_up_to_a_kilometre_the_distance_equals_the_geodesic_within_a_millimetre(
+    latitude: float, longitude: float, azimuth: float, distance_m: float
 ) -> None:
-    to_longitude, to_latitude, _ = EARTH.fwd(longitude, latitude, azimuth, far_m)
-    one, other = ecef_m(np.array([latitude, to_latitude]), np.array([longitude, to_longitude]), np.zeros(2))
-    assert np.linalg.norm(other - one) == pytest.approx(far_m, abs=1e-4)
+    to_longitude, to_latitude, _ = EARTH.fwd(longitude, latitude, azimuth, distance_m)
+    start, end = ecef_m(np.array([latitude, to_latitude]), np.array([longitude, to_longitude]), np.zeros(2))
+    assert np.linalg.norm(end - start) == pytest.approx(distance_m, abs=1e-4)
 
 
 @given(LATITUDES, LONGITUDES, st.floats(-500, 10_000))
-def test_heights_count_as_proj_counts_them(latitude: float, longitude: float, height_m: float) -> None:
-    (found,) = ecef_m(np.array([latitude]), np.array([longitude]), np.array([height_m]))
-    assert found == pytest.approx(TO_CENTRE.transform(longitude, latitude, height_m), abs=1e-6)
+def test_coordinates_with_heights_equal_those_of_proj(latitude: float, longitude: float, height_m: float) -> None:
+    (place_m,) = ecef_m(np.array([latitude]), np.array([longitude]), np.array([height_m]))
+    assert place_m == pytest.approx(TO_CENTRE.transform(longitude, latitude, height_m), abs=1e-6)

@@ -1,4 +1,4 @@
-"""Bags that tell where a robot was, made by rosbags' writer: every type, frames, stamps, and how odometry begins."""
+"""Positions in bags written by rosbags: every message type, frames, stamps, and the start of odometry."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -42,15 +42,15 @@ def odometry(at_ns: int, x: float, y: float, yaw: float = 0.0) -> Any:  # noqa: 
 
 
 def fix(at_ns: int, latitude: float, longitude: float, status: int = 0) -> Any:  # noqa: ANN401 (of rosbags)
-    said = TYPES["sensor_msgs/msg/NavSatStatus"](status, 1)
+    fix_status = TYPES["sensor_msgs/msg/NavSatStatus"](status, 1)
     place = (latitude, longitude, 520.0)
-    return TYPES["sensor_msgs/msg/NavSatFix"](header(at_ns, "gps"), said, *place, np.zeros(9), 0)
+    return TYPES["sensor_msgs/msg/NavSatFix"](header(at_ns, "gps"), fix_status, *place, np.zeros(9), 0)
 
 
 def transform(at_ns: int, x: float, y: float, child: str, frame: str = "map") -> Any:  # noqa: ANN401 (of rosbags)
     at = TYPES["geometry_msgs/msg/Vector3"](x, y, 0.0)
-    there = TYPES["geometry_msgs/msg/Transform"](at, pose(0, 0, 0).orientation)
-    return TYPES["geometry_msgs/msg/TransformStamped"](header(at_ns, frame), child, there)
+    pose_transform = TYPES["geometry_msgs/msg/Transform"](at, pose(0, 0, 0).orientation)
+    return TYPES["geometry_msgs/msg/TransformStamped"](header(at_ns, frame), child, pose_transform)
 
 
 def stamped(at_ns: int, x: float, y: float, frame: str = "map") -> Any:  # noqa: ANN401 (of rosbags)
@@ -63,7 +63,7 @@ def covered(at_ns: int, x: float, y: float) -> Any:  # noqa: ANN401 (of rosbags)
 
 
 def written(folder: Path, messages: Iterable[Any], topic: str = "/where", late_ns: int = 1000) -> Path:
-    """Write a ROS 1 bag of messages that came a little after their stamps."""
+    """Write a ROS 1 bag of messages that were received a little after their stamps."""
     path = folder / "track.bag"
     with rosbag1.Writer(path) as writer:
         connections: dict[str, Any] = {}
@@ -86,13 +86,13 @@ def written(folder: Path, messages: Iterable[Any], topic: str = "/where", late_n
         (lambda at, x, y: fix(at, 48 + x, 11 + y), WGS84, [[48, 11, 520], [49, 13, 520]]),
     ],
 )
-def test_every_type_tells_places(
+def test_every_message_type_has_positions(
     tmp_path: Path, made: Callable[[int, float, float], Any], frame: str, places: list[list[float]]
 ) -> None:
     path = written(tmp_path, [made(BEGAN_NS, 0.0, 0.0), made(BEGAN_NS + S, 1.0, 2.0)])
-    found = recorded.read_bag(path, Account(topic="/where"))
-    assert (found.frame, found.values.tolist()) == (frame, places)
-    assert found.times_ns.tolist() == [BEGAN_NS, BEGAN_NS + S]
+    samples = recorded.read_bag(path, Account(topic="/where"))
+    assert (samples.frame, samples.values.tolist()) == (frame, places)
+    assert samples.times_ns.tolist() == [BEGAN_NS, BEGAN_NS + S]
 
 
 def written_ros2(folder: Path, message: Any, kind: str) -> Path:  # noqa: ANN401 (of rosbags)
@@ -113,58 +113,58 @@ def transform2(x: float, y: float, frame: str, child: str) -> Any:  # noqa: ANN4
     return types["geometry_msgs/msg/TransformStamped"](head, child, types["geometry_msgs/msg/Transform"](at, turned))
 
 
-def test_ros_2_says_the_same_and_of_a_tree_the_child_is_asked_for(tmp_path: Path) -> None:
+def test_ros_2_bags_and_the_child_frame_of_a_transform_tree(tmp_path: Path) -> None:
     kind = "tf2_msgs/msg/TFMessage"
     tree: Any = STORE2.types[kind]
     both = tree([transform2(1.0, 2.0, "world", "/base"), transform2(5.0, 5.0, "base", "wheel")])
     path = written_ros2(tmp_path, both, kind)
-    found = recorded.read_bag(path, Account(topic="/where", child="base"))
-    assert (found.frame, found.values.tolist()) == ("frame world", [[1, 2, 0]])
-    with pytest.raises(EvidenceError, match="tells places in base, world"):
+    samples = recorded.read_bag(path, Account(topic="/where", child="base"))
+    assert (samples.frame, samples.values.tolist()) == ("frame world", [[1, 2, 0]])
+    with pytest.raises(EvidenceError, match="has positions in several frames: base, world"):
         recorded.read_bag(path, Account(topic="/where"))
-    with pytest.raises(EvidenceError, match="no position of /where"):
+    with pytest.raises(EvidenceError, match="no position in /where"):
         recorded.read_bag(path, Account(topic="/where", child="roof"))
 
 
-def test_without_a_fix_there_is_no_place_and_of_one_time_the_first_counts(tmp_path: Path) -> None:
+def test_messages_without_a_fix_and_with_equal_times_are_ignored(tmp_path: Path) -> None:
     lost, nan = fix(BEGAN_NS, 0.0, 0.0, status=-1), fix(BEGAN_NS + 2 * S, math.nan, 11.0)
     path = written(tmp_path, [lost, fix(BEGAN_NS + S, 48.0, 11.0), fix(BEGAN_NS + S, 49.0, 11.0), nan])
-    found = recorded.read_bag(path, Account(topic="/where"))
-    assert (found.times_ns.tolist(), found.values.tolist()) == ([BEGAN_NS + S], [[48, 11, 520]])
+    samples = recorded.read_bag(path, Account(topic="/where"))
+    assert (samples.times_ns.tolist(), samples.values.tolist()) == ([BEGAN_NS + S], [[48, 11, 520]])
 
 
-def test_stamps_of_another_clock_are_refused_unless_those_of_the_recorder_are_asked_for(tmp_path: Path) -> None:
+def test_stamps_of_another_clock_are_rejected_unless_times_are_the_recorders(tmp_path: Path) -> None:
     path = written(tmp_path, [stamped(7 * S, 1.0, 1.0)])
-    with pytest.raises(EvidenceError, match="the stamps of /where are 1795348793 s from") as caught:
+    with pytest.raises(EvidenceError, match="the stamps of /where differ by 1795348793 s from") as caught:
         recorded.read_bag(path, Account(topic="/where"))
     assert caught.value.remedy == "write times: received, in the step"
-    found = recorded.read_bag(path, Account(topic="/where", stamps="received"))
-    assert found.times_ns.tolist() == [BEGAN_NS + 1000]
+    samples = recorded.read_bag(path, Account(topic="/where", stamps="received"))
+    assert samples.times_ns.tolist() == [BEGAN_NS + 1000]
 
 
 @pytest.mark.parametrize(
-    ("messages", "topic", "complaint"),
+    ("messages", "topic", "message"),
     [
-        ([stamped(BEGAN_NS, 0.0, 0.0)], "/other", "no position of /other"),
+        ([stamped(BEGAN_NS, 0.0, 0.0)], "/other", "no position in /other"),
         ([TYPES["std_msgs/msg/String"]("here")], "/where", "says no position"),
-        ([stamped(BEGAN_NS, 0.0, 0.0), stamped(BEGAN_NS, 0.0, 0.0, "odom")], "/where", "in map, odom"),
+        ([stamped(BEGAN_NS, 0.0, 0.0), stamped(BEGAN_NS, 0.0, 0.0, "odom")], "/where", "frames: map, odom"),
     ],
 )
-def test_what_tells_no_places_is_refused(tmp_path: Path, messages: list[Any], topic: str, complaint: str) -> None:
-    with pytest.raises(EvidenceError, match=complaint):
+def test_topics_without_positions_are_rejected(tmp_path: Path, messages: list[Any], topic: str, message: str) -> None:
+    with pytest.raises(EvidenceError, match=message):
         recorded.read_bag(written(tmp_path, messages), Account(topic=topic))
 
 
-def test_odometry_begins_where_the_robot_was_placed_and_as_it_faced(tmp_path: Path) -> None:
-    # It was driven about before: at the beginning its odometry has it 5 m away, turned to the left.
+def test_odometry_is_transformed_to_the_robots_place_and_heading(tmp_path: Path) -> None:
+    # The robot was driven before the step: its odometry starts 5 m away, turned to the left.
     began = (5.0, 5.0, math.pi / 2)
     messages = [odometry(BEGAN_NS, *began), odometry(BEGAN_NS + S, 5.0, 7.0, math.pi / 2)]
-    read = recorded.read_bag(written(tmp_path, messages), Account(topic="/where"))
+    odometry_samples = recorded.read_bag(written(tmp_path, messages), Account(topic="/where"))
     account = Account(topic="/where", start=(10.0, 0.0, 0.0), heading_rad=math.pi, began_utc_ns=BEGAN_NS + S // 2)
-    found = recorded.from_start(read, account)
-    assert found.values == pytest.approx(np.array([[10, 0, 0], [8, 0, 0]]), abs=1e-9), "2 m ahead, facing back"
+    samples = recorded.from_start(odometry_samples, account)
+    assert samples.values == pytest.approx(np.array([[10, 0, 0], [8, 0, 0]]), abs=1e-9), "2 m ahead, facing back"
     late = Account(topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS - 3 * S)
-    with pytest.raises(EvidenceError, match=r"/where begins 3\.0 s after the robot may have moved"):
-        recorded.from_start(read, late)
-    with pytest.raises(EvidenceError, match="nobody says where its robot faced"):
-        recorded.from_start(read, Account(topic="/where", began_utc_ns=BEGAN_NS))
+    with pytest.raises(EvidenceError, match=r"/where begins 3\.0 s after the step started"):
+        recorded.from_start(odometry_samples, late)
+    with pytest.raises(EvidenceError, match="the robot's initial heading is unknown"):
+        recorded.from_start(odometry_samples, Account(topic="/where", began_utc_ns=BEGAN_NS))

@@ -1,4 +1,4 @@
-"""CSV and GPX that tell where a robot was: what is read, and what is refused by file and line."""
+"""CSV and GPX files with positions: reading, and errors that name file and line."""
 
 import math
 from pathlib import Path
@@ -35,16 +35,16 @@ def written(folder: Path, text: str, name: str = "walk.csv") -> Path:
     return path
 
 
-def test_metres_by_whatever_unit_and_order(tmp_path: Path) -> None:
+def test_lengths_in_any_unit_and_order(tmp_path: Path) -> None:
     text = "\ufeffy_ft,note,t,x_cm\n10,begin,2026-11-22T12:00:00Z,-50\n20,,2026-11-22T14:00:00.000001+02:00,50\n"
-    found = read_csv(written(tmp_path, text))
-    assert found.frame == LOCAL
-    assert found.times_ns.tolist() == [NOON_NS, NOON_NS + 1000]
-    assert found.values == pytest.approx(np.array([[-0.5, 3.048, 0], [0.5, 6.096, 0]]))
+    samples = read_csv(written(tmp_path, text))
+    assert samples.frame == LOCAL
+    assert samples.times_ns.tolist() == [NOON_NS, NOON_NS + 1000]
+    assert samples.values == pytest.approx(np.array([[-0.5, 3.048, 0], [0.5, 6.096, 0]]))
 
 
 @pytest.mark.parametrize(
-    ("name", "one", "other"),
+    ("name", "first", "second"),
     [
         ("t_s", "1795348800", "1795348800.000000001"),
         ("t_ms", "1795348800000", "1795348800000.000001"),
@@ -52,90 +52,92 @@ def test_metres_by_whatever_unit_and_order(tmp_path: Path) -> None:
         ("t_ns", "1795348800000000000", "1795348800000000001"),
     ],
 )
-def test_times_by_whatever_unit_lose_no_nanosecond(tmp_path: Path, name: str, one: str, other: str) -> None:
-    found = read_csv(written(tmp_path, f"{name},lat,lon_deg,alt_m\n{one},48.1,11.5,520\n{other},48.1,11.5,521\n"))
-    assert found.frame == WGS84
-    assert found.times_ns.tolist() == [NOON_NS, NOON_NS + 1]
-    assert found.values.tolist() == [[48.1, 11.5, 520], [48.1, 11.5, 521]]
+def test_times_in_any_unit_keep_every_nanosecond(tmp_path: Path, name: str, first: str, second: str) -> None:
+    samples = read_csv(
+        written(tmp_path, f"{name},lat,lon_deg,alt_m\n{first},48.1,11.5,520\n{second},48.1,11.5,521\n")
+    )
+    assert samples.frame == WGS84
+    assert samples.times_ns.tolist() == [NOON_NS, NOON_NS + 1]
+    assert samples.values.tolist() == [[48.1, 11.5, 520], [48.1, 11.5, 521]]
 
 
-def test_a_height_that_nobody_tells_is_not_zero(tmp_path: Path) -> None:
+def test_an_unknown_height_is_not_zero(tmp_path: Path) -> None:
     assert math.isnan(read_csv(written(tmp_path, "t_s,lat,lon\n1,48.1,11.5\n")).values[0, 2])
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "message"),
     [
-        ("", "has 0 columns of times"),
-        ("t,x_m,y_m\n", "holds no position with a time"),
-        ("t,x,y\n2026-11-22T12:00:00Z,1,2\n", "does not name its places"),
-        ("t,lat,x_m\n2026-11-22T12:00:00Z,1,2\n", "does not name its places"),
-        ("t,lat,lon,x_m,y_m\n2026-11-22T12:00:00Z,1,2,3,4\n", "does not name its places"),
-        ("x_m,y_m\n1,2\n", "has 0 columns of times"),
-        ("t,t_s,x_m,y_m\n1,2,3,4\n", "has 2 columns of times"),
+        ("", "has 0 time columns"),
+        ("t,x_m,y_m\n", "has no position with a time"),
+        ("t,x,y\n2026-11-22T12:00:00Z,1,2\n", "has no complete set of position columns"),
+        ("t,lat,x_m\n2026-11-22T12:00:00Z,1,2\n", "has no complete set of position columns"),
+        ("t,lat,lon,x_m,y_m\n2026-11-22T12:00:00Z,1,2,3,4\n", "has no complete set of position columns"),
+        ("x_m,y_m\n1,2\n", "has 0 time columns"),
+        ("t,t_s,x_m,y_m\n1,2,3,4\n", "has 2 time columns"),
         ("t,x_m,y_m\n2026-11-22T12:00:00,1,2\n", "csv:2: '2026-11-22T12:00:00' has no time zone"),
-        ("t,x_m,y_m\nnoon,1,2\n", "csv:2: 'noon' is no time"),
-        ("t_s,x_m,y_m\n1e3,1,2\n", "csv:2: '1e3' is no time"),
-        ("t_s,x_m,y_m\n1.795348800e09,1,2\n", "csv:2: '1.795348800e09' is no time"),
-        ("t_s,x_m,y_m\n1_000,1,2\n", "csv:2: '1_000' is no time"),
+        ("t,x_m,y_m\nnoon,1,2\n", "csv:2: 'noon' is not a time"),
+        ("t_s,x_m,y_m\n1e3,1,2\n", "csv:2: '1e3' is not a time"),
+        ("t_s,x_m,y_m\n1.795348800e09,1,2\n", "csv:2: '1.795348800e09' is not a time"),
+        ("t_s,x_m,y_m\n1_000,1,2\n", "csv:2: '1_000' is not a time"),
         ("t_s,x_m,y_m\n-0.5,1,2\n", "csv:2: a time is before 1970"),
         ("t_s,x_m,y_m\n-1,1,2\n", "csv:2: a time is before 1970"),
-        ("t_s,x_m,y_m\n1,1,2\n1,1,2\n", "csv:3: a time comes twice"),
-        ("t_s,x_m,y_m\n2,1,2\n\n1,1,2\n", "csv:4: a time is before the one above it"),
-        ("t_s,x_m,y_m\n1,nan,2\n", "csv:2: 'nan' is no place"),
-        ("t_s,x_m,y_m\n1,,2\n", "csv:2: '' is no place"),
-        ("t_s,x_m,y_m\n1,inf,2\n", "csv:2: 'inf' is no place"),
-        ("t_s,lat,lon\n1,91,2\n", "csv:2: '91' is no place"),
-        ("t_s,x_m,y_m\n1,2\n", "csv:2: has 2 cells, and the header 3"),
-        ('t_s,x_m,y_m\n1,"2,3\n', "is no CSV"),
+        ("t_s,x_m,y_m\n1,1,2\n1,1,2\n", "csv:3: a time occurs twice"),
+        ("t_s,x_m,y_m\n2,1,2\n\n1,1,2\n", "csv:4: a time is earlier than the previous one"),
+        ("t_s,x_m,y_m\n1,nan,2\n", "csv:2: 'nan' is not a valid coordinate"),
+        ("t_s,x_m,y_m\n1,,2\n", "csv:2: '' is not a valid coordinate"),
+        ("t_s,x_m,y_m\n1,inf,2\n", "csv:2: 'inf' is not a valid coordinate"),
+        ("t_s,lat,lon\n1,91,2\n", "csv:2: '91' is not a valid coordinate"),
+        ("t_s,x_m,y_m\n1,2\n", "csv:2: has 2 cells, but the header has 3"),
+        ('t_s,x_m,y_m\n1,"2,3\n', "is not valid CSV"),
     ],
 )
-def test_what_says_no_places_and_times_is_refused_by_its_line(tmp_path: Path, text: str, complaint: str) -> None:
-    with pytest.raises(EvidenceError, match=complaint):
+def test_invalid_positions_and_times_are_rejected_with_their_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(EvidenceError, match=message):
         read_csv(written(tmp_path, text))
 
 
 @given(st.text(alphabet='t_snxy,m\n"1.-eZ:latlo', max_size=60))
-def test_whatever_stands_there_nothing_else_is_raised(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+def test_any_content_raises_only_evidence_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
     path = written(tmp_path_factory.getbasetemp(), text)
     try:
-        found = read_csv(path)
+        samples = read_csv(path)
     except EvidenceError:
         return
-    assert (np.diff(found.times_ns) > 0).all()
-    assert np.isfinite(found.values[:, :2]).all()
+    assert (np.diff(samples.times_ns) > 0).all()
+    assert np.isfinite(samples.values[:, :2]).all()
 
 
-def test_gpx_gives_the_points_of_its_tracks(tmp_path: Path) -> None:
-    found = recorded.read_file(written(tmp_path, GPX, "walk.GPX"))
-    assert found.frame == WGS84
-    assert (found.times_ns - NOON_NS).tolist() == [0, 1_250_000_000, 3_000_000_000]
-    assert found.values[:, :2].tolist() == [[48.1374, 11.5755], [48.1375, 11.5756], [48.1376, 11.5757]]
-    assert found.values[[0, 2], 2].tolist() == [520.5, 521]
-    assert math.isnan(found.values[1, 2])
+def test_gpx_tracks_are_read(tmp_path: Path) -> None:
+    samples = recorded.read_file(written(tmp_path, GPX, "walk.GPX"))
+    assert samples.frame == WGS84
+    assert (samples.times_ns - NOON_NS).tolist() == [0, 1_250_000_000, 3_000_000_000]
+    assert samples.values[:, :2].tolist() == [[48.1374, 11.5755], [48.1375, 11.5756], [48.1376, 11.5757]]
+    assert samples.values[[0, 2], 2].tolist() == [520.5, 521]
+    assert math.isnan(samples.values[1, 2])
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "complaint"),
+    ("old", "new", "message"),
     [
         ("</gpx>", "", "cannot be read as GPX"),
         (GPX, "", "cannot be read as GPX"),
-        ("12:00:00Z</time></trkpt>", "12:00:00</time></trkpt>", "a time has no zone"),
+        ("12:00:00Z</time></trkpt>", "12:00:00</time></trkpt>", "a time has no time zone"),
         ("<time>2026-11-22T12:00:01.250Z</time>", "", "1 of 3 points have no time"),
-        ("12:00:01.250Z", "12:00:00Z", "point 2: a time comes twice"),
-        ("12:00:01.250Z", "12:00:04Z", "point 3: a time is before the one above it"),
-        ('lat="48.137500"', 'lat="95"', "no place|cannot be read as GPX"),
-        ('lat="48.137500"', 'lat="nan"', "no place|cannot be read as GPX"),
-        ("trkpt", "rtept", "cannot be read as GPX|holds no position with a time"),
+        ("12:00:01.250Z", "12:00:00Z", "point 2: a time occurs twice"),
+        ("12:00:01.250Z", "12:00:04Z", "point 3: a time is earlier than the previous one"),
+        ('lat="48.137500"', 'lat="95"', "invalid coordinates|cannot be read as GPX"),
+        ('lat="48.137500"', 'lat="nan"', "invalid coordinates|cannot be read as GPX"),
+        ("trkpt", "rtept", "cannot be read as GPX|has no position with a time"),
     ],
 )
-def test_gpx_that_says_no_places_and_times_is_refused(tmp_path: Path, old: str, new: str, complaint: str) -> None:
+def test_gpx_without_valid_positions_and_times_is_rejected(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert old in GPX
-    with pytest.raises(EvidenceError, match=complaint):
+    with pytest.raises(EvidenceError, match=message):
         recorded.read_file(written(tmp_path, GPX.replace(old, new), "walk.gpx"))
 
 
-def test_gpx_that_grows_while_it_is_read_is_refused(tmp_path: Path) -> None:
+def test_gpx_that_expands_while_it_is_read_is_rejected(tmp_path: Path) -> None:
     entities = "".join(f'<!ENTITY e{n} "{f"&e{n - 1};" * 10}">' for n in range(1, 10))
     bomb = (
         f'<?xml version="1.0"?><!DOCTYPE gpx [<!ENTITY e0 "boom">{entities}]><gpx><trk><name>&e9;</name></trk></gpx>'
@@ -144,6 +146,6 @@ def test_gpx_that_grows_while_it_is_read_is_refused(tmp_path: Path) -> None:
         recorded.read_file(written(tmp_path, bomb, "walk.gpx"))
 
 
-def test_another_kind_of_file_is_none(tmp_path: Path) -> None:
+def test_other_file_types_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="neither GPX nor CSV"):
         recorded.read_file(written(tmp_path, GPX, "walk.kml"))

@@ -1,4 +1,4 @@
-"""Trajectories through samples: distances and speeds against closed forms and dense sums, and where nobody knows."""
+"""Trajectories: distances and speeds compared with closed forms and dense sums, and unknown positions."""
 
 import math
 
@@ -8,16 +8,16 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from fieldkit.measure.positions import trajectories
-from fieldkit.measure.positions.trajectories import Trajectory, apart, standing
+from fieldkit.measure.positions.trajectories import Trajectory, apart, stationary
 
 S = 10**9
 EPOCH_NS = 1_795_365_294 * S
-"""As large as times are."""
-ORIGIN = standing(np.zeros(3))
+"""A realistic time."""
+ORIGIN = stationary(np.zeros(3))
 
 
 def trajectory(*samples: tuple[float, float, float], gap_s: float = 3.0) -> Trajectory:
-    """Return a trajectory on the ground through samples: seconds, metres east and north."""
+    """Return a trajectory on the ground from samples: seconds, metres east and north."""
     times_ns = np.array([EPOCH_NS + round(at_s * S) for at_s, *_ in samples])
     return Trajectory(times_ns, np.array([(east, north, 0.0) for _, east, north in samples]), round(gap_s * S))
 
@@ -26,55 +26,59 @@ def at(seconds: float) -> int:
     return EPOCH_NS + round(seconds * S)
 
 
-def test_who_passes_by_is_nearest_at_the_side_and_its_mean_is_the_integral() -> None:
+def test_a_robot_that_passes_by_has_the_closed_form_of_smallest_and_mean_distance() -> None:
     passing = trajectory((0, -4, 3), (2, 0, 3), (4, 4, 3))
-    found = apart(ORIGIN, passing, at(0), at(4))
+    separation = apart(ORIGIN, passing, at(0), at(4))
     integral = 4 * 5 / 2 + 9 / 2 * math.asinh(4 / 3)  # of sqrt(x^2 + 9) from 0 to 4
-    assert found.distance_start_m == found.distance_max_m == pytest.approx(5)
-    assert found.distance_min_m == pytest.approx(3)
-    assert found.distance_mean_m == pytest.approx(integral / 4)
-    assert found.relative_speed_m_s == pytest.approx(2)
-    assert found.sender_speed_m_s == 0
+    assert separation.distance_start_m == separation.distance_max_m == pytest.approx(5)
+    assert separation.distance_min_m == pytest.approx(3)
+    assert separation.distance_mean_m == pytest.approx(integral / 4)
+    assert separation.relative_speed_m_s == pytest.approx(2)
+    assert separation.sender_speed_m_s == 0
 
 
-def test_the_nearest_place_between_two_samples_counts() -> None:
+def test_the_smallest_distance_may_be_between_two_samples() -> None:
     assert apart(ORIGIN, trajectory((0, -4, 3), (4, 4, 3), gap_s=5), at(0), at(4)).distance_min_m == pytest.approx(3)
 
 
-def test_two_that_go_together_have_no_relative_speed() -> None:
-    one, other = trajectory((0, 0, 0), (2, 2, 0)), trajectory((0, 0, 5), (1, 1, 5), (2, 2, 5))
-    found = apart(one, other, at(0.5), at(1.5))
-    assert (found.distance_min_m, found.distance_max_m, found.distance_mean_m) == pytest.approx((5, 5, 5))
-    assert found.relative_speed_m_s == pytest.approx(0, abs=1e-6)
-    assert found.sender_speed_m_s == pytest.approx(1)
+def test_two_robots_that_move_together_have_no_relative_speed() -> None:
+    source, destination = trajectory((0, 0, 0), (2, 2, 0)), trajectory((0, 0, 5), (1, 1, 5), (2, 2, 5))
+    separation = apart(source, destination, at(0.5), at(1.5))
+    assert (separation.distance_min_m, separation.distance_max_m, separation.distance_mean_m) == pytest.approx(
+        (5, 5, 5)
+    )
+    assert separation.relative_speed_m_s == pytest.approx(0, abs=1e-6)
+    assert separation.sender_speed_m_s == pytest.approx(1)
 
 
-def test_a_moment_has_a_distance_and_the_speed_around_it() -> None:
-    found = apart(ORIGIN, trajectory((0, 0, 0), (3, 6, 0)), at(1), at(1))
-    assert found.distance_start_m == found.distance_mean_m == pytest.approx(2)
-    assert found.relative_speed_m_s == pytest.approx(2)
+def test_a_single_time_has_a_distance_and_the_speed_around_it() -> None:
+    separation = apart(ORIGIN, trajectory((0, 0, 0), (3, 6, 0)), at(1), at(1))
+    assert separation.distance_start_m == separation.distance_mean_m == pytest.approx(2)
+    assert separation.relative_speed_m_s == pytest.approx(2)
 
 
-def test_noise_between_near_samples_is_no_speed() -> None:
+def test_noise_in_close_samples_is_not_a_speed() -> None:
     trembling = trajectory(*((0.001 * n, 10 + 0.001 * (-1) ** n, 0) for n in range(1001)))
     assert apart(ORIGIN, trembling, at(0), at(1)).relative_speed_m_s < 0.02
 
 
 @pytest.mark.parametrize(
-    ("begin_s", "end_s", "why"),
+    ("begin_s", "end_s", "problem"),
     [
         (0, 4, None),
         (1, 1, None),
-        (4, 9.5, "has a gap of 5.0 s, and 3 s are allowed"),
-        (6, 7, "has a gap of 5.0 s, and 3 s are allowed"),
+        (4, 9.5, "have a gap of 5.0 s, and 3 s are allowed"),
+        (6, 7, "have a gap of 5.0 s, and 3 s are allowed"),
         (9.5, 10, None),
-        (-1.5, 2, "begins 1.5 s too late"),
-        (3, 12, "ends 2.0 s too early"),
+        (-1.5, 2, "begin 1.5 s too late"),
+        (3, 12, "end 2.0 s too early"),
     ],
 )
-def test_nobody_knows_in_a_gap_and_beyond_the_ends(begin_s: float, end_s: float, why: str | None) -> None:
+def test_positions_are_unknown_in_a_gap_and_beyond_the_ends(
+    begin_s: float, end_s: float, problem: str | None
+) -> None:
     walked = trajectory((0, 0, 0), (2, 1, 0), (4, 2, 0), (9, 3, 0), (10, 4, 0))
-    assert walked.unknown(at(begin_s), at(end_s)) == why
+    assert walked.coverage_problem(at(begin_s), at(end_s)) == problem
 
 
 COORDINATES = st.floats(-1000, 1000)
@@ -85,39 +89,43 @@ TIMES = st.lists(st.integers(0, 10_000), min_size=2, max_size=8, unique=True).ma
 def any_trajectory(draw: st.DrawFn) -> Trajectory:
     times_ms = draw(TIMES)
     places = [(draw(COORDINATES), draw(COORDINATES), draw(COORDINATES)) for _ in times_ms]
-    return Trajectory(np.array([EPOCH_NS + 10**6 * one for one in times_ms]), np.array(places), 2**62)
+    return Trajectory(np.array([EPOCH_NS + 10**6 * time_ms for time_ms in times_ms]), np.array(places), 2**62)
 
 
 @given(any_trajectory(), any_trajectory(), st.data())
-def test_distances_are_those_of_a_dense_sum(one: Trajectory, other: Trajectory, data: st.DataObject) -> None:
-    first = int(max(one.times_ns[0], other.times_ns[0]))
-    last = int(min(one.times_ns[-1], other.times_ns[-1]))
+def test_distances_equal_a_dense_sum(source: Trajectory, destination: Trajectory, data: st.DataObject) -> None:
+    first = int(max(source.times_ns[0], destination.times_ns[0]))
+    last = int(min(source.times_ns[-1], destination.times_ns[-1]))
     assume(last > first)
     start_ns = data.draw(st.integers(first, last - 1))
     end_ns = data.draw(st.integers(start_ns + 1, last))
-    found = apart(one, other, start_ns, end_ns)
+    separation = apart(source, destination, start_ns, end_ns)
     times_ns = np.linspace(start_ns - EPOCH_NS, end_ns - EPOCH_NS, 4001).astype(np.int64) + EPOCH_NS
-    dense = np.linalg.norm(other.at_m(times_ns) - one.at_m(times_ns), axis=1)
-    assert found.distance_start_m == pytest.approx(dense[0], abs=1e-6)
-    assert found.distance_min_m <= dense.min() + 1e-6
-    assert found.distance_min_m <= found.distance_mean_m + 1e-6 <= found.distance_max_m + 2e-6
-    # Between two of the dense samples a distance changes by no more than both move.
+    dense = np.linalg.norm(destination.at_m(times_ns) - source.at_m(times_ns), axis=1)
+    assert separation.distance_start_m == pytest.approx(dense[0], abs=1e-6)
+    assert separation.distance_min_m <= dense.min() + 1e-6
+    assert separation.distance_min_m <= separation.distance_mean_m + 1e-6 <= separation.distance_max_m + 2e-6
+    # Between two of the dense samples a distance changes by at most the movement of both robots.
     coarse_m = max(float(np.abs(np.diff(dense)).max()), 1e-6)
-    assert found.distance_min_m == pytest.approx(dense.min(), abs=2 * coarse_m + 1e-3)
-    assert found.distance_max_m == pytest.approx(dense.max(), abs=2 * coarse_m + 1e-3)
-    assert found.distance_mean_m == pytest.approx(np.trapezoid(dense) / 4000, abs=2 * coarse_m + 1e-3)
+    assert separation.distance_min_m == pytest.approx(dense.min(), abs=2 * coarse_m + 1e-3)
+    assert separation.distance_max_m == pytest.approx(dense.max(), abs=2 * coarse_m + 1e-3)
+    assert separation.distance_mean_m == pytest.approx(np.trapezoid(dense) / 4000, abs=2 * coarse_m + 1e-3)
 
 
 @given(any_trajectory(), any_trajectory(), st.integers(-(10**15), 10**15))
-def test_nothing_depends_on_when_it_was(one: Trajectory, other: Trajectory, by_ns: int) -> None:
-    first = int(max(one.times_ns[0], other.times_ns[0]))
-    last = int(min(one.times_ns[-1], other.times_ns[-1]))
+def test_results_do_not_depend_on_absolute_time(source: Trajectory, destination: Trajectory, by_ns: int) -> None:
+    first = int(max(source.times_ns[0], destination.times_ns[0]))
+    last = int(min(source.times_ns[-1], destination.times_ns[-1]))
     assume(last > first)
-    late_one, late_other = (Trajectory(each.times_ns + by_ns, each.places_m, each.gap_ns) for each in (one, other))
-    assert apart(late_one, late_other, first + by_ns, last + by_ns) == apart(one, other, first, last)
+    late_source, late_destination = (
+        Trajectory(each.times_ns + by_ns, each.places_m, each.gap_ns) for each in (source, destination)
+    )
+    assert apart(late_source, late_destination, first + by_ns, last + by_ns) == apart(
+        source, destination, first, last
+    )
 
 
-def test_distances_are_told_where_both_are_known() -> None:
+def test_distances_are_given_while_both_positions_are_known() -> None:
     times_ns, metres = trajectories.distances_m(trajectory((0, 0, 0), (2, 2, 0)), trajectory((1, 4, 0), (3, 4, 0)))
     assert (times_ns - EPOCH_NS).tolist() == [S, 2 * S]
     assert metres.tolist() == pytest.approx([3, 2])

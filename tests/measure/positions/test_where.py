@@ -1,4 +1,4 @@
-"""Who tells where robots were, and which of them counts; clocks, frames and heights; accounts that are damaged."""
+"""Sources of positions and their precedence; clocks, frames and heights; damaged files of sources."""
 
 import json
 import math
@@ -27,7 +27,7 @@ ORACLE = (
     Whereabouts(BEGAN_NS, RECEIVER, (100.0, 0.0, 0.2)),
 )
 AWAY = [odometry(BEGAN_NS + n * S, float(n), 0.0) for n in range(5)]
-"""1 m/s, for 4 s."""
+"""Odometry of a robot that moves away at 1 m/s for 4 s."""
 ODOMETRY = Account(
     file="track.bag", topic="/where", start=(10.0, 0.0, 0.0), heading_rad=0.0, began_utc_ns=BEGAN_NS, gap_s=1.5
 )
@@ -36,45 +36,48 @@ HERE = Account(place=(0.0, 0.0, 0.0))
 
 @pytest.fixture
 def attempt(tmp_path: Path) -> Path:
-    """Return the folder of an attempt, as it lies in its trial."""
+    """Return the folder of an attempt in the folder of a trial."""
     folder = tmp_path / "repeats" / "udp-01"
     folder.mkdir(parents=True)
     return folder
 
 
-def tell(folder: Path, robots: Mapping[Role, Account], clocks: Mapping[Role, float] | None = None) -> None:
+def write_accounts(folder: Path, robots: Mapping[Role, Account], clocks: Mapping[Role, float] | None = None) -> None:
     offsets = {role: Offset(offset_s, 0.01) for role, offset_s in (clocks or {}).items()}
     (folder / accounts.FILE).write_text(accounts.text(Accounts(robots, offsets)), encoding="utf-8")
 
 
 def mean_m(folder: Path, begin_s: float = 1.0, end_s: float = 3.0) -> float | str:
-    """Return the mean distance in so many seconds by the sender's clock, or why there is none."""
+    """Return the mean distance during these seconds by the sender's clock, or the reason why it is missing."""
     times_ns = [BEGAN_NS + round(at_s * S) for at_s in (begin_s, end_s)]
-    found = where.measure(AttemptEvidence(folder), ping.WAY_COLUMNS, ENDS, times_ns)
+    measured = where.measure(AttemptEvidence(folder), ping.WAY_COLUMNS, ENDS, times_ns)
     name = "rtt_distance_mean_m"
-    assert found.values.keys() | found.missing.keys() == {column.name for column in ping.WAY_COLUMNS}
-    return float(found.values[name]) if name in found.values else found.missing[name]
+    assert measured.values.keys() | measured.missing.keys() == {column.name for column in ping.WAY_COLUMNS}
+    return float(measured.values[name]) if name in measured.values else measured.missing[name]
 
 
-def test_what_was_given_later_counts_before_what_was_recorded_and_that_before_the_testbed(attempt: Path) -> None:
+def test_the_trials_sources_precede_the_attempts_and_those_the_testbeds(attempt: Path) -> None:
     assert mean_m(attempt) == "nobody knows where robots are"
     (attempt / track.FILE).write_text(track.text(ORACLE), encoding="ascii")
     assert mean_m(attempt) == pytest.approx(100)
     written(attempt, AWAY)
-    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert mean_m(attempt) == pytest.approx(12)
     assert where.in_words(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
     trial = attempt.parent.parent
     lines = "".join(f"{BEGAN_NS + n * S},{30 + n},0\n" for n in range(5))
     (trial / "positions-receiver.csv").write_text(f"t_ns,x_m,y_m\n{lines}", encoding="ascii")
     local = Account(place=(0.0, 0.0, 0.0), frame=LOCAL)
-    tell(trial, {SENDER: local, RECEIVER: Account(file="positions-receiver.csv")})
+    write_accounts(trial, {SENDER: local, RECEIVER: Account(file="positions-receiver.csv")})
     assert mean_m(attempt) == pytest.approx(32)
     later = Account(file="positions-receiver.csv", offset_s=-1.0)
-    tell(trial, {SENDER: local, RECEIVER: later})
+    write_accounts(trial, {SENDER: local, RECEIVER: later})
     assert mean_m(attempt) == pytest.approx(33), "each line was so a second before"
-    tell(trial, {RECEIVER: later})
-    assert mean_m(attempt) == f"robots are not told of in one frame: the sender {PLACED}, the receiver {LOCAL}"
+    write_accounts(trial, {RECEIVER: later})
+    assert (
+        mean_m(attempt)
+        == f"the positions of the robots are in different frames: the sender {PLACED}, the receiver {LOCAL}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,7 +89,9 @@ def test_what_was_given_later_counts_before_what_was_recorded_and_that_before_th
         ({SENDER: -3600.0, RECEIVER: -3600.0}, 12),
     ],
 )
-def test_clocks_of_robots_are_brought_to_one(attempt: Path, clocks: Mapping[Role, float], metres: float) -> None:
+def test_times_of_robots_are_converted_to_one_clock(
+    attempt: Path, clocks: Mapping[Role, float], metres: float
+) -> None:
     wrong_ns = round(1e9 * clocks.get(RECEIVER, 0.0)) if clocks.get(RECEIVER) == -3600 else 0
     written(attempt, [odometry(BEGAN_NS + wrong_ns + n * S, float(n), 0.0) for n in range(-1, 6)], late_ns=wrong_ns)
     start = Account(
@@ -96,7 +101,7 @@ def test_clocks_of_robots_are_brought_to_one(attempt: Path, clocks: Mapping[Role
         heading_rad=0.0,
         began_utc_ns=BEGAN_NS - round(1e9 * clocks.get(RECEIVER, 0.0)) * (not wrong_ns),
     )
-    tell(attempt, {SENDER: HERE, RECEIVER: start}, clocks)
+    write_accounts(attempt, {SENDER: HERE, RECEIVER: start}, clocks)
     begin_s, end_s = (1.0 + wrong_ns / 1e9, 3.0 + wrong_ns / 1e9)
     assert mean_m(attempt, begin_s, end_s) == pytest.approx(metres)
     assert where.clock_error_s(AttemptEvidence(attempt)) == (pytest.approx(0.01 * len(clocks)) if clocks else None)
@@ -105,67 +110,70 @@ def test_clocks_of_robots_are_brought_to_one(attempt: Path, clocks: Mapping[Role
 @pytest.mark.parametrize(
     ("begin_s", "end_s", "why"),
     [
-        (-1, 2, "what /where tells of the receiver begins 1.0 s too late"),
-        (2, 6, "what /where tells of the receiver ends 2.0 s too early"),
+        (-1, 2, "the positions of the receiver from /where begin 1.0 s too late"),
+        (2, 6, "the positions of the receiver from /where end 2.0 s too early"),
     ],
 )
-def test_times_that_are_not_covered_are_missing_for_a_reason(
+def test_times_that_are_not_covered_are_missing_with_a_reason(
     attempt: Path, begin_s: float, end_s: float, why: str
 ) -> None:
     written(attempt, AWAY)
-    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert mean_m(attempt, begin_s, end_s) == why
 
 
-def test_a_gap_is_missing_and_not_made_up(attempt: Path) -> None:
+def test_positions_in_a_gap_are_not_interpolated(attempt: Path) -> None:
     written(attempt, AWAY[:2] + AWAY[3:])
-    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
-    why = "what /where tells of the receiver has a gap of 2.0 s, and 1.5 s are allowed"
+    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    why = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
     assert mean_m(attempt) == why
 
 
-def test_a_time_line_is_by_the_clock_of_who_sends_and_nobody_knows_in_a_gap(attempt: Path) -> None:
+def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt: Path) -> None:
     written(attempt, AWAY[:2] + AWAY[3:])
-    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
-    found = where.distances_m(AttemptEvidence(attempt), ENDS)
+    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
+    distances = where.distances_m(AttemptEvidence(attempt), ENDS)
     begin_ns = BEGAN_NS + S // 4
     in_gap = (begin_ns + S + 1, None)
-    assert found == [(begin_ns, 10), (begin_ns + S, 11), in_gap, (begin_ns + 3 * S, 13), (begin_ns + 4 * S, 14)]
+    assert distances == [(begin_ns, 10), (begin_ns + S, 11), in_gap, (begin_ns + 3 * S, 13), (begin_ns + 4 * S, 14)]
     (attempt / "track.bag").unlink()
     assert where.distances_m(AttemptEvidence(attempt), ENDS) == ()
 
 
-def test_whom_nobody_tells_of_has_no_distance(attempt: Path) -> None:
+def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
     written(attempt, AWAY)
-    tell(attempt, {RECEIVER: ODOMETRY})
-    assert mean_m(attempt) == "nobody tells where the sender was"
+    write_accounts(attempt, {RECEIVER: ODOMETRY})
+    assert mean_m(attempt) == "no source has the position of the sender"
     (attempt / "track.bag").unlink()
-    tell(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert "cannot be read" in str(mean_m(attempt))
 
 
-def test_a_tracker_and_a_place_in_its_frame(attempt: Path) -> None:
+def test_a_tracker_and_a_fixed_place_in_its_frame(attempt: Path) -> None:
     written(attempt, [stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
     tracker = Account(file="track.bag", topic="/where")
-    tell(attempt, {SENDER: Account(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
+    write_accounts(attempt, {SENDER: Account(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
     assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)
-    tell(attempt, {SENDER: HERE, RECEIVER: tracker})
-    assert mean_m(attempt) == "robots are not told of in one frame: the sender as placed, the receiver frame map"
+    write_accounts(attempt, {SENDER: HERE, RECEIVER: tracker})
+    assert (
+        mean_m(attempt)
+        == "the positions of the robots are in different frames: the sender as placed, the receiver frame map"
+    )
 
 
-def test_on_the_earth_heights_count_only_if_they_are_to(attempt: Path) -> None:
-    latitude, longitude = 39.74, -104.99  # a mile high, where a metre of degrees is 0.25 mm longer than at the sea
+def test_wgs84_heights_are_used_only_if_requested(attempt: Path) -> None:
+    latitude, longitude = 39.74, -104.99  # 1600 m high: the same angle is 0.25 mm per metre longer than at sea level
     to_longitude, to_latitude, _ = Geod(ellps="WGS84").fwd(longitude, latitude, 60.0, 1000.0)
     high, low = (latitude, longitude, 1650.0), (to_latitude, to_longitude, 1600.0)
     robots = {SENDER: Account(place=high, frame=WGS84), RECEIVER: Account(place=low, frame=WGS84)}
-    tell(attempt, robots)
+    write_accounts(attempt, robots)
     level_m = 1000 * (1 + 1625 / 6_371_000)
     assert mean_m(attempt) == pytest.approx(level_m, abs=0.002)
     (attempt / accounts.FILE).write_text(accounts.text(Accounts(robots, heights=True)), encoding="utf-8")
     assert mean_m(attempt) == pytest.approx(math.hypot(level_m, 50), abs=0.002)
-    untold = robots | {SENDER: Account(place=(latitude, longitude, None), frame=WGS84)}
-    (attempt / accounts.FILE).write_text(accounts.text(Accounts(untold, heights=True)), encoding="utf-8")
-    assert mean_m(attempt) == "heights are to count, and are not told everywhere"
+    without_height = robots | {SENDER: Account(place=(latitude, longitude, None), frame=WGS84)}
+    (attempt / accounts.FILE).write_text(accounts.text(Accounts(without_height, heights=True)), encoding="utf-8")
+    assert mean_m(attempt) == "heights are required, but some positions have none"
 
 
 FLOATS = st.floats(-1e9, 1e9)
@@ -181,7 +189,7 @@ ACCOUNTS = st.builds(
     heading_rad=st.none() | FLOATS,
     began_utc_ns=st.integers(0, 2**62 - 1),
 )
-TOLD = st.builds(
+ANY_ACCOUNTS = st.builds(
     Accounts,
     st.dictionaries(st.sampled_from(FIXED_ROLES), ACCOUNTS),
     st.dictionaries(st.sampled_from(FIXED_ROLES), st.builds(Offset, FLOATS, FLOATS)),
@@ -189,11 +197,13 @@ TOLD = st.builds(
 )
 
 
-@given(TOLD)
-def test_accounts_are_read_as_they_were_written(tmp_path_factory: pytest.TempPathFactory, told: Accounts) -> None:
+@given(ANY_ACCOUNTS)
+def test_accounts_are_read_as_they_were_written(
+    tmp_path_factory: pytest.TempPathFactory, written_accounts: Accounts
+) -> None:
     path = tmp_path_factory.getbasetemp() / accounts.FILE
-    path.write_text(accounts.text(told), encoding="utf-8")
-    assert accounts.read(path) == told
+    path.write_text(accounts.text(written_accounts), encoding="utf-8")
+    assert accounts.read(path) == written_accounts
 
 
 @pytest.mark.parametrize(
@@ -219,10 +229,10 @@ def test_accounts_are_read_as_they_were_written(tmp_path_factory: pytest.TempPat
         {"more": 1},
     ],
 )
-def test_accounts_that_are_none_are_refused_and_leave_the_columns_empty(attempt: Path, damage: object) -> None:
+def test_invalid_accounts_are_rejected_and_leave_the_columns_empty(attempt: Path, damage: object) -> None:
     assert isinstance(damage, dict)
     path = attempt / accounts.FILE
     path.write_text(json.dumps({"robots": {}, "clocks": {}, "heights": False} | damage), encoding="utf-8")
-    with pytest.raises(EvidenceError, match="who tells where robots were"):
+    with pytest.raises(EvidenceError, match="list of position sources"):
         accounts.read(path)
-    assert "who tells where robots were" in str(mean_m(attempt))
+    assert "list of position sources" in str(mean_m(attempt))

@@ -1,4 +1,4 @@
-"""Transfers that cross at the same time between the same robots: the figures of each are of its own packets."""
+"""Concurrent transfers between the same robots: each transfer counts its own packets."""
 
 import random
 import struct
@@ -43,17 +43,17 @@ class Flow:
 
     @property
     def transfer(self) -> Transfer:
-        one = replace(transfer(Protocol.UDP), port=self.port, sent_file=f"{self.name}.bag", name=self.name)
-        one = replace(one, received_file=f"{self.name}.recv.bag")
+        base = replace(transfer(Protocol.UDP), port=self.port, sent_file=f"{self.name}.bag", name=self.name)
+        base = replace(base, received_file=f"{self.name}.recv.bag")
         if not self.back:
-            return one
+            return base
         return replace(
-            one,
+            base,
             source=Role.RECEIVER,
             destination=Role.SENDER,
             sender_address=RECEIVER,
             receiver_address=SENDER,
-            captures=one.captures[::-1],
+            captures=base.captures[::-1],
         )
 
     def packets(self) -> Iterator[list[bytes]]:
@@ -79,7 +79,7 @@ class Flow:
 
 
 def air(folder: Path, flows: list[Flow], chance: random.Random, loss: float) -> None:
-    """Let datagrams of all flows cross in any order, and write what both robots captured and received."""
+    """Send datagrams of all flows in random order, and write the captures and received files of both robots."""
     near, far, now_ns = list[Frame](), list[Frame](), 1_700_000_000 * SECOND_NS
     waiting = [list(flow.packets()) for flow in flows]
     while any(waiting):
@@ -112,10 +112,10 @@ def air(folder: Path, flows: list[Flow], chance: random.Random, loss: float) -> 
     apart=st.integers(-8, 8),
     back=st.booleans(),
 )
-def test_each_transfer_counts_its_own_packets_also_where_ids_are_those_of_another(
+def test_each_transfer_counts_its_own_packets_even_with_equal_ids(
     loss: float, seed: int, sizes: list[int], apart: int, back: bool
 ) -> None:
-    """Each socket counts IP ids from a random one on (Linux, ip_select_ident_segs), so those of two may be equal."""
+    """Each socket counts IP ids from a random start (Linux, ip_select_ident_segs), so ids may be equal."""
     flows = [
         Flow(f"flow{number}", 1234 + number, size, 100 + number * apart, back=back and number == 1)
         for number, size in enumerate(sizes)
@@ -126,8 +126,8 @@ def test_each_transfer_counts_its_own_packets_also_where_ids_are_those_of_anothe
         for flow in flows:
             assert figures.incomparable(evidence, flow.transfer) is None
             assert not list(contradictions.find(evidence, flow.transfer, finished=True))
-            found = figures.measure(evidence, flow.transfer).values
+            values = figures.measure(evidence, flow.transfer).values
             counted = ("ip_packets_sent", "ip_packets_received", "datagrams_sent", "datagrams_received")
-            assert [found[name] for name in counted] == [flow.sent, flow.arrived, flow.datagrams, flow.whole]
-            assert found["file_loss"] == 1 - len(flow.received) / flow.size_bytes
-            assert found["paper_packets"] == flow.datagrams
+            assert [values[name] for name in counted] == [flow.sent, flow.arrived, flow.datagrams, flow.whole]
+            assert values["file_loss"] == 1 - len(flow.received) / flow.size_bytes
+            assert values["paper_packets"] == flow.datagrams

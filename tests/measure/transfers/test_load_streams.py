@@ -1,4 +1,4 @@
-"""Stalls and jitter of iperf3's streams, by captures whose gaps and delays are known."""
+"""Stalls and jitter of iperf3's streams, from captures with known gaps and delays."""
 
 import random
 from collections.abc import Iterable, Sequence
@@ -25,15 +25,15 @@ GAP = (100, 150)
 
 
 def measured(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
-    found = load_streams.measure("iperf3", load, *captured(streams))
-    assert found.values.keys() | found.missing.keys() == {
+    result = load_streams.measure("iperf3", load, *captured(streams))
+    assert result.values.keys() | result.missing.keys() == {
         column.name for column in stalls.declared("iperf3", "iperf3", 0)
     }
-    return {name.removeprefix("iperf3_"): value for name, value in found.values.items()}
+    return {name.removeprefix("iperf3_"): value for name, value in result.values.items()}
 
 
 def control(**ends: Any) -> Stream:  # noqa: ANN401 (fields of Stream)
-    """The connection by which both ends agree, opened first and idle meanwhile."""
+    """The control connection, which is opened first and idle during the test."""
     stream = Stream(**{"sport": 39000, **ends})
     stream.opens(0)
     for number, at_ns in enumerate((10 * MS, 9 * SECOND)):
@@ -49,12 +49,12 @@ def data(sport: int = 40000, lost: range = range(*GAP)) -> Stream:
     return stream
 
 
-def test_datagrams_that_the_radio_lost_in_a_row_are_a_stall() -> None:
-    found = measured(UDP, [control(), data()])
-    assert found == {"stall_s": pytest.approx(0.5), "stalls": 1}
+def test_consecutive_lost_datagrams_are_a_stall() -> None:
+    result = measured(UDP, [control(), data()])
+    assert result == {"stall_s": pytest.approx(0.5), "stalls": 1}
 
 
-def test_parallel_streams_stall_each_by_itself() -> None:
+def test_stalls_of_parallel_streams_are_counted_separately() -> None:
     both = [control(), data(), data(40001, range(200, 300))]
     two = replace(UDP, count=2)
     assert measured(two, both) == {"stall_s": pytest.approx(1.0), "stalls": 2}
@@ -62,17 +62,17 @@ def test_parallel_streams_stall_each_by_itself() -> None:
     assert measured(named, both) == {"stall_s": pytest.approx(0.5), "stalls": 1}
 
 
-def test_streams_that_cannot_be_told_from_others_have_no_stall() -> None:
+def test_streams_that_cannot_be_distinguished_have_no_stall() -> None:
     assert not measured(UDP, [control(), data(), data(40001)])
 
 
-def test_a_test_that_lasted_longer_than_anything_arrived_has_a_lower_bound() -> None:
+def test_a_test_longer_than_its_arrivals_has_a_lower_bound() -> None:
     lasts = replace(UDP, expected=replace(EVERY, lasts_s=10.0))
     assert measured(lasts, [control(), data()]) == {"stall_at_least_s": pytest.approx(6.0), "stalls": 2}
 
 
 def tcp_data(gap_ns: int) -> Stream:
-    """A data connection: the cookie of a client, segments, and a gap in which one is sent again in vain."""
+    """A data connection: the client's cookie, segments, and a gap with retransmissions that are lost."""
     stream = Stream()
     stream.opens(100 * MS)
     stream.forward(105 * MS, ISN + 1, "PA", b"c" * COOKIE_BYTES)
@@ -90,11 +90,11 @@ def tcp_data(gap_ns: int) -> Stream:
 
 @given(st.integers(300, 4000))
 @settings(max_examples=15, deadline=None)
-def test_segments_sent_again_in_vain_end_no_stall(gap_ms: int) -> None:
-    found = measured(TCP, [control(), tcp_data(gap_ms * MS)])
-    # The setup counts, too: from SYN to the first data 0.9 s.
-    assert found["stall_s"] == pytest.approx(max(gap_ms / 1e3 + 0.01, 0.9), abs=1e-3)
-    assert found["stalls"] == 2
+def test_retransmissions_that_are_lost_do_not_end_a_stall(gap_ms: int) -> None:
+    result = measured(TCP, [control(), tcp_data(gap_ms * MS)])
+    # The setup is included: 0.9 s from SYN to the first data.
+    assert result["stall_s"] == pytest.approx(max(gap_ms / 1e3 + 0.01, 0.9), abs=1e-3)
+    assert result["stalls"] == 2
 
 
 def test_a_test_in_reverse_sends_from_the_servers_port() -> None:
@@ -111,7 +111,7 @@ def test_a_test_in_reverse_sends_from_the_servers_port() -> None:
 
 
 @pytest.mark.parametrize("end", ["sender", "receiver"])
-def test_a_clock_that_is_set_forward_is_no_stall(end: str) -> None:
+def test_a_clock_that_is_set_forward_is_not_a_stall(end: str) -> None:
     streams = [control(), data()]
     for stream in streams:
         frames = getattr(stream, end)
@@ -122,14 +122,14 @@ def test_a_clock_that_is_set_forward_is_no_stall(end: str) -> None:
     assert not measured(UDP, streams)
 
 
-def test_without_captures_or_packets_nothing_is_told() -> None:
+def test_without_captures_or_packets_the_columns_are_empty() -> None:
     assert not load_streams.measure("iperf3", UDP, None, captured([data()])[1]).values
     assert not measured(UDP, [])
     assert not measured(TCP, [control()])
 
 
 def rfc_3550(transit_s: Sequence[float]) -> float:
-    """The mean of the estimator, as the RFC writes it down."""
+    """The mean of the estimator as defined in the RFC."""
     jitter_s, all_of_them = 0.0, []
     for before_s, after_s in pairwise(transit_s):
         jitter_s += (abs(after_s - before_s) - jitter_s) / 16
@@ -138,9 +138,9 @@ def rfc_3550(transit_s: Sequence[float]) -> float:
 
 
 @given(st.lists(st.integers(0, 50_000_000), min_size=2, max_size=400))
-def test_the_mean_of_the_estimator_is_that_of_its_definition(transit_ns: list[int]) -> None:
-    found = delay.mean_jitter_s(np.array(transit_ns))
-    assert found == pytest.approx(rfc_3550([one / 1e9 for one in transit_ns]), abs=1e-12)
+def test_the_mean_jitter_equals_its_definition(transit_ns: list[int]) -> None:
+    result = delay.mean_jitter_s(np.array(transit_ns))
+    assert result == pytest.approx(rfc_3550([transit / 1e9 for transit in transit_ns]), abs=1e-12)
 
 
 def jittered(delays_ms: Sequence[float], sport: int = 40000) -> Stream:
@@ -152,29 +152,29 @@ def jittered(delays_ms: Sequence[float], sport: int = 40000) -> Stream:
 
 
 def jitter(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
-    found = load_streams.measure_jitter(load, *captured(streams))
-    assert found.values.keys() | found.missing.keys() == {column.name for column in load_streams.JITTER}
-    return {name.removeprefix("iperf3_captured_"): value for name, value in found.values.items()}
+    result = load_streams.measure_jitter(load, *captured(streams))
+    assert result.values.keys() | result.missing.keys() == {column.name for column in load_streams.JITTER}
+    return {name.removeprefix("iperf3_captured_"): value for name, value in result.values.items()}
 
 
-def test_jitter_is_that_of_the_whole_test_and_not_of_its_end() -> None:
+def test_mean_jitter_covers_the_whole_test() -> None:
     noisy = [random.Random(number).uniform(2.0, 20.0) for number in range(60)]
     quiet = [5.0] * 20
     delays_ms = [*noisy, *quiet]
-    found = jitter(UDP, [control(), jittered(delays_ms)])
-    assert found["jitter_mean_s"] == pytest.approx(rfc_3550([one / 1e3 for one in delays_ms]), rel=1e-3)
-    assert found["variation_p95_s"] == pytest.approx((np.percentile(delays_ms, 95) - min(delays_ms)) / 1e3, rel=1e-3)
-    last_s = delay.jitter_s(np.array([round(one * MS) for one in delays_ms]))
+    result = jitter(UDP, [control(), jittered(delays_ms)])
+    assert result["jitter_mean_s"] == pytest.approx(rfc_3550([delay_ms / 1e3 for delay_ms in delays_ms]), rel=1e-3)
+    assert result["variation_p95_s"] == pytest.approx((np.percentile(delays_ms, 95) - min(delays_ms)) / 1e3, rel=1e-3)
+    last_s = delay.jitter_s(np.array([round(delay_ms * MS) for delay_ms in delays_ms]))
     assert last_s is not None
-    assert last_s < 0.5 * found["jitter_mean_s"], "the last value tells of the quiet end alone"
+    assert last_s < 0.5 * result["jitter_mean_s"], "the last value reflects the quiet end alone"
 
 
-def test_jitter_of_streams_is_that_of_all_their_datagrams() -> None:
+def test_mean_jitter_of_several_streams_covers_all_datagrams() -> None:
     steady, noisy = [5.0] * 30, [5.0, 15.0] * 15
-    found = jitter(replace(UDP, count=2), [control(), jittered(steady), jittered(noisy, 40001)])
-    assert found["jitter_mean_s"] == pytest.approx(rfc_3550([one / 1e3 for one in noisy]) / 2, rel=1e-3)
+    result = jitter(replace(UDP, count=2), [control(), jittered(steady), jittered(noisy, 40001)])
+    assert result["jitter_mean_s"] == pytest.approx(rfc_3550([delay_ms / 1e3 for delay_ms in noisy]) / 2, rel=1e-3)
 
 
-def test_of_tcp_there_is_no_jitter_and_of_one_way_traffic_neither() -> None:
+def test_tcp_and_one_way_traffic_have_no_jitter() -> None:
     assert not jitter(TCP, [control(), tcp_data(SECOND)])
     assert not jitter(UDP, [data()])

@@ -1,4 +1,4 @@
-"""Packets whose headers look alike, over links of known truth: exact, or marked, or empty."""
+"""Packets with equal headers over simulated links: counts are exact, marked as ambiguous, or empty."""
 
 import random
 from dataclasses import replace
@@ -40,7 +40,7 @@ def _to(protocol: Protocol, *, ipv6: bool) -> Transfer:
 def _udp(
     link: Link, contents: list[bytes], *, ids: list[int | None], step_ns: int = MS
 ) -> tuple[udp.UdpCounts, Fate]:
-    """Send datagrams one after the other, and return what was counted and what was true."""
+    """Send datagrams one after the other; return the measured counts and the true fate."""
     sent = [
         Frame(10**18 + number * step_ns, links.udp(content, ip_id=ip_id), 2000)
         for number, (content, ip_id) in enumerate(zip(contents, ids, strict=True))
@@ -52,7 +52,7 @@ def _udp(
     return counts, Fate.of(len(sent), [which for _, which in arrivals])
 
 
-def _found(counts: udp.UdpCounts) -> Fate:
+def _fate(counts: udp.UdpCounts) -> Fate:
     assert counts.packets_reordered is not None
     assert counts.loss_bursts is not None
     lost = counts.packets_sent - counts.packets_received
@@ -61,79 +61,79 @@ def _found(counts: udp.UdpCounts) -> Fate:
 
 @given(lossy, same_ids)
 @settings(max_examples=60)
-def test_content_tells_what_headers_do_not(link: Link, ip_id: int | None) -> None:
+def test_content_distinguishes_packets_with_equal_headers(link: Link, ip_id: int | None) -> None:
     counts, truth = _udp(link, [link.draw.randbytes(40) for _ in range(120)], ids=[ip_id] * 120)
-    assert _found(counts) == truth
-    assert counts.packets_doubtful == counts.packets_dubious == 0
+    assert _fate(counts) == truth
+    assert counts.packets_ambiguous == counts.possible_copies == 0
 
 
 @given(lossy, same_ids)
 @settings(max_examples=100)
-def test_without_content_a_number_is_right_or_marked(link: Link, ip_id: int | None) -> None:
+def test_without_content_a_count_is_correct_or_marked_as_ambiguous(link: Link, ip_id: int | None) -> None:
     counts, truth = _udp(link, [bytes(40)] * 120, ids=[ip_id] * 120)
-    assert counts.packets_doubtful == 120
+    assert counts.packets_ambiguous == 120
     assert counts.packets_reordered is None
     if not truth.duplicated:
         assert counts.packets_received == 120 - truth.lost
         assert counts.loss_bursts is None if truth.lost else counts.loss_bursts == 0
     else:
-        assert counts.packets_dubious, "a copy beside its twin, or all so late that any may be a copy"
+        assert counts.possible_copies, "copies close to the original, or so late that any packet may be a copy"
 
 
-def test_as_many_copies_as_losses_are_no_transfer_without_loss() -> None:
-    """6 % lost and 6 % copied, all with id 0 and the same bytes: the number received alone would hide both."""
+def test_as_many_copies_as_losses_do_not_hide_the_losses() -> None:
+    """6 % lost and 6 % copied, all with id 0 and equal bytes: the number of arrivals alone would hide both."""
     counts, truth = _udp(Link(3, loss=0.06, copied=0.06, jitter_ns=30_000), [bytes(100)] * 500, ids=[0] * 500)
     assert (truth.lost, truth.duplicated) == (33, 29)
-    assert (counts.packets_doubtful, counts.packets_dubious) == (500, 496)
+    assert (counts.packets_ambiguous, counts.possible_copies) == (500, 496)
 
 
-def test_a_copy_that_comes_long_after_its_twin_hides_no_loss() -> None:
-    """Ten packets 1 ms apart, all alike; the sixth is lost, and a copy of the third comes 2.4 ms behind it."""
+def test_a_late_copy_hides_no_loss() -> None:
+    """Ten equal packets 1 ms apart; the sixth is lost, and a copy of the third arrives 2.4 ms after it."""
     sent = [Frame(10**18 + at * MS, links.udp(bytes(40), ip_id=0)) for at in range(10)]
     late_ns = [*(at * MS for at in range(10) if at != 5), 2 * MS + 2_400_000]
     received = [Frame(10**18 + 7 * MS + at, sent[0].data) for at in sorted(late_ns)]
     counts = udp.count(udp.cross(packets(sent), packets(received), transfer(Protocol.UDP)))
-    assert (counts.packets_doubtful, counts.packets_dubious) == (10, 10)
+    assert (counts.packets_ambiguous, counts.possible_copies) == (10, 10)
 
 
-def test_of_a_single_segment_nothing_tells_which_copy_arrived() -> None:
-    """Sent twice 210 ms apart, without time stamps, and nothing else by which to compare the two clocks."""
+def test_the_arrival_of_a_single_repeated_segment_is_ambiguous() -> None:
+    """Sent twice, 210 ms apart, without time stamps and without other packets that give the clock offset."""
     syn, data = segment(0, 0, flags=2), segment(1, 700)
-    sent = [Frame(10**18 + at * MS, one) for at, one in ((0, syn), (10, data), (220, data))]
-    received = [Frame(10**18 + at * MS, one) for at, one in ((3, syn), (223, data))]
+    sent = [Frame(10**18 + at * MS, packet) for at, packet in ((0, syn), (10, data), (220, data))]
+    received = [Frame(10**18 + at * MS, packet) for at, packet in ((3, syn), (223, data))]
     counts = tcp.count(tcp.cross(packets(sent), packets(received), transfer(Protocol.TCP)))
-    assert (counts.doubtful_frames, counts.dubious_frames, counts.received_bytes) == (2, 0, 700)
+    assert (counts.ambiguous_frames, counts.possible_copies, counts.received_bytes) == (2, 0, 700)
     assert counts.spurious_frames is counts.reordered_frames is None
 
 
-def test_of_joined_segments_that_are_repeated_at_once_nothing_tells_which_arrived() -> None:
-    """Three segments in one frame, sent again 1 ms later; the way cuts both: neither arrives as it was."""
+def test_arrivals_of_joined_segments_repeated_immediately_are_ambiguous() -> None:
+    """Three segments in one frame, sent again 1 ms later; a router cuts both, so neither arrives as it was sent."""
     syn = segment(0, 0, flags=2, ip_id=9, mss=700)
     sent = timed([syn, segment(1, 2100, ip_id=10), segment(1, 2100, ip_id=13)])
     cut = [segment(1 + 700 * (number % 3), 700, ip_id=10 + number) for number in range(6)]
     counts = tcp.count(tcp.cross(packets(sent), packets(timed([syn, *cut])), transfer(Protocol.TCP)))
-    assert (counts.doubtful_frames, counts.lost_bytes, counts.received_bytes) == (2, 0, 4200)
+    assert (counts.ambiguous_frames, counts.lost_bytes, counts.received_bytes) == (2, 0, 4200)
     assert counts.spurious_frames is counts.reordered_frames is None
 
 
-def test_a_repeat_tells_no_loss_that_copies_may_hide(tmp_path: Path) -> None:
-    """33 of 500 lost and 29 copied, all alike: what was sent is told, and nothing that arrived."""
+def test_a_repeat_has_no_loss_if_copies_may_hide_losses(tmp_path: Path) -> None:
+    """33 of 500 lost and 29 copied, all equal: counts of sent packets are present, counts of arrivals are empty."""
     link = Link(3, loss=0.06, copied=0.06, jitter_ns=30_000)
     sent = [Frame(10**18 + at * MS, links.udp(bytes(100), ip_id=0), 128) for at in range(500)]
-    arrivals = link.arrivals([one.time_ns for one in sent])
+    arrivals = link.arrivals([frame.time_ns for frame in sent])
     (tmp_path / "sender.pcap").write_bytes(file_bytes(sent))
     (tmp_path / "receiver.pcap").write_bytes(file_bytes(Frame(at, sent[which].data, 128) for at, which in arrivals))
-    found = measure(tmp_path, transfer(Protocol.UDP))
-    assert (found.ip_packets_sent, found.ip_packets_doubtful, found.datagrams_sent) == (500, 500, 500)
-    assert found.one_way_withheld == "the packets of the transfer look alike"
-    told = {name for name in found if name.startswith(("ip_", "datagram", "byte_"))}
-    assert told == {"ip_packets_sent", "ip_packets_doubtful", "datagrams_sent"}
+    measures = measure(tmp_path, transfer(Protocol.UDP))
+    assert (measures.ip_packets_sent, measures.ip_packets_doubtful, measures.datagrams_sent) == (500, 500, 500)
+    assert measures.one_way_withheld == "the packets of the transfer cannot be distinguished"
+    present = {name for name in measures if name.startswith(("ip_", "datagram", "byte_"))}
+    assert present == {"ip_packets_sent", "ip_packets_doubtful", "datagrams_sent"}
     assert fates.read(AttemptEvidence(tmp_path), transfer(Protocol.UDP)) is None
 
 
 @pytest.mark.parametrize("kept", [True, False])
-def test_ids_that_come_again_after_65536_datagrams(kept: bool) -> None:
-    """One loss and one copy across a wrap, some reordered and lost besides; with content and without."""
+def test_ids_that_repeat_after_65536_datagrams(kept: bool) -> None:
+    """One loss and one copy around the wrap of the ids, and others lost or reordered; with and without content."""
     count, draw = 70_000, random.Random(5)
     contents = [draw.randbytes(32) if kept else bytes(32) for _ in range(count)]
     sent = [
@@ -143,13 +143,15 @@ def test_ids_that_come_again_after_65536_datagrams(kept: bool) -> None:
     times_ns = [frame.time_ns + 5 * 10**9 + draw.randint(MS, MS + 30_000) for frame in sent]
     lost, copied = {100, 65_536 + 200, *range(30_000, 30_010)}, [65_536 + 100, 200]
     arrived = [number for number in range(count) if number not in lost]
-    arrivals = sorted([(times_ns[one], one) for one in arrived] + [(times_ns[one] + 10_000, one) for one in copied])
+    arrivals = sorted(
+        [(times_ns[index], index) for index in arrived] + [(times_ns[index] + 10_000, index) for index in copied]
+    )
     received = [Frame(at, sent[which].data, 2000) for at, which in arrivals]
     counts = udp.count(udp.cross(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
     truth = Fate.of(count, [which for _, which in arrivals])
-    assert _found(counts) == truth
+    assert _fate(counts) == truth
     assert (truth.lost, truth.duplicated, truth.bursts) == (12, 2, 3)
-    assert counts.packets_doubtful == counts.packets_dubious == 0
+    assert counts.packets_ambiguous == counts.possible_copies == 0
 
 
 def _is(counts: tcp.TcpCounts, truth: links.TcpTruth) -> None:
@@ -159,7 +161,7 @@ def _is(counts: tcp.TcpCounts, truth: links.TcpTruth) -> None:
 
 @given(lossy, joined, shares, names)
 @settings(max_examples=100)
-def test_time_stamps_tell_a_retransmission_whatever_offload_does(
+def test_time_stamps_identify_retransmissions_with_any_offload(
     link: Link, offload: int, again: float, name: str
 ) -> None:
     ipv6 = name == "v6"
@@ -168,20 +170,20 @@ def test_time_stamps_tell_a_retransmission_whatever_offload_does(
     _is(counts, truth)
     assert counts.received_bytes == truth.received_bytes
     assert (counts.spurious_frames, counts.reordered_frames) == (truth.spurious, truth.reordered)
-    assert counts.doubtful_frames == 0
+    assert counts.ambiguous_frames == 0
 
 
 @given(lossy, joined, shares, names)
 @settings(max_examples=100)
-def test_without_time_stamps_order_is_told_or_empty(link: Link, offload: int, again: float, name: str) -> None:
+def test_without_time_stamps_order_is_correct_or_empty(link: Link, offload: int, again: float, name: str) -> None:
     ipv6 = name == "v6"
     truth = links.tcp(link, 100, ids=name == "ids", ipv6=ipv6, offload=offload, again=again, stamped=False)
     counts = tcp.count(tcp.cross(packets(truth.sender), packets(truth.receiver), _to(Protocol.TCP, ipv6=ipv6)))
     _is(counts, truth)
     if counts.received_bytes != truth.received_bytes:
-        assert counts.doubtful_frames
-        assert counts.dubious_frames
-    if counts.doubtful_frames:
+        assert counts.ambiguous_frames
+        assert counts.possible_copies
+    if counts.ambiguous_frames:
         assert counts.spurious_frames is counts.reordered_frames is None
         assert truth.retransmitted
         assert name != "ids" or offload > 1
@@ -190,36 +192,41 @@ def test_without_time_stamps_order_is_told_or_empty(link: Link, offload: int, ag
         assert (counts.spurious_frames, counts.reordered_frames) == (truth.spurious, truth.reordered)
 
 
-def test_what_one_capture_cut_off_tells_nothing_and_misleads_nobody() -> None:
-    """A snap length that keeps content, or time stamps, at one end alone."""
+def test_content_truncated_in_one_capture_is_not_used() -> None:
+    """The snap length includes content, or time stamps, at one end only."""
     link = Link(8, loss=0.1, copied=0.1)
     sent = [Frame(10**18 + at * MS, links.udp(link.draw.randbytes(40), ip_id=0), 68) for at in range(200)]
     arrivals = link.arrivals([frame.time_ns for frame in sent])
     received = [Frame(at, sent[which].data[:58], 68) for at, which in arrivals]
     counts = udp.count(udp.cross(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
-    assert (counts.packets_sent, counts.packets_doubtful) == (200, 200)
-    assert counts.packets_dubious
+    assert (counts.packets_sent, counts.packets_ambiguous) == (200, 200)
+    assert counts.possible_copies
     truth = links.tcp(Link(8, loss=0.1), 100, ids=False, again=0.2)
-    short = [Frame(one.time_ns, one.data[:44], one.wire_bytes) for one in truth.receiver]
-    found = tcp.count(tcp.cross(packets(truth.sender), packets(short), _to(Protocol.TCP, ipv6=False)))
-    _is(found, truth)
-    assert found.doubtful_frames
-    assert found.spurious_frames is found.reordered_frames is None
+    short = [Frame(frame.time_ns, frame.data[:44], frame.wire_bytes) for frame in truth.receiver]
+    short_counts = tcp.count(tcp.cross(packets(truth.sender), packets(short), _to(Protocol.TCP, ipv6=False)))
+    _is(short_counts, truth)
+    assert short_counts.ambiguous_frames
+    assert short_counts.spurious_frames is short_counts.reordered_frames is None
 
 
 @pytest.mark.parametrize("protocol", Protocol)
-def test_links_of_two_kinds_carry_the_same_packets(protocol: Protocol) -> None:
-    """A VLAN at one end and cooked frames at the other; padding behind short packets is no content."""
+def test_captures_of_different_link_types_match(protocol: Protocol) -> None:
+    """VLAN tags at one end, cooked frames at the other; padding after short packets is not content."""
     if protocol is Protocol.UDP:
         link = Link(2, loss=0.1, copied=0.1, late=0.1)
         sent = [Frame(10**18 + at * MS, links.udp(link.draw.randbytes(5), ip_id=0)) for at in range(200)]
-        received = [Frame(at, sent[which].data) for at, which in link.arrivals([one.time_ns for one in sent])]
+        received = [Frame(at, sent[which].data) for at, which in link.arrivals([frame.time_ns for frame in sent])]
     else:
         truth = links.tcp(Link(2, loss=0.1, copied=0.1, late=0.1), 100, ids=False, again=0.1)
         sent, received = truth.sender, truth.receiver
     vlan, cooked = bytes(12) + b"\x81\x00\x00\x07\x08\x00", bytes(14) + b"\x08\x00"
-    ours = [Frame(one.time_ns, vlan + one.data + bytes(20), one.wire_bytes and one.wire_bytes + 18) for one in sent]
-    theirs = [Frame(one.time_ns, cooked + one.data, one.wire_bytes and one.wire_bytes + 16) for one in received]
+    ours = [
+        Frame(frame.time_ns, vlan + frame.data + bytes(20), frame.wire_bytes and frame.wire_bytes + 18)
+        for frame in sent
+    ]
+    theirs = [
+        Frame(frame.time_ns, cooked + frame.data, frame.wire_bytes and frame.wire_bytes + 16) for frame in received
+    ]
     plain = packets(sent), packets(received)
     framed = (
         pcap.parse(file_bytes(ours, link_type=1), where="test").packets,

@@ -1,4 +1,4 @@
-"""The line between two clocks: against the truth, for any offset, drift and queues, and against linear programs."""
+"""The line between two clocks compared with the truth for any offset, drift and queues, and with linear programs."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ drifts = st.floats(-100e-6, 100e-6)
 
 
 class World:
-    """Two hosts whose receiver's clock is `offset_s` ahead at the start and gains `drift` from then on."""
+    """Two robots; the receiver's clock is `offset_s` ahead at the start and gains `drift` from then on."""
 
     def __init__(self, offset_s: float, drift: float) -> None:
         self.offset_s, self.drift = offset_s, drift
@@ -29,21 +29,21 @@ class World:
     def sender_ns(time_s: Floats) -> Ints:
         return START_NS + np.floor(time_s * 1e9).astype(np.int64)
 
-    def forward(self, left_s: Floats, delay_s: Floats) -> StampPairs:
-        return _cut(self.sender_ns(left_s), self.receiver_ns(left_s + delay_s))
+    def forward(self, sent_s: Floats, delay_s: Floats) -> StampPairs:
+        return _cut(self.sender_ns(sent_s), self.receiver_ns(sent_s + delay_s))
 
-    def reverse(self, left_s: Floats, delay_s: Floats) -> StampPairs:
-        return _cut(self.sender_ns(left_s + delay_s), self.receiver_ns(left_s))
+    def reverse(self, sent_s: Floats, delay_s: Floats) -> StampPairs:
+        return _cut(self.sender_ns(sent_s + delay_s), self.receiver_ns(sent_s))
 
     def ahead_s(self, receiver_ns: Ints) -> Floats:
-        """The truth, at times of the receiver's clock."""
+        """The true offset at times of the receiver's clock."""
         elapsed_s = ((receiver_ns - START_NS) / 1e9 - self.offset_s) / (1 + self.drift)
         truth: Floats = self.offset_s + self.drift * elapsed_s
         return truth
 
 
 def _cut(sender_ns: Ints, receiver_ns: Ints) -> StampPairs:
-    """As tcpdump writes them: whole microseconds."""
+    """Truncate times to microseconds as tcpdump does."""
     return StampPairs(sender_ns // 1000 * 1000, receiver_ns // 1000 * 1000)
 
 
@@ -53,11 +53,11 @@ def _ahead_s(clocks: Clocks, receiver_ns: Ints) -> Floats:
 
 @st.composite
 def traffic(draw: st.DrawFn, largest: int = 40) -> tuple[Floats, Floats]:
-    """When packets left, and a floor of delay with any queues upon it."""
+    """Times of sending, and delays with a lower limit and random queues."""
     count = draw(st.integers(1, largest))
-    left_s = draw(st.lists(st.floats(0, 60), min_size=count, max_size=count))
+    sent_s = draw(st.lists(st.floats(0, 60), min_size=count, max_size=count))
     queue_s = draw(st.lists(st.floats(0, 2), min_size=count, max_size=count))
-    return np.array(left_s), draw(st.floats(0, 0.1)) + np.array(queue_s)
+    return np.array(sent_s), draw(st.floats(0, 0.1)) + np.array(queue_s)
 
 
 @given(offsets_s, drifts, traffic(), traffic())
@@ -81,7 +81,7 @@ def test_offset_and_skew_are_within_their_errors(
 def test_the_error_is_that_of_two_linear_programs(
     offset_s: float, drift: float, there: tuple[Floats, Floats], back: tuple[Floats, Floats]
 ) -> None:
-    """No line that the packets allow is farther away, and some line is as far."""
+    """The farthest possible line has the distance of the error."""
     world = World(offset_s, drift)
     forward, reverse = world.forward(*there), world.reverse(*back)
     clocks = estimate(forward, reverse)
@@ -109,32 +109,32 @@ def test_the_error_is_that_of_two_linear_programs(
     assert clocks.error_s(at_ns) == pytest.approx(max(best - reach[0], reach[1] - best), abs=1e-6)
 
 
-def test_with_free_ways_throughout_the_skew_is_found_and_the_error_is_half_of_a_round_trip() -> None:
+def test_without_queues_the_skew_is_exact_and_the_error_is_half_a_round_trip() -> None:
     world = World(-12.5, 40e-6)
     random = np.random.default_rng(4)
-    left_s = np.sort(random.uniform(0, 200, 3000))
-    # Every tenth packet meets no queue.
+    sent_s = np.sort(random.uniform(0, 200, 3000))
+    # Every tenth packet has no queueing delay.
     queue_s = np.where(random.random(3000) < 0.1, 0, random.exponential(0.05, 3000))
-    clocks = estimate(world.forward(left_s, 0.004 + queue_s), world.reverse(left_s, 0.006 + queue_s[::-1]))
+    clocks = estimate(world.forward(sent_s, 0.004 + queue_s), world.reverse(sent_s, 0.006 + queue_s[::-1]))
     assert clocks is not None
     assert 1e6 * clocks.skew == pytest.approx(40, abs=1)
     middle = np.array([clocks.middle_ns])
     assert clocks.error_s(middle) == pytest.approx(0.005, abs=0.0005)
-    # The ways differ by 2 ms, which nothing in the captures tells: the estimate is wrong by half of that.
+    # The delays of the directions differ by 2 ms, which captures cannot show: the estimate is wrong by half of that.
     assert world.ahead_s(middle)[0] - _ahead_s(clocks, middle)[0] == pytest.approx(0.001, abs=0.0001)
 
 
-def test_a_growing_queue_is_no_drift() -> None:
-    """Moon's one-way hull would take a buffer that fills for a fast clock; here the packets back contradict it."""
+def test_a_growing_queue_is_not_taken_for_drift() -> None:
+    """Moon's one-way hull would take a buffer that fills up for a fast clock; packets in reverse contradict it."""
     world = World(0.25, 0.0)
-    left_s = np.linspace(0, 200, 500)
-    clocks = estimate(world.forward(left_s, 0.003 + 60e-6 * left_s), world.reverse(left_s, np.full(500, 0.003)))
+    sent_s = np.linspace(0, 200, 500)
+    clocks = estimate(world.forward(sent_s, 0.003 + 60e-6 * sent_s), world.reverse(sent_s, np.full(500, 0.003)))
     assert clocks is not None
     assert clocks.skew_error < QUARTZ_SKEW
     assert clocks.skew == pytest.approx(0, abs=1e-6)
 
 
-def test_one_round_trip_tells_an_offset_and_nothing_of_the_skew() -> None:
+def test_one_round_trip_gives_an_offset_but_no_skew() -> None:
     world = World(7.0, 0.0)
     clocks = estimate(
         world.forward(np.array([0.0]), np.array([0.01])), world.reverse(np.array([0.02]), np.array([0.01]))
@@ -145,11 +145,11 @@ def test_one_round_trip_tells_an_offset_and_nothing_of_the_skew() -> None:
 
 
 @pytest.mark.parametrize("step_s", [-1.0, 1.0])
-def test_a_clock_that_is_set_in_the_midst_fits_no_line(step_s: float) -> None:
+def test_a_clock_that_is_set_during_the_capture_fits_no_line(step_s: float) -> None:
     before, after = World(0.0, 0.0), World(step_s, 0.0)
     early, late, delay = np.array([0.0]), np.array([1.0]), np.array([0.01])
     sides = [
-        StampPairs.joined((before_part, after_part))
+        StampPairs.concatenated((before_part, after_part))
         for before_part, after_part in (
             (before.forward(early, delay), after.forward(late, delay)),
             (before.reverse(early, delay), after.reverse(late, delay)),
@@ -158,12 +158,12 @@ def test_a_clock_that_is_set_in_the_midst_fits_no_line(step_s: float) -> None:
     assert estimate(*sides) is None
 
 
-def test_clocks_decades_apart_lose_no_digit() -> None:
-    """A robot without a clock of its own starts in 1970."""
+def test_clocks_decades_apart_lose_no_precision() -> None:
+    """A robot without a battery-backed clock starts in 1970."""
     world = World(-1.7e9, 0.0)
-    left_s, delay_s = np.linspace(0, 1, 9), np.full(9, 0.0005)
-    forward = world.forward(left_s, delay_s)
-    clocks = estimate(forward, world.reverse(left_s, delay_s))
+    sent_s, delay_s = np.linspace(0, 1, 9), np.full(9, 0.0005)
+    forward = world.forward(sent_s, delay_s)
+    clocks = estimate(forward, world.reverse(sent_s, delay_s))
     assert clocks is not None
     delays_s = (forward.receiver_ns - forward.sender_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(forward.receiver_ns)
     assert delays_s == pytest.approx(delay_s, abs=2e-6)
@@ -171,12 +171,12 @@ def test_clocks_decades_apart_lose_no_digit() -> None:
 
 @given(st.integers(1, 5000), st.integers(0, 2**32))
 @settings(max_examples=20)
-def test_many_packets_are_thinned_and_the_truth_stays_possible(count: int, seed: int) -> None:
+def test_with_many_packets_a_sample_is_used_and_the_truth_stays_possible(count: int, seed: int) -> None:
     random = np.random.default_rng(seed)
     world = World(float(random.uniform(-3600, 3600)), float(random.uniform(-1e-4, 1e-4)))
-    left_s = np.sort(random.uniform(0, 100, count))
-    forward = world.forward(left_s, random.exponential(0.02, count))
-    clocks = estimate(forward, world.reverse(left_s, random.exponential(0.02, count)))
+    sent_s = np.sort(random.uniform(0, 100, count))
+    forward = world.forward(sent_s, random.exponential(0.02, count))
+    clocks = estimate(forward, world.reverse(sent_s, random.exponential(0.02, count)))
     assert clocks is not None
     wrong_s = np.abs(_ahead_s(clocks, forward.receiver_ns) - world.ahead_s(forward.receiver_ns))
     assert wrong_s.max() <= clocks.error_s(forward.receiver_ns) + 1e-9

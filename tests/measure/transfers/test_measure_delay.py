@@ -1,4 +1,4 @@
-"""One-way delay and jitter: a transfer on two clocks, crafted and real, against what is known of each packet."""
+"""One-way delay and jitter of crafted and real transfers with two clocks, compared with known values."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,39 +29,39 @@ Wrong = tuple[float, float]  # offset in seconds, drift in seconds per second
 CLOCKS: list[Wrong] = [(0, 0), (3600, 0), (-3600, 0), (0, 100e-6), (0, -100e-6), (3600, -100e-6), (-3600, 100e-6)]
 
 
-def _measured(sender: Packets, receiver: Packets, what: Transfer, sent: int | None = None) -> Measures:
-    if what.protocol is Protocol.UDP:
-        own = delay.udp_packets(udp.cross(sender, receiver, what))
+def _measured(sender: Packets, receiver: Packets, aim: Transfer, sent: int | None = None) -> Measures:
+    if aim.protocol is Protocol.UDP:
+        pairs = delay.udp_packets(udp.cross(sender, receiver, aim))
     else:
-        own = delay.tcp_frames(tcp.cross(sender, receiver, what))
-    found = delay.measure(own, sender, receiver, what, sent=len(own) if sent is None else sent)
-    assert not found.values.keys() & found.missing.keys(), "no column is told twice"
-    assert found.values.keys() | found.missing.keys() == {
+        pairs = delay.tcp_frames(tcp.cross(sender, receiver, aim))
+    columns = delay.measure(pairs, sender, receiver, aim, sent=len(pairs) if sent is None else sent)
+    assert not columns.values.keys() & columns.missing.keys(), "no column has both a value and a reason"
+    assert columns.values.keys() | columns.missing.keys() == {
         column.name for column in (*delay.COLUMNS, *delay.SENT_COLUMNS)
     }
-    return Measures(**found.values)
+    return Measures(**columns.values)
 
 
 def _on_another_clock(capture: Packets, offset_s: float, drift: float) -> Packets:
-    """The capture as a host with another clock would have written it, in whole microseconds."""
+    """The capture as it would be with another clock, in whole microseconds."""
     elapsed_ns = capture.time_ns - START_NS
     wrong_ns = capture.time_ns + np.round(offset_s * 1e9 + drift * elapsed_ns).astype(np.int64)
     return replace(capture, time_ns=wrong_ns // 1000 * 1000)
 
 
 def _real_delays_s(protocol: Protocol) -> list[float]:
-    """Delay of each packet of the real transfer by the one clock of both captures, as scapy reads them."""
+    """Delay of each packet of the real transfer; both captures have the same clock, and scapy reads them."""
     moments: list[dict[tuple[int, int], float]] = []
     for role in ("sender", "receiver"):
-        found = {}
+        times_s = {}
         for frame in rdpcap(str(TWO_WAY / f"{protocol}-{role}.pcap")):
             ip = frame[IP]
             if ip.src != "10.42.0.1" or ICMP in ip or ip.proto == 1:
                 continue
             if protocol is Protocol.TCP and ip.len - 20 - ip[TCP].dataofs * 4 == 0:
                 continue
-            found[ip.id, ip.frag] = float(frame.time)
-        moments.append(found)
+            times_s[ip.id, ip.frag] = float(frame.time)
+        moments.append(times_s)
     sent, received = moments
     return [received[key] - sent[key] for key in sent if key in received]
 
@@ -69,48 +69,48 @@ def _real_delays_s(protocol: Protocol) -> list[float]:
 def _real(protocol: Protocol, offset_s: float = 0.0, drift: float = 0.0) -> Measures:
     sender, receiver = (pcap.read(TWO_WAY / f"{protocol}-{role}.pcap").packets for role in ("sender", "receiver"))
     start_ns = int(sender.time_ns.min()) - START_NS
-    sender, receiver = (replace(one, time_ns=one.time_ns - start_ns) for one in (sender, receiver))
-    what = replace(transfer(protocol), sender_address="10.42.0.1", receiver_address="10.42.0.2", port=1234)
-    return _measured(sender, _on_another_clock(receiver, offset_s, drift), what)
+    sender, receiver = (replace(capture, time_ns=capture.time_ns - start_ns) for capture in (sender, receiver))
+    aim = replace(transfer(protocol), sender_address="10.42.0.1", receiver_address="10.42.0.2", port=1234)
+    return _measured(sender, _on_another_clock(receiver, offset_s, drift), aim)
 
 
 @pytest.mark.parametrize(("offset_s", "drift"), CLOCKS)
 @pytest.mark.parametrize("protocol", Protocol)
-def test_a_real_transfer_keeps_its_delays_whatever_its_clocks_say(
+def test_delays_of_a_real_transfer_are_correct_for_any_clock_offset(
     protocol: Protocol, offset_s: float, drift: float
 ) -> None:
-    """Real captures of a link with 2 ms, 1 Mbit/s and 3 % loss; both robots had one clock, so the truth is known."""
+    """Real captures of a link with 2 ms, 1 Mbit/s and 3 % loss; both robots had one clock, so delays are known."""
     truth_s = _real_delays_s(protocol)
-    found = _real(protocol, offset_s, drift)
-    assert found.one_way_error_s is not None
-    assert found.one_way_p95_s == pytest.approx(np.percentile(truth_s, 95), abs=found.one_way_error_s)
+    measures = _real(protocol, offset_s, drift)
+    assert measures.one_way_error_s is not None
+    assert measures.one_way_p95_s == pytest.approx(np.percentile(truth_s, 95), abs=measures.one_way_error_s)
     if protocol is Protocol.TCP:
-        assert found.one_way_median_s == pytest.approx(median(truth_s), abs=found.one_way_error_s)
-        assert found.one_way_mean_s == pytest.approx(mean(truth_s), abs=found.one_way_error_s)
-    over_s = [one - min(truth_s) for one in truth_s]
-    # Drift that the packets cannot tell goes into it: 100 ppm of the transfer's 0.2 s.
-    assert found.delay_variation_median_s == pytest.approx(median(over_s), abs=30e-6)
-    assert found.clock_offset_s is not None
-    assert found.clock_offset_error_s is not None
+        assert measures.one_way_median_s == pytest.approx(median(truth_s), abs=measures.one_way_error_s)
+        assert measures.one_way_mean_s == pytest.approx(mean(truth_s), abs=measures.one_way_error_s)
+    over_s = [delay_s - min(truth_s) for delay_s in truth_s]
+    # Drift that the packets do not determine is included: 100 ppm of the transfer's 0.2 s.
+    assert measures.delay_variation_median_s == pytest.approx(median(over_s), abs=30e-6)
+    assert measures.clock_offset_s is not None
+    assert measures.clock_offset_error_s is not None
     # In the middle of 2 s the drift has moved the clock by less than 0.3 ms.
-    assert abs(found.clock_offset_s - offset_s - drift * 1.0) <= found.clock_offset_error_s + 3e-4
+    assert abs(measures.clock_offset_s - offset_s - drift * 1.0) <= measures.clock_offset_error_s + 3e-4
 
 
-def test_the_real_transfers_errors_are_half_of_the_fastest_round_trip_of_any_two_packets() -> None:
-    """A bare ACK of 52 bytes takes 2.6 ms, a full fragment 14 ms, and nothing shorter came back in the UDP repeat."""
+def test_errors_of_a_real_transfer_are_half_of_the_fastest_round_trip() -> None:
+    """A bare ACK of 52 bytes takes 2.6 ms, a full fragment 14 ms; no shorter packet came back in the UDP repeat."""
     tcp, udp = _real(Protocol.TCP), _real(Protocol.UDP)
     assert tcp.one_way_error_s == pytest.approx(2.5e-3, abs=0.2e-3)
     assert tcp.one_way_withheld == "the error is above a tenth of: min"
     assert udp.one_way_error_s == pytest.approx(15e-3, abs=2e-3)
     assert (udp.one_way_median_s, udp.one_way_withheld) == (None, "the error is above a tenth of: min, median, mean")
-    for one in (tcp, udp):
-        assert (one.clock_skew_ppm, one.clock_skew_error_ppm) == (None, 500), "2 s tell nothing of the drift"
+    for result in (tcp, udp):
+        assert (result.clock_skew_ppm, result.clock_skew_error_ppm) == (None, 500), "2 s do not determine the drift"
 
 
 def _exchange(
     left_ms: list[float], delay_ms: list[float], wrong: Wrong, *, back_ms: float = 1.0
 ) -> tuple[Packets, Packets]:
-    """A UDP transfer of datagrams of one packet, and ten pings after it, on a sender with the true clock."""
+    """A UDP transfer of unfragmented datagrams with ten pings after it; the sender has the true clock."""
     there = [(ms, extra, datagram(n, 1000)[0]) for n, (ms, extra) in enumerate(zip(left_ms, delay_ms, strict=True))]
     asked_ms = [max(left_ms) + 10 * n for n in range(1, 11)]
     there += [(ms, back_ms, ipv4(bytes(8), protocol=1, ip_id=60000 + n)) for n, ms in enumerate(asked_ms)]
@@ -119,13 +119,13 @@ def _exchange(
         for n, ms in enumerate(asked_ms)
     ]
 
-    def seen(items: list[tuple[float, bytes]]) -> Packets:
+    def capture(items: list[tuple[float, bytes]]) -> Packets:
         return packets(
-            Frame(START_NS + round(ms * MILLISECOND_NS), data) for ms, data in sorted(items, key=lambda one: one[0])
+            Frame(START_NS + round(ms * MILLISECOND_NS), data) for ms, data in sorted(items, key=lambda item: item[0])
         )
 
-    sender = seen([(ms, data) for ms, _, data in there] + [(ms + extra, data) for ms, extra, data in back])
-    receiver = seen([(ms + extra, data) for ms, extra, data in there] + [(ms, data) for ms, _, data in back])
+    sender = capture([(ms, data) for ms, _, data in there] + [(ms + extra, data) for ms, extra, data in back])
+    receiver = capture([(ms + extra, data) for ms, extra, data in there] + [(ms, data) for ms, _, data in back])
     return sender, _on_another_clock(receiver, *wrong)
 
 
@@ -134,12 +134,12 @@ delays_ms = st.lists(st.floats(1, 400), min_size=2, max_size=30)
 
 @given(st.sampled_from(CLOCKS), delays_ms, st.floats(0.5, 50))
 @settings(max_examples=60, deadline=None)
-def test_what_is_shown_is_right_within_its_error_and_what_is_not_is_too_uncertain(
+def test_values_are_correct_within_their_error_or_withheld(
     wrong: Wrong, delay_ms: list[float], back_ms: float
 ) -> None:
     sender, receiver = _exchange([20.0 * n for n in range(len(delay_ms))], delay_ms, wrong, back_ms=back_ms)
-    found = _measured(sender, receiver, transfer(Protocol.UDP))
-    error_s = found.one_way_error_s
+    measures = _measured(sender, receiver, transfer(Protocol.UDP))
+    error_s = measures.one_way_error_s
     assert error_s is not None
     delay_s = np.array(delay_ms) / 1e3
     truths = {
@@ -149,9 +149,9 @@ def test_what_is_shown_is_right_within_its_error_and_what_is_not_is_too_uncertai
         "p95": np.percentile(delay_s, 95),
     }
     for name, truth_s in truths.items():
-        shown_s = getattr(found, f"one_way_{name}_s")
+        shown_s = getattr(measures, f"one_way_{name}_s")
         if shown_s is None:
-            assert name in (found.one_way_withheld or "")
+            assert name in (measures.one_way_withheld or "")
             assert error_s > 0.1 * (truth_s - error_s) - 1e-9
         else:
             assert abs(shown_s - truth_s) <= error_s + 1e-9
@@ -159,80 +159,85 @@ def test_what_is_shown_is_right_within_its_error_and_what_is_not_is_too_uncertai
 
 
 def test_closed_forms_on_two_clocks() -> None:
-    """Delays 100, 110, 100, 110 ... ms, pings of 1 ms each way: all known by arithmetic."""
+    """Delays 100, 110, 100, 110 ... ms, pings of 1 ms in each direction: all results follow by arithmetic."""
     delay_ms = [100.0 + 10 * (n % 2) for n in range(101)]
     sender, receiver = _exchange([50.0 * n for n in range(101)], delay_ms, (-3600, 0))
-    found = _measured(sender, receiver, transfer(Protocol.UDP))
-    assert found.one_way_withheld is None
-    assert found.one_way_min_s == pytest.approx(0.100, abs=1e-5)
-    assert found.one_way_median_s == pytest.approx(0.100, abs=1e-5)
-    assert found.one_way_mean_s == pytest.approx((51 * 0.1 + 50 * 0.11) / 101, abs=1e-5)
-    assert found.one_way_p95_s == pytest.approx(0.110, abs=1e-5)
-    # Half a round trip, and what 500 ppm may move in the 5 s before the pings.
-    assert found.one_way_error_s == pytest.approx(0.001 + 500e-6 * 5.0, abs=0.2e-3)
-    assert found.delay_variation_median_s == 0
-    assert found.delay_variation_p95_s == pytest.approx(0.010)
-    assert found.jitter_s == pytest.approx(0.010 * (1 - (15 / 16) ** 100))
-    assert found.clock_offset_s == pytest.approx(-3600, abs=1e-5)
+    measures = _measured(sender, receiver, transfer(Protocol.UDP))
+    assert measures.one_way_withheld is None
+    assert measures.one_way_min_s == pytest.approx(0.100, abs=1e-5)
+    assert measures.one_way_median_s == pytest.approx(0.100, abs=1e-5)
+    assert measures.one_way_mean_s == pytest.approx((51 * 0.1 + 50 * 0.11) / 101, abs=1e-5)
+    assert measures.one_way_p95_s == pytest.approx(0.110, abs=1e-5)
+    # Half a round trip, and the largest drift of 500 ppm in the 5 s before the pings.
+    assert measures.one_way_error_s == pytest.approx(0.001 + 500e-6 * 5.0, abs=0.2e-3)
+    assert measures.delay_variation_median_s == 0
+    assert measures.delay_variation_p95_s == pytest.approx(0.010)
+    assert measures.jitter_s == pytest.approx(0.010 * (1 - (15 / 16) ** 100))
+    assert measures.clock_offset_s == pytest.approx(-3600, abs=1e-5)
 
 
-def test_a_lost_packet_is_later_than_all_in_the_median_of_what_was_sent() -> None:
+def test_a_lost_packet_counts_as_latest_in_the_median_of_all_sent() -> None:
     sender, receiver = _exchange([50.0 * n for n in range(101)], [100.0 + n for n in range(101)], (0, 0))
-    found = {sent: _measured(sender, receiver, transfer(Protocol.UDP), sent) for sent in (101, 151, 202, 203)}
-    assert all(delays.one_way_median_s == pytest.approx(0.150, abs=1e-5) for delays in found.values())
-    assert found[101].one_way_median_sent_s == found[101].one_way_median_s
-    assert found[151].one_way_median_sent_s == pytest.approx(0.175, abs=1e-5)
-    assert found[202].one_way_median_sent_s is found[203].one_way_median_sent_s is None
+    measures = {sent: _measured(sender, receiver, transfer(Protocol.UDP), sent) for sent in (101, 151, 202, 203)}
+    assert all(delays.one_way_median_s == pytest.approx(0.150, abs=1e-5) for delays in measures.values())
+    assert measures[101].one_way_median_sent_s == measures[101].one_way_median_s
+    assert measures[151].one_way_median_sent_s == pytest.approx(0.175, abs=1e-5)
+    assert measures[202].one_way_median_sent_s is measures[203].one_way_median_sent_s is None
 
 
-def test_packets_that_overtake_others_and_ones_of_another_transfer() -> None:
-    """Sent every 10 ms, the second arrives last: in the order of arrival delays are 100, 100, 100, 300 ms."""
+def test_reordered_packets_and_packets_of_another_transfer() -> None:
+    """Sent every 10 ms, the second arrives last: delays in the order of arrival are 100, 100, 100, 300 ms."""
     sender, receiver = _exchange([0.0, 10.0, 20.0, 30.0], [100.0, 300.0, 100.0, 100.0], (5.0, 0))
-    other = [Frame(START_NS + n * MILLISECOND_NS, one) for n in range(9) for one in datagram(900 + n, 3000, port=9)]
-    later = [replace(one, time_ns=one.time_ns + 5_000_000_000) for one in other]
-    sender, receiver = Packets.joined((sender, packets(other))), Packets.joined((receiver, packets(later)))
-    found = _measured(sender, receiver, transfer(Protocol.UDP))
-    assert found.jitter_s == pytest.approx(0.2 / 16)
-    assert found.delay_variation_p95_s == pytest.approx(0.2 * 0.85), "the other transfer's are 5 s late"
-    assert found.one_way_mean_s == pytest.approx(0.150, abs=1e-5)
+    other = [
+        Frame(START_NS + n * MILLISECOND_NS, packet) for n in range(9) for packet in datagram(900 + n, 3000, port=9)
+    ]
+    later = [replace(frame, time_ns=frame.time_ns + 5_000_000_000) for frame in other]
+    sender, receiver = (
+        Packets.concatenated((sender, packets(other))),
+        Packets.concatenated((receiver, packets(later))),
+    )
+    measures = _measured(sender, receiver, transfer(Protocol.UDP))
+    assert measures.jitter_s == pytest.approx(0.2 / 16)
+    assert measures.delay_variation_p95_s == pytest.approx(0.2 * 0.85), "the other transfer's are 5 s late"
+    assert measures.one_way_mean_s == pytest.approx(0.150, abs=1e-5)
 
 
-def test_jitter_is_that_of_the_rfcs_own_loop() -> None:
+def test_jitter_equals_the_loop_of_the_rfc() -> None:
     """RFC 3550, appendix A.8."""
     transit_ns = np.random.default_rng(1).integers(-(10**9), 10**9, 300)
     j = 0.0
-    for one, two in pairwise(transit_ns):
-        j += (abs(two - one) / 1e9 - j) / 16
+    for previous, current in pairwise(transit_ns):
+        j += (abs(current - previous) / 1e9 - j) / 16
     assert delay.jitter_s(transit_ns) == pytest.approx(j)
     assert delay.jitter_s(transit_ns[:1]) is None
 
 
-def test_of_tcp_with_offload_a_frame_arrives_with_its_last_byte() -> None:
-    """A super-frame of three segments, its last one joined by none; the one sent twice is anybody's guess."""
+def test_with_offload_a_tcp_frame_arrives_with_its_last_byte() -> None:
+    """A superframe of three segments, of which the last arrives separately; the segment sent twice is ambiguous."""
     isn = 2**32 - 1500
     sent = [(0, segment(isn, 0, flags=2)), (10, segment(isn + 1, 3000)), (20, segment(isn + 3001, 1000))]
     sent += [(60, segment(isn + 3001, 1000)), (70, segment(isn + 4001, 500))]
     back = segment(9, 0, sport=1234, port=40000)
     back = back[:12] + back[16:20] + back[12:16] + back[20:]
-    came = [(1, sent[0][1]), *((110 + 5 * n, segment(isn + 1 + 1000 * n, 1000)) for n in range(3))]
-    came += [(150, segment(isn + 3001, 1000)), (200, sent[-1][1])]
+    arrivals = [(1, sent[0][1]), *((110 + 5 * n, segment(isn + 1 + 1000 * n, 1000)) for n in range(3))]
+    arrivals += [(150, segment(isn + 3001, 1000)), (200, sent[-1][1])]
     sender, receiver = (
         packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames)
-        for frames in ([*sent, (3, back)], [*came, (2, back)])
+        for frames in ([*sent, (3, back)], [*arrivals, (2, back)])
     )
-    found = _measured(sender, receiver, transfer(Protocol.TCP))
-    assert found.one_way_error_s == pytest.approx(0.001, abs=0.2e-3)
-    assert found.one_way_min_s == pytest.approx(0.110, abs=1e-5), "of the super-frame's last byte"
-    assert found.one_way_mean_s == pytest.approx((0.110 + 0.130) / 2, abs=1e-5)
+    measures = _measured(sender, receiver, transfer(Protocol.TCP))
+    assert measures.one_way_error_s == pytest.approx(0.001, abs=0.2e-3)
+    assert measures.one_way_min_s == pytest.approx(0.110, abs=1e-5), "of the super-frame's last byte"
+    assert measures.one_way_mean_s == pytest.approx((0.110 + 0.130) / 2, abs=1e-5)
 
 
-def test_of_tcp_a_frame_lost_is_not_the_one_that_was_sent_again_within_a_larger_one() -> None:
-    """Two segments are lost, and sent again as one super-frame, of which they arrive singly 10 ms later."""
+def test_a_lost_tcp_frame_does_not_match_a_retransmission_in_a_larger_frame() -> None:
+    """Two segments are lost and sent again as one superframe; they arrive separately 10 ms later."""
     sent = [(0, segment(0, 0, flags=2)), (10, segment(1, 1000)), (12, segment(1001, 1000)), (14, segment(2001, 1000))]
-    came = [(10, sent[0][1]), (24, sent[3][1]), (310, sent[1][1]), (310, sent[2][1])]
+    arrivals = [(10, sent[0][1]), (24, sent[3][1]), (310, sent[1][1]), (310, sent[2][1])]
     sent += [(300, segment(1, 2000))]
     sender, receiver = (
-        packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, came)
+        packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, arrivals)
     )
     own = delay.tcp_frames(tcp.cross(sender, receiver, transfer(Protocol.TCP)))
     assert ((own.receiver_ns - own.sender_ns) / MILLISECOND_NS).tolist() == [10, 10]
@@ -256,12 +261,18 @@ WITHHELD: dict[str, Change] = {
 
 
 @pytest.mark.parametrize("why", WITHHELD)
-def test_what_cannot_be_known_is_empty_and_says_why(why: str) -> None:
+def test_unknown_values_are_empty_with_a_reason(why: str) -> None:
     sender, receiver = _exchange([0.0, 1.0, 2.0], [1.0, 1.0, 1.5], (12.0, 0))
-    found = _measured(*WITHHELD[why](sender, receiver), transfer(Protocol.UDP))
-    assert found.one_way_withheld == why
-    assert found.one_way_min_s is found.one_way_median_s is found.one_way_mean_s is found.one_way_p95_s is None
+    measures = _measured(*WITHHELD[why](sender, receiver), transfer(Protocol.UDP))
+    assert measures.one_way_withheld == why
+    assert (
+        measures.one_way_min_s
+        is measures.one_way_median_s
+        is measures.one_way_mean_s
+        is measures.one_way_p95_s
+        is None
+    )
     uncertain = why.startswith("the error")
-    assert (found.one_way_error_s is not None) == (found.clock_offset_s is not None) == uncertain
-    # What needs no common clock is there as long as packets and times are, and clocks go evenly.
-    assert (found.jitter_s is None) == (why.startswith(("no packet of", "no offset")) or "times" in why)
+    assert (measures.one_way_error_s is not None) == (measures.clock_offset_s is not None) == uncertain
+    # Values that need no common clock are present if packets and times are and both clocks are steady.
+    assert (measures.jitter_s is None) == (why.startswith(("no packet of", "no offset")) or "times" in why)

@@ -1,4 +1,4 @@
-"""What captures say of an iperf3 test, by packets whose times and sizes are known."""
+"""Columns of an iperf3 test from captures with known times and sizes of packets."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ START = 1_700_000_000_000_000_000
 
 
 def udp_frames(count: int) -> list[Frame]:
-    """A greeting of 4 bytes, then datagrams; among them packets of another port, and of another size."""
+    """A datagram of the setup with 4 bytes, then datagrams; among them packets with another port or size."""
     data = [datagram(index, PAYLOAD_BYTES)[0] for index in range(count)]
     frames = [Frame(START - 10**9, datagram(9_000, 4)[0]), *timed(data, start_ns=START, step_ns=EVERY_NS)]
     strange = [datagram(9_001, PAYLOAD_BYTES, sport=40001)[0], datagram(9_002, PAYLOAD_BYTES, port=5202)[0]]
@@ -38,73 +38,73 @@ def tcp_frames(count: int, *, again: tuple[int, ...] = ()) -> list[Frame]:
 
 
 def measured(flow: LoadFlow, sent: list[Frame], received: list[Frame]) -> dict[str, object]:
-    found = load.measure(flow, packets(sent), packets(received))
-    assert found.values.keys() | found.missing.keys() == {column.name for column in load.COLUMNS}
-    return dict(found.values)
+    result = load.measure(flow, packets(sent), packets(received))
+    assert result.values.keys() | result.missing.keys() == {column.name for column in load.COLUMNS}
+    return dict(result.values)
 
 
-def test_the_rate_is_that_of_the_datagrams_in_the_seconds_that_count() -> None:
+def test_the_rate_is_that_of_the_datagrams_in_the_measured_seconds() -> None:
     frames = udp_frames(400)
-    found = measured(UDP, frames, frames)
-    assert found == {"iperf3_captured_bit_s": RATE, "iperf3_captured_loss": 0.0}
+    result = measured(UDP, frames, frames)
+    assert result == {"iperf3_captured_bit_s": RATE, "iperf3_captured_loss": 0.0}
 
 
 @given(st.sets(st.integers(0, 399), max_size=399))
 def test_losses_are_those_of_the_radio(lost: set[int]) -> None:
     sent = udp_frames(400)
     received = [frame for index, frame in enumerate(sent) if index - 1 not in lost]
-    found = measured(UDP, sent, received)
-    assert found["iperf3_captured_loss"] == pytest.approx(len(lost) / 400)
+    result = measured(UDP, sent, received)
+    assert result["iperf3_captured_loss"] == pytest.approx(len(lost) / 400)
     first = min(set(range(400)) - lost)
     inside = sum(index not in lost for index in range(first + 100, min(first + 300, 400)))
-    assert found["iperf3_captured_bit_s"] == pytest.approx(8 * PAYLOAD_BYTES * inside / 2.0)
+    assert result["iperf3_captured_bit_s"] == pytest.approx(8 * PAYLOAD_BYTES * inside / 2.0)
 
 
-def test_bytes_that_come_again_count_once_in_the_rate() -> None:
+def test_retransmitted_bytes_count_once_in_the_rate() -> None:
     sent = tcp_frames(400, again=tuple(range(0, 400, 10)))
-    found = measured(TCP, sent, sent)
-    assert found == {"iperf3_captured_bit_s": RATE, "iperf3_captured_loss": 0.0}
+    result = measured(TCP, sent, sent)
+    assert result == {"iperf3_captured_bit_s": RATE, "iperf3_captured_loss": 0.0}
 
 
-def test_what_was_sent_again_counts_among_what_was_lost() -> None:
+def test_retransmissions_count_in_the_loss() -> None:
     again = tuple(range(0, 400, 10))
-    found = measured(TCP, tcp_frames(400, again=again), tcp_frames(400))
+    result = measured(TCP, tcp_frames(400, again=again), tcp_frames(400))
     sent_bytes = 440 * PAYLOAD_BYTES + COOKIE
-    assert found["iperf3_captured_loss"] == pytest.approx(40 * PAYLOAD_BYTES / sent_bytes)
-    assert found["iperf3_captured_bit_s"] == RATE
+    assert result["iperf3_captured_loss"] == pytest.approx(40 * PAYLOAD_BYTES / sent_bytes)
+    assert result["iperf3_captured_bit_s"] == RATE
 
 
 def test_streams_are_summed() -> None:
     second = [
-        Frame(one.time_ns, datagram(20_000 + index, PAYLOAD_BYTES, sport=50_000)[0])
-        for index, one in enumerate(udp_frames(400)[1:401])
+        Frame(frame.time_ns, datagram(20_000 + index, PAYLOAD_BYTES, sport=50_000)[0])
+        for index, frame in enumerate(udp_frames(400)[1:401])
     ]
     both = udp_frames(400) + second
     flow = replace(UDP, ports=((40000, PORT), (50000, PORT)))
     assert measured(flow, both, both)["iperf3_captured_bit_s"] == 2 * RATE
 
 
-def test_of_fragments_no_loss_is_told() -> None:
+def test_fragmented_datagrams_have_no_loss() -> None:
     flow = replace(UDP, payload_bytes=3000)
     data = [piece for index in range(400) for piece in datagram(index, 3000)]
     frames = timed(data, start_ns=START, step_ns=EVERY_NS // 3)
-    found = measured(flow, frames, frames)
-    assert "iperf3_captured_loss" not in found
+    result = measured(flow, frames, frames)
+    assert "iperf3_captured_loss" not in result
 
 
 @pytest.mark.parametrize(
     "flow",
     [replace(UDP, ports=()), replace(UDP, window_s=(0.0, 0.0)), replace(UDP, destination_address="10.9.0.9")],
 )
-def test_where_nothing_is_to_be_counted_nothing_is_told(flow: LoadFlow) -> None:
+def test_without_packets_of_the_test_the_columns_are_empty(flow: LoadFlow) -> None:
     frames = udp_frames(400)
     assert "iperf3_captured_bit_s" not in measured(flow, frames, frames)
 
 
-def test_a_connection_whose_beginning_was_not_captured_has_no_rate() -> None:
+def test_a_connection_without_a_captured_syn_has_no_rate() -> None:
     frames = tcp_frames(400)
     assert "iperf3_captured_bit_s" not in measured(TCP, frames, frames[1:])
 
 
-def test_without_both_captures_nothing_is_told() -> None:
+def test_without_both_captures_the_columns_are_empty() -> None:
     assert not load.measure(UDP, None, packets(udp_frames(3))).values

@@ -23,16 +23,16 @@ sizes = st.lists(st.integers(0, 9000), min_size=1, max_size=8)
 
 
 def length(data: bytes) -> int:
-    """Bytes of an IPv4 packet, header included, as the header tells."""
+    """Bytes of an IPv4 packet including its header, by the header."""
     return int.from_bytes(data[2:4], "big")
 
 
 def through_link(data: Sequence[bytes], start_ns: int = START_NS) -> list[Frame]:
-    """Each packet when its last bit has come over a link of 1 Mbit/s that never rests."""
+    """Each packet at the time its last bit arrives over a link of 1 Mbit/s that is always busy."""
     frames, at_ns = [], start_ns
-    for one in data:
-        at_ns += 8 * length(one) * NS_PER_BIT
-        frames.append(Frame(at_ns, one, wire_bytes=len(one)))
+    for packet in data:
+        at_ns += 8 * length(packet) * NS_PER_BIT
+        frames.append(Frame(at_ns, packet, wire_bytes=len(packet)))
     return frames
 
 
@@ -47,41 +47,41 @@ def of_tcp(sent: list[Frame], received: list[Frame]) -> Rates:
 
 
 @given(sizes)
-def test_of_a_busy_link_the_throughput_is_its_rate_and_the_goodput_less_by_the_headers(sizes: list[int]) -> None:
-    sent = [one for ip_id, size in enumerate(sizes) for one in datagram(ip_id, size)]
-    found = of_udp(timed(sent), through_link(sent))
+def test_on_a_busy_link_throughput_is_its_rate_and_goodput_excludes_headers(sizes: list[int]) -> None:
+    sent = [packet for ip_id, size in enumerate(sizes) for packet in datagram(ip_id, size)]
+    result = of_udp(timed(sent), through_link(sent))
     if len(sent) == 1:
-        assert (found.throughput_bit_s, found.values(sum(sizes))["goodput_bit_s"]) == (None, None)
+        assert (result.throughput_bit_s, result.values(sum(sizes))["goodput_bit_s"]) == (None, None)
         return
-    assert found.throughput_bit_s == pytest.approx(1e6)
+    assert result.throughput_bit_s == pytest.approx(1e6)
     lengths = list(map(length, sent))
-    assert found.completion_s == pytest.approx(8 * sum(lengths[1:]) / 1e6)
+    assert result.completion_s == pytest.approx(8 * sum(lengths[1:]) / 1e6)
     payload = sum(sizes) - (min(lengths[0] - 20, 1480) - 8)
-    assert found.values(sum(sizes))["goodput_bit_s"] == pytest.approx(1e6 * payload / sum(lengths[1:]))
+    assert result.values(sum(sizes))["goodput_bit_s"] == pytest.approx(1e6 * payload / sum(lengths[1:]))
 
 
 @given(sizes, st.data())
-def test_lost_and_copied_fragments_count_as_they_came(sizes: list[int], data: st.DataObject) -> None:
+def test_lost_and_copied_fragments_count_as_they_arrived(sizes: list[int], data: st.DataObject) -> None:
     cut = [datagram(ip_id, size) for ip_id, size in enumerate(sizes)]
-    sent = timed([one for fragments in cut for one in fragments])
+    sent = timed([packet for fragments in cut for packet in fragments])
     times = data.draw(st.lists(st.sampled_from((0, 1, 1, 2)), min_size=len(sent), max_size=len(sent)))
-    came = [one.data for one, count in zip(sent, times, strict=True) for _ in range(count)]
-    received = through_link(came)
-    found = of_udp(sent, received)
+    arrived = [packet.data for packet, count in zip(sent, times, strict=True) for _ in range(count)]
+    received = through_link(arrived)
+    result = of_udp(sent, received)
 
-    later = sum(map(length, came[1:]))
-    assert found.throughput_bit_s == (pytest.approx(1e6) if later else None)
+    later = sum(map(length, arrived[1:]))
+    assert result.throughput_bit_s == (pytest.approx(1e6) if later else None)
     ends, at = [], 0
     for fragments in cut:
         if all(times[at : at + len(fragments)]):
             last = sum(times[: at + len(fragments)]) - times[at + len(fragments) - 1]
             ends.append(received[last].time_ns)
         at += len(fragments)
-    assert found.completion_s == (pytest.approx((max(ends) - received[0].time_ns) / 1e9) if ends else None)
+    assert result.completion_s == (pytest.approx((max(ends) - received[0].time_ns) / 1e9) if ends else None)
 
 
 def stream(total: int, *, joined: int = 1, again: Sequence[int] = ()) -> list[bytes]:
-    """A connection's frames on their way there, `joined` segments each; those of `again` are repeated at the end."""
+    """Frames of a connection with `joined` segments each; those at the indices `again` are repeated at the end."""
     starts = list(range(0, total, joined * SEGMENT))
     starts += [starts[index] for index in again]
     data = [segment(ISN + 1 + at, min(joined * SEGMENT, total - at)) for at in starts]
@@ -89,40 +89,40 @@ def stream(total: int, *, joined: int = 1, again: Sequence[int] = ()) -> list[by
 
 
 def closed(received: list[Frame], after_ns: int, acked: int) -> list[Frame]:
-    """The receiver's FIN so long after the last frame, having got so many bytes and the sender's FIN."""
+    """The receiver's FIN `after_ns` after the last frame, acknowledging `acked` bytes and the sender's FIN."""
     at_ns = received[-1].time_ns + after_ns
     return [*received, Frame(at_ns, segment(77, 0, flags=FIN_ACK, ack=ISN + 1 + acked + 1, back=True))]
 
 
 @given(st.integers(2 * SEGMENT, 60_000), st.integers(0, 10**9))
 def test_tcp_ends_when_the_receiver_closes(total: int, after_ns: int) -> None:
-    """The sequence numbers wrap in most of them."""
+    """In most examples the sequence numbers wrap."""
     sent = stream(total)
     received = through_link(sent)
-    found = of_tcp(timed(sent), closed(received, after_ns, total))
-    assert found.throughput_bit_s == pytest.approx(1e6)
+    result = of_tcp(timed(sent), closed(received, after_ns, total))
+    assert result.throughput_bit_s == pytest.approx(1e6)
     completion_s = (received[-1].time_ns + after_ns - received[0].time_ns) / 1e9
-    assert found.completion_s == pytest.approx(completion_s)
-    assert found.values(total)["goodput_bit_s"] == pytest.approx(8 * total / completion_s)
+    assert result.completion_s == pytest.approx(completion_s)
+    assert result.values(total)["goodput_bit_s"] == pytest.approx(8 * total / completion_s)
 
 
-def test_retransmissions_are_throughput_and_no_goodput() -> None:
+def test_retransmissions_count_in_throughput_but_not_in_goodput() -> None:
     total, sent = 10 * SEGMENT, stream(10 * SEGMENT, again=[3, 3, 4])
     received = through_link(sent)
-    found = of_tcp(timed(sent), closed(received, 0, total))
-    assert found.throughput_bit_s == pytest.approx(1e6)
+    result = of_tcp(timed(sent), closed(received, 0, total))
+    assert result.throughput_bit_s == pytest.approx(1e6)
     took_s = (received[-1].time_ns - received[0].time_ns) / 1e9
-    assert found.values(total)["goodput_bit_s"] == pytest.approx(8 * total / took_s)
+    assert result.values(total)["goodput_bit_s"] == pytest.approx(8 * total / took_s)
 
 
 @pytest.mark.parametrize("joined", [2, 10, 40])
 def test_segments_that_offload_joined_have_the_throughput_of_the_link(joined: int) -> None:
     sent = timed(stream(120 * SEGMENT))
     at_ns, frames = START_NS, []
-    for one in stream(120 * SEGMENT, joined=joined):
-        payload = length(one) - HEADERS
-        at_ns += 8 * NS_PER_BIT * (length(one) + max(0, -(-payload // SEGMENT) - 1) * HEADERS)
-        frames.append(Frame(at_ns, one, wire_bytes=length(one)))
+    for packet in stream(120 * SEGMENT, joined=joined):
+        payload = length(packet) - HEADERS
+        at_ns += 8 * NS_PER_BIT * (length(packet) + max(0, -(-payload // SEGMENT) - 1) * HEADERS)
+        frames.append(Frame(at_ns, packet, wire_bytes=length(packet)))
     assert of_tcp(sent, frames).throughput_bit_s == pytest.approx(1e6)
 
 
@@ -137,15 +137,15 @@ def test_segments_that_offload_joined_have_the_throughput_of_the_link(joined: in
     ],
     ids=["none", "open", "early", "another's", "sender's"],
 )
-def test_without_a_close_after_all_bytes_nobody_knows_that_the_program_had_the_file(ending: list[bytes]) -> None:
+def test_without_a_close_after_all_bytes_there_is_no_completion_time(ending: list[bytes]) -> None:
     received = timed([*stream(5000), *ending])
-    found = of_tcp(timed(stream(5000)), received)
-    assert (found.completion_s, found.values(5000)["goodput_bit_s"]) == (None, None)
-    assert found.throughput_bit_s is not None
+    result = of_tcp(timed(stream(5000)), received)
+    assert (result.completion_s, result.values(5000)["goodput_bit_s"]) == (None, None)
+    assert result.throughput_bit_s is not None
 
 
-def test_what_has_no_time_has_no_rate() -> None:
-    sent = [one for ip_id in range(3) for one in datagram(ip_id, 8192)]
+def test_without_times_there_is_no_rate() -> None:
+    sent = [packet for ip_id in range(3) for packet in datagram(ip_id, 8192)]
     at_once = [replace(frame, time_ns=START_NS) for frame in timed(sent)]
     assert of_udp(timed(sent), at_once).values(3 * 8192) == {
         "throughput_bit_s": None,
@@ -156,7 +156,7 @@ def test_what_has_no_time_has_no_rate() -> None:
     assert of_tcp(timed(stream(5000)), timed(stream(0))) == Rates(None, None)
 
 
-def test_a_transfer_of_which_nothing_reached_the_program_has_a_goodput_of_none() -> None:
-    sent = [one for ip_id in range(3) for one in datagram(ip_id, 8192)]
+def test_a_transfer_without_a_received_file_has_no_goodput() -> None:
+    sent = [packet for ip_id in range(3) for packet in datagram(ip_id, 8192)]
     assert of_udp(timed(sent), timed(sent)).values(0)["goodput_bit_s"] == 0
     assert of_udp(timed(sent), timed(sent)).values(None)["goodput_bit_s"] is None

@@ -1,4 +1,4 @@
-"""Records of equal length are looked through in leaps; the frames found are those of one record after the other."""
+"""Scans of pcap records of equal length in leaps find the same frames as a scan record by record."""
 
 import struct
 
@@ -12,7 +12,7 @@ runs = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 200)), min_size=1, 
 
 
 def records(data: bytes) -> list[int]:
-    """Return where each record's frame starts, by the file's own lengths."""
+    """Return the start of each record's frame from the record headers."""
     at, starts = 24, []
     while at < len(data):
         starts.append(at + 16)
@@ -33,8 +33,8 @@ def test_runs_of_any_lengths(some: list[tuple[int, int]], chunk_bytes: int) -> N
 def test_a_run_cut_anywhere_gives_what_is_before_the_cut(cut: int) -> None:
     whole = file_bytes([Frame(index, segment(index, 0)) for index in range(100)])
     data = whole[: max(24, len(whole) - cut)]
-    found = pcap.parse(data, where="test")
+    capture = pcap.parse(data, where="test")
     per_packet = len(segment(0, 0)) + 16
-    assert len(found.packets) == (len(data) - 24) // per_packet
-    assert (found.damage is None) == ((len(data) - 24) % per_packet == 0)
-    assert found.packets.tcp_seq.tolist() == list(range(len(found.packets)))
+    assert len(capture.packets) == (len(data) - 24) // per_packet
+    assert (capture.damage is None) == ((len(data) - 24) % per_packet == 0)
+    assert capture.packets.tcp_seq.tolist() == list(range(len(capture.packets)))

@@ -1,4 +1,4 @@
-"""Packets that something between the captures makes others of: seen, told, and nothing counted."""
+"""Packets that are altered between the captures are detected and reported, and give no counts."""
 
 import struct
 from collections.abc import Callable
@@ -22,8 +22,8 @@ from tests.helpers.plans import problems
 Change = Callable[[bytes], bytes]
 
 ROUTER = "10.9.0.77"
-TRANSLATED = "an address or a port is translated on the way"
-CHANGED = "they are changed on the way, or the sender's capture lacks them"
+TRANSLATED = "a router on the path translates an address or a port"
+CHANGED = "they were changed on the path, or the sender's capture is incomplete"
 
 
 def _put(at: int, form: str, value: int) -> Change:
@@ -44,7 +44,7 @@ def _added(at: int, form: str, more: int) -> Change:
 
 
 def _port(packet: bytes) -> bytes:
-    """Only what has a port has another one: of a datagram's fragments the first."""
+    """Change the port of packets that have one: only the first fragment of a datagram."""
     return packet if packet[6:8] not in {b"\0\0", b"\x20\0", b"\x40\0"} else _put(20, ">H", 55_555)(packet)
 
 
@@ -53,14 +53,14 @@ target = _put(16, ">I", int.from_bytes(bytes((10, 9, 0, 78))))
 WAYS: dict[str, tuple[Change, str]] = {
     "the source's address": (source, TRANSLATED),
     "the target's address": (target, TRANSLATED),
-    "the source's address and port": (lambda one: _port(source(one)), TRANSLATED),
+    "the source's address and port": (lambda packet: _port(source(packet)), TRANSLATED),
     "the source's port": (_port, TRANSLATED),
 }
 
 
 def _udp(change: Change, *, kept_of: int = 10, ip_id: int | None = None) -> tuple[list[Frame], list[Frame]]:
-    """36 datagrams of six fragments, of which one in `kept_of` packets is lost."""
-    cut = [one for number in range(36) for one in datagram(number if ip_id is None else ip_id, 8192)]
+    """36 datagrams of six fragments; one in `kept_of` packets is lost."""
+    cut = [packet for number in range(36) for packet in datagram(number if ip_id is None else ip_id, 8192)]
     sent = timed(cut)
     return sent, [
         Frame(frame.time_ns, change(frame.data), 2000) for at, frame in enumerate(sent) if at % kept_of != 3
@@ -69,7 +69,7 @@ def _udp(change: Change, *, kept_of: int = 10, ip_id: int | None = None) -> tupl
 
 def _tcp(change: Change, *, stamped: bool = True) -> tuple[list[Frame], list[Frame]]:
     truth = links.tcp(Link(4, loss=0.1), 200, ids=True, offload=10, stamped=stamped)
-    return truth.sender, [Frame(one.time_ns, change(one.data), one.wire_bytes) for one in truth.receiver]
+    return truth.sender, [Frame(frame.time_ns, change(frame.data), frame.wire_bytes) for frame in truth.receiver]
 
 
 def _why(captures: tuple[list[Frame], list[Frame]], protocol: Protocol) -> str | None:
@@ -79,71 +79,71 @@ def _why(captures: tuple[list[Frame], list[Frame]], protocol: Protocol) -> str |
 
 @pytest.mark.parametrize("protocol", Protocol)
 @pytest.mark.parametrize("what", WAYS)
-def test_a_translation_is_told(what: str, protocol: Protocol) -> None:
+def test_a_translated_address_or_port_is_reported(what: str, protocol: Protocol) -> None:
     change, why = WAYS[what]
-    found = _why(_udp(change) if protocol is Protocol.UDP else _tcp(change), protocol)
-    assert found
-    assert found.endswith(why)
-    assert f"as {SENDER}:40000 > {RECEIVER}:{PORT} and reached the receiver as " in found
-    assert not what.endswith("port") or ":55555 > " in found
+    reason = _why(_udp(change) if protocol is Protocol.UDP else _tcp(change), protocol)
+    assert reason
+    assert reason.endswith(why)
+    assert f"as {SENDER}:40000 > {RECEIVER}:{PORT} and reached the receiver as " in reason
+    assert not what.endswith("port") or ":55555 > " in reason
 
 
 @pytest.mark.parametrize(
     "change", [_added(24, ">I", 1 << 31), _added(44, ">I", 77_777)], ids=["sequence numbers", "time stamps"]
 )
-def test_a_firewall_that_gives_other_numbers_is_told(change: Change) -> None:
-    found = _why(_tcp(change), Protocol.TCP)
-    assert found
-    assert found.endswith(CHANGED)
+def test_changed_sequence_numbers_are_reported(change: Change) -> None:
+    reason = _why(_tcp(change), Protocol.TCP)
+    assert reason
+    assert reason.endswith(CHANGED)
 
 
-def test_a_router_that_gives_other_ids_is_told() -> None:
-    found = _why(_udp(_added(4, ">H", 30_000)), Protocol.UDP)
-    assert found
-    assert found.endswith(CHANGED)
+def test_changed_ids_are_reported() -> None:
+    reason = _why(_udp(_added(4, ">H", 30_000)), Protocol.UDP)
+    assert reason
+    assert reason.endswith(CHANGED)
 
 
-def test_a_port_that_changes_in_the_middle_is_told() -> None:
-    """As a router does that forgot the flow: half of the packets arrive as they were sent."""
-    sent, received = _udp(lambda one: one)
+def test_a_port_that_changes_during_the_transfer_is_reported() -> None:
+    """Like a router that lost its state for the flow: half of the packets arrive as they were sent."""
+    sent, received = _udp(lambda packet: packet)
     half = len(received) // 2
     later = [Frame(frame.time_ns, _port(frame.data), 2000) for frame in received[half:]]
-    found = _why((sent, [*received[:half], *later]), Protocol.UDP)
-    assert found
-    assert found.endswith(TRANSLATED)
+    reason = _why((sent, [*received[:half], *later]), Protocol.UDP)
+    assert reason
+    assert reason.endswith(TRANSLATED)
 
 
-def test_what_the_senders_capture_lacks_is_told() -> None:
-    sent, received = _udp(lambda one: one)
+def test_packets_missing_in_the_senders_capture_are_reported() -> None:
+    sent, received = _udp(lambda packet: packet)
     assert str(_why((sent[60:], received), Protocol.UDP)).endswith(CHANGED)
 
 
 @pytest.mark.parametrize("protocol", Protocol)
-def test_packets_that_the_sender_captured_on_two_interfaces_are_told(protocol: Protocol) -> None:
-    """As `-i any` does where packets pass a bridge or a VLAN: they would be half lost, or sent again."""
-    sent, received = _udp(lambda one: one) if protocol is Protocol.UDP else _tcp(lambda one: one)
-    twice = [one for frame in sent for one in (frame, replace(frame, time_ns=frame.time_ns + 5000))]
-    found = _why((twice, received), protocol)
-    assert found
-    assert "in the sender's capture are there twice" in found
-    assert _why((sent, [*received, *received]), protocol) is None, "a link may copy"
+def test_packets_captured_on_two_interfaces_are_reported(protocol: Protocol) -> None:
+    """As with `-i any` if packets pass a bridge or a VLAN: they would appear as lost or retransmitted."""
+    sent, received = _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
+    twice = [packet for frame in sent for packet in (frame, replace(frame, time_ns=frame.time_ns + 5000))]
+    reason = _why((twice, received), protocol)
+    assert reason
+    assert "in the sender's capture occur twice" in reason
+    assert _why((sent, [*received, *received]), protocol) is None, "a link may duplicate packets"
 
 
 @pytest.mark.parametrize("end", ["sender", "receiver"])
 @pytest.mark.parametrize(
     ("protocol", "kept"), [(Protocol.UDP, 2), (Protocol.UDP, 4), (Protocol.TCP, 2), (Protocol.TCP, 8)]
 )
-def test_a_snap_length_within_the_headers_makes_no_loss(protocol: Protocol, kept: int, end: str) -> None:
-    """Without ports all of it seems lost, or never sent; without sequence numbers, no payload of TCP."""
-    sent, received = _udp(lambda one: one) if protocol is Protocol.UDP else _tcp(lambda one: one)
-    cut = [replace(one, data=one.data[: 20 + kept]) for one in (sent if end == "sender" else received)]
-    found = _why((cut, received) if end == "sender" else (sent, cut), protocol)
-    assert found
-    assert f"in the {end}'s capture were cut off before the end of their TCP or UDP header" in found
+def test_a_snap_length_within_the_headers_does_not_appear_as_loss(protocol: Protocol, kept: int, end: str) -> None:
+    """Without ports everything appears lost or never sent; without sequence numbers TCP has no payload."""
+    sent, received = _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
+    cut = [replace(packet, data=packet.data[: 20 + kept]) for packet in (sent if end == "sender" else received)]
+    reason = _why((cut, received) if end == "sender" else (sent, cut), protocol)
+    assert reason
+    assert f"in the {end}'s capture were truncated in their TCP or UDP header" in reason
 
 
-def test_what_looks_like_it_is_no_translation() -> None:
-    sent, received = _udp(lambda one: one)
+def test_similar_traffic_is_not_taken_for_a_translation() -> None:
+    sent, received = _udp(lambda packet: packet)
     stranger = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
     of_another = [Frame(frame.time_ns, source(frame.data), 2000) for frame in stranger]
     translated_here = [Frame(frame.time_ns, target(frame.data), 2000) for frame in received]
@@ -162,7 +162,7 @@ def test_what_looks_like_it_is_no_translation() -> None:
 
 @given(st.integers(0, 2**32), st.sampled_from((1, 40)), st.booleans(), st.booleans())
 @settings(max_examples=30)
-def test_a_link_that_loses_copies_and_reorders_translates_nothing(
+def test_losses_copies_and_reordering_are_not_taken_for_a_translation(
     seed: int, offload: int, ids: bool, stamped: bool
 ) -> None:
     link = Link(seed, loss=0.3, copied=0.1, late=0.1)
@@ -172,33 +172,33 @@ def test_a_link_that_loses_copies_and_reorders_translates_nothing(
 
 @pytest.mark.parametrize("what", WAYS)
 @pytest.mark.parametrize("protocol", Protocol)
-def test_nothing_is_counted_of_what_does_not_compare(tmp_path: Path, what: str, protocol: Protocol) -> None:
+def test_captures_that_cannot_be_compared_give_no_counts(tmp_path: Path, what: str, protocol: Protocol) -> None:
     change, _ = WAYS[what]
     sent, received = _udp(change) if protocol is Protocol.UDP else _tcp(change)
     (tmp_path / "sender.pcap").write_bytes(file_bytes(sent))
     (tmp_path / "receiver.pcap").write_bytes(file_bytes(received))
-    found = measure(tmp_path, transfer(protocol))
-    assert TRANSLATED in found.one_way_withheld
+    measures = measure(tmp_path, transfer(protocol))
+    assert TRANSLATED in measures.one_way_withheld
     layers = ("ip_", "datagram", "byte_", "tcp_", "paper_received", "paper_loss", "jitter", "transfer_s")
-    assert not [name for name in found if name.startswith(layers)]
+    assert not [name for name in measures if name.startswith(layers)]
     assert fates.read(AttemptEvidence(tmp_path), transfer(protocol)) is None
     other = measure(tmp_path, replace(transfer(protocol), port=9))
     assert not other.ip_packets_sent
 
 
 def _planned(packet: bytes) -> bytes:
-    """Between the robots of the plan, 10.42.0.1 and 10.42.0.2."""
+    """A packet between the addresses of the plan's robots, 10.42.0.1 and 10.42.0.2."""
     return _put(16, ">I", 0x0A2A0002)(_put(12, ">I", 0x0A2A0001)(packet))
 
 
-def test_a_repeat_of_which_addresses_are_translated_is_void(tmp_path: Path) -> None:
+def test_a_repeat_with_translated_addresses_is_void(tmp_path: Path) -> None:
     plan = los_plan(protocols=(Protocol.UDP,))
-    sent, received = _udp(lambda one: source(_planned(one)))
-    (tmp_path / "sender.pcap").write_bytes(file_bytes([Frame(one.time_ns, _planned(one.data)) for one in sent]))
+    sent, received = _udp(lambda packet: source(_planned(packet)))
+    (tmp_path / "sender.pcap").write_bytes(file_bytes([Frame(frame.time_ns, _planned(frame.data)) for frame in sent]))
     (tmp_path / "receiver.pcap").write_bytes(file_bytes(received))
     (tmp_path / "recv.bag").write_bytes(b"x")
-    said = problems(plan, Protocol.UDP, tmp_path)
-    assert [one for one in said if "left as 10.42.0.1:40000 > 10.42.0.2:1234" in one], said
+    reasons = problems(plan, Protocol.UDP, tmp_path)
+    assert [reason for reason in reasons if "left as 10.42.0.1:40000 > 10.42.0.2:1234" in reason], reasons
     (tmp_path / "receiver.pcap").write_bytes(file_bytes([]))
-    said = problems(plan, Protocol.UDP, tmp_path)
-    assert [one for one in said if "recv.bag has bytes, and no packet of the transfer" in one], said
+    reasons = problems(plan, Protocol.UDP, tmp_path)
+    assert [reason for reason in reasons if "recv.bag is not empty, but the capture of" in reason], reasons

@@ -1,4 +1,4 @@
-"""Sequence ranges against a model that keeps every byte in a set."""
+"""Counts of sequence ranges compared with a model that has every byte in a set."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -29,38 +29,38 @@ def _frames(isn: int, sent: Iterable[Range], *, syn: bool = True, sport: int = 4
     return opening + [segment(isn + 1 + start, size, sport=sport) for start, size in sent]
 
 
-def _bytes(these: Iterable[Range]) -> Counter[int]:
-    return Counter(byte for start, size in these for byte in range(start, start + size))
+def _bytes(byte_ranges: Iterable[Range]) -> Counter[int]:
+    return Counter(byte for start, size in byte_ranges for byte in range(start, start + size))
 
 
 def _retransmitted(sent: Iterable[Range]) -> int:
-    seen: set[int] = set()
+    sent_before: set[int] = set()
     repeated = 0
     for start, size in sent:
         own = set(range(start, start + size))
-        repeated += bool(own & seen)
-        seen |= own
+        repeated += bool(own & sent_before)
+        sent_before |= own
     return repeated
 
 
 @given(initial, ranges, ranges, st.booleans())
 @settings(max_examples=300)
 def test_ranges_equal_a_model_of_single_bytes(isn: int, sent: list[Range], received: list[Range], syn: bool) -> None:
-    """Any frames at either end: partial overlaps, reordering, duplicates, offload, a sequence number that wraps."""
+    """Any frames at either end: partial overlaps, reordering, duplicates, offload, wrapping sequence numbers."""
     counts = tcp.count(
         tcp.cross(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received, syn=syn))), TCP_TRANSFER)
     )
-    left, came = _bytes(sent), _bytes(received)
-    assert counts.sent_bytes == left.total()
-    assert counts.unique_bytes == len(left)
-    assert counts.received_bytes == (left & came).total()
-    assert counts.lost_bytes == len(set(left) - set(came))
+    sent_bytes, received_bytes = _bytes(sent), _bytes(received)
+    assert counts.sent_bytes == sent_bytes.total()
+    assert counts.unique_bytes == len(sent_bytes)
+    assert counts.received_bytes == (sent_bytes & received_bytes).total()
+    assert counts.lost_bytes == len(set(sent_bytes) - set(received_bytes))
     assert counts.retransmitted_frames == _retransmitted(sent)
     assert (counts.frames_sent, counts.frames_received) == (1 + len(sent), syn + len(received))
 
 
 def _slow_order(sent: list[Range], arrivals: list[int]) -> tuple[int, int]:
-    """Spurious frames, and reordered ones, of frames that arrive as they were sent."""
+    """Return the number of spurious and of reordered frames, for frames that arrive as they were sent."""
     spurious = 0
     for index, (start, size) in enumerate(sent):
         there = _bytes(sent[before] for before in range(index) if before in arrivals)
@@ -71,8 +71,8 @@ def _slow_order(sent: list[Range], arrivals: list[int]) -> tuple[int, int]:
 
 @given(initial, ranges, st.data())
 @settings(max_examples=300)
-def test_what_needs_the_order_equals_a_slow_count(isn: int, sent: list[Range], data: st.DataObject) -> None:
-    """Frames with IP ids of their own, lost, copied and reordered as wholes."""
+def test_counts_that_depend_on_the_order_equal_a_slow_count(isn: int, sent: list[Range], data: st.DataObject) -> None:
+    """Complete frames with unique IP ids are lost, copied and reordered."""
     frames = timed([
         segment(isn, 0, flags=SYN, ip_id=999),
         *(segment(isn + 1 + start, size, ip_id=number) for number, (start, size) in enumerate(sent)),
@@ -82,14 +82,16 @@ def test_what_needs_the_order_equals_a_slow_count(isn: int, sent: list[Range], d
         tcp.cross(packets(frames), packets(timed([frames[1 + index].data for index in arrivals])), TCP_TRANSFER)
     )
     assert (counts.spurious_frames, counts.reordered_frames) == _slow_order(sent, arrivals)
-    came = _bytes(sent[index] for index in arrivals)
-    assert counts.duplicated_bytes == came.total() - len(came)
-    assert (counts.doubtful_frames, counts.superframes) == (0, None)
+    received_bytes = _bytes(sent[index] for index in arrivals)
+    assert counts.duplicated_bytes == received_bytes.total() - len(received_bytes)
+    assert (counts.ambiguous_frames, counts.superframes) == (0, None)
 
 
 @given(initial, st.lists(st.integers(1, 90_000), min_size=1, max_size=6), st.data())
-def test_offload_alone_loses_repeats_and_reorders_nothing(isn: int, sizes: list[int], data: st.DataObject) -> None:
-    """The same stream cut anywhere at either end, in frames of up to 90,000 bytes without a length."""
+def test_offload_alone_is_not_loss_retransmission_or_reordering(
+    isn: int, sizes: list[int], data: st.DataObject
+) -> None:
+    """The same stream divided differently at the two ends, into frames of up to 90,000 bytes without an IP length."""
     end = sum(sizes)
     cuts = sorted(data.draw(st.sets(st.integers(1, end - 1), max_size=9))) if end > 1 else []
     sent = [(sum(sizes[:at]), size) for at, size in enumerate(sizes)]
@@ -97,19 +99,19 @@ def test_offload_alone_loses_repeats_and_reorders_nothing(isn: int, sizes: list[
     both = [
         [
             Frame(10**18 + number, segment(isn, 0, flags=SYN, mss=1460)),
-            *(Frame(10**18 + number, _lengthless(isn + 1 + start, size), 40 + size) for start, size in these),
+            *(Frame(10**18 + number, _lengthless(isn + 1 + start, size), 40 + size) for start, size in ranges),
         ]
-        for number, these in enumerate((sent, received))
+        for number, ranges in enumerate((sent, received))
     ]
     counts = tcp.count(tcp.cross(packets(both[0]), packets(both[1]), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes, counts.lost_bytes) == (end, end, end, 0)
     assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (0, 0, 0)
-    assert (counts.duplicated_bytes, counts.doubtful_frames) == (0, 0)
+    assert (counts.duplicated_bytes, counts.ambiguous_frames) == (0, 0)
     assert counts.superframes == sum(size > 1460 for _, size in [*sent, *received])
 
 
 def _lengthless(seq: int, payload_bytes: int) -> bytes:
-    """A frame whose IP length is 0, as above 64 KiB: the length on the wire tells it."""
+    """A frame whose IP length is 0, as above 64 KiB, so that only the length on the wire is known."""
     whole = segment(seq, payload_bytes)
     return whole[:2] + bytes(2) + whole[4:]
 
@@ -121,13 +123,13 @@ def test_a_retransmission_is_spurious_only_if_an_earlier_copy_arrived() -> None:
         assert (counts.retransmitted_frames, counts.spurious_frames) == (2, spurious), kept
 
 
-def test_without_ids_time_tells_which_of_the_same_bytes_arrived() -> None:
-    """A super-frame of two segments, its second one lost and sent again: what arrived is the retransmission."""
+def test_without_ids_time_shows_which_copy_of_a_byte_arrived() -> None:
+    """A superframe of two segments; the second is lost and sent again: the retransmission arrived."""
     second = 1_000_000_000
     frames = [segment(0, 0, flags=SYN), segment(1, 2000), segment(2001, 1000), segment(1001, 1000)]
-    sent = packets([Frame(second + at * 10**8, one) for at, one in enumerate(frames)])
+    sent = packets([Frame(second + at * 10**8, frame) for at, frame in enumerate(frames)])
     arrivals = [(0, segment(0, 0, flags=SYN)), (1, segment(1, 1000)), (2, segment(2001, 1000)), (3, frames[3])]
-    received = packets([Frame(second * 5 + at * 10**8, one) for at, one in arrivals])
+    received = packets([Frame(second * 5 + at * 10**8, frame) for at, frame in arrivals])
     counts = tcp.count(tcp.cross(sent, received, TCP_TRANSFER))
     assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (1, 0, 0)
     assert (counts.lost_bytes, counts.duplicated_bytes) == (0, 0)
@@ -140,11 +142,11 @@ def test_captures_that_started_late_or_ended_early() -> None:
     early_sender = tcp.count(tcp.cross(packets(whole[:5]), packets(whole), TCP_TRANSFER))
     assert (early_sender.sent_bytes, early_sender.received_bytes, early_sender.lost_bytes) == (4000, 4000, 0)
     assert early_sender.duplicated_bytes == 0
-    # Without its beginning nobody knows what a connection is of.
+    # Without its SYN it is unknown to which transfer a connection belongs.
     assert tcp.count(tcp.cross(packets(whole[1:]), packets(whole), TCP_TRANSFER)).sent_bytes == 0
 
 
-def test_super_frames_at_either_end_count_as_their_segments() -> None:
+def test_superframes_at_either_end_count_as_their_segments() -> None:
     segments = [(start, 1448) for start in range(0, 14480, 1448)]
     joined = [(0, 7240), (7240, 7240)]
     isn = 2**32 - 5000
@@ -167,15 +169,15 @@ def test_a_retransmission_that_repairs_a_loss() -> None:
     assert (counts.lost_bytes, counts.retransmitted_frames) == (0, 1)
 
 
-def test_syn_and_fin_take_sequence_numbers_but_are_no_bytes() -> None:
+def test_syn_and_fin_consume_sequence_numbers_but_are_not_payload() -> None:
     isn = 2**32 - 2
-    # Data in the SYN (fast open) starts one after its own number.
+    # Data in the SYN (TCP Fast Open) starts after the SYN's sequence number.
     frames = timed([segment(isn, 10, flags=SYN), segment(isn + 1, 10), segment(isn + 11, 0, flags=FIN_ACK)])
     counts = tcp.count(tcp.cross(packets(frames), packets(frames), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.retransmitted_frames) == (20, 10, 1)
 
 
-def test_connections_are_counted_singly_and_other_ports_not_at_all() -> None:
+def test_connections_are_counted_separately_and_other_ports_are_ignored() -> None:
     first, second = _frames(10, [(0, 100)]), _frames(2**31, [(0, 100)], sport=40001)
     other = [segment(10, 500, port=22)]
     back = [bytes(IP(src=RECEIVER, dst=SENDER) / TCP(sport=PORT, dport=40000, seq=1) / Raw(bytes(50)))]
@@ -185,8 +187,8 @@ def test_connections_are_counted_singly_and_other_ports_not_at_all() -> None:
     assert counts.frames_sent == 4
 
 
-def test_what_the_kernel_still_repeats_of_an_earlier_transfer_is_not_counted() -> None:
-    """Seen at 30 % loss: a broken transfer's orphaned connection sent a segment into a later repeat."""
+def test_retransmissions_of_an_earlier_transfer_are_not_counted() -> None:
+    """Observed at 30 % loss: a connection of an aborted transfer sent a segment during a later repeat."""
     orphan = segment(2**31, 1448, sport=41878)
     own = _frames(10, [(0, 100)], sport=42344)
     sent = packets(timed([own[0], orphan, *own[1:]]))
@@ -206,16 +208,16 @@ def test_transfer_time_is_from_the_receivers_first_frame_to_its_last_payload() -
     assert nothing.transfer_s is None
 
 
-def test_nothing_sent_is_counted_as_nothing() -> None:
+def test_empty_captures_give_zero_counts() -> None:
     assert tcp.count(tcp.cross(packets([]), packets([]), TCP_TRANSFER)) == tcp.TcpCounts(
         0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None, 0, 0, None
     )
 
 
 def test_a_real_capture_with_segmentation_offload() -> None:
-    found = pcap.read(TCPDUMP / "nc-tcp.pcap").packets
+    captured = pcap.read(TCPDUMP / "nc-tcp.pcap").packets
     loopback = replace(TCP_TRANSFER, sender_address="127.0.0.1", receiver_address="127.0.0.1", port=1234)
-    counts = tcp.count(tcp.cross(found, found, loopback))
+    counts = tcp.count(tcp.cross(captured, captured, loopback))
     assert counts.unique_bytes == counts.sent_bytes == counts.received_bytes == 293_797
     assert counts.lost_bytes == counts.retransmitted_frames == 0
-    assert found.tcp_payload_bytes.max() > 1460
+    assert captured.tcp_payload_bytes.max() > 1460

@@ -1,4 +1,4 @@
-"""Figures of topics, against closed forms and what is counted by hand."""
+"""Columns of topics compared with closed forms and manual counts."""
 
 import random
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from scapy.layers.inet import IP, UDP, fragment
 
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import topics
-from fieldkit.measure.transfers.topic_log import Stamped, TopicLog
+from fieldkit.measure.transfers.topic_log import TopicLog, TopicSamples
 from fieldkit.measure.transfers.topics import TopicTraffic
 from tests.helpers.captures import RECEIVER, SENDER, Frame, datagram, ipv4, packets
 
@@ -26,8 +26,8 @@ EVERY = 100 * MS
 
 
 def log(sequence: Sequence[int], at_ns: Sequence[int], **changes: int | None) -> TopicLog:
-    sent_ns = np.array([START + EVERY * one for one in sequence], dtype=np.int64)
-    samples = Stamped(
+    sent_ns = np.array([START + EVERY * number for number in sequence], dtype=np.int64)
+    samples = TopicSamples(
         np.array(sequence, dtype=np.int64),
         np.full(len(sequence), 100, dtype=np.int64),
         sent_ns,
@@ -39,15 +39,15 @@ def log(sequence: Sequence[int], at_ns: Sequence[int], **changes: int | None) ->
 
 
 def published(count: int) -> TopicLog:
-    return log(range(count), [START + EVERY * one for one in range(count)])
+    return log(range(count), [START + EVERY * number for number in range(count)])
 
 
 def arrived(sequence: Sequence[int], delay_ns: int = 2 * MS, ahead_ns: int = 0) -> TopicLog:
-    return log(sequence, [START + EVERY * one + delay_ns + ahead_ns for one in sequence])
+    return log(sequence, [START + EVERY * number + delay_ns + ahead_ns for number in sequence])
 
 
 def captures(ahead_ns: int = 0, one_way_ns: int = MS // 100) -> tuple[Packets, Packets]:
-    """Ten echoes and their answers, by which the receiver's clock is ahead by so much."""
+    """Ten echoes and their replies; the receiver's clock is ahead by `ahead_ns`."""
     near, far = [], []
     for number in range(10):
         at_ns = START + number * EVERY
@@ -60,32 +60,32 @@ def captures(ahead_ns: int = 0, one_way_ns: int = MS // 100) -> tuple[Packets, P
     return packets(near), packets(far)
 
 
-def measured(sent: TopicLog, came: TopicLog, *captured: Packets | None) -> dict[str, object]:
-    found = topics.measure(FLOW, sent, came, *(captured or (None, None))) | topics.withheld_mark("")
-    assert found.values.keys() | found.missing.keys() == {column.name for column in topics.COLUMNS}
-    return dict(found.values)
+def measured(sent: TopicLog, received: TopicLog, *captured: Packets | None) -> dict[str, object]:
+    result = topics.measure(FLOW, sent, received, *(captured or (None, None))) | topics.withheld_mark("")
+    assert result.values.keys() | result.missing.keys() == {column.name for column in topics.COLUMNS}
+    return dict(result.values)
 
 
 @given(st.sets(st.integers(0, 49)), st.lists(st.integers(0, 49), max_size=5))
-def test_losses_are_samples_that_never_came(lost: set[int], again: list[int]) -> None:
+def test_losses_are_samples_that_never_arrived(lost: set[int], again: list[int]) -> None:
     there = [number for number in range(50) if number not in lost]
     repeated = [number for number in again if number not in lost]
-    found = measured(published(50), arrived([*there, *repeated]))
-    assert (found["topic_sent"], found["topic_received"]) == (50, 50 - len(lost))
-    assert found["topic_loss"] == pytest.approx(len(lost) / 50)
-    assert found["topic_repeated"] == len(repeated)
+    result = measured(published(50), arrived([*there, *repeated]))
+    assert (result["topic_sent"], result["topic_received"]) == (50, 50 - len(lost))
+    assert result["topic_loss"] == pytest.approx(len(lost) / 50)
+    assert result["topic_repeated"] == len(repeated)
 
 
 @pytest.mark.parametrize(
     ("lost", "median_s", "p95_s"), [(0, 2e-3, 2e-3), (2, 2e-3, 2e-3), (3, 2e-3, None), (25, None, None)]
 )
-def test_a_lost_sample_is_later_than_all_in_the_delays_of_what_was_sent(
+def test_a_lost_sample_counts_as_latest_in_the_delays_of_all_sent(
     lost: int, median_s: float | None, p95_s: float | None
 ) -> None:
-    found = measured(published(50), arrived(range(lost, 50)), *captures())
-    assert found["topic_delay_median_s"] == pytest.approx(2e-3, rel=1e-3)
+    result = measured(published(50), arrived(range(lost, 50)), *captures())
+    assert result["topic_delay_median_s"] == pytest.approx(2e-3, rel=1e-3)
     for name, expected in (("median", median_s), ("p95", p95_s)):
-        value = found.get(f"topic_delay_{name}_sent_s")
+        value = result.get(f"topic_delay_{name}_sent_s")
         assert value == (None if expected is None else pytest.approx(expected, rel=1e-3))
 
 
@@ -93,10 +93,10 @@ def test_discovery_is_timed_by_the_publishers_clock() -> None:
     assert measured(published(3), arrived([0, 1, 2]))["topic_discovery_s"] == 0.5
 
 
-def test_nobody_found_is_a_measurement() -> None:
+def test_failed_discovery_is_a_measurement() -> None:
     nothing = replace(log([], []), matched_ns=None)
-    found = measured(nothing, log([], []))
-    assert found == {
+    result = measured(nothing, log([], []))
+    assert result == {
         "topic_sent": 0,
         "topic_received": 0,
         "topic_repeated": 0,
@@ -108,48 +108,48 @@ def test_nobody_found_is_a_measurement() -> None:
 
 
 @pytest.mark.parametrize("ahead_ns", [0, 5 * SECOND, -3600 * SECOND])
-def test_delays_are_those_of_one_clock(ahead_ns: int) -> None:
-    found = measured(published(10), arrived(range(10), 2 * MS, ahead_ns), *captures(ahead_ns))
-    assert found["topic_delay_median_s"] == pytest.approx(2e-3, abs=1e-5)
-    assert found["topic_delay_max_s"] == pytest.approx(2e-3, abs=1e-5)
-    assert found["topic_delay_error_s"] == pytest.approx(1.1e-5, rel=0.5)
-    assert found["topic_delay_variation_p95_s"] == 0
-    assert found["topic_jitter_s"] == 0
-    # Of even samples of one delay: half a period and the delay; at its peak a whole one.
-    assert found["topic_age_mean_s"] == pytest.approx(0.05 + 2e-3, abs=1e-5)
-    assert found["topic_age_peak_s"] == pytest.approx(0.1 + 2e-3, abs=1e-5)
+def test_delays_are_corrected_for_the_clock_offset(ahead_ns: int) -> None:
+    result = measured(published(10), arrived(range(10), 2 * MS, ahead_ns), *captures(ahead_ns))
+    assert result["topic_delay_median_s"] == pytest.approx(2e-3, abs=1e-5)
+    assert result["topic_delay_max_s"] == pytest.approx(2e-3, abs=1e-5)
+    assert result["topic_delay_error_s"] == pytest.approx(1.1e-5, rel=0.5)
+    assert result["topic_delay_variation_p95_s"] == 0
+    assert result["topic_jitter_s"] == 0
+    # With evenly spaced samples and a constant delay: half a period plus the delay; the peak is a whole period more.
+    assert result["topic_age_mean_s"] == pytest.approx(0.05 + 2e-3, abs=1e-5)
+    assert result["topic_age_peak_s"] == pytest.approx(0.1 + 2e-3, abs=1e-5)
 
 
-def test_a_delay_that_the_clocks_may_be_wrong_by_is_withheld() -> None:
-    found = measured(published(10), arrived(range(10), 2 * MS), *captures(one_way_ns=MS))
-    assert "topic_delay_median_s" not in found
-    assert found["topic_delay_error_s"] == pytest.approx(1e-3, rel=0.1)
-    assert found["topic_age_mean_s"] == pytest.approx(0.052, abs=1e-3)
+def test_a_delay_below_the_clock_error_is_withheld() -> None:
+    result = measured(published(10), arrived(range(10), 2 * MS), *captures(one_way_ns=MS))
+    assert "topic_delay_median_s" not in result
+    assert result["topic_delay_error_s"] == pytest.approx(1e-3, rel=0.1)
+    assert result["topic_age_mean_s"] == pytest.approx(0.052, abs=1e-3)
 
 
-def test_without_captures_no_delay_is_told() -> None:
-    found = measured(published(10), arrived(range(10)))
-    assert not {name for name in found if "delay_m" in name or "age" in name}
-    assert found["topic_jitter_s"] == 0
+def test_without_captures_there_is_no_delay() -> None:
+    result = measured(published(10), arrived(range(10)))
+    assert not {name for name in result if "delay_m" in name or "age" in name}
+    assert result["topic_jitter_s"] == 0
 
 
-def test_age_of_what_comes_late_and_out_of_order() -> None:
-    """Sent at 0, 1, 2 and 3 s; the second overtaken by the third, so that it makes nothing newer."""
+def test_age_of_late_and_reordered_samples() -> None:
+    """Sent at 0, 1, 2 and 3 s; the third overtakes the second, which then does not reduce the age."""
     at_s, delay_s = np.array([0.5, 2.5, 2.75, 3.5]), np.array([0.5, 0.5, 1.75, 0.5])
     mean_s, peak_s = topics.age_s(at_s, delay_s)
-    # 0.5 rises to 2.5 in 2 s, falls to 0.5 and rises to 1.5 in 1 s.
+    # The age rises from 0.5 to 2.5 in 2 s, drops to 0.5 and rises to 1.5 in 1 s.
     assert mean_s == pytest.approx(((0.5 + 2.5) / 2 * 2 + (0.5 + 1.5) / 2 * 1) / 3)
     assert peak_s == pytest.approx((2.5 + 1.5) / 2)
 
 
 @given(st.lists(st.floats(0.01, 3), min_size=2, max_size=40), st.lists(st.floats(0.001, 5), min_size=40, max_size=40))
-def test_the_mean_age_is_the_area_under_the_saw(gaps: list[float], delays: list[float]) -> None:
+def test_the_mean_age_is_the_area_under_the_sawtooth(gaps: list[float], delays: list[float]) -> None:
     at_s = np.cumsum(gaps)
     delay_s = np.array(delays[: len(gaps)])
     mean_s, _ = topics.age_s(at_s, delay_s)
     if mean_s is None:
         return
-    # The age at moments between: since the newest sample that had arrived was sent.
+    # The age at times in between: time since the newest arrived sample was sent.
     newest_s = np.maximum.accumulate(at_s - delay_s)
     fresh = np.concatenate(([True], newest_s[1:] > newest_s[:-1]))
     moments = np.linspace(at_s[0], at_s[fresh][-1], 20_001)[:-1] + (at_s[fresh][-1] - at_s[0]) / 40_000
@@ -162,40 +162,40 @@ def test_the_mean_age_is_the_area_under_the_saw(gaps: list[float], delays: list[
     [([0, 100, 200], 0), ([0, 150], 0), ([0, 151], 1), ([0, 300, 350], 1), ([0, 460], 3), ([0], 0)],
 )
 def test_each_deadline_without_a_sample_is_missed(at_ms: list[int], missed: int) -> None:
-    assert topics.misses(np.array(at_ms, dtype=np.int64) * MS, 0.15) == missed
+    assert topics.deadline_misses(np.array(at_ms, dtype=np.int64) * MS, 0.15) == missed
 
 
-def test_traffic_is_told_by_its_ports() -> None:
+def test_traffic_is_identified_by_its_ports() -> None:
     both = [datagram(1, 100, port=DATA), datagram(2, 100, port=DATA, sport=DISCOVERY), datagram(3, 3000, port=DATA)]
     looks = [datagram(4, 60, port=DISCOVERY), datagram(5, 60, port=DISCOVERY, sport=DATA)]
     others = [datagram(6, 60), [ipv4(bytes(8), protocol=1, ip_id=7)], [ipv4(b"", protocol=1, size=99, offset=1480)]]
-    frames = [Frame(START, one) for group in (*both, *looks, *others) for one in group]
-    found = measured(published(2), arrived([0, 1]), packets(frames), packets(frames))
-    # 3,008 bytes of UDP are three fragments.
-    assert (found["topic_data_packets"], found["topic_discovery_packets"]) == (5, 2)
-    sizes = sum(len(one) for group in looks for one in group)
-    assert found["topic_discovery_bytes"] == sizes
+    frames = [Frame(START, packet) for group in (*both, *looks, *others) for packet in group]
+    result = measured(published(2), arrived([0, 1]), packets(frames), packets(frames))
+    # 3,008 bytes over UDP are three fragments.
+    assert (result["topic_data_packets"], result["topic_discovery_packets"]) == (5, 2)
+    sizes = sum(len(packet) for group in looks for packet in group)
+    assert result["topic_discovery_bytes"] == sizes
 
 
-def test_packets_of_data_that_the_subscriber_lacks_are_lost() -> None:
-    """Fragments by themselves; what goes back, what looks for others, and what is TCP's are no data on their way."""
-    data = [one for number in (1, 2) for one in datagram(number, 3000, port=DATA)]
+def test_data_packets_missing_at_the_subscriber_are_lost() -> None:
+    """Each fragment separately; replies, discovery and TCP packets are not data packets of the topic."""
+    data = [packet for number in (1, 2) for packet in datagram(number, 3000, port=DATA)]
     others = [*datagram(3, 60, port=DISCOVERY), ipv4(bytes(8), protocol=17, ip_id=4, src=RECEIVER, dst=SENDER)]
-    left = [Frame(START + number * MS, one) for number, one in enumerate((*data, *others))]
+    sent_frames = [Frame(START + number * MS, packet) for number, packet in enumerate((*data, *others))]
     lost = [1, 5, 6]
-    came = [one for number, one in enumerate(left) if number not in lost]
+    received_frames = [frame for number, frame in enumerate(sent_frames) if number not in lost]
     assert len(data) == 6
-    found = measured(published(2), arrived([0]), packets(left), packets(came))
-    assert found["topic_packet_loss"] == pytest.approx(2 / 6)
+    result = measured(published(2), arrived([0]), packets(sent_frames), packets(received_frames))
+    assert result["topic_packet_loss"] == pytest.approx(2 / 6)
 
 
-def test_no_packets_of_udp_lose_nothing() -> None:
+def test_without_udp_packets_there_is_no_packet_loss() -> None:
     assert "topic_packet_loss" not in measured(published(2), arrived([0]), *captures())
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_each_of_two_streams_of_one_pair_has_its_own_fragments(seed: int) -> None:
-    """As scapy cuts datagrams; ids come again in both streams, in answers, and in packets that are whole."""
+def test_two_streams_of_one_pair_have_separate_fragments(seed: int) -> None:
+    """Datagrams fragmented by scapy; ids repeat in both streams, in replies, and in unfragmented packets."""
     draw = random.Random(seed)
     cut: list[tuple[int, list[IP]]] = []
     for number in range(30):
@@ -207,20 +207,28 @@ def test_each_of_two_streams_of_one_pair_has_its_own_fragments(seed: int) -> Non
             / bytes(draw.randrange(256) for _ in range(size))
         )
         cut.append((port, fragment(whole, 1480)))  # type: ignore[no-untyped-call]
-        if draw.random() < 0.3:  # between two fragments of the last one
+        if draw.random() < 0.3:  # between two fragments packet_port the last packet
             alone = IP(src=SENDER, dst=RECEIVER, id=number % 3, flags="DF") / UDP(sport=OTHER_DATA, dport=OTHER_DATA)
             cut[-1:] = [(port, cut[-1][1][:1]), (OTHER_DATA, [alone]), (port, cut[-1][1][1:])]
-    sent = [(START + MS * at, *one) for at, one in enumerate((port, one) for port, each in cut for one in each)]
-    came = [one for one in sent if draw.random() < 0.8]
-    near, far = (packets(Frame(at_ns, bytes(one)) for at_ns, _, one in every) for every in (sent, came))
+    sent = [
+        (START + MS * at, *packet)
+        for at, packet in enumerate((port, packet) for port, each in cut for packet in each)
+    ]
+    received = [packet for packet in sent if draw.random() < 0.8]
+    publisher, subscriber = (
+        packets(Frame(at_ns, bytes(packet)) for at_ns, _, packet in capture) for capture in (sent, received)
+    )
     for port in (DATA, OTHER_DATA):
         flow = replace(FLOW, data_ports=frozenset({port}))
-        found = topics.measure(flow, None, None, near, far).values
-        own = [one for _, of, one in sent if of == port]
-        assert found["topic_data_packets"] == len(own)
-        assert found["topic_data_bytes"] == sum(map(len, own))
-        there, here = ([one for _, of, one in every if of == port and one.src == SENDER] for every in (sent, came))
-        assert found["topic_packet_loss"] == pytest.approx(1 - len(here) / len(there))
+        result = topics.measure(flow, None, None, publisher, subscriber).values
+        data = [packet for _, packet_port, packet in sent if packet_port == port]
+        assert result["topic_data_packets"] == len(data)
+        assert result["topic_data_bytes"] == sum(map(len, data))
+        sent_data, received_data = (
+            [packet for _, packet_port, packet in capture if packet_port == port and packet.src == SENDER]
+            for capture in (sent, received)
+        )
+        assert result["topic_packet_loss"] == pytest.approx(1 - len(received_data) / len(sent_data))
 
 
 def test_only_columns_that_need_the_captures_are_withheld() -> None:

@@ -1,4 +1,4 @@
-"""Fragments lost at random against counts in closed form, and ids that come again."""
+"""Randomly lost fragments compared with closed forms, and repeated ids."""
 
 from itertools import groupby
 
@@ -27,7 +27,7 @@ def test_any_subset_of_fragments_gives_the_counts_in_closed_form(
     sizes: list[int], start: int, data: st.DataObject
 ) -> None:
     cut = [datagram((start + index) % 65536, size) for index, size in enumerate(sizes)]
-    sent = timed([one for fragments in cut for one in fragments])
+    sent = timed([packet for fragments in cut for packet in fragments])
     kept = data.draw(st.lists(st.booleans(), min_size=len(sent), max_size=len(sent)))
     received = [frame for frame, keep in zip(sent, kept, strict=True) if keep]
     order = data.draw(st.permutations(received))
@@ -36,7 +36,7 @@ def test_any_subset_of_fragments_gives_the_counts_in_closed_form(
 
     flags = iter(kept)
     fates = [[next(flags) for _ in fragments] for fragments in cut]
-    carried = [[len_of(one) for one in fragments] for fragments in cut]
+    carried = [[len_of(packet) for packet in fragments] for fragments in cut]
     assert counts.packets_sent == len(sent)
     assert counts.packets_received == sum(kept)
     assert counts.datagrams_sent == len(sizes)
@@ -58,7 +58,7 @@ def test_any_subset_of_fragments_gives_the_counts_in_closed_form(
 @given(st.lists(st.integers(0, 4000), min_size=1, max_size=8), st.data())
 def test_bursts_copies_and_reordering_equal_a_slow_count(sizes: list[int], data: st.DataObject) -> None:
     other = datagram(1000, 3000, port=5353)
-    sent = timed([*(one for ip_id, size in enumerate(sizes) for one in datagram(ip_id, size)), *other])
+    sent = timed([*(packet for ip_id, size in enumerate(sizes) for packet in datagram(ip_id, size)), *other])
     ours = len(sent) - len(other)
     arrivals = data.draw(st.lists(st.integers(0, len(sent) - 1), max_size=2 * len(sent)))
     received = [Frame(sent[0].time_ns + place, sent[index].data, 2000) for place, index in enumerate(arrivals)]
@@ -72,19 +72,19 @@ def test_bursts_copies_and_reordering_equal_a_slow_count(sizes: list[int], data:
     assert counts.packets_duplicated == sum(index < ours for index in arrivals) - len(arrived)
     assert counts.packets_reordered == late
     assert (counts.loss_bursts, counts.longest_burst) == (len(runs), max(runs, default=0))
-    assert counts.packets_doubtful == 0
+    assert counts.packets_ambiguous == 0
 
 
 def len_of(packet: bytes) -> int:
-    """Payload bytes that a fragment carries, UDP header left out."""
+    """Return the payload bytes of a fragment without the UDP header."""
     first = int.from_bytes(packet[6:8], "big") & 0x1FFF == 0
     return int.from_bytes(packet[2:4], "big") - 20 - (8 if first else 0)
 
 
 @given(st.integers(1, 6), st.integers(1, 6), st.data())
 @settings(max_examples=200)
-def test_ids_that_come_again_are_told_apart_by_time(ids: int, rounds: int, data: st.DataObject) -> None:
-    """The counter wraps: each id carries `rounds` datagrams, seconds apart, seen by another clock with jitter."""
+def test_packets_with_repeated_ids_are_distinguished_by_time(ids: int, rounds: int, data: st.DataObject) -> None:
+    """The counter wraps: each id is used by `rounds` datagrams, seconds apart, with another clock and jitter."""
     clock_ns = data.draw(st.integers(-(10**12), 10**12))
     sent: list[Frame] = []
     received: list[Frame] = []
@@ -93,7 +93,7 @@ def test_ids_that_come_again_are_told_apart_by_time(ids: int, rounds: int, data:
         for ip_id in range(ids):
             at_ns = 10**15 + turn * 5 * 10**9 + ip_id * 10**6
             fate = data.draw(st.lists(st.booleans(), min_size=3, max_size=3))
-            cut = [Frame(at_ns + n, one, wire_bytes=2000) for n, one in enumerate(datagram(ip_id, 4000))]
+            cut = [Frame(at_ns + n, packet, wire_bytes=2000) for n, packet in enumerate(datagram(ip_id, 4000))]
             sent += cut
             received += [
                 Frame(frame.time_ns + clock_ns + data.draw(st.integers(0, 10**8)), frame.data, wire_bytes=2000)
@@ -102,8 +102,8 @@ def test_ids_that_come_again_are_told_apart_by_time(ids: int, rounds: int, data:
             ]
             whole += all(fate)
             arrived += sum(fate)
-    # One datagram with an id of its own arrives whole: what tells the clocks apart.
-    known = [Frame(10**15 - 10**7, one, wire_bytes=2000) for one in datagram(9999, 4000)]
+    # One datagram with a unique id arrives completely, which gives the clock offset.
+    known = [Frame(10**15 - 10**7, packet, wire_bytes=2000) for packet in datagram(9999, 4000)]
     sent += known
     received += [Frame(frame.time_ns + clock_ns, frame.data, wire_bytes=2000) for frame in known]
 
@@ -125,23 +125,23 @@ def test_unfragmented_packets_that_all_have_the_same_id_are_counted_as_a_multise
     counts = _count(frames, arrivals)
     assert counts.packets_received == counts.datagrams_received == received
     assert counts.bytes_received == 100 * received
-    assert counts.packets_doubtful == (sent if sent > 1 and received else 0)
+    assert counts.packets_ambiguous == (sent if sent > 1 and received else 0)
 
 
-def test_duplicates_on_the_way_count_once() -> None:
+def test_duplicates_count_once() -> None:
     sent = timed(datagram(5, 8192))
     counts = _count(sent, [*sent, *sent[:3]])
     assert (counts.packets_sent, counts.packets_received, counts.datagrams_received) == (6, 6, 1)
     assert counts.bytes_received == 8192
 
 
-def test_only_the_first_fragment_lost_loses_the_datagram_and_its_own_bytes() -> None:
+def test_a_lost_first_fragment_loses_the_datagram_but_only_its_bytes() -> None:
     sent = timed(datagram(5, 8192))
     counts = _count(sent, sent[1:])
     assert (counts.packets_received, counts.datagrams_received, counts.bytes_received) == (5, 0, 8192 - 1472)
 
 
-def test_other_ports_hosts_and_protocols_are_left_out_even_with_the_same_id() -> None:
+def test_other_ports_hosts_and_protocols_are_ignored_even_with_equal_ids() -> None:
     ours = datagram(5, 4000)
     other_port = datagram(5, 4000, port=5353)
     back = [ipv4(bytes(8), protocol=17, src=RECEIVER, dst=SENDER)]
@@ -152,32 +152,32 @@ def test_other_ports_hosts_and_protocols_are_left_out_even_with_the_same_id() ->
     assert (counts.datagrams_sent, counts.datagrams_received) == (1, 1)
 
 
-def test_another_ports_first_fragment_is_not_taken_for_ours() -> None:
+def test_the_first_fragment_of_another_port_is_ignored() -> None:
     ours, others = datagram(5, 100), datagram(5, 100, port=5353)
     sent = timed([*others, *ours])
     counts = _count(sent, [Frame(sent[1].time_ns, others[0], 2000)])
     assert (counts.packets_sent, counts.packets_received, counts.transfer_s) == (1, 0, None)
 
 
-def test_a_later_fragment_captured_before_the_first_still_belongs_to_it() -> None:
-    one, two, three = datagram(5, 4000)
-    sent = timed([two, one, three])
+def test_a_later_fragment_captured_before_the_first_is_assigned_to_it() -> None:
+    first, second, third = datagram(5, 4000)
+    sent = timed([second, first, third])
     counts = _count(sent, sent)
     assert (counts.packets_sent, counts.datagrams_received) == (3, 1)
 
 
-def test_a_datagram_that_never_left_whole_is_not_received_whole() -> None:
+def test_a_datagram_that_was_not_sent_completely_is_not_received_completely() -> None:
     sent = timed(datagram(5, 4000)[:2])
     counts = _count(sent, sent)
     assert (counts.packets_received, counts.datagrams_sent, counts.datagrams_received) == (2, 1, 0)
 
 
-def test_nothing_sent_is_counted_as_nothing() -> None:
+def test_empty_captures_give_zero_counts() -> None:
     stray = timed(datagram(5, 4000)[1:])
     assert _count([], []) == _count(stray, stray) == udp.UdpCounts(0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None)
 
 
-def test_datagrams_that_scapy_cuts_with_the_papers_file() -> None:
+def test_the_papers_file_in_datagrams_fragmented_by_scapy() -> None:
     blocks = [8192] * 35 + [293_797 - 35 * 8192]
     sent: list[Frame] = []
     for number, size in enumerate(blocks):
@@ -185,7 +185,7 @@ def test_datagrams_that_scapy_cuts_with_the_papers_file() -> None:
             IP(src=SENDER, dst=RECEIVER, id=65_520 + number & 0xFFFF) / UDP(sport=1, dport=PORT) / Raw(bytes(size))
         )
         cut = fragment(whole, 1480)  # type: ignore[no-untyped-call]
-        sent += [Frame(number * 10**6 + at, bytes(one)) for at, one in enumerate(cut)]
+        sent += [Frame(number * 10**6 + at, bytes(packet)) for at, packet in enumerate(cut)]
     lost = np.random.default_rng(1).random(len(sent)) < 0.1
     counts = _count(sent, [frame for frame, gone in zip(sent, lost, strict=True) if not gone])
     assert (counts.packets_sent, counts.datagrams_sent, counts.bytes_sent) == (215, 36, 293_797)

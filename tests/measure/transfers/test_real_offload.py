@@ -1,4 +1,4 @@
-"""A real transfer with segmentation offload at the sender and none at the receiver, through a router between them."""
+"""A real transfer with segmentation offload at the sender and none at the receiver, through a router."""
 
 import subprocess
 from pathlib import Path
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.emulated
 FILE_BYTES = 1_000_000
 TRANSFER = Transfer(Protocol.TCP, Role.SENDER, Role.RECEIVER, "10.7.0.1", "10.8.0.1", 1234, "scan.bag", "recv.bag")
 
-# Named namespaces are mounts below /run: in a mount namespace of its own the host sees none of them.
+# Named namespaces are mounts below /run; in a separate mount namespace they are invisible to the host.
 IN_NAMESPACES = """
 set -e
 mount -t tmpfs tmpfs /run
@@ -29,7 +29,7 @@ ip -n sender address add 10.7.0.1/24 dev out
 ip -n router address add 10.7.0.2/24 dev in
 ip -n router address add 10.8.0.2/24 dev out
 ip -n receiver address add 10.8.0.1/24 dev in
-# The router hands on one segment at a time.
+# The router forwards single segments.
 ip -n router link set out gso_max_segs 1
 for link in sender:out router:in router:out receiver:in; do ip -n ${link%:*} link set ${link#*:} up; done
 ip -n sender route add default via 10.7.0.2
@@ -64,7 +64,7 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
 
     counts = tcp.count(tcp.cross(sender, receiver, TRANSFER))
 
-    # Veth on several cores reorders now and then, and TCP then repeats: the kernel's own counters say whether it did.
+    # Veth with several cores reorders sometimes, and TCP then retransmits: the kernel's counters show whether it did.
     repeated, late = counted(tmp_path / "sent.nstat"), counted(tmp_path / "received.nstat")
     assert (counts.unique_bytes, counts.lost_bytes) == (FILE_BYTES, 0)
     assert counts.sent_bytes == counts.received_bytes
@@ -72,13 +72,13 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
     assert counts.sent_bytes - FILE_BYTES <= repeated * single
     assert counts.superframes == int((sender.tcp_payload_bytes > 1460).sum()) > 0
     sent = TRANSFER.forward(sender)
-    found = match(sent, TRANSFER.forward(receiver))
-    assert found.arrived.all()
-    assert not found.duplicates.any()
-    # Joined segments that TCP repeats within the same millisecond have the same time stamp, and the router cuts both.
-    assert set(np.flatnonzero(found.doubtful)) <= repeated_at_once(sent)
-    assert (counts.doubtful_frames > 0) == found.doubtful.any()
-    if counts.doubtful_frames:
+    matched = match(sent, TRANSFER.forward(receiver))
+    assert matched.arrived.all()
+    assert not matched.duplicates.any()
+    # Joined segments that TCP retransmits within one millisecond have equal time stamps, and the router cuts both.
+    assert set(np.flatnonzero(matched.doubtful)) <= repeated_at_once(sent)
+    assert (counts.ambiguous_frames > 0) == matched.doubtful.any()
+    if counts.ambiguous_frames:
         assert counts.spurious_frames is counts.reordered_frames is None
     else:
         assert counts.spurious_frames == counts.retransmitted_frames
@@ -87,7 +87,7 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
 
 
 def repeated_at_once(sent: Packets) -> set[int]:
-    """Return the frames of which a byte is in another one with the same time stamp, told pair by pair."""
+    """Return the frames with a byte that is also in another frame with the same time stamp, compared pair by pair."""
     carries = np.flatnonzero(sent.tcp_payload_bytes)
     first, stamp = sent.tcp_seq[carries], sent.tcp_stamp[carries]
     end = first + sent.tcp_payload_bytes[carries]
@@ -96,5 +96,5 @@ def repeated_at_once(sent: Packets) -> set[int]:
 
 
 def counted(table: Path) -> int:
-    """Return the one counter in a table that nstat wrote."""
+    """Return the single counter in a table of nstat."""
     return int(table.read_text().splitlines()[-1].split()[1])

@@ -1,4 +1,4 @@
-"""Recovery of flows after faults, by deliveries and faults whose times are known."""
+"""Recovery of flows after faults, from known deliveries and times of faults."""
 
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ def delivery(*at_ms: int, begin_ms: int = 0, end_ms: int | None = None) -> Deliv
 
 
 def times(began_ms: int, ended_ms: int | None, ahead_s: float = 0.0, error_s: float = 0.001) -> FaultTimes:
-    """Of a fault, by a laptop that the robot's clock is ahead of."""
+    """Times of a fault by the laptop's clock; the robot's clock is ahead by `ahead_s`."""
     began_ns, ended_ns = (
         None if moment is None else START + moment * MS - round(ahead_s * 1e9) for moment in (began_ms, ended_ms)
     )
@@ -37,11 +37,11 @@ def times(began_ms: int, ended_ms: int | None, ahead_s: float = 0.0, error_s: fl
 
 
 def measured(when: FaultTimes | None, *streams: Delivery) -> dict[str, Any]:
-    found = recoveries.measure("transfer", KIND, lambda: streams, when, ROBOT)
+    result = recoveries.measure("transfer", KIND, lambda: streams, when, ROBOT)
     own = {column.name for column in recoveries.declared("transfer", KIND)}
-    assert found.values.keys() | found.missing.keys() == own
-    assert not found.values.keys() & found.missing.keys()
-    return {name.removeprefix("transfer_link_down_"): value for name, value in found.values.items()}
+    assert result.values.keys() | result.missing.keys() == own
+    assert not result.values.keys() & result.missing.keys()
+    return {name.removeprefix("transfer_link_down_"): value for name, value in result.values.items()}
 
 
 @given(
@@ -49,31 +49,31 @@ def measured(when: FaultTimes | None, *streams: Delivery) -> dict[str, Any]:
     recovery_ms=st.integers(1, 20_000),
     ahead_s=st.integers(-86_400, 86_400),
 )
-def test_recovery_is_from_the_end_of_the_cause_whatever_the_clocks(
+def test_recovery_starts_at_the_end_of_the_cause_for_any_clock_offset(
     before_ms: list[int], recovery_ms: int, ahead_s: int
 ) -> None:
     steady = delivery(*sorted(before_ms), 3000 + recovery_ms, 3000 + recovery_ms + 10)
-    found = measured(times(1000, 3000, float(ahead_s)), steady)
-    assert found["recovery_s"] == pytest.approx(recovery_ms / 1e3, abs=1e-6)
-    assert found["outage_s"] == pytest.approx((3000 + recovery_ms - max(before_ms)) / 1e3, abs=1e-6)
+    result = measured(times(1000, 3000, float(ahead_s)), steady)
+    assert result["recovery_s"] == pytest.approx(recovery_ms / 1e3, abs=1e-6)
+    assert result["outage_s"] == pytest.approx((3000 + recovery_ms - max(before_ms)) / 1e3, abs=1e-6)
 
 
-def test_a_flow_that_the_fault_did_not_touch_recovers_with_its_next_payload() -> None:
-    found = measured(times(1000, 3000), delivery(*range(0, 5000, 20)))
-    assert found == {"recovery_s": pytest.approx(0.02), "outage_s": pytest.approx(0.02)}
+def test_an_unaffected_flow_recovers_with_its_next_payload() -> None:
+    result = measured(times(1000, 3000), delivery(*range(0, 5000, 20)))
+    assert result == {"recovery_s": pytest.approx(0.02), "outage_s": pytest.approx(0.02)}
 
 
-def test_a_flow_that_never_came_back_has_lower_bounds() -> None:
-    found = measured(times(1000, 3000), delivery(0, 500, 900, end_ms=9000))
-    assert found == {"recovery_at_least_s": pytest.approx(6.0), "outage_at_least_s": pytest.approx(8.1)}
+def test_a_flow_that_never_recovered_has_lower_bounds() -> None:
+    result = measured(times(1000, 3000), delivery(0, 500, 900, end_ms=9000))
+    assert result == {"recovery_at_least_s": pytest.approx(6.0), "outage_at_least_s": pytest.approx(8.1)}
 
 
-def test_a_flow_that_ended_within_the_fault_has_an_outage_alone() -> None:
-    found = measured(times(1000, 3000), delivery(0, 900, end_ms=2000))
-    assert found == {"outage_at_least_s": pytest.approx(1.1)}
+def test_a_flow_that_ended_during_the_fault_has_only_an_outage() -> None:
+    result = measured(times(1000, 3000), delivery(0, 900, end_ms=2000))
+    assert result == {"outage_at_least_s": pytest.approx(1.1)}
 
 
-def test_of_several_streams_the_last_to_come_back_counts() -> None:
+def test_the_last_of_several_streams_to_recover_counts() -> None:
     back, gone = delivery(0, 900, 3100), delivery(0, 900, end_ms=5000)
     assert measured(times(1000, 3000), back, delivery(0, 950, 3900))["recovery_s"] == pytest.approx(0.9)
     assert measured(times(1000, 3000), back, gone) == {
@@ -82,14 +82,14 @@ def test_of_several_streams_the_last_to_come_back_counts() -> None:
     }
 
 
-def test_a_flow_that_was_being_set_up_has_an_outage_from_its_beginning() -> None:
-    found = measured(times(1000, 3000), delivery(4000, 4010, begin_ms=500))
-    assert found == {"recovery_s": pytest.approx(1.0), "outage_s": pytest.approx(3.5)}
+def test_a_flow_that_was_being_set_up_has_an_outage_from_its_start() -> None:
+    result = measured(times(1000, 3000), delivery(4000, 4010, begin_ms=500))
+    assert result == {"recovery_s": pytest.approx(1.0), "outage_s": pytest.approx(3.5)}
 
 
-def test_where_nobody_knows_when_the_cause_was_over_there_is_an_outage_alone() -> None:
-    found = measured(times(1000, None), delivery(0, 990, 4000, 4010))
-    assert found == {"outage_s": pytest.approx(3.01)}
+def test_if_the_end_of_the_cause_is_unknown_there_is_only_an_outage() -> None:
+    result = measured(times(1000, None), delivery(0, 990, 4000, 4010))
+    assert result == {"outage_s": pytest.approx(3.01)}
 
 
 @pytest.mark.parametrize(
@@ -105,9 +105,7 @@ def test_where_nobody_knows_when_the_cause_was_over_there_is_an_outage_alone() -
         (times(1000, 3000), delivery(0, 900, end_ms=950)),
     ],
 )
-def test_what_did_not_run_across_the_fault_or_cannot_be_timed_has_nothing(
-    when: FaultTimes | None, stream: Delivery
-) -> None:
+def test_flows_outside_the_fault_or_without_times_have_no_recovery(when: FaultTimes | None, stream: Delivery) -> None:
     assert not measured(when, stream)
 
 
@@ -117,18 +115,20 @@ def test_what_did_not_run_across_the_fault_or_cannot_be_timed_has_nothing(
     st.dictionaries(st.sampled_from([Role.SENDER, Role.RECEIVER, Role.RELAY]), st.integers(-(10**9), 10**9)),
 )
 def test_times_are_read_as_they_were_written(began_ns: int, ended_ns: int | None, ahead: dict[Role, int]) -> None:
-    written = FaultTimes(began_ns, ended_ns, {role: Offset(one / 1e6, 0.25) for role, one in ahead.items()})
+    written = FaultTimes(
+        began_ns, ended_ns, {role: Offset(offset_us / 1e6, 0.25) for role, offset_us in ahead.items()}
+    )
     text = fault_times.text(written)
-    found = fault_times.parse(text)
-    assert (found.began_ns, found.ended_ns, found.ahead.keys()) == (began_ns, ended_ns, ahead.keys())
-    for role, one in found.ahead.items():
-        assert one.offset_s == pytest.approx(written.ahead[role].offset_s, abs=1e-9)
+    parsed = fault_times.parse(text)
+    assert (parsed.began_ns, parsed.ended_ns, parsed.ahead.keys()) == (began_ns, ended_ns, ahead.keys())
+    for role, offset in parsed.ahead.items():
+        assert offset.offset_s == pytest.approx(written.ahead[role].offset_s, abs=1e-9)
 
 
 @pytest.mark.parametrize(
     "text", ["", "began_utc_ns 1\n", "began_utc_ns x\nended_utc_ns 2\n", "began_utc_ns 1\nended_utc_ns 2\nx\n"]
 )
-def test_a_file_that_was_cut_says_nothing(tmp_path: Path, text: str) -> None:
+def test_a_truncated_file_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "times.txt").write_text(text, encoding="ascii")
-    with pytest.raises(EvidenceError, match="when the fault began"):
+    with pytest.raises(EvidenceError, match="does not contain the start and end of the fault"):
         fault_times.read(tmp_path / "times.txt")

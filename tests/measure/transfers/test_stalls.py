@@ -1,4 +1,4 @@
-"""Stalls of transfers, by captures whose gaps are known."""
+"""Stalls of transfers, from captures with known gaps."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -22,16 +22,16 @@ TCP, UDP = transfer(Protocol.TCP), transfer(Protocol.UDP)
 STEP_NS = 10 * MS
 
 
-def of_tcp(sender: Packets, receiver: Packets, known: FlowSchedule = UNKNOWN) -> list[Delivery]:
-    return transfer_stalls.of_tcp(tcp.cross(sender, receiver, TCP), TCP.backward(sender), known)
+def of_tcp(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[Delivery]:
+    return transfer_stalls.of_tcp(tcp.cross(sender, receiver, TCP), TCP.backward(sender), schedule)
 
 
-def of_udp(sender: Packets, receiver: Packets, known: FlowSchedule = UNKNOWN) -> list[Delivery]:
-    return transfer_stalls.of_udp(udp.cross(sender, receiver, UDP), known)
+def of_udp(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[Delivery]:
+    return transfer_stalls.of_udp(udp.cross(sender, receiver, UDP), schedule)
 
 
-def measured(found: list[Delivery]) -> dict[str, Any]:
-    values = stalls.measure("transfer", lambda: found).values
+def measured(deliveries: list[Delivery]) -> dict[str, Any]:
+    values = stalls.measure("transfer", lambda: deliveries).values
     assert ("transfer_stall_s" in values) is not ("transfer_stall_at_least_s" in values), "one of the two"
     return {name.removeprefix("transfer_"): value for name, value in values.items()}
 
@@ -51,7 +51,7 @@ def sends(count: int, *, every_ns: int = STEP_NS) -> Stream:
     offload=st.booleans(),
 )
 @settings(max_examples=40, deadline=None)
-def test_the_longest_stall_is_the_longest_gap_whatever_is_repeated(
+def test_the_longest_stall_is_the_longest_gap_despite_retransmissions(
     gaps_ms: list[int], copies: int, offload: bool
 ) -> None:
     stream = Stream()
@@ -63,39 +63,39 @@ def test_the_longest_stall_is_the_longest_gap_whatever_is_repeated(
         arrived_ns.append(at_ns)
         for copy in range(1, copies + 1):  # repeats of what was delivered, within the gap that follows
             stream.segment(number * segments, at_ns + copy * MS // 4, segments=segments)
-    found = measured(of_tcp(*captured([stream])))
+    result = measured(of_tcp(*captured([stream])))
     lasted_ms = [(later - earlier) / MS for earlier, later in pairwise(arrived_ns)]
-    assert found["stall_s"] == pytest.approx(max(lasted_ms) / 1e3, abs=1e-6)
-    assert found["stalls"] == sum(one > 200 for one in lasted_ms)
+    assert result["stall_s"] == pytest.approx(max(lasted_ms) / 1e3, abs=1e-6)
+    assert result["stalls"] == sum(duration_ms > 200 for duration_ms in lasted_ms)
 
 
 @given(st.integers(200, 5000), st.integers(1, 30))
 @settings(max_examples=25, deadline=None)
-def test_what_arrives_behind_a_hole_ends_no_stall(hole_ms: int, behind: int) -> None:
+def test_segments_after_a_gap_do_not_end_a_stall(hole_ms: int, behind: int) -> None:
     stream = sends(10)
     begin_ns = 5 * MS + 10 * STEP_NS
     stream.segment(10, begin_ns, arrives=False)
     for number in range(behind):
         stream.segment(11 + number, begin_ns + (number + 1) * MS)
     stream.segment(10, begin_ns + hole_ms * MS)
-    found = measured(of_tcp(*captured([stream])))
-    assert found["stall_s"] == pytest.approx(hole_ms / 1e3 + STEP_NS / SECOND, abs=1e-6)
-    assert found["stalls"] == 1
+    result = measured(of_tcp(*captured([stream])))
+    assert result["stall_s"] == pytest.approx(hole_ms / 1e3 + STEP_NS / SECOND, abs=1e-6)
+    assert result["stalls"] == 1
 
 
-def test_nothing_is_delivered_behind_a_hole_that_is_never_filled() -> None:
+def test_nothing_is_delivered_after_a_gap_that_is_never_filled() -> None:
     stream = sends(10)
     begin_ns = 5 * MS + 10 * STEP_NS
     stream.segment(10, begin_ns, arrives=False)
     for number in range(50):
         stream.segment(11 + number, begin_ns + (number + 1) * STEP_NS)
-    found = measured(of_tcp(*captured([stream])))
-    assert found == {"stall_at_least_s": pytest.approx(0.51, abs=1e-6), "stalls": 1}
+    result = measured(of_tcp(*captured([stream])))
+    assert result == {"stall_at_least_s": pytest.approx(0.51, abs=1e-6), "stalls": 1}
 
 
 def test_a_stream_without_a_stall_has_its_longest_gap_and_no_stall() -> None:
-    found = measured(of_tcp(*captured([sends(50)])))
-    assert found == {"stall_s": pytest.approx(0.01, abs=1e-6), "stalls": 0}
+    result = measured(of_tcp(*captured([sends(50)])))
+    assert result == {"stall_s": pytest.approx(0.01, abs=1e-6), "stalls": 0}
 
 
 def test_a_stall_that_lasts_until_the_listener_ended_is_a_lower_bound() -> None:
@@ -104,17 +104,20 @@ def test_a_stall_that_lasts_until_the_listener_ended_is_a_lower_bound() -> None:
     for again_ns in (200 * MS, 600 * MS, 1400 * MS):
         stream.segment(10, last_ns + again_ns, arrives=False)
     ended_ns = START + last_ns + 5 * SECOND
-    known = FlowSchedule(size_bytes=20_000, until_ns=ended_ns)
-    found = measured(of_tcp(*captured([stream]), known))
-    assert found == {"stall_at_least_s": pytest.approx(5.0 - stream.delay_ns / SECOND, abs=1e-6), "stalls": 1}
-    # Without the end of its program, the last that the sender sent is what is known.
-    found = measured(of_tcp(*captured([stream])))
-    assert found == {"stall_at_least_s": pytest.approx(1.4, abs=1e-6), "stalls": 1}
+    schedule = FlowSchedule(size_bytes=20_000, until_ns=ended_ns)
+    result = measured(of_tcp(*captured([stream]), schedule))
+    assert result == {"stall_at_least_s": pytest.approx(5.0 - stream.delay_ns / SECOND, abs=1e-6), "stalls": 1}
+    # Without the end of its program, the stall lasts until the sender's last packet.
+    result = measured(of_tcp(*captured([stream])))
+    assert result == {"stall_at_least_s": pytest.approx(1.4, abs=1e-6), "stalls": 1}
 
 
 def test_a_file_that_is_complete_does_not_stall_until_its_listener_ends() -> None:
-    known = FlowSchedule(size_bytes=10_000, until_ns=START + 30 * SECOND)
-    assert measured(of_tcp(*captured([sends(10)]), known)) == {"stall_s": pytest.approx(0.01, abs=1e-6), "stalls": 0}
+    schedule = FlowSchedule(size_bytes=10_000, until_ns=START + 30 * SECOND)
+    assert measured(of_tcp(*captured([sends(10)]), schedule)) == {
+        "stall_s": pytest.approx(0.01, abs=1e-6),
+        "stalls": 0,
+    }
 
 
 def test_a_connection_that_was_set_up_late_has_stalled() -> None:
@@ -122,24 +125,24 @@ def test_a_connection_that_was_set_up_late_has_stalled() -> None:
     stream.opens(3 * SECOND, lost=(0, SECOND))
     for number in range(10):
         stream.segment(number, 3 * SECOND + 5 * MS + number * STEP_NS)
-    found = measured(of_tcp(*captured([stream])))
-    assert found == {"stall_s": pytest.approx(3.005, abs=1e-6), "stalls": 1}
+    result = measured(of_tcp(*captured([stream])))
+    assert result == {"stall_s": pytest.approx(3.005, abs=1e-6), "stalls": 1}
 
 
-def test_a_connection_that_is_never_made_has_a_lower_bound() -> None:
+def test_a_connection_that_is_never_established_has_a_lower_bound() -> None:
     stream = Stream()
     for at_ns in (0, SECOND, 3 * SECOND, 7 * SECOND):
         stream.forward(at_ns, 0, "S", arrives=False)
-    found = measured(of_tcp(*captured([stream])))
-    assert found == {"stall_at_least_s": pytest.approx(7.0), "stalls": 1}
+    result = measured(of_tcp(*captured([stream])))
+    assert result == {"stall_at_least_s": pytest.approx(7.0), "stalls": 1}
 
 
 def test_data_that_never_arrives_has_a_lower_bound() -> None:
     stream = Stream()
     for number in range(100):
         stream.datagram(number, number * STEP_NS, arrives=False)
-    found = measured(of_udp(*captured([stream])))
-    assert found == {"stall_at_least_s": pytest.approx(0.99), "stalls": 1}
+    result = measured(of_udp(*captured([stream])))
+    assert result == {"stall_at_least_s": pytest.approx(0.99), "stalls": 1}
 
 
 @given(st.sets(st.integers(1, 98), max_size=90), st.integers(0, 1))
@@ -149,39 +152,39 @@ def test_datagrams_that_are_lost_make_a_gap_whole_or_in_fragments(lost: set[int]
     size = 1000 if not fragments else 4000
     for number in range(100):
         stream.datagram(number, number * STEP_NS, size=size, arrives=number not in lost)
-    found = measured(of_udp(*captured([stream])))
+    result = measured(of_udp(*captured([stream])))
     there = sorted(set(range(100)) - lost)
     gaps_s = [(later - earlier) * 0.01 for earlier, later in pairwise(there)]
-    assert found["stall_s"] == pytest.approx(max(gaps_s), abs=1e-5)
-    assert found["stalls"] == sum(gap_s > 0.2001 for gap_s in gaps_s)
+    assert result["stall_s"] == pytest.approx(max(gaps_s), abs=1e-5)
+    assert result["stalls"] == sum(gap_s > 0.2001 for gap_s in gaps_s)
 
 
 @pytest.mark.parametrize("last", [60, 95])
-def test_the_end_of_a_flow_counts_from_the_least_stall_on(last: int) -> None:
+def test_the_end_of_a_flow_counts_if_it_is_longer_than_the_minimum_stall(last: int) -> None:
     stream = Stream()
     for number in range(100):
         stream.datagram(number, number * STEP_NS, arrives=number <= last)
-    found = measured(of_udp(*captured([stream])))
+    result = measured(of_udp(*captured([stream])))
     if last == 95:
-        assert found == {"stall_s": pytest.approx(0.01), "stalls": 0}, "four datagrams were lost, and that is a loss"
+        assert result == {"stall_s": pytest.approx(0.01), "stalls": 0}, "four datagrams were lost, and that is a loss"
     else:
-        assert found == {"stall_at_least_s": pytest.approx(0.39), "stalls": 1}
+        assert result == {"stall_at_least_s": pytest.approx(0.39), "stalls": 1}
 
 
-def test_pauses_between_payloads_that_are_sent_at_a_rate_are_no_stall() -> None:
+def test_pauses_of_a_flow_with_a_fixed_rate_are_no_stalls() -> None:
     stream = Stream()
     for number in range(10):
         stream.datagram(number, number * SECOND, arrives=number not in {4, 5})
     once_a_second = FlowSchedule(interval_s=1.0)
-    found = measured(of_udp(*captured([stream]), once_a_second))
-    assert found == {"stall_s": pytest.approx(2.0), "stalls": 0}, "two in a row are a loss"
+    result = measured(of_udp(*captured([stream]), once_a_second))
+    assert result == {"stall_s": pytest.approx(2.0), "stalls": 0}, "two in a row are a loss"
     stream = Stream()
     for number in range(10):
         stream.datagram(number, number * SECOND)
     assert measured(of_udp(*captured([stream]), once_a_second)) == {"stall_s": 0.0, "stalls": 0}
 
 
-def test_a_flow_that_should_have_lasted_longer_has_stalled_until_then() -> None:
+def test_a_flow_shorter_than_its_schedule_has_stalled_until_the_end_of_it() -> None:
     stream = Stream()
     for number in range(100):  # the sender's kernel takes no more of them after 1 s: its interface is down
         stream.datagram(number, number * STEP_NS)
@@ -198,11 +201,11 @@ def test_an_offset_between_the_clocks_changes_nothing(ahead_ns: int) -> None:
     for number in range(20):
         stream.segment(number, SECOND + 5 * MS + number * STEP_NS)
     stream.segment(20, 2 * SECOND, arrives=False)
-    found = measured(of_tcp(*captured([stream])))
-    assert found == {"stall_at_least_s": pytest.approx(1.005, abs=1e-6), "stalls": 2}
+    result = measured(of_tcp(*captured([stream])))
+    assert result == {"stall_at_least_s": pytest.approx(1.005, abs=1e-6), "stalls": 2}
 
 
-def test_a_clock_that_is_set_back_is_no_measure_of_time() -> None:
+def test_a_clock_that_is_set_back_is_rejected() -> None:
     stream = sends(20)
     late = captured([stream])[1]
     times_ns = late.time_ns.copy()
@@ -212,27 +215,27 @@ def test_a_clock_that_is_set_back_is_no_measure_of_time() -> None:
         of_tcp(captured([stream])[0], stepped)
 
 
-def test_times_beyond_all_bounds_are_no_overflow() -> None:
+def test_extreme_times_do_not_overflow() -> None:
     stream = sends(20)
     near, far = captured([stream])
     times_ns = far.time_ns.copy()
     times_ns[-1] = 2**63 - 1
-    found = measured(of_tcp(near, replace(far, time_ns=times_ns)))
-    assert found["stall_s"] > 7e9
+    result = measured(of_tcp(near, replace(far, time_ns=times_ns)))
+    assert result["stall_s"] > 7e9
 
 
-def test_each_connection_stalls_by_itself() -> None:
+def test_stalls_of_connections_are_counted_separately() -> None:
     steady, other = sends(100), Stream(sport=40001)
     other.opens()
     for number in range(10):
         other.segment(number, 5 * MS + number * 300 * MS)
-    found = measured(of_tcp(*captured([steady, other])))
-    assert found == {"stall_s": pytest.approx(0.3), "stalls": 9}
+    result = measured(of_tcp(*captured([steady, other])))
+    assert result == {"stall_s": pytest.approx(0.3), "stalls": 9}
 
 
-def test_empty_captures_tell_nothing(tmp_path: Path) -> None:
+def test_empty_captures_give_empty_columns(tmp_path: Path) -> None:
     nothing = captured([])
     for deliveries in (lambda: of_udp(*nothing), lambda: of_tcp(*nothing)):
-        found = stalls.measure("transfer", deliveries)
-        assert not found.values
-        assert found.missing.keys() == {column.name for column in stalls.declared("transfer", "it", 0)}
+        result = stalls.measure("transfer", deliveries)
+        assert not result.values
+        assert result.missing.keys() == {column.name for column in stalls.declared("transfer", "it", 0)}

@@ -1,4 +1,4 @@
-"""Logs of topics, as the agent itself writes them, and damaged in each way that a robot can damage them."""
+"""Logs of topics written by the agent, and damaged in each way that is possible on a robot."""
 
 from pathlib import Path
 
@@ -26,62 +26,62 @@ def written(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def test_what_the_agent_writes_is_read(tmp_path: Path) -> None:
+def test_logs_of_the_agent_are_read(tmp_path: Path) -> None:
     written(tmp_path / "log")
-    found = topic_log.read(tmp_path / "log")
-    assert (found.begun_ns, found.matched_ns) == (10, 30)
-    assert (found.refused, found.skipped, found.foreign, found.whole) == (1, 6, 1, True)
-    assert found.samples.sequence.tolist() == [0, 1, 2]
-    assert found.samples.size_bytes.tolist() == [50, 50, 50]
-    assert found.samples.sent_ns.tolist() == [100, 110, 120]
-    assert found.samples.at_ns.tolist() == [105, 115, 125]
+    parsed = topic_log.read(tmp_path / "log")
+    assert (parsed.begun_ns, parsed.matched_ns) == (10, 30)
+    assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.whole) == (1, 6, 1, True)
+    assert parsed.samples.sequence.tolist() == [0, 1, 2]
+    assert parsed.samples.size_bytes.tolist() == [50, 50, 50]
+    assert parsed.samples.sent_ns.tolist() == [100, 110, 120]
+    assert parsed.samples.at_ns.tolist() == [105, 115, 125]
 
 
-def test_a_log_that_was_cut_has_what_came_before_and_no_end(tmp_path: Path) -> None:
+def test_a_truncated_log_has_its_earlier_records_and_no_end(tmp_path: Path) -> None:
     whole = written(tmp_path / "log")
     for length in range(len(records.MAGIC), len(whole)):
         (tmp_path / "cut").write_bytes(whole[:length])
-        found = topic_log.read(tmp_path / "cut")
-        assert not found.whole
-        assert len(found.samples) == min(max((length - len(records.MAGIC)) // topic_log.RECORD_BYTES - 2, 0), 3)
+        parsed = topic_log.read(tmp_path / "cut")
+        assert not parsed.whole
+        assert len(parsed.samples) == min(max((length - len(records.MAGIC)) // topic_log.RECORD_BYTES - 2, 0), 3)
 
 
-def test_a_log_that_counts_wrongly_is_refused(tmp_path: Path) -> None:
+def test_a_log_with_a_wrong_count_is_rejected(tmp_path: Path) -> None:
     whole, size = written(tmp_path / "log"), topic_log.RECORD_BYTES
     start = len(records.MAGIC) + 2 * size
     for damaged in (whole[:start] + whole[start + size :], whole + whole[-size:]):
         (tmp_path / "log").write_bytes(damaged)
-        with pytest.raises(EvidenceError, match="counts other samples"):
+        with pytest.raises(EvidenceError, match="does not have the number of samples"):
             topic_log.read(tmp_path / "log")
 
 
 @given(zeros=st.integers(0, 5000), ended=st.booleans())
-def test_zeros_behind_the_last_record_are_no_records(
+def test_zeros_after_the_last_record_are_ignored(
     zeros: int, ended: bool, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """As a writer leaves them that is killed: between two records, or between its end and the cut of the file."""
+    """A killed writer leaves zeros: between two records, or between its last record and the end of the file."""
     log = tmp_path_factory.getbasetemp() / "zeros"
     whole = written(log)
     log.write_bytes(whole[: None if ended else -topic_log.RECORD_BYTES] + bytes(zeros))
-    found = topic_log.read(log)
-    assert (found.begun_ns, found.matched_ns) == (10, 30)
-    assert (found.refused, found.skipped, found.foreign, found.whole) == (1, 6, 1, ended)
-    assert found.samples.sequence.tolist() == [0, 1, 2]
+    parsed = topic_log.read(log)
+    assert (parsed.begun_ns, parsed.matched_ns) == (10, 30)
+    assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.whole) == (1, 6, 1, ended)
+    assert parsed.samples.sequence.tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("content", [b"", b"fieldkit", b"\xd4\xc3\xb2\xa1" * 9])
-def test_another_file_is_refused(content: bytes, tmp_path: Path) -> None:
+def test_another_file_is_rejected(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "log").write_bytes(content)
-    with pytest.raises(EvidenceError, match="no log of a topic"):
+    with pytest.raises(EvidenceError, match="not a log of a topic"):
         topic_log.read(tmp_path / "log")
 
 
 @given(content=st.binary(max_size=400))
-def test_any_bytes_are_read_or_refused(content: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_any_bytes_are_read_or_rejected(content: bytes, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("any") / "log"
     path.write_bytes(records.MAGIC + content)
     try:
-        found = topic_log.read(path)
+        parsed = topic_log.read(path)
     except EvidenceError:
         return
-    assert len(found.samples) <= len(content) // topic_log.RECORD_BYTES
+    assert len(parsed.samples) <= len(content) // topic_log.RECORD_BYTES

@@ -1,4 +1,4 @@
-"""Stalls of topics, by logs whose gaps are known."""
+"""Stalls of topics, from logs with known gaps."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -18,64 +18,64 @@ EXPECTED = FlowSchedule(interval_s=0.1, lasts_s=9.9)
 SECOND = 1_000_000_000
 
 
-def measured(sent: TopicLog | None, came: TopicLog | None, **changes: Any) -> dict[str, Any]:  # noqa: ANN401
+def measured(sent: TopicLog | None, received: TopicLog | None, **changes: Any) -> dict[str, Any]:  # noqa: ANN401
     near, far = captures()
-    known = replace(EXPECTED, **changes)
-    found = topic_stalls.measure(FLOW, (sent, came), (near, far), known)
-    assert found.values.keys() | found.missing.keys() == {column.name for column in topic_stalls.COLUMNS}
-    return {name.removeprefix("topic_"): value for name, value in found.values.items()}
+    schedule = replace(EXPECTED, **changes)
+    result = topic_stalls.measure(FLOW, (sent, received), (near, far), schedule)
+    assert result.values.keys() | result.missing.keys() == {column.name for column in topic_stalls.COLUMNS}
+    return {name.removeprefix("topic_"): value for name, value in result.values.items()}
 
 
 @given(st.sets(st.integers(1, 98), max_size=95))
-def test_samples_that_are_lost_in_a_row_are_overdue_one_interval_each(lost: set[int]) -> None:
+def test_consecutive_lost_samples_are_overdue_by_one_interval_each(lost: set[int]) -> None:
     there = [number for number in range(100) if number not in lost]
-    found = measured(published(100), arrived(there))
+    result = measured(published(100), arrived(there))
     overdue_s = [(later - earlier - 1) * 0.1 for earlier, later in pairwise(there)]
-    assert found["stall_s"] == pytest.approx(max(overdue_s), abs=1e-6)
-    assert found["stalls"] == sum(one > 0.30001 for one in overdue_s)
+    assert result["stall_s"] == pytest.approx(max(overdue_s), abs=1e-6)
+    assert result["stalls"] == sum(duration_s > 0.30001 for duration_s in overdue_s)
 
 
-def test_samples_that_come_again_or_late_are_counted_once() -> None:
+def test_repeated_or_late_samples_are_counted_once() -> None:
     assert measured(published(100), arrived([*range(100), *range(50)]))["stalls"] == 0
 
 
 @pytest.mark.parametrize(("last", "bound_s"), [(0, 9.8), (49, 4.9), (97, None), (99, None)])
-def test_a_topic_that_never_came_back_has_a_lower_bound(last: int, bound_s: float | None) -> None:
-    found = measured(published(100), arrived(list(range(last + 1))))
+def test_a_topic_that_never_recovered_has_a_lower_bound(last: int, bound_s: float | None) -> None:
+    result = measured(published(100), arrived(list(range(last + 1))))
     if bound_s is None:
-        assert found == {"stall_s": pytest.approx(0.0), "stalls": 0}
+        assert result == {"stall_s": pytest.approx(0.0), "stalls": 0}
     else:
-        assert found == {"stall_at_least_s": pytest.approx(bound_s), "stalls": 1}
+        assert result == {"stall_at_least_s": pytest.approx(bound_s), "stalls": 1}
 
 
-def test_a_publisher_that_could_not_write_any_more_has_stalled_too() -> None:
-    found = measured(published(50), arrived(list(range(50))))
-    assert found == {"stall_at_least_s": pytest.approx(4.9), "stalls": 1}
+def test_a_publisher_that_stopped_writing_has_stalled() -> None:
+    result = measured(published(50), arrived(list(range(50))))
+    assert result == {"stall_at_least_s": pytest.approx(4.9), "stalls": 1}
 
 
 def test_a_topic_of_which_nothing_arrived_has_a_lower_bound() -> None:
     assert measured(published(100), log([], [])) == {"stall_at_least_s": pytest.approx(9.9), "stalls": 1}
 
 
-def test_a_subscription_that_heard_nothing_at_first_has_stalled() -> None:
+def test_a_subscription_that_received_nothing_at_first_has_stalled() -> None:
     assert measured(published(100), arrived(list(range(30, 100)))) == {"stall_s": pytest.approx(3.0), "stalls": 1}
 
 
-def test_a_clock_that_was_set_is_no_measure_of_time() -> None:
-    came = arrived(list(range(100)))
-    at_ns = came.samples.at_ns + np.where(came.samples.sequence >= 50, -10 * SECOND, 0)
-    assert not measured(published(100), replace(came, samples=replace(came.samples, at_ns=at_ns)))
+def test_a_clock_that_was_set_is_rejected() -> None:
+    received = arrived(list(range(100)))
+    at_ns = received.samples.at_ns + np.where(received.samples.sequence >= 50, -10 * SECOND, 0)
+    assert not measured(published(100), replace(received, samples=replace(received.samples, at_ns=at_ns)))
     near, far = captures()
     forward = replace(far, time_ns=far.time_ns + 3600 * SECOND * (np.arange(len(far)) > len(far) // 2))
-    found = topic_stalls.measure(FLOW, (published(100), arrived(list(range(100)))), (near, forward), EXPECTED)
-    assert not found.values
+    result = topic_stalls.measure(FLOW, (published(100), arrived(list(range(100)))), (near, forward), EXPECTED)
+    assert not result.values
 
 
-def test_without_whole_logs_nothing_is_told() -> None:
+def test_without_complete_logs_the_columns_are_empty() -> None:
     assert not measured(None, arrived([1]))
     assert not measured(published(0), log([], []))
 
 
-def test_its_columns_are_those_of_every_flow() -> None:
+def test_its_columns_equal_those_of_other_flows() -> None:
     own = [column.name for column in stalls.declared("topic", "the topic", 0)]
     assert [column.name for column in topic_stalls.COLUMNS] == own
