@@ -147,7 +147,7 @@ def test_figures_are_those_of_the_end_that_sends_and_the_one_that_receives(tmp_p
         (lambda path: path.unlink(), "receiver-iperf3.json: cannot be read"),
         (
             lambda path: path.write_text(path.read_text()[:-60]),
-            "receiver-iperf3.json: is no JSON of iperf3, or was cut",
+            "receiver-iperf3.json: is not JSON of iperf3, or was truncated",
         ),
         (
             lambda path: shutil.copy(DATA / "iperf3" / "3.7" / "refused-client.json", path),

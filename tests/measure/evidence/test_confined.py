@@ -91,7 +91,7 @@ def test_a_reader_that_something_else_ends_is_asked_again_and_leaves_nothing(
 def test_an_answer_may_be_as_long_as_its_file_is_large(unpacks: confined.Confined) -> None:
     large = confined.ANSWER_BYTES + 1000
     assert len(unpacks.ask({"says": large}, 4096)["said"]) == large
-    with pytest.raises(confined.ConfinedAnswerError, match="it says more than a file of its size may"):
+    with pytest.raises(confined.ConfinedAnswerError, match="its contents exceed the limit for a file of its size"):
         unpacks.ask({"says": large}, 10)
     assert len(unpacks.ask({"says": 10}, 10)["said"]) == 10, "the next question is answered"
 
@@ -107,9 +107,9 @@ def test_neither_holes_nor_size_lift_the_bounds_above_what_the_machine_has(tmp_p
     path.touch()
     os.truncate(path, 1 << 42)
     assert bag.given_bytes(path) < 128 * MIB
-    memory_bytes, _, cpu_s = confined._bounds(1 << 42)
+    memory_bytes, _, cpu_s = confined._limits(1 << 42)
     assert memory_bytes < os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    assert cpu_s == confined.MOST_CPU_S
+    assert cpu_s == confined.MAX_CPU_S
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_a_chunk_that_unpacks_to_more_memory_than_it_may_take_is_refused(tmp_pat
         connection = writer.add_connection(TOPIC, TYPE, typestore=store)
         writer.write(connection, 1, store.serialize_ros1(message(Stores.ROS1_NOETIC, 0.5), TYPE))
     assert bag.read(path).messages == 1
-    with pytest.raises(EvidenceError, match="more memory than a file of its size may"):
+    with pytest.raises(EvidenceError, match="more memory than the limit for a file of its size"):
         bag.battery_share(path, TOPIC)
     assert bag.battery_share(ros1(Path(tempfile.mkdtemp(dir=tmp_path)), [0.5]), TOPIC) == 0.5
 

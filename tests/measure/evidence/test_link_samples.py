@@ -71,7 +71,7 @@ def test_a_testbeds_file_that_is_not_whole_says_so(tmp_path: Path, damage: "type
     sample = LinkSample(5, (StationSample("turtlebot-1", -50.0, 6e6, None, 1, 2, 3, 4),), noise_dbm=-95.0)
     path = tmp_path / link_samples.FILE
     path.write_text(damage(link_samples.text({Role.SENDER: [sample]})), encoding="ascii")
-    with pytest.raises(EvidenceError, match="does not say how links were"):
+    with pytest.raises(EvidenceError, match="is not a file of link samples"):
         link_samples.read(path)
 
 
@@ -80,7 +80,7 @@ def test_a_testbeds_file_that_was_cut_says_so_and_an_earlier_one_is_read(tmp_pat
     path, whole = tmp_path / link_samples.FILE, link_samples.text(samples)
     count, *lines = whole.splitlines(keepends=True)
     path.write_text("".join([count, *lines[:-1]]), encoding="ascii")
-    with pytest.raises(EvidenceError, match="has 2 lines of 3: it was cut"):
+    with pytest.raises(EvidenceError, match="has 2 lines of 3: it was truncated"):
         link_samples.read(path)
     path.write_text("".join(lines), encoding="ascii")
     assert link_samples.read(path) == samples
@@ -120,7 +120,7 @@ def test_a_sampler_that_was_cut_leaves_what_it_had_told(at: int) -> None:
 
 
 def test_without_a_clock_or_a_file_there_are_none(tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="what its clock showed"):
+    with pytest.raises(EvidenceError, match="does not contain the clock"):
         link_samples.read_own(tmp_path, Role.SENDER)
     (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")
     assert link_samples.read_own(tmp_path, Role.SENDER) == ()

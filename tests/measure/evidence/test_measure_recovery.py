@@ -108,11 +108,11 @@ def test_a_process_that_never_comes_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "text", "complaint"),
     [
-        (FaultKind.LINK_DOWN, pings(list(range(1, 60)), 59), "left no mark"),
-        (FaultKind.REBOOT, pings([1, 2, 4, 5], 5), "left no mark"),
+        (FaultKind.LINK_DOWN, pings(list(range(1, 60)), 59), "had no effect"),
+        (FaultKind.REBOOT, pings([1, 2, 4, 5], 5), "had no effect"),
         (FaultKind.LINK_DOWN, pings([], 59), "not there before"),
         (FaultKind.LINK_DOWN, pings(AWAY, 49).partition("\n\n")[0], "summary is missing"),
-        (FaultKind.KILL, watched((5.0, "31"), (5.1, "31 32"), (5.2, "31")), "left no mark"),
+        (FaultKind.KILL, watched((5.0, "31"), (5.1, "31 32"), (5.2, "31")), "had no effect"),
         (FaultKind.KILL, watched((5.0, ""), (5.1, "")), "not there before"),
         (FaultKind.KILL, "", "not there before"),
     ],
@@ -128,7 +128,7 @@ def test_evidence_that_shows_no_fault_is_none(tmp_path: Path, kind: FaultKind, t
 def test_a_note_that_does_not_say_it_is_no_evidence(tmp_path: Path, note: str) -> None:
     folder(tmp_path, FaultKind.LINK_DOWN, pings(AWAY, 49))
     (tmp_path / "fault-link-down.txt").write_text(note, encoding="utf-8")
-    with pytest.raises(EvidenceError, match="how long the fault lasted"):
+    with pytest.raises(EvidenceError, match="duration of the fault"):
         recovery.read(tmp_path, FaultKind.LINK_DOWN)
 
 

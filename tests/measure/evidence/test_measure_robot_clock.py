@@ -44,7 +44,7 @@ def test_the_step_of_a_tampered_reading_is_told_with_its_sign_and_error() -> Non
     back = BUSYBOX.replace(" 1795320484.0", " 1795320483.9").replace(" 1795320484.1", " 1795320484.0")
     problem = clock.problem(known(COREUTILS), known(back))
     assert problem is not None
-    assert problem.startswith("its clock was set back by 0.099 s (known to 0.006 s)")
+    assert problem.startswith("its clock was set back by 0.099 s (uncertainty 0.006 s)")
     hour = BUSYBOX.replace(" 1795320484", " 1795324084")
     assert (clock.problem(known(COREUTILS), known(hour)) or "").startswith("its clock was set ahead by 3600.0")
 
@@ -52,7 +52,7 @@ def test_the_step_of_a_tampered_reading_is_told_with_its_sign_and_error() -> Non
 def test_whole_seconds_show_a_step_of_more_than_they_hide() -> None:
     seconds = "100.00 1000 100.01\n100.01 1000 100.02\n"
     assert clock.problem(known(seconds), known("200.00 1100 200.01\n")) is None
-    assert "set ahead by 3.005 s (known to 1.015 s)" in (
+    assert "set ahead by 3.005 s (uncertainty 1.015 s)" in (
         clock.problem(known(seconds), known("200.00 1103 200.01\n")) or ""
     )
 

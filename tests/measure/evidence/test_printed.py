@@ -44,8 +44,8 @@ def test_a_path_finds_a_value_of_its_column(said: Path, where: str, unit: str, v
 @pytest.mark.parametrize(
     ("found", "unit", "why"),
     [
-        (None, "V", "there is none"),
-        ("", "text", "there is none"),
+        (None, "V", "the value is missing"),
+        ("", "text", "the value is missing"),
         ({"a": 1}, "text", "not one value"),
         ([], "V", "not one value"),
         (True, "V", "another type"),
@@ -101,7 +101,7 @@ def test_what_suits_is_not_refused() -> None:
 @pytest.mark.parametrize("text", ["", "{", "{'a': 1}", 100_000 * "[", STATUS[:-9], "NaN x", "9" * 5000])
 def test_what_is_no_json_is_told(said: Path, text: str) -> None:
     said.write_text(text, encoding="utf-8")
-    with pytest.raises(EvidenceError, match="is no JSON"):
+    with pytest.raises(EvidenceError, match="is not JSON"):
         printed.at_path(said, "a")
 
 

@@ -32,12 +32,12 @@ def test_a_pipe_and_a_device_are_no_files(tmp_path: Path, read: object) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "device").symlink_to("/dev/zero")
     for name in ("pipe", "device"):
-        with pytest.raises(EvidenceError, match="is no file"):
+        with pytest.raises(EvidenceError, match="is not a regular file"):
             read(tmp_path / name)
 
 
 def test_text_that_is_longer_than_any_tool_says_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "MOST_TEXT_BYTES", 1 << 20)
+    monkeypatch.setattr(reading, "MAX_TEXT_BYTES", 1 << 20)
     (tmp_path / "ping.txt").write_bytes(b"\n" * (1 << 20))
     assert len(reading.text(tmp_path / "ping.txt")) == 1 << 20
     (tmp_path / "ping.txt").write_bytes(b"\n" * ((1 << 20) + 1))

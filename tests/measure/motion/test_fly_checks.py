@@ -66,7 +66,7 @@ def test_a_log_as_the_agent_writes_it_has_no_contradiction(tmp_path: Path) -> No
 
 
 def test_a_log_without_its_end_is_noticed(tmp_path: Path) -> None:
-    assert reasons(written(tmp_path, lines(), ended=False)) == ["it has no end: its writer was ended"]
+    assert reasons(written(tmp_path, lines(), ended=False)) == ["its last line is missing: its writer was killed"]
     short = reasons(written(tmp_path, lines()[:90]))
     assert short == ["ends while the drone was flying, not coming down"]
 

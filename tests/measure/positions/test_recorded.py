@@ -146,7 +146,7 @@ def test_stamps_of_another_clock_are_refused_unless_those_of_the_recorder_are_as
     ("messages", "topic", "complaint"),
     [
         ([stamped(BEGAN_NS, 0.0, 0.0)], "/other", "no position of /other"),
-        ([TYPES["std_msgs/msg/String"]("here")], "/where", "says no position"),
+        ([TYPES["std_msgs/msg/String"]("here")], "/where", "contains no position"),
         ([stamped(BEGAN_NS, 0.0, 0.0), stamped(BEGAN_NS, 0.0, 0.0, "odom")], "/where", "in map, odom"),
     ],
 )

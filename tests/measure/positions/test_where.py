@@ -57,7 +57,7 @@ def mean_m(folder: Path, begin_s: float = 1.0, end_s: float = 3.0) -> float | st
 
 
 def test_what_was_given_later_counts_before_what_was_recorded_and_that_before_the_testbed(attempt: Path) -> None:
-    assert mean_m(attempt) == "nobody knows where robots are"
+    assert mean_m(attempt) == "the positions of the robots are unknown"
     (attempt / track.FILE).write_text(track.text(ORACLE), encoding="ascii")
     assert mean_m(attempt) == pytest.approx(100)
     written(attempt, AWAY)

@@ -146,9 +146,9 @@ def test_what_is_true_or_false_is_said_as_it_stands_in_the_table() -> None:
     [
         ('{"cells": [{"V": 2.5}]}', "battery.json: volts is 2.5, less than 3"),
         ('{"cells": [{"V": 5}]}', "battery.json: volts is 5.0, more than 4.2"),
-        ('{"cells": []}', "battery.json: no volts: there is none"),
+        ('{"cells": []}', "battery.json: no volts: the value is missing"),
         ('{"cells": [{"V": "high"}]}', "battery.json: no volts: it is 'high', not a number"),
-        ('{"cells": [{"V"', "battery.json: no volts: is no JSON"),
+        ('{"cells": [{"V"', "battery.json: no volts: is not JSON"),
         (None, "battery.json: cannot be read"),
         (" " * printed.MOST_BYTES, "battery.json: the program printed more than 1 MiB"),
     ],
