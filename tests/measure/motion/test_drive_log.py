@@ -111,12 +111,12 @@ def test_what_stopped_it_is_said_without_what_moves_a_cursor(tmp_path: Path) -> 
     ],
 )
 def test_a_line_that_no_driver_writes_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
-    with pytest.raises(EvidenceError, match="line 2 does not say where the robot drove"):
+    with pytest.raises(EvidenceError, match="line 2 is not a line of a drive log"):
         drive_log.read(written(tmp_path, [LINE, {**LINE, **wrong}]))
 
 
 def test_a_log_that_is_none_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="says nothing of where"):
+    with pytest.raises(EvidenceError, match="contains no position of a"):
         drive_log.read(written(tmp_path, []))
     with pytest.raises(EvidenceError, match="not in the order of time"):
         drive_log.read(written(tmp_path, [{**LINE, "at_s": 1.0}, LINE]))

@@ -14,7 +14,7 @@ from fieldkit.agent.numbered_lines import NumberedLines
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import numbered_lines
 from fieldkit.measure.motion import fly_checks, fly_log
-from fieldkit.measure.motion.fly_checks import PLACE_M, FlyPlan
+from fieldkit.measure.motion.fly_checks import POSITION_ERROR_M, FlyPlan
 
 START_NS = 1_795_000_000_000_000_000
 PLAN = FlyPlan(3.0, 20.0, 3.0, (START_NS - 10**9, START_NS + 60 * 10**9))
@@ -76,7 +76,7 @@ def test_a_log_without_its_end_is_noticed(tmp_path: Path) -> None:
     [
         ("ahead_m", 200.0, "farther from the one before it"),
         ("up_m", 50.0, "farther from the one before it"),
-        ("speed_m_s", 60.0, "the drone flew at 62.0 m/s, and its limit is 3 m/s"),
+        ("speed_m_s", 60.0, "the drone flew at 62.0 m/s, but its limit is 3 m/s"),
         ("utc_ns", 3600 * 10**9, "from before the attempt or after it"),
         ("at_s", 0.05, ""),
     ],
@@ -108,7 +108,7 @@ def test_any_range_of_a_field_that_changes_is_noticed(
     except EvidenceError:
         return
     for name, value in fly_log.measure(fly_log.read(path)).values.items():
-        assert value == pytest.approx(before[name], abs=PLACE_M + 2.0), name
+        assert value == pytest.approx(before[name], abs=POSITION_ERROR_M + 2.0), name
 
 
 def test_telemetry_of_another_flight_is_noticed(tmp_path: Path) -> None:

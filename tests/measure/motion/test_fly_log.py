@@ -114,12 +114,12 @@ def test_no_flight_ends_because_it_cannot_be_written_down(place: str) -> None:
     ],
 )
 def test_a_line_that_no_flight_writes_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
-    with pytest.raises(EvidenceError, match="line 2 does not say where the drone flew"):
+    with pytest.raises(EvidenceError, match="line 2 is not a line of a flight log"):
         fly_log.read(written(tmp_path, [LINE, {**LINE, **wrong}]))
 
 
 def test_a_log_that_is_none_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="says nothing of where"):
+    with pytest.raises(EvidenceError, match="contains no position of a"):
         fly_log.read(written(tmp_path, []))
     with pytest.raises(EvidenceError, match="not in the order of time"):
         fly_log.read(written(tmp_path, [{**LINE, "at_s": 1.0}, LINE]))
