@@ -172,7 +172,7 @@ def test_what_may_matter_is_said_and_refuses_nothing(changes: dict[str, Any], sa
 
 def test_attempts_that_both_runs_have_are_said() -> None:
     (concern,) = compare(parsed(UDP), parsed(UDP[:7])).concerns
-    assert str(concern) == "attempts that the other has too: A has 7, B has 7"
+    assert str(concern) == "attempts that the other run has too: A has 7, B has 7"
     assert not concern.refuses
 
 

@@ -118,7 +118,7 @@ def test_what_a_spreadsheet_makes_of_a_table_is_read(tmp_path: Path, spell: Call
         (lambda lines: [*lines[:2], lines[2].replace("9.144", "near"), *lines[3:]], 3, "distance_m is 'near'"),
         (lambda lines: [*lines[:2], lines[2].replace("9.144", "inf"), *lines[3:]], 3, "distance_m is 'inf'"),
         (lambda lines: [*lines[:2], lines[2].replace("los", "l\udcffs"), *lines[3:]], 3, "not UTF-8"),
-        (lambda lines: [*lines[:4], lines[4].replace("valid", '"valid')], 5, "no CSV"),
+        (lambda lines: [*lines[:4], lines[4].replace("valid", '"valid')], 5, "not CSV"),
     ],
     ids=["torn", "status", "number", "infinite", "bytes", "quote"],
 )
@@ -143,7 +143,7 @@ def test_a_table_cut_at_any_byte_of_its_last_line_is_refused_or_lacks_that_line(
         if end == last:
             assert len(read([path], trial_columns())) == 1
             continue
-        with pytest.raises(EvidenceError, match="the last line has no end: the table may be cut") as told:
+        with pytest.raises(EvidenceError, match="the last line has no line feed: the table may be truncated") as told:
             read([path], trial_columns())
         assert told.value.where == f"{path}:3"
 
@@ -160,7 +160,7 @@ def test_a_newer_schema_asks_for_a_newer_fieldkit(tmp_path: Path) -> None:
     [
         ("", "lacks schema_version, trial"),
         ("time,x\n1,2\n", "lacks"),
-        ("{header},status\n", "status is there twice"),
+        ("{header},status\n", "it has more than one column status"),
         ("{header}" + 140_000 * "x", "lacks schema_version, trial"),
     ],
 )

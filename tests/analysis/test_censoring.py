@@ -95,7 +95,7 @@ def test_the_worst_repeats_do_not_make_an_expectation_hold() -> None:
     """The case of issue 21: in 3 of 10 repeats the link was down when the ping ended."""
     found = judged("rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8]))
     assert found.ruling is Ruling.OPEN
-    assert found.why == "in 3 of 10 repeats it had not ended, so that they give lower bounds"
+    assert found.why == "in 3 of 10 repeats it had not ended, so they give only lower bounds"
     assert judged("every rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8])).ruling is Ruling.FAILS
     assert judged("max rtt_gap_s < 2 s", gaps([0.2] * 7, [1.3])).ruling is Ruling.OPEN
     assert judged("rtt_gap_s < 2 s", gaps([], [5.0] * 4)).ruling is Ruling.FAILS
@@ -157,13 +157,13 @@ def rtt(medians_s: Sequence[Known], of_sent_s: Sequence[Known]) -> Cell:
     [
         ([0.1] * 10, Ruling.HOLDS, ""),
         ([0.15] * 10, Ruling.HOLDS, ""),
-        ([0.3] * 10, Ruling.OPEN, "counting what was lost as late, the interval goes beyond it"),
+        ([0.3] * 10, Ruling.OPEN, "if lost items count as late, the interval extends beyond it"),
         (
             [None] + [0.1] * 9,
             Ruling.OPEN,
-            "in 1 of 10 repeats it has no value over all that was sent: too much was lost",
+            "in 1 of 10 repeats too much was lost for a value over all sent items",
         ),
-        ([None] * 10, Ruling.OPEN, "in 10 of 10 repeats it has no value over all that was sent: too much was lost"),
+        ([None] * 10, Ruling.OPEN, "in 10 of 10 repeats too much was lost for a value over all sent items"),
     ],
 )
 def test_a_median_rtt_of_the_answers_is_judged_over_all_requests(
@@ -200,4 +200,4 @@ def test_steps_that_have_names_have_companions_of_their_own() -> None:
 
 def test_means_have_no_lower_bounds() -> None:
     (column,) = columns(100, ("stalls", "count", "Stalls.", Figure("stalls", Kind.MEAN, at_least="other")))
-    assert column.flaw() == "only a median has lower bounds, or a figure over all that was sent"
+    assert column.flaw() == "only a median can have a column of lower bounds (at_least) or of all sent items (of_sent)"

@@ -55,14 +55,14 @@ def said(text: str, repeats: int) -> str:
         (
             "link_down_recovered > 90 %",
             20,
-            "needs at least 35 repeats for 95 % confidence, if it is so in all of them; this trial has 20",
+            "needs at least 35 repeats for 95 % confidence, if it is true in all of them; this trial has 20",
         ),
         ("rtt_gap_s < 300 ms", 6, ""),
         (
             "rtt_gap_s < 300 ms",
             5,
             (
-                "needs at least 6 repeats for 95 % confidence whatever the distribution of the repeats is; this "
+                "needs at least 6 repeats for 95 % confidence for any distribution of the repeats; this "
                 "trial has 5"
             ),
         ),

@@ -82,10 +82,10 @@ def test_a_share_that_its_counts_contradict_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "what"),
     [
-        (lambda text: text.replace(",", ";").encode(), "its cells stand apart by semicolons"),
-        (lambda text: quoted(text, ";").encode(), "its cells stand apart by semicolons"),
-        (lambda text: text.replace(",", "\t").encode(), "its cells stand apart by tabs"),
-        (lambda text: text.encode("utf-16"), "its letters are UTF-16"),
+        (lambda text: text.replace(",", ";").encode(), "its cells are separated by semicolons"),
+        (lambda text: quoted(text, ";").encode(), "its cells are separated by semicolons"),
+        (lambda text: text.replace(",", "\t").encode(), "its cells are separated by tabs"),
+        (lambda text: text.encode("utf-16"), "its encoding is UTF-16"),
         (lambda text: b'"' + b"x" * 200_000 + text.encode(), "it lacks schema_version"),
     ],
     ids=["semicolons", "semicolons, quoted", "tabs", "UTF-16", "no table"],
@@ -116,7 +116,7 @@ def test_a_moment_that_a_spreadsheet_shortened_is_told_with_the_way_out(tmp_path
     path.write_text(table.replace("1795309790492337123", "1.79531E+18"), encoding="utf-8")
     with pytest.raises(EvidenceError, match="not a whole number") as told:
         read([path], trial_columns())
-    assert "a spreadsheet has cut its digits" in told.value.remedy
+    assert "a spreadsheet has removed digits" in told.value.remedy
 
 
 def test_a_moment_keeps_its_nanoseconds_beside_a_hole(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ def test_what_differs_behind_one_name_is_told_beside_the_table(
     for name, procedure in (("one", "bbbb"), ("two", "dddd")):  # as --record 1s and --record 15s make them
         write(tmp_path / name, repeats(replace(ROW, trial=name, procedure_sha256=procedure, **alike), 3))
     assert main(["aggregate", str(tmp_path), "--quantity", "ip_loss"]) == 0
-    assert capsys.readouterr().err == "note: A procedure is not the same in all its trials\n"
+    assert capsys.readouterr().err == "note: A procedure differs between its trials\n"
     assert main(["aggregate", str(tmp_path / "one"), "--quantity", "ip_loss"]) == 0
     assert capsys.readouterr().err == ""
 
@@ -113,7 +113,7 @@ def test_round_trips_of_several_sizes_in_one_condition_are_told(
         write(tmp_path, [*repeats(udp, 3), *tcp_repeats(replace(udp, protocol="tcp", rtt_payload_bytes=502), 3)])
     )
     assert main(["aggregate", table, "--quantity", "rtt_median_s", "--by", "distance"]) == 0
-    assert capsys.readouterr().err.startswith("note: Echo requests of several sizes are in one condition")
+    assert capsys.readouterr().err.startswith("note: A condition has echo requests of different sizes")
     assert main(["aggregate", table, "--quantity", "rtt_median_s"]) == 0
     assert capsys.readouterr().err == ""
 
