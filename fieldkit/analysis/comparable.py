@@ -121,7 +121,7 @@ def mixtures(repeats: Repeats, by: Sequence[str] = DEFAULT_BY) -> Iterator[str]:
             return
 
 
-def doubts(a: Repeats, b: Repeats) -> Iterator[Concern]:
+def notes(a: Repeats, b: Repeats) -> Iterator[Concern]:
     """Yield notes on all repeats: different versions of fieldkit, or attempts that are in both runs."""
     yield from _compare_column("code_sha256", a, b, refuses=False)
     if common := len(_attempts(a) & _attempts(b)):

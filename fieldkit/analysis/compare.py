@@ -161,7 +161,7 @@ def compare(
         differences = _differences(sides, (rows_a.get(key), rows_b.get(key)), compared, thresholds or {})
         pairs.append(Pair(_condition_name(by, key), dict(zip(by, key, strict=True)), *sides, differences))
     both = [(_condition_name(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
-    return Comparison(tuple(by), _with_holm(pairs), (*comparable.concerns(both, by), *comparable.doubts(a, b)))
+    return Comparison(tuple(by), _with_holm(pairs), (*comparable.concerns(both, by), *comparable.notes(a, b)))
 
 
 def _quantities(a: Repeats, b: Repeats) -> tuple[Quantity, ...]:

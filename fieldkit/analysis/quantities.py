@@ -134,7 +134,9 @@ def in_order(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
 
 def symbols(unit: str) -> tuple[str, ...]:
     """Return the symbols in which values of a unit, and differences of them, are written."""
-    return tuple(PER_UNIT[unit]) if unit in PER_UNIT else tuple(dict.fromkeys((unit, APART.get(unit, unit))))
+    return (
+        tuple(PER_UNIT[unit]) if unit in PER_UNIT else tuple(dict.fromkeys((unit, DIFFERENCE_UNITS.get(unit, unit))))
+    )
 
 
 def parse_amount(text: str, unit: str, what: str) -> float:
@@ -164,7 +166,7 @@ LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "ip_loss", "file_loss", "rtt_
 PER_UNIT: Final = MappingProxyType({"share": FRACTION_PER_UNIT, "s": SECONDS_PER_UNIT, "bit/s": BITS_PER_S_PER_UNIT})
 """Symbols and factors of units that are written in several ways; other units are written as they are."""
 
-APART: Final = MappingProxyType({"share": "points", "dBm": "dB"})
+DIFFERENCE_UNITS: Final = MappingProxyType({"share": "points", "dBm": "dB"})
 """Unit of the difference of two values, if it is not the unit of the values."""
 
 DEFAULT_BY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")

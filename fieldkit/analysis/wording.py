@@ -10,7 +10,7 @@ from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.compare import Comparison, Difference
 from fieldkit.analysis.expectations import Scope
 from fieldkit.analysis.judgements import Judgement
-from fieldkit.analysis.quantities import APART, Quantity, in_order
+from fieldkit.analysis.quantities import DIFFERENCE_UNITS, Quantity, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, assured
 from fieldkit.analysis.words import Tally
 from fieldkit.core import columns
@@ -305,7 +305,7 @@ def verdict(difference: Difference, comparisons: int) -> str:
         more = "more" if difference.value > 0 else "less"
         interval_text = comparison_scale(difference).interval(low, high)
         text = f"B {_amount(abs(difference.value), difference)} {more} {interval_text}"
-        if not holds(difference):
+        if not is_significant(difference):
             text += f"; may be chance among {comparisons}"
     else:
         most = max(abs(difference.interval.low), abs(difference.interval.high))
@@ -313,7 +313,7 @@ def verdict(difference: Difference, comparisons: int) -> str:
     return text + _threshold(difference)
 
 
-def holds(difference: Difference) -> bool:
+def is_significant(difference: Difference) -> bool:
     """Return True if a difference is significant after correction for the number of comparisons."""
     return difference.p_holm is not None and difference.p_holm < 1 - CONFIDENCE
 
@@ -322,7 +322,7 @@ def conclusions(comparison: Comparison) -> Iterator[str]:
     """Yield the conclusions of a comparison, and the conditions that could not be compared."""
     comparisons, differences = comparison.made, comparison.differences
     seen = sum(difference.seen for difference in differences)
-    significant = sum(holds(difference) for difference in differences)
+    significant = sum(is_significant(difference) for difference in differences)
     yield (
         f"{format_count(comparisons, 'comparison')}: {format_count(seen, 'difference')} seen, {significant} after "
         f"correction for their number; were there none, about {(1 - CONFIDENCE) * comparisons:.1f} would be seen"
@@ -368,4 +368,4 @@ def _amount(amount: float, difference: Difference) -> str:
 
 def _unit(difference: Difference) -> str:
     """Return the unit of a difference, such as percentage points for shares."""
-    return APART.get(difference.quantity.unit, comparison_scale(difference).unit)
+    return DIFFERENCE_UNITS.get(difference.quantity.unit, comparison_scale(difference).unit)

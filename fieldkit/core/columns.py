@@ -230,14 +230,14 @@ def plain_name(name: str) -> str:
     return name.rpartition(".")[2]
 
 
-def prefixed(name: str, what: str) -> str:
-    """Return the name of a step's column, job or file: `up.file_loss`; `what` if the step has no name."""
-    return f"{name}.{what}" if name else what
+def prefixed(name: str, plain: str) -> str:
+    """Return the name of a step's column, job or file: `up.file_loss`; `plain` if the step has no name."""
+    return f"{name}.{plain}" if name else plain
 
 
-def of_fault(kind: FaultKind, what: str) -> str:
-    """Return the name of a fault's column; `what` is for example `outage_s`, `recovery_s` or `recovered`."""
-    return f"{kind.replace('-', '_')}_{what}"
+def of_fault(kind: FaultKind, quantity: str) -> str:
+    """Return the name of a fault's column; `quantity` is for example `outage_s`, `recovery_s` or `recovered`."""
+    return f"{kind.replace('-', '_')}_{quantity}"
 
 
 @dataclass(frozen=True)

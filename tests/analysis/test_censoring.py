@@ -200,4 +200,5 @@ def test_steps_that_have_names_have_companions_of_their_own() -> None:
 
 def test_means_have_no_lower_bounds() -> None:
     (column,) = columns(100, ("stalls", "count", "Stalls.", Figure("stalls", Kind.MEAN, at_least="other")))
-    assert column.flaw() == "only a median can have a column of lower bounds (at_least) or of all sent items (of_sent)"
+    flaw = "only a median can have a column of lower bounds (at_least) or of all sent items (of_sent)"
+    assert column.flaw() == flaw

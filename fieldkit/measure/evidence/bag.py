@@ -89,7 +89,7 @@ def read(path: Path) -> Bag:
 
 
 @dataclass(frozen=True)
-class Heard:
+class TopicStats:
     """Number and times of the recorded messages of one topic.
 
     Attributes:
@@ -105,7 +105,7 @@ class Heard:
     gap_ns: int
 
 
-def heard(path: Path) -> Mapping[str, Heard]:
+def heard(path: Path) -> Mapping[str, TopicStats]:
     """Return number and times of the messages by topic; topics without a message are omitted.
 
     Raises:
@@ -117,7 +117,7 @@ def heard(path: Path) -> Mapping[str, Heard]:
         topics = _query(path, heard="true")["topics"]
     except ConfinedAnswerError as error:
         raise EvidenceError(f"the bag cannot be read: {error}", where=str(path)) from error
-    return {topic: Heard(**fields) for topic, fields in topics.items()}
+    return {topic: TopicStats(**fields) for topic, fields in topics.items()}
 
 
 def battery_share(path: Path, topic: str) -> float | None:

@@ -72,7 +72,7 @@ def contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
 
 
 def heard(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
-    """Return number and times of the messages by topic, keyed by the attributes of `Heard`."""
+    """Return number and times of the messages by topic, keyed by the attributes of `TopicStats`."""
     by_topic: dict[str, dict[str, int]] = {}
     with reader:
         for connection, stamp_ns, _ in reader.messages():

@@ -39,5 +39,5 @@ def read(path: Path, header: str, pattern: re.Pattern[str], error: str) -> list[
     if first != header or lines[-1:] != [""] or len(matches) < len(lines) - 1:
         raise EvidenceError(error, where=str(path))
     if count and int(count[1]) != len(matches):
-        raise EvidenceError(f"has {len(matches)} lines of {count[1]}: it was truncated", where=str(path))
+        raise EvidenceError(f"has {len(matches)} lines of {count[1]}: truncated", where=str(path))
     return matches

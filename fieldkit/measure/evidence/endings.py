@@ -91,7 +91,7 @@ def problem(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) ->
     if ending.cause is Cause.ITSELF and ending.code > _KILLED:
         return f"was killed by {_signal(ending.code - _KILLED)}, not by fieldkit"
     if ending.cause is Cause.ITSELF and ending.lasted_s is not None and ending.lasted_s + _TOLERANCE_S < least_s:
-        return f"exited after {ending.lasted_s:.1f} s instead of {least_s:g} s"
+        return f"exited after {ending.lasted_s:.1f} s of {least_s:g} s"
     return None
 
 

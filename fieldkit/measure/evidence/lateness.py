@@ -62,7 +62,7 @@ def read(path: Path) -> Lateness:
     bound, line_count, body = match.groups()
     lines = body.splitlines()
     if line_count is not None and int(line_count) != len(lines):
-        raise EvidenceError(f"has {len(lines)} lines of {line_count}: it was truncated", where=str(path))
+        raise EvidenceError(f"has {len(lines)} lines of {line_count}: truncated", where=str(path))
     packets = {int(late_ns): int(count) for _, late_ns, count in map(str.split, lines)}
     if sum(packets.values()) >= _MAX_PACKETS:
         raise EvidenceError("contains an impossible number of packets", where=str(path))

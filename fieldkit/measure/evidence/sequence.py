@@ -12,7 +12,7 @@ messages."""
 
 
 @dataclass(frozen=True)
-class Counted:
+class MessageCounts:
     """Message counts derived from sequence numbers.
 
     Attributes:
@@ -30,7 +30,7 @@ class Counted:
     rate_hz: float
 
 
-def counted(arrivals: Sequence[tuple[int, int]], ended_us: int) -> Counted:
+def count_messages(arrivals: Sequence[tuple[int, int]], ended_us: int) -> MessageCounts:
     """Count received and lost messages.
 
     Between two consecutive messages, `(number - previous number - 1) % 256` are missing; a message that arrives late
@@ -42,7 +42,7 @@ def counted(arrivals: Sequence[tuple[int, int]], ended_us: int) -> Counted:
         ended_us: End of the reception in us; 0 if unknown.
     """
     if not arrivals:
-        return Counted(0, 0, 0, 0.0, 0.0)
+        return MessageCounts(0, 0, 0, 0.0, 0.0)
     rate_hz = _rate_hz(arrivals)
     messages, lost, repeated, silence_us = 1, 0, 0, 0
     newest = arrivals[0][1]
@@ -61,7 +61,7 @@ def counted(arrivals: Sequence[tuple[int, int]], ended_us: int) -> Counted:
     tail_us = max(ended_us - arrivals[-1][0], 0)
     if tail_us > SILENCE_US:
         lost += max(round(rate_hz * tail_us / 1e6) - 1, 0)
-    return Counted(messages, lost, repeated, max(silence_us, tail_us) / 1e6, rate_hz)
+    return MessageCounts(messages, lost, repeated, max(silence_us, tail_us) / 1e6, rate_hz)
 
 
 def _rate_hz(arrivals: Sequence[tuple[int, int]]) -> float:

@@ -107,7 +107,7 @@ _READER: Final = Confined("fieldkit.measure.motion.tlog_reader")
 
 
 @dataclass(frozen=True)
-class Told:
+class RecorderSummary:
     """Summary that a recorder wrote at the end of its log.
 
     Attributes:
@@ -128,7 +128,7 @@ class Told:
     slow_s: float | None = None
 
 
-def told(path: Path) -> Told:
+def told(path: Path) -> RecorderSummary:
     """Return the summary of a recorder.
 
     Raises:
@@ -142,7 +142,7 @@ def told(path: Path) -> Told:
         frames, left_out, ended_us = (_non_negative_int(data[name]) for name in ("frames", "left_out", "ended_us"))
         crc32 = _non_negative_int(data["crc32"]) if "crc32" in data else None
         slow_s = max((_duration_s(lasted) for lasted in data.get("slow_s", {}).values()), default=None)
-        return Told(frames, left_out, ended_us, refused, crc32, slow_s)
+        return RecorderSummary(frames, left_out, ended_us, refused, crc32, slow_s)
     except JSON_ERRORS as error:
         raise EvidenceError(
             "is not a summary of a recording", where=str(path), remedy="read the recorder's log: was it killed?"
@@ -218,7 +218,9 @@ def read(path: Path, system: int, ended_us: int) -> Tlog:
     )
 
 
-def contradictions(log: Tlog, said: Told, sum_of_file: int, window: tuple[int, int] | None) -> Iterator[str]:
+def contradictions(
+    log: Tlog, said: RecorderSummary, sum_of_file: int, window: tuple[int, int] | None
+) -> Iterator[str]:
     """Yield the contradictions between a log, the recorder's summary and the attempt, one sentence each.
 
     Args:
@@ -247,7 +249,7 @@ def measure(log: Tlog | None, slow_s: float | None = None) -> Measured:
 
     Args:
         log: Contents of the log; None if it is incomplete.
-        slow_s: `Told.slow_s`.
+        slow_s: `RecorderSummary.slow_s`.
     """
     if log is None:
         return Measured.nothing(COLUMNS, "the telemetry log is incomplete")

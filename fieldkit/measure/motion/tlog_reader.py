@@ -175,7 +175,7 @@ def _summary(data: bytes, autopilot: Source, ended_us: int) -> Json:
         "damaged": decoder.damaged,
         "system": autopilot[0],
         "kinds": dict(kinds),
-        "numbers": vars(sequence.counted(numbers, ended_us)),
+        "numbers": vars(sequence.count_messages(numbers, ended_us)),
         "periodic": periodic.lost(numbers, streams, ended_us),
         "values": dict(_column_values(series)),
     }

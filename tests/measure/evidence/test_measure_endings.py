@@ -44,7 +44,7 @@ def test_a_line_that_is_none_tells_nothing(line: str) -> None:
         ("job limit 137 100 9.00", {Cause.LIMIT}, 15.0, None),
         ("job asked 0 100 9.00", {Cause.ITSELF}, 0.0, "was stopped by fieldkit before it had finished"),
         ("job itself 0 100 15.95", {Cause.ITSELF}, 15.0, None),
-        ("job itself 0 100 9.00", {Cause.ITSELF}, 15.0, "exited after 8.0 s instead of 15 s"),
+        ("job itself 0 100 9.00", {Cause.ITSELF}, 15.0, "exited after 8.0 s of 15 s"),
         ("job itself - 100 -", {Cause.ITSELF}, 15.0, "was killed"),
         ("job running - 100 -", {Cause.ITSELF}, 0.0, "was still running when the evidence was collected"),
     ],

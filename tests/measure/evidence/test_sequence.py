@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.measure.evidence.sequence import NUMBERS, counted
+from fieldkit.measure.evidence.sequence import NUMBERS, count_messages
 
 PERIOD_US = 20_000
 
@@ -22,7 +22,7 @@ def test_what_is_missing_between_the_first_and_the_last_is_counted(lost: list[bo
     # A second without a message, where the number alone does not tell it, has tests of its own.
     if not came or max((after[0] - before[0] for before, after in pairwise(came)), default=0) > 1e6:
         return
-    found = counted(came, 0)
+    found = count_messages(came, 0)
     missing = came[-1][0] // PERIOD_US - came[0][0] // PERIOD_US + 1 - len(came)
     assert (found.messages, found.lost, found.repeated) == (len(came), missing, 0)
 
@@ -32,31 +32,31 @@ def test_who_comes_late_is_not_lost_and_who_comes_twice_counts_once(order: list[
     came = sent(40, first)
     came[10:14] = [came[10 + index] for index in order]
     came.insert(20, came[19])
-    found = counted([(at * PERIOD_US, number) for at, (_, number) in enumerate(came)], 0)
+    found = count_messages([(at * PERIOD_US, number) for at, (_, number) in enumerate(came)], 0)
     assert (found.messages, found.lost, found.repeated) == (40, 0, 1)
 
 
 @pytest.mark.parametrize("gone", [40, 51, 200, 255, 256, 257, 700, 3000])
 def test_a_silence_of_more_than_256_messages_is_counted_by_the_rate(gone: int) -> None:
     came = sent(5000)
-    found = counted(came[:500] + came[500 + gone :], 0)
+    found = count_messages(came[:500] + came[500 + gone :], 0)
     assert (found.messages, found.lost) == (5000 - gone, gone)
     assert found.silence_s == pytest.approx((gone + 1) / 50)
     assert found.rate_hz == pytest.approx(50)
 
 
 def test_what_was_sent_after_the_last_that_came_is_counted_by_the_rate() -> None:
-    found = counted(sent(500), 500 * PERIOD_US + 10_000_000)
+    found = count_messages(sent(500), 500 * PERIOD_US + 10_000_000)
     assert found.lost == pytest.approx(500, abs=1)
     assert found.silence_s == pytest.approx(10, abs=0.03)
 
 
 def test_nothing_came() -> None:
-    assert (counted([], 9).messages, counted([(1, 2)], 0).messages) == (0, 1)
+    assert (count_messages([], 9).messages, count_messages([(1, 2)], 0).messages) == (0, 1)
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**52), st.integers(0, 255)), max_size=40), st.integers(0, 2**62))
 def test_whatever_the_numbers_are_it_ends(came: list[tuple[int, int]], ended_us: int) -> None:
-    found = counted(came, ended_us)
+    found = count_messages(came, ended_us)
     assert 0 <= found.messages <= len(came)
     assert found.lost >= 0

@@ -192,7 +192,7 @@ SAID = {"frames": 3, "bytes": 99, "left_out": 0, "ended_us": 5, "refused": {"32"
 def test_what_the_recorder_said(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
     path.write_text(json.dumps(SAID), encoding="utf-8")
-    assert tlog.told(path) == tlog.Told(3, 0, 5, {32: 2})
+    assert tlog.told(path) == tlog.RecorderSummary(3, 0, 5, {32: 2})
 
 
 WRONG: list[dict[str, object]] = [
@@ -217,7 +217,7 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_noticed(tmp_path:
     path = tmp_path / "mavlink.tlog"
     path.write_bytes(flight())
     log = tlog.read(path, 0, 0)
-    said = tlog.Told(log.frames, 0, log.last_us + 5, {}, tlog.sum_of(path))
+    said = tlog.RecorderSummary(log.frames, 0, log.last_us + 5, {}, tlog.sum_of(path))
     window = log.first_us * 1000, log.last_us * 1000 + 999
     assert list(tlog.contradictions(log, said, tlog.sum_of(path), window)) == []
     for other, total, around, why in (
@@ -235,7 +235,7 @@ def test_frames_that_were_moved_are_noticed(tmp_path: Path) -> None:
     whole = flight()
     path.write_bytes(whole + whole)
     log = tlog.read(path, 0, 0)
-    (reason,) = tlog.contradictions(log, tlog.Told(log.frames, 0, log.last_us, {}), 0, None)
+    (reason,) = tlog.contradictions(log, tlog.RecorderSummary(log.frames, 0, log.last_us, {}), 0, None)
     assert "a frame that is 10.001 s earlier than the previous one" in reason
 
 
