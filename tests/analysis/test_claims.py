@@ -1,4 +1,4 @@
-"""What expectations need before a trial runs, against trials in which everything goes as well as it can."""
+"""Repeats and packets that expectations need, compared with judgements of trials with the best possible results."""
 
 import pytest
 from hypothesis import given
@@ -17,7 +17,7 @@ RETRIES = Quantity("retries", "retries", Kind.MEAN, "count")
 KNOWN = (PACKETS, GAP, BACK, RATE, RETRIES)
 
 
-def said(text: str, repeats: int) -> str:
+def warning(text: str, repeats: int) -> str:
     return " ".join(claims.shortfalls([expectations.parse(text, KNOWN)], KNOWN, repeats))
 
 
@@ -74,12 +74,12 @@ def said(text: str, repeats: int) -> str:
         ("retries < 3", 2, ""),
     ],
 )  # fmt: skip
-def test_what_a_claim_needs_is_said_before_a_run(text: str, repeats: int, shown: str) -> None:
-    assert said(text, repeats) == (shown and f"expected {text}: {shown}")
+def test_the_needs_of_an_expectation_are_reported_before_a_trial(text: str, repeats: int, shown: str) -> None:
+    assert warning(text, repeats) == (shown and f"expected {text}: {shown}")
 
 
 @given(st.integers(1, 60), st.integers(1, 60))
 def test_without_a_warning_a_perfect_trial_holds_and_with_one_it_does_not(percent: int, repeats: int) -> None:
     for text in (f"ip_loss < {percent} %", f"{percent} % of ip_loss < 1 %"):
-        (found,) = judgements.judge([expectations.parse(text, KNOWN)], [losses(*[0] * repeats)])
-        assert (found.ruling is Ruling.HOLDS) is (said(text, repeats) == "")
+        (judgement,) = judgements.judge([expectations.parse(text, KNOWN)], [losses(*[0] * repeats)])
+        assert (judgement.ruling is Ruling.HOLDS) is (warning(text, repeats) == "")

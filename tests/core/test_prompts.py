@@ -38,7 +38,7 @@ def test_an_answer_has_no_note_if_it_skips(line: str, may_skip: bool) -> None:
     assert answer is None or not (answer.skip and (answer.note or not may_skip))
 
 
-def test_a_script_reads_a_line_only_after_its_request_was_told() -> None:
+def test_a_script_reads_a_line_only_after_its_request_was_reported() -> None:
     events: list[Event] = []
 
     def lines() -> Iterator[str]:

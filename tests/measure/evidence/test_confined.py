@@ -40,9 +40,9 @@ def unpacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[confine
     (tmp_path / "tmp").mkdir()
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    one = confined.Confined("unpacks")
-    yield one
-    one.end()
+    reader = confined.Confined("unpacks")
+    yield reader
+    reader.end()
 
 
 _UNPACKS = """

@@ -29,10 +29,10 @@ def write_bag(path: Path, topics: dict[str, int], period_s: float = 0.2) -> Path
 
 
 def test_contents_of_a_bag(tmp_path: Path) -> None:
-    found = bag.read(write_bag(tmp_path / "scan.bag", {"/scan": 74, "/odom": 3}))
-    assert found.messages == 77
-    assert dict(found.messages_by_topic) == {"/scan": 74, "/odom": 3}
-    assert found.duration_s == 14.6
+    contents = bag.read(write_bag(tmp_path / "scan.bag", {"/scan": 74, "/odom": 3}))
+    assert contents.messages == 77
+    assert dict(contents.messages_by_topic) == {"/scan": 74, "/odom": 3}
+    assert contents.duration_s == 14.6
 
 
 def test_a_ros_1_bag_is_read_without_what_those_of_ros_2_take(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def ros2(folder: Path, percentages: Sequence[float], storage: StoragePlugin) -> 
         connection = writer.add_connection(TOPIC, TYPE, typestore=store)
         for at, percentage in enumerate(percentages):
             writer.write(connection, at, store.serialize_cdr(message(Stores.ROS2_FOXY, percentage), TYPE))
-    (path,) = (one for one in (folder / "scan").iterdir() if one.suffix in {".db3", ".mcap"})
+    (path,) = (file for file in (folder / "scan").iterdir() if file.suffix in {".db3", ".mcap"})
     return path
 
 

@@ -17,11 +17,11 @@ send limit 130 1286154 12981.58
 
 
 def test_what_a_robot_noted_is_read() -> None:
-    found = endings.parse(NOTED.splitlines())
-    assert (found["capture"].cause, found["capture"].code) == (Cause.ASKED, 0)
-    assert found["capture"].lasted_s == pytest.approx(2.25)
-    assert found["killed"] == Ending(Cause.ITSELF, None, None)
-    assert [found[name].cause for name in ("ping", "busy", "send")] == [Cause.ITSELF, Cause.RUNNING, Cause.LIMIT]
+    by_name = endings.parse(NOTED.splitlines())
+    assert (by_name["capture"].cause, by_name["capture"].code) == (Cause.ASKED, 0)
+    assert by_name["capture"].lasted_s == pytest.approx(2.25)
+    assert by_name["killed"] == Ending(Cause.ITSELF, None, None)
+    assert [by_name[name].cause for name in ("ping", "busy", "send")] == [Cause.ITSELF, Cause.RUNNING, Cause.LIMIT]
 
 
 @pytest.mark.parametrize("line", ["", "capture", "a b 0 1 2.00", "ping itself 0 1 2.0 more", "x itself 9999 1 2.00"])

@@ -27,8 +27,8 @@ UdpLite: 0 0 0 0 77 0 0 0 0
 
 
 def test_counters_come_from_their_own_section_and_group() -> None:
-    found = host.parse(STATE.format(reassembly=3, buffer=17))
-    assert (found.udp_buffer_errors, found.reassembly_failures) == (17, 3)
+    counters = host.parse(STATE.format(reassembly=3, buffer=17))
+    assert (counters.udp_buffer_errors, counters.reassembly_failures) == (17, 3)
 
 
 def test_the_difference_is_after_less_before() -> None:

@@ -78,12 +78,12 @@ def test_a_file_that_was_cut_anywhere_does_not_look_whole(tmp_path_factory: pyte
 @given(st.lists(st.integers(0, 10**10), min_size=1, max_size=300), st.floats(0.01, 1.0))
 def test_quantiles_are_those_of_the_packets_rounded_up(late_ns: list[int], share: float) -> None:
     counted = Lateness(bound_ns=1, packets=Counter(map(rounded_up, late_ns)))
-    found = lateness.quantile_ns(counted, share)
+    quantile_ns = lateness.quantile_ns(counted, share)
     true_ns = int(np.quantile(late_ns, share, method="inverted_cdf"))
-    assert found is not None
-    assert true_ns < found <= true_ns * 9 / 8 + 1
+    assert quantile_ns is not None
+    assert true_ns < quantile_ns <= true_ns * 9 / 8 + 1
 
 
 @given(st.sets(st.integers(0, 2**40), min_size=1))
 def test_lateness_of_any_size_takes_few_values(late_ns: set[int]) -> None:
-    assert len({rounded_up(one) for one in late_ns}) <= 8 * 41
+    assert len({rounded_up(value) for value in late_ns}) <= 8 * 41

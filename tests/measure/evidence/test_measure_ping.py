@@ -37,15 +37,15 @@ def test_other_pings_are_understood_but_for_what_is_none_of_theirs() -> None:
 
 
 def test_busyboxs_duplicate_counts_once_and_its_times_are_milliseconds() -> None:
-    found = ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt")
-    assert [(reply.seq, reply.duplicate) for reply in found.replies] == [
+    result = ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt")
+    assert [(reply.seq, reply.duplicate) for reply in result.replies] == [
         (0, False),
         (0, True),
         (2, False),
         (3, False),
     ]
-    assert found.rtt_s == (0.170 / 1e3, 0.157 / 1e3, 0.149 / 1e3)
-    assert {reply.at_utc_ns for reply in found.replies} == {None}
+    assert result.rtt_s == (0.170 / 1e3, 0.157 / 1e3, 0.149 / 1e3)
+    assert {reply.at_utc_ns for reply in result.replies} == {None}
 
 
 def test_an_interrupted_busybox_run_has_gaps_from_0() -> None:
@@ -99,16 +99,16 @@ def test_a_normal_run() -> None:
 def test_what_real_runs_say(
     name: str, payload_bytes: int, answers: int, summary: tuple[int | None, int | None], gaps: tuple[int, ...]
 ) -> None:
-    found = ping.read(OUTPUTS / f"{name}.txt")
-    assert found.payload_bytes == payload_bytes
-    assert len(found.answers) == answers
-    assert ((found.transmitted, found.received), found.gaps) == (summary, gaps)
+    result = ping.read(OUTPUTS / f"{name}.txt")
+    assert result.payload_bytes == payload_bytes
+    assert len(result.answers) == answers
+    assert ((result.transmitted, result.received), result.gaps) == (summary, gaps)
 
 
 def test_a_duplicate_is_kept_and_marked_but_does_not_count() -> None:
-    found = ping.read(OUTPUTS / "duplicates.txt")
-    assert [(reply.seq, reply.duplicate) for reply in found.replies] == [(1, False), (1, True), (3, False)]
-    assert found.rtt_s == (0.159 / 1e3, 0.052 / 1e3)
+    result = ping.read(OUTPUTS / "duplicates.txt")
+    assert [(reply.seq, reply.duplicate) for reply in result.replies] == [(1, False), (1, True), (3, False)]
+    assert result.rtt_s == (0.159 / 1e3, 0.052 / 1e3)
 
 
 def test_errors_keep_who_says_what_of_which_request() -> None:
@@ -118,14 +118,14 @@ def test_errors_keep_who_says_what_of_which_request() -> None:
 
 
 def test_a_payload_too_short_for_a_time_stamp_gives_no_round_trip_times() -> None:
-    found = ping.read(OUTPUTS / "payload-8.txt")
-    assert len(found.answers) == 2
-    assert found.rtt_s == ()
+    result = ping.read(OUTPUTS / "payload-8.txt")
+    assert len(result.answers) == 2
+    assert result.rtt_s == ()
 
 
 def test_a_reply_with_a_wrong_checksum_is_none() -> None:
-    found = ping.parse("64 bytes from 10.9.0.2: icmp_seq=1 ttl=64 time=1.00 ms (BAD CHECKSUM!)\n")
-    assert (len(found.replies), len(found.answers), found.gaps) == (1, 0, ())
+    result = ping.parse("64 bytes from 10.9.0.2: icmp_seq=1 ttl=64 time=1.00 ms (BAD CHECKSUM!)\n")
+    assert (len(result.replies), len(result.answers), result.gaps) == (1, 0, ())
 
 
 def test_gaps_of_an_interrupted_run_end_at_the_last_number_seen() -> None:
@@ -154,9 +154,9 @@ words = st.sampled_from([
 @given(st.one_of(st.text(), st.lists(words, max_size=30).map("".join)))
 @example("64 bytes from 1: icmp_seq=" + "9" * 5000)
 def test_garbage_never_raises(text: str) -> None:
-    found = ping.parse(text)
-    assert len(found.answers) <= len(found.replies) <= text.count("\n") + 1
-    assert len(found.gaps) <= 65536
+    result = ping.parse(text)
+    assert len(result.answers) <= len(result.replies) <= text.count("\n") + 1
+    assert len(result.gaps) <= 65536
 
 
 @given(st.binary())
@@ -170,8 +170,8 @@ def test_garbage_between_the_lines_of_a_real_run_changes_nothing(data: st.DataOb
     lines = real.split("\n")
     noise = st.text(st.characters(exclude_characters="\n"), min_size=1).filter(lambda line: "e" not in line)
     at = data.draw(st.integers(0, len(lines)))
-    found = ping.parse("\n".join([*lines[:at], data.draw(noise), *lines[at:]]))
-    assert (found.replies, found.transmitted) == (ping.parse(real).replies, 3)
+    result = ping.parse("\n".join([*lines[:at], data.draw(noise), *lines[at:]]))
+    assert (result.replies, result.transmitted) == (ping.parse(real).replies, 3)
 
 
 def answered(*seqs_ms: tuple[int, int], sent: int) -> Ping:
@@ -211,8 +211,8 @@ def test_the_longest_gap_has_the_number_of_lost_requests() -> None:
 def test_a_gap_that_the_ping_began_or_ended_in_is_a_lower_bound(
     ping_: Ping, lasted_s: float, lost: int, is_open: bool
 ) -> None:
-    found = ping.longest_gap(ping_, INTERVAL_S)
-    assert found == AnswerGap(pytest.approx(lasted_s), lost, is_open)  # type: ignore[arg-type]
+    result = ping.longest_gap(ping_, INTERVAL_S)
+    assert result == AnswerGap(pytest.approx(lasted_s), lost, is_open)  # type: ignore[arg-type]
     values = ping.measure_gap(ping_, INTERVAL_S).values
     suffix = ("_at_least_s", "_lost_at_least") if is_open else ("_s", "_lost")
     assert values == {
@@ -234,8 +234,8 @@ def test_without_time_stamps_there_is_no_gap() -> None:
 
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
 def test_every_ping_has_either_a_gap_or_its_lower_bound(came: list[bool]) -> None:
-    found = answered(*((seq, 100 * seq) for seq, arrived in enumerate(came, 1) if arrived), sent=len(came))
-    measured = ping.measure_gap(found, INTERVAL_S)
+    result = answered(*((seq, 100 * seq) for seq, arrived in enumerate(came, 1) if arrived), sent=len(came))
+    measured = ping.measure_gap(result, INTERVAL_S)
     longest_run = max((len(list(run)) for arrived, run in groupby(came) if not arrived), default=0)
     if len(came) == 1 and came[0]:
         assert not measured.values

@@ -37,14 +37,14 @@ VECTORS = st.tuples(COORDINATES, COORDINATES, COORDINATES)
 TRACKS = st.lists(
     st.builds(Whereabouts, st.integers(0, 2**63), st.sampled_from(FIXED_ROLES), st.none() | VECTORS, VECTORS),
     max_size=20,
-).map(lambda track: sorted(track, key=lambda one: one.utc_ns))
+).map(lambda track: sorted(track, key=lambda entry: entry.utc_ns))
 
 
 def test_distance_and_speed_are_means_over_the_time_and_nowhere_is_no_distance() -> None:
-    found = track.apart(AWAY, *ENDS, 10 * S + S // 2, 14 * S)
+    separation = track.apart(AWAY, *ENDS, 10 * S + S // 2, 14 * S)
     # 0.5 s at 5 m, 2 s at 8 m, then 1 s nowhere.
-    assert found is not None
-    assert astuple(found) == pytest.approx((5.0, 5.0, 18.5 / 2.5, 8.0, 11.5 / 2.5, 11.5 / 2.5))
+    assert separation is not None
+    assert astuple(separation) == pytest.approx((5.0, 5.0, 18.5 / 2.5, 8.0, 11.5 / 2.5, 11.5 / 2.5))
 
 
 def test_a_moment_has_a_distance_and_the_time_before_all_has_none() -> None:
@@ -69,11 +69,11 @@ def test_columns_say_how_far_apart_the_robots_were_while_ping_had_replies(tmp_pa
     without = measure(tmp_path, None)
     assert without.rtt_distance_start_m is None
     (tmp_path / "track.csv").write_text(track.text(AWAY), encoding="ascii")
-    said = measure(tmp_path, None)
-    assert (said.rtt_distance_start_m, said.rtt_distance_min_m, said.rtt_distance_max_m) == (5.0, 5.0, 8.0)
-    assert said.rtt_distance_mean_m == pytest.approx((0.5 * 5 + 1.5 * 8) / 2)
-    assert said.rtt_sender_speed_m_s == pytest.approx((0.5 * 3 + 1.5 * 5) / 2)
-    assert said.transfer_distance_start_m is None
+    row = measure(tmp_path, None)
+    assert (row.rtt_distance_start_m, row.rtt_distance_min_m, row.rtt_distance_max_m) == (5.0, 5.0, 8.0)
+    assert row.rtt_distance_mean_m == pytest.approx((0.5 * 5 + 1.5 * 8) / 2)
+    assert row.rtt_sender_speed_m_s == pytest.approx((0.5 * 3 + 1.5 * 5) / 2)
+    assert row.transfer_distance_start_m is None
     (tmp_path / "track.csv").write_text(track.text(AWAY)[:-1], encoding="ascii")
     assert measure(tmp_path, None) == without
 

@@ -118,8 +118,8 @@ def test_a_ros2_recorder_looks_for_all_its_topics_at_once(suffix: str, tmp_path:
         for at_ns in (BEGAN_NS + 2 * S, BEGAN_NS + 3 * S):
             writer.write(connection, at_ns, data)
     (tmp_path / "log").write_text(ROS2.format(s=BEGAN_NS // S, ns=BEGAN_NS % S), encoding="utf-8")
-    found = reception.read(tmp_path, "log", f"scan/scan.{suffix}", ["/scan"], 4.0)
-    assert found == RecordingReception(discovered=True, messages=2, discovery_s=2.0, gap_s=1.0)
+    result = reception.read(tmp_path, "log", f"scan/scan.{suffix}", ["/scan"], 4.0)
+    assert result == RecordingReception(discovered=True, messages=2, discovery_s=2.0, gap_s=1.0)
 
 
 @given(st.integers(0, 9_999_999_999 * S), st.sampled_from([ROSBAG, ROS2]))

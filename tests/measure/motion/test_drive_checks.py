@@ -34,16 +34,16 @@ def lines() -> list[dict[str, Any]]:
     return [{**line, "utc_ns": START_NS + round(1e9 * line["at_s"])} for line in made]
 
 
-def written(folder: Path, said: list[dict[str, Any]], *, numbered: bool = True) -> Path:
+def written(folder: Path, lines_: list[dict[str, Any]], *, numbered: bool = True) -> Path:
     """Write lines as the agent does; without numbers as agents of older versions did."""
     text = StringIO()
     log = NumberedLines(text)
-    for line in said[:-1]:
+    for line in lines_[:-1]:
         log.write(line)
-    log.end(said[-1])
+    log.end(lines_[-1])
     path = folder / drive_log.FILE
     path.write_text(
-        text.getvalue() if numbered else "".join(f"{json.dumps(line)}\n" for line in said), encoding="ascii"
+        text.getvalue() if numbered else "".join(f"{json.dumps(line)}\n" for line in lines_), encoding="ascii"
     )
     return path
 
@@ -97,9 +97,9 @@ def test_a_line_that_was_changed_is_noticed(name: str, tmp_path: Path) -> None:
 
 def test_a_way_that_is_not_the_planned_one_is_noticed(tmp_path: Path) -> None:
     made = [{**line, "x_m": 3 * line["x_m"], "driven_m": 3 * line["driven_m"]} for line in lines()]
-    found = reasons(written(tmp_path, made))
-    assert any("deviates by 4.0 m" in reason for reason in found)
-    assert any("drove at 3.00 m/s instead of 1 m/s" in reason for reason in found)
+    contradictions = reasons(written(tmp_path, made))
+    assert any("deviates by 4.0 m" in reason for reason in contradictions)
+    assert any("drove at 3.00 m/s instead of 1 m/s" in reason for reason in contradictions)
 
 
 @settings(max_examples=150, deadline=None)

@@ -44,10 +44,10 @@ def lines() -> list[dict[str, Any]]:
 PHASES = (("standing", 0.5), ("climbing", 3.0), ("up", 4.0), ("flying", 14.0), ("there", 14.5), ("coming down", 20.0))
 
 
-def written(folder: Path, said: list[dict[str, Any]], *, ended: bool = True) -> Path:
+def written(folder: Path, lines_: list[dict[str, Any]], *, ended: bool = True) -> Path:
     text = StringIO()
     log = NumberedLines(text)
-    for line in said:
+    for line in lines_:
         log.write(line)
     if ended:
         log.end({"utc_ns": START_NS + 21 * 10**9, "ended": "landed"})
@@ -84,8 +84,8 @@ def test_a_log_without_its_end_is_noticed(tmp_path: Path) -> None:
 def test_a_line_that_was_changed_is_noticed(field: str, by: float, why: str, tmp_path: Path) -> None:
     made = lines()
     made[80] = {**made[80], field: made[80][field] + by}
-    found = reasons(written(tmp_path, made))
-    assert any(why in reason for reason in found) if why else found == []
+    contradictions = reasons(written(tmp_path, made))
+    assert any(why in reason for reason in contradictions) if why else contradictions == []
 
 
 @settings(max_examples=150, deadline=None)

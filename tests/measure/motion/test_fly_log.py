@@ -67,9 +67,9 @@ def test_the_columns_of_a_flight_that_is_known(tmp_path: Path, yaw_rad: float) -
     log = fly_log.read(tmp_path / fly_log.FILE)
     assert len(log) == 21, "before it stood, and where it does not say where it is, nothing is written"
     assert (log[13].ahead_m, log[13].left_m) == pytest.approx((4.0, 3.0), abs=1e-3)
-    found = fly_log.measure(log)
-    assert not found.missing
-    assert found.values == pytest.approx(
+    measured = fly_log.measure(log)
+    assert not measured.missing
+    assert measured.values == pytest.approx(
         {
             "fly_height_median_m": 3.0,
             "fly_height_max_m": 3.1,
@@ -85,8 +85,8 @@ def test_the_columns_of_a_flight_that_is_known(tmp_path: Path, yaw_rad: float) -
 def test_what_is_not_known_is_missing_and_says_why(tmp_path: Path) -> None:
     assert fly_log.measure(None).missing.keys() == NAMES
     torn = written(tmp_path, [{**LINE, "phase": "up"}], end='{"utc_ns": 1')
-    found = fly_log.measure(fly_log.read(torn))
-    assert found.missing.keys() == {"fly_height_median_m", "fly_speed_median_m_s", "fly_back_off_m"}
+    measured = fly_log.measure(fly_log.read(torn))
+    assert measured.missing.keys() == {"fly_height_median_m", "fly_speed_median_m_s", "fly_back_off_m"}
 
 
 @pytest.mark.parametrize("place", ["/dev/full", "/nowhere/fly.jsonl", ""])
@@ -141,8 +141,8 @@ moments = st.builds(
 
 @given(st.lists(moments, max_size=6))
 def test_the_columns_of_any_log_are_possible(log: list[FlightMoment]) -> None:
-    found = fly_log.measure(log)
-    assert found.values.keys() | found.missing.keys() == NAMES
+    measured = fly_log.measure(log)
+    assert measured.values.keys() | measured.missing.keys() == NAMES
     for column in fly_log.COLUMNS:
-        if column.name in found.values:
-            assert column.problem(str(found.values[column.name])) is None
+        if column.name in measured.values:
+            assert column.problem(str(measured.values[column.name])) is None

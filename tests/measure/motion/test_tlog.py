@@ -25,9 +25,9 @@ def written(tmp_path: Path, data: bytes) -> Path:
 
 
 def measured(tmp_path: Path, data: bytes, ended_us: int = 0) -> dict[str, object]:
-    found = tlog.measure(tlog.read(written(tmp_path, data), 0, ended_us))
-    assert found.values.keys() | found.missing.keys() == {column.name for column in tlog.COLUMNS}
-    return dict(found.values)
+    measured_log = tlog.measure(tlog.read(written(tmp_path, data), 0, ended_us))
+    assert measured_log.values.keys() | measured_log.missing.keys() == {column.name for column in tlog.COLUMNS}
+    return dict(measured_log.values)
 
 
 def test_a_flight_in_figures(tmp_path: Path) -> None:
@@ -37,7 +37,7 @@ def test_a_flight_in_figures(tmp_path: Path) -> None:
     assert values["mavlink_armed"] is True
     assert (values["mavlink_north_begin_m"], values["mavlink_north_end_m"]) == (0, 15)
     assert values["mavlink_speed_mean_m_s"] == values["mavlink_speed_max_m_s"] == 1.5
-    assert [values[f"mavlink_height_{what}_m"] for what in ("min", "mean", "max")] == [3, 3, 3]
+    assert [values[f"mavlink_height_{statistic}_m"] for statistic in ("min", "mean", "max")] == [3, 3, 3]
     assert values["mavlink_roll_max_deg"] == pytest.approx(5.73, abs=0.01)
     assert values["mavlink_pitch_min_deg"] == pytest.approx(-11.46, abs=0.01)
     assert "mavlink_lat_begin_deg" not in values
@@ -57,7 +57,7 @@ def test_battery_place_and_both_links(tmp_path: Path) -> None:
         sender.frame(d.MAVLink_sys_status_message(*sensors, 11_100, 100, 42, 250, 0, 0, 0, 0, 0)),
         sender.frame(d.MAVLink_sys_status_message(*sensors, 65_535, 100, -1, 0, 0, 0, 0, 0, 0)),
     ]
-    values = measured(tmp_path, stamped([(number, one) for number, one in enumerate(messages)]))
+    values = measured(tmp_path, stamped([(number, item) for number, item in enumerate(messages)]))
     assert (values["mavlink_battery_begin"], values["mavlink_battery_end"]) == (0.9, 0.42)
     assert (values["mavlink_battery_begin_v"], values["mavlink_battery_end_v"]) == (12.6, 11.1)
     assert (values["mavlink_lat_begin_deg"], values["mavlink_lon_end_deg"]) == (48.1374, 11.5755)
@@ -110,8 +110,8 @@ def test_values_that_cannot_be_are_missing(tmp_path: Path) -> None:
         d.MAVLink_local_position_ned_message(0, float("nan"), 1e30, float("inf"), 1e20, 0, float("nan")),
         d.MAVLink_attitude_message(0, 1e30, float("nan"), 0, 0, 0, 0),
     ]
-    values = measured(tmp_path, stamped([(0, sender.frame(one)) for one in messages]))
-    assert not {one for one in values if one.endswith(("_m", "_m_s", "_deg"))}
+    values = measured(tmp_path, stamped([(0, sender.frame(item)) for item in messages]))
+    assert not {item for item in values if item.endswith(("_m", "_m_s", "_deg"))}
 
 
 @pytest.mark.parametrize("how", ["old", "signed"])
@@ -124,7 +124,7 @@ def test_logs_of_mavlink_1_and_of_signed_frames(how: str, tmp_path: Path) -> Non
     for number, message in enumerate(messages):
         frames.append((number, bytes(message.pack(sender.link, force_mavlink1=how == "old"))))
         sender.link.seq = number + 1
-    assert {one[0] for _, one in frames} == {0xFE if how == "old" else 0xFD}
+    assert {item[0] for _, item in frames} == {0xFE if how == "old" else 0xFD}
     values = measured(tmp_path, stamped(frames))
     assert (values["mavlink_messages"], values["mavlink_sent"], values["mavlink_damaged"]) == (6, 6, 0)
     assert values["mavlink_roll_max_deg"] == pytest.approx(28.65, abs=0.01)
@@ -168,7 +168,7 @@ def test_cut_anywhere_it_is_whole_frames_or_refused(end: int) -> None:
         frames = list(tlog_reader.frames(data))
     except ValueError:
         return
-    assert sum(8 + len(one.data) for one in frames) == end
+    assert sum(8 + len(item.data) for item in frames) == end
 
 
 @given(st.binary(max_size=300), st.integers(0, 2**40))
@@ -205,10 +205,12 @@ WRONG: list[dict[str, object]] = [
 ]
 
 
-@pytest.mark.parametrize("said", ["", "[]", "7", "[" * 5000, *(json.dumps({**SAID, **wrong}) for wrong in WRONG)])
-def test_what_a_recorder_never_says(said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "recorder_summary", ["", "[]", "7", "[" * 5000, *(json.dumps({**SAID, **wrong}) for wrong in WRONG)]
+)
+def test_what_a_recorder_never_says(recorder_summary: str, tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
-    path.write_text(said, encoding="utf-8")
+    path.write_text(recorder_summary, encoding="utf-8")
     with pytest.raises(EvidenceError, match="is not a summary of a recording"):
         tlog.told(path)
 
@@ -217,14 +219,19 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_noticed(tmp_path:
     path = tmp_path / "mavlink.tlog"
     path.write_bytes(flight())
     log = tlog.read(path, 0, 0)
-    said = tlog.RecorderSummary(log.frames, 0, log.last_us + 5, {}, tlog.sum_of(path))
+    recorder_summary = tlog.RecorderSummary(log.frames, 0, log.last_us + 5, {}, tlog.sum_of(path))
     window = log.first_us * 1000, log.last_us * 1000 + 999
-    assert list(tlog.contradictions(log, said, tlog.sum_of(path), window)) == []
+    assert list(tlog.contradictions(log, recorder_summary, tlog.sum_of(path), window)) == []
     for other, total, around, why in (
-        (said, 7, window, "its checksum is not"),
-        (replace(said, ended_us=log.last_us - 10**6), tlog.sum_of(path), window, "1.000 s after its recorder ended"),
-        (said, tlog.sum_of(path), (window[0] + 10**9, window[1]), "from before the attempt or after it"),
-        (said, tlog.sum_of(path), (window[0], window[1] - 10**9), "from before the attempt or after it"),
+        (recorder_summary, 7, window, "its checksum is not"),
+        (
+            replace(recorder_summary, ended_us=log.last_us - 10**6),
+            tlog.sum_of(path),
+            window,
+            "1.000 s after its recorder ended",
+        ),
+        (recorder_summary, tlog.sum_of(path), (window[0] + 10**9, window[1]), "from before the attempt or after it"),
+        (recorder_summary, tlog.sum_of(path), (window[0], window[1] - 10**9), "from before the attempt or after it"),
     ):
         (reason,) = tlog.contradictions(log, other, total, around)
         assert why in reason
