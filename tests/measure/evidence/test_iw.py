@@ -1,4 +1,4 @@
-"""What iw and the kernel print, read from real outputs of versions 3 to 6 and of eleven drivers."""
+"""Parsing of real outputs of iw versions 3 to 6 with eleven drivers, and of the kernel."""
 
 from dataclasses import replace
 
@@ -30,11 +30,11 @@ def output(name: str) -> str:
 
 
 @pytest.mark.parametrize("name", STATIONS)
-def test_a_station_is_read_from_what_each_driver_tells(name: str) -> None:
+def test_a_station_is_parsed_from_the_output_of_each_driver(name: str) -> None:
     assert iw.stations(output(name)) == (STATIONS[name],)
 
 
-def test_several_stations_follow_each_other() -> None:
+def test_several_stations_are_parsed() -> None:
     both = iw.stations(output("station-iwlwifi-6") + output("station-mt7603-6"))
     assert both == (STATIONS["station-iwlwifi-6"], STATIONS["station-mt7603-6"])
     assert [peer.signal_dbm for peer in iw.stations(output("stations-ap"))] == [-57.0]
@@ -42,7 +42,7 @@ def test_several_stations_follow_each_other() -> None:
     assert (other.tx_packets, other.tx_failures, peer.tx_packets, peer.tx_failures) == (13, 7, 6, 0)
 
 
-def test_the_access_point_that_a_station_is_joined_to() -> None:
+def test_the_associated_access_point() -> None:
     assert iw.cell(output("link-rtl8812au")) == StationSample("xx:xx", -45.0, 216.7e6)
     pi = iw.cell(output("link-station"))
     assert pi == StationSample("f0:99:bf:0e:86:98", -65.0, 65e6, None, 1263, 25943), "a Raspberry Pi's brcmfmac"
@@ -56,14 +56,14 @@ def test_the_access_point_that_a_station_is_joined_to() -> None:
     assert iw.cell(output("link-hwsim-6")) == replace(rates, tx_packets=21, rx_packets=3950)
 
 
-def test_the_channel_in_use_is_the_one_that_counts() -> None:
+def test_only_the_channel_in_use_is_parsed() -> None:
     assert iw.channel(output("survey-ath9k-4")) == (-95.0, 1704490481 * 10**6, 945335227 * 10**6)
     assert iw.channel(output("survey-mt7996-6")) == (-84.0, 497753 * 10**6, 104676 * 10**6)
-    assert iw.channel(output("survey-hwsim-6")) == (None, None, None), "it does not say which one is in use"
+    assert iw.channel(output("survey-hwsim-6")) == (None, None, None), "no channel is marked as in use"
     assert iw.channel(output("survey-ath10k-4")) == iw.channel("") == (None, None, None)
 
 
-def test_the_kernels_own_line_tells_powers_where_they_are_powers() -> None:
+def test_a_line_of_proc_net_wireless_has_powers_if_they_are_valid() -> None:
     def behind(name: str) -> str:
         return output(name).splitlines()[-1].partition(":")[2].lstrip()
 
@@ -74,7 +74,7 @@ def test_the_kernels_own_line_tells_powers_where_they_are_powers() -> None:
 
 
 @given(st.sampled_from([*STATIONS, "link-station", "survey-mt7996-6"]), st.integers(0), st.binary(max_size=20))
-def test_a_changed_output_says_less_or_other_and_raises_nothing(name: str, at: int, with_: bytes) -> None:
+def test_a_changed_output_raises_no_error(name: str, at: int, with_: bytes) -> None:
     complete = output(name).encode()
     at %= len(complete)
     text = (complete[:at] + with_ + complete[at + len(with_) :]).decode(errors="replace")

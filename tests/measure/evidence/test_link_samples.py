@@ -1,4 +1,4 @@
-"""Samples of links: a robot's own file, whole, cut and compressed, and a testbed's."""
+"""Samples of links: files of robots, complete, truncated and compressed, and files of testbeds."""
 
 import gzip
 from pathlib import Path
@@ -58,7 +58,7 @@ SAMPLES = st.lists(
 
 
 @given(samples=st.dictionaries(st.sampled_from(FIXED_ROLES), SAMPLES.filter(bool)))
-def test_what_a_testbed_noted_is_read_as_it_was_written(
+def test_samples_of_a_testbed_are_read_as_written(
     samples: dict[Role, list[LinkSample]], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("links") / link_samples.FILE
@@ -67,7 +67,7 @@ def test_what_a_testbed_noted_is_read_as_it_was_written(
 
 
 @pytest.mark.parametrize("damage", [lambda text: text[:-5], lambda text: text.replace("-5", "x5"), lambda _: ""])
-def test_a_testbeds_file_that_is_not_whole_says_so(tmp_path: Path, damage: "type[str]") -> None:
+def test_an_incomplete_file_of_a_testbed_is_an_error(tmp_path: Path, damage: "type[str]") -> None:
     sample = LinkSample(5, (StationSample("turtlebot-1", -50.0, 6e6, None, 1, 2, 3, 4),), noise_dbm=-95.0)
     path = tmp_path / link_samples.FILE
     path.write_text(damage(link_samples.text({Role.SENDER: [sample]})), encoding="ascii")
@@ -75,7 +75,7 @@ def test_a_testbeds_file_that_is_not_whole_says_so(tmp_path: Path, damage: "type
         link_samples.read(path)
 
 
-def test_a_testbeds_file_that_was_cut_says_so_and_an_earlier_one_is_read(tmp_path: Path) -> None:
+def test_a_truncated_file_of_a_testbed_is_an_error_and_an_earlier_format_is_read(tmp_path: Path) -> None:
     samples = {Role.SENDER: [LinkSample(at_ns, noise_dbm=-95.0) for at_ns in range(3)]}
     path, whole = tmp_path / link_samples.FILE, link_samples.text(samples)
     count, *lines = whole.splitlines(keepends=True)
@@ -87,7 +87,7 @@ def test_a_testbeds_file_that_was_cut_says_so_and_an_earlier_one_is_read(tmp_pat
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_a_robots_own_file_is_read_with_its_clock_and_the_states_around_it(tmp_path: Path, packed: bool) -> None:
+def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, packed: bool) -> None:
     (tmp_path / "sender-before.txt").write_text(STATE + output("station-iwlwifi-6").replace("3441", "3431"))
     (tmp_path / "sender-after.txt").write_text(
         STATE.replace("100.00 ", "102.00 ").replace(f"{BOOTED_S + 100}", f"{BOOTED_S + 102}")
@@ -112,18 +112,18 @@ def test_a_robots_own_file_is_read_with_its_clock_and_the_states_around_it(tmp_p
 
 
 @given(st.integers(0, len(OWN)))
-def test_a_sampler_that_was_cut_leaves_what_it_had_told(at: int) -> None:
+def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
     whole, cut = link_samples.parse(OWN), link_samples.parse(OWN[:at])
     assert [item.utc_ns for item in cut] == [item.utc_ns for item in whole][: len(cut)]
     for item, other in zip(cut, whole, strict=False):
         for station in item.stations:
             (same,) = (known for known in other.stations if known.station == station.station)
             present = {name: value for name, value in vars(station).items() if value is not None}
-            later = {"tx_packets", "rx_packets", "signal_dbm", "tx_rate_bit_s"}  # which link tells first
+            later = {"tx_packets", "rx_packets", "signal_dbm", "tx_rate_bit_s"}  # `link` reports these first
             assert all(value == getattr(same, name) for name, value in present.items() if name not in later)
 
 
-def test_without_a_clock_or_a_file_there_are_none(tmp_path: Path) -> None:
+def test_without_a_clock_or_a_file_there_are_no_samples(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="does not contain the clock"):
         link_samples.read_own(tmp_path, Role.SENDER)
     (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")

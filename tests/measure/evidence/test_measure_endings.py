@@ -1,4 +1,4 @@
-"""How a job ended, as its robot noted it, and whether that spoils what it measured."""
+"""Terminations of jobs recorded by a robot, and whether they are acceptable."""
 
 from collections.abc import Collection
 
@@ -16,7 +16,7 @@ send limit 130 1286154 12981.58
 """
 
 
-def test_what_a_robot_noted_is_read() -> None:
+def test_recorded_terminations_are_parsed() -> None:
     by_name = endings.parse(NOTED.splitlines())
     assert (by_name["capture"].cause, by_name["capture"].code) == (Cause.ASKED, 0)
     assert by_name["capture"].lasted_s == pytest.approx(2.25)
@@ -25,7 +25,7 @@ def test_what_a_robot_noted_is_read() -> None:
 
 
 @pytest.mark.parametrize("line", ["", "capture", "a b 0 1 2.00", "ping itself 0 1 2.0 more", "x itself 9999 1 2.00"])
-def test_a_line_that_is_none_tells_nothing(line: str) -> None:
+def test_other_lines_are_ignored(line: str) -> None:
     assert endings.parse([line]) == {}
 
 
@@ -49,5 +49,7 @@ def test_a_line_that_is_none_tells_nothing(line: str) -> None:
         ("job running - 100 -", {Cause.ITSELF}, 0.0, "was still running when the evidence was collected"),
     ],
 )
-def test_a_job_ends_as_it_is_to(line: str, allowed: Collection[Cause], least_s: float, problem: str | None) -> None:
+def test_terminations_that_are_not_acceptable(
+    line: str, allowed: Collection[Cause], least_s: float, problem: str | None
+) -> None:
     assert endings.problem(endings.parse([line])["job"], allowed, least_s) == problem

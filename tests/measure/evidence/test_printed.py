@@ -1,4 +1,4 @@
-"""Values in what any program printed."""
+"""Values in the output of programs."""
 
 import json
 import math
@@ -58,12 +58,12 @@ def test_a_path_finds_a_value_of_its_column(output: Path, where: str, unit: str,
         (10**400, "count", "not from"),
     ],
 )
-def test_what_is_no_value_of_a_column_is_told(extracted: object, unit: str, reason: str) -> None:
+def test_an_invalid_value_is_an_error(extracted: object, unit: str, reason: str) -> None:
     with pytest.raises(EvidenceError, match=reason):
         printed.value(column(unit), extracted)
 
 
-def test_a_number_as_text_is_one_and_words_are_made_harmless() -> None:
+def test_a_number_as_text_is_accepted_and_words_are_sanitized() -> None:
     assert printed.value(column("V"), " 12.5\n") == 12.5
     assert printed.value(column("count"), "1e3") == 1000
     assert printed.value(column("text"), "a\x1b[31m\u202eb\r\nc" + 500 * "d").startswith("a?[31m?b c")  # type: ignore[union-attr]
@@ -77,45 +77,45 @@ def test_an_expression_finds_what_its_group_matches_first(output: Path) -> None:
     assert printed.by_expression(output, r"^rate: ([0-9]+)") is None
 
 
-def test_an_expression_that_backtracks_elsewhere_takes_no_time(output: Path) -> None:
-    """Python's own `re` takes 2^100000 steps for this one; the run would never end."""
+def test_an_expression_with_catastrophic_backtracking_is_fast(output: Path) -> None:
+    """Python's `re` needs 2^100000 steps for this expression."""
     output.write_text(100_000 * "a" + "b", encoding="utf-8")
     assert printed.by_expression(output, r"^(a+)+$") is None
 
 
 @pytest.mark.parametrize("text", ["(", "a", "(a)(b)", r"(a)\1", "(?=a)(b)"])
-def test_what_is_no_expression_with_one_group_is_refused(text: str) -> None:
+def test_an_expression_without_exactly_one_group_is_refused(text: str) -> None:
     assert printed.problem_of_expression(text)
 
 
 @pytest.mark.parametrize("text", ["", "a[", "a b", "f("])
-def test_what_is_no_path_is_refused(text: str) -> None:
+def test_an_invalid_path_is_refused(text: str) -> None:
     assert printed.problem_of_path(text)
 
 
-def test_what_suits_is_not_refused() -> None:
+def test_valid_paths_and_expressions_are_accepted() -> None:
     assert printed.problem_of_path("a.b[0].c") is None
     assert printed.problem_of_expression("(?:a|b)([0-9.]+)") is None
 
 
 @pytest.mark.parametrize("text", ["", "{", "{'a': 1}", 100_000 * "[", STATUS[:-9], "NaN x", "9" * 5000])
-def test_what_is_no_json_is_told(output: Path, text: str) -> None:
+def test_invalid_json_is_an_error(output: Path, text: str) -> None:
     output.write_text(text, encoding="utf-8")
     with pytest.raises(EvidenceError, match="is not JSON"):
         printed.at_path(output, "a")
 
 
-def test_a_mark_of_byte_order_before_json_is_none_of_it_and_the_last_of_two_values_counts(output: Path) -> None:
+def test_a_byte_order_mark_is_ignored_and_the_last_of_duplicate_keys_is_used(output: Path) -> None:
     output.write_text('\ufeff{"a": 3, "a": 4}', encoding="utf-8")
     assert printed.at_path(output, "a") == 4
 
 
-def test_a_path_that_does_not_suit_the_data_is_told(output: Path) -> None:
+def test_a_path_that_does_not_match_the_data_is_an_error(output: Path) -> None:
     with pytest.raises(EvidenceError, match="sum"):
         printed.at_path(output, "sum(mode)")
 
 
-def test_output_that_was_cut_is_none(output: Path) -> None:
+def test_truncated_output_is_an_error(output: Path) -> None:
     output.write_bytes(b" " * (printed.MOST_BYTES - 1))
     assert len(printed.text(output)) == printed.MOST_BYTES - 1
     output.write_bytes(b" " * printed.MOST_BYTES)
@@ -130,7 +130,7 @@ def test_output_that_was_cut_is_none(output: Path) -> None:
     ),
     st.sampled_from(["V", "count", "B", "ns", "s", "share", "bool", "text"]),
 )
-def test_whatever_is_found_becomes_a_cell_that_can_be_read_again_or_is_told(extracted: object, unit: str) -> None:
+def test_any_extracted_value_is_a_valid_cell_or_an_error(extracted: object, unit: str) -> None:
     extracted = json.loads(json.dumps(extracted))
     try:
         value = printed.value(column(unit), extracted)

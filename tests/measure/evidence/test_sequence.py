@@ -1,4 +1,4 @@
-"""Losses counted by numbers that come again, against messages of which it is known which were lost."""
+"""Losses from wrapping sequence numbers, compared with known losses."""
 
 from itertools import pairwise
 
@@ -12,12 +12,12 @@ PERIOD_US = 20_000
 
 
 def sent(count: int, first: int = 0) -> list[tuple[int, int]]:
-    """Messages of 50 Hz, each with its time and its number."""
+    """Messages at 50 Hz, each with its time and its number."""
     return [(number * PERIOD_US, (first + number) % NUMBERS) for number in range(count)]
 
 
 @given(st.lists(st.booleans(), min_size=10, max_size=900), st.integers(0, 255))
-def test_what_is_missing_between_the_first_and_the_last_is_counted(lost: list[bool], first: int) -> None:
+def test_losses_between_the_first_and_the_last_message_are_counted(lost: list[bool], first: int) -> None:
     arrivals = [one for one, n_lost in zip(sent(len(lost), first), lost, strict=True) if not n_lost]
     # A second without a message, where the number alone does not tell it, has tests of its own.
     if not arrivals or max((after[0] - before[0] for before, after in pairwise(arrivals)), default=0) > 1e6:
@@ -28,7 +28,7 @@ def test_what_is_missing_between_the_first_and_the_last_is_counted(lost: list[bo
 
 
 @given(st.permutations(range(4)), st.integers(0, 255))
-def test_who_comes_late_is_not_lost_and_who_comes_twice_counts_once(order: list[int], first: int) -> None:
+def test_late_messages_are_not_lost_and_duplicates_count_once(order: list[int], first: int) -> None:
     arrivals = sent(40, first)
     arrivals[10:14] = [arrivals[10 + index] for index in order]
     arrivals.insert(20, arrivals[19])
@@ -37,7 +37,7 @@ def test_who_comes_late_is_not_lost_and_who_comes_twice_counts_once(order: list[
 
 
 @pytest.mark.parametrize("gone", [40, 51, 200, 255, 256, 257, 700, 3000])
-def test_a_silence_of_more_than_256_messages_is_counted_by_the_rate(n_lost: int) -> None:
+def test_losses_in_a_silence_of_more_than_256_messages_are_computed_from_the_rate(n_lost: int) -> None:
     arrivals = sent(5000)
     counts = count_messages(arrivals[:500] + arrivals[500 + n_lost :], 0)
     assert (counts.messages, counts.lost) == (5000 - n_lost, n_lost)
@@ -45,18 +45,18 @@ def test_a_silence_of_more_than_256_messages_is_counted_by_the_rate(n_lost: int)
     assert counts.rate_hz == pytest.approx(50)
 
 
-def test_what_was_sent_after_the_last_that_came_is_counted_by_the_rate() -> None:
+def test_losses_after_the_last_message_are_computed_from_the_rate() -> None:
     counts = count_messages(sent(500), 500 * PERIOD_US + 10_000_000)
     assert counts.lost == pytest.approx(500, abs=1)
     assert counts.silence_s == pytest.approx(10, abs=0.03)
 
 
-def test_nothing_came() -> None:
+def test_no_messages() -> None:
     assert (count_messages([], 9).messages, count_messages([(1, 2)], 0).messages) == (0, 1)
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**52), st.integers(0, 255)), max_size=40), st.integers(0, 2**62))
-def test_whatever_the_numbers_are_it_ends(arrivals: list[tuple[int, int]], ended_us: int) -> None:
+def test_any_numbers_give_valid_counts(arrivals: list[tuple[int, int]], ended_us: int) -> None:
     counts = count_messages(arrivals, ended_us)
     assert 0 <= counts.messages <= len(arrivals)
     assert counts.lost >= 0

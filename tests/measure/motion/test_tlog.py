@@ -1,4 +1,4 @@
-"""Telemetry logs: values against messages that are known, and logs that are cut, damaged, or of somebody else."""
+"""Telemetry logs: values of known messages, and logs that are truncated, damaged, or of other systems."""
 
 import json
 import random
@@ -30,7 +30,7 @@ def measured(tmp_path: Path, data: bytes, ended_us: int = 0) -> dict[str, object
     return dict(measured_log.values)
 
 
-def test_a_flight_in_figures(tmp_path: Path) -> None:
+def test_the_columns_of_a_flight(tmp_path: Path) -> None:
     values = measured(tmp_path, flight(10, 1.5))
     assert values["mavlink_messages"] == values["mavlink_sent"] == 1 + 2 * 101
     assert values["mavlink_loss"] == values["mavlink_damaged"] == 0
@@ -43,7 +43,7 @@ def test_a_flight_in_figures(tmp_path: Path) -> None:
     assert "mavlink_lat_begin_deg" not in values
 
 
-def test_battery_place_and_both_links(tmp_path: Path) -> None:
+def test_battery_position_and_both_links(tmp_path: Path) -> None:
     sender, radio = Sender(), Sender(51, 68)
     sensors = (0, 0, 0, 200)
     messages = [
@@ -68,7 +68,7 @@ def test_battery_place_and_both_links(tmp_path: Path) -> None:
     assert values["mavlink_armed"] is False
 
 
-def test_what_is_lost_is_a_share_of_what_was_sent(tmp_path: Path) -> None:
+def test_the_loss_is_a_share_of_the_sent_messages(tmp_path: Path) -> None:
     values = measured(tmp_path, flight(10, lost=lambda number: number % 10 == 5))
     assert (values["mavlink_messages"], values["mavlink_sent"]) == (183, 203)
     assert values["mavlink_loss_most"] == pytest.approx(20 / 203)
@@ -76,7 +76,7 @@ def test_what_is_lost_is_a_share_of_what_was_sent(tmp_path: Path) -> None:
     assert values["mavlink_loss"] == pytest.approx(20 / 202)
 
 
-def test_numbers_that_a_router_withheld_are_no_loss_but_a_bound_of_it(tmp_path: Path) -> None:
+def test_numbers_that_a_router_filtered_are_only_in_the_upper_bound(tmp_path: Path) -> None:
     sender, frames = Sender(), [(0, Sender().frame(beat()))]
     sender.link.seq = 1
     for number in range(200):
@@ -103,7 +103,7 @@ def test_a_damaged_frame_is_counted_and_lost(tmp_path: Path) -> None:
     assert values["mavlink_messages"] == 22
 
 
-def test_values_that_cannot_be_are_missing(tmp_path: Path) -> None:
+def test_impossible_values_are_missing(tmp_path: Path) -> None:
     sender = Sender()
     messages = [
         beat(),
@@ -130,7 +130,7 @@ def test_logs_of_mavlink_1_and_of_signed_frames(how: str, tmp_path: Path) -> Non
     assert values["mavlink_roll_max_deg"] == pytest.approx(28.65, abs=0.01)
 
 
-def test_of_two_autopilots_one_has_to_be_named(tmp_path: Path) -> None:
+def test_one_of_two_autopilots_must_be_named(tmp_path: Path) -> None:
     frames = [(0, Sender(system).frame(beat())) for system in (3, 4)]
     path = written(tmp_path, stamped(frames))
     with pytest.raises(EvidenceError, match="autopilots of systems 3, 4: name one"):
@@ -151,7 +151,7 @@ def test_of_two_autopilots_one_has_to_be_named(tmp_path: Path) -> None:
         (stamped([(0, Sender().frame(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)))]), "no heartbeat"),
     ],
 )
-def test_what_is_no_whole_log_is_refused(data: bytes, complaint: str, tmp_path: Path) -> None:
+def test_an_incomplete_log_is_refused(data: bytes, complaint: str, tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match=complaint):
         tlog.read(written(tmp_path, data), 0, 0)
 
@@ -162,7 +162,7 @@ def test_a_log_that_is_missing(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, len(flight(1)) - 1))
-def test_cut_anywhere_it_is_whole_frames_or_refused(end: int) -> None:
+def test_a_truncated_log_has_only_complete_frames_or_is_refused(end: int) -> None:
     data = flight(1)[:end]
     try:
         frames = list(tlog_reader.frames(data))
@@ -175,7 +175,7 @@ def test_cut_anywhere_it_is_whole_frames_or_refused(end: int) -> None:
 def test_bytes_of_any_kind_are_refused_or_read(noise: bytes, at_us: int) -> None:
     for data in (noise, stamped([(at_us, Sender().frame(beat()))]) + noise):
         for question in ({"ended_us": 0}, {"positions": tlog.LOCAL}, {"positions": tlog.GLOBAL}):
-            with suppress(ValueError):  # and nothing else
+            with suppress(ValueError):  # no other error
                 _answered(data, question)
 
 
@@ -189,7 +189,7 @@ def _answered(data: bytes, question: Mapping[str, object]) -> object:
 SAID = {"frames": 3, "bytes": 99, "left_out": 0, "ended_us": 5, "refused": {"32": 2}}
 
 
-def test_what_the_recorder_said(tmp_path: Path) -> None:
+def test_the_summary_of_a_recorder(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
     path.write_text(json.dumps(SAID), encoding="utf-8")
     assert tlog.told(path) == tlog.RecorderSummary(3, 0, 5, {32: 2})
@@ -208,14 +208,14 @@ WRONG: list[dict[str, object]] = [
 @pytest.mark.parametrize(
     "recorder_summary", ["", "[]", "7", "[" * 5000, *(json.dumps({**SAID, **wrong}) for wrong in WRONG)]
 )
-def test_what_a_recorder_never_says(recorder_summary: str, tmp_path: Path) -> None:
+def test_an_invalid_summary_is_refused(recorder_summary: str, tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
     path.write_text(recorder_summary, encoding="utf-8")
     with pytest.raises(EvidenceError, match="is not a summary of a recording"):
         tlog.told(path)
 
 
-def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_noticed(tmp_path: Path) -> None:
+def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.tlog"
     path.write_bytes(flight())
     log = tlog.read(path, 0, 0)
@@ -223,7 +223,7 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_noticed(tmp_path:
     window = log.first_us * 1000, log.last_us * 1000 + 999
     assert list(tlog.contradictions(log, recorder_summary, tlog.sum_of(path), window)) == []
     for other, total, around, why in (
-        (recorder_summary, 7, window, "its checksum is not"),
+        (recorder_summary, 7, window, "its checksum differs"),
         (
             replace(recorder_summary, ended_us=log.last_us - 10**6),
             tlog.sum_of(path),
@@ -237,7 +237,7 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_noticed(tmp_path:
         assert why in reason
 
 
-def test_frames_that_were_moved_are_noticed(tmp_path: Path) -> None:
+def test_moved_frames_are_detected(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.tlog"
     whole = flight()
     path.write_bytes(whole + whole)
@@ -247,13 +247,13 @@ def test_frames_that_were_moved_are_noticed(tmp_path: Path) -> None:
 
 
 @given(st.floats(0, 0.3), st.integers(0, 2**32))
-def test_random_loss_is_found_whatever_a_router_withheld(share: float, seed: int) -> None:
+def test_random_loss_is_measured_even_if_a_router_filters_messages(share: float, seed: int) -> None:
     dice = random.Random(seed)
     numbers, streams, truth = list[tuple[int, int]](), dict[str, list[StreamMessage]](), 0
     sent = 0
     for slot in range(400):
         for name in ("ATTITUDE", "LOCAL_POSITION_NED"):
-            sent += 1 + (dice.random() < 0.02)  # an answer to another station has a number, too
+            sent += 1 + (dice.random() < 0.02)  # an answer to another station has a number too
             if 0 < slot < 399 and dice.random() < share:
                 truth += 1
                 continue
