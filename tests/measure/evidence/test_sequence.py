@@ -18,7 +18,7 @@ def sent(count: int, first: int = 0) -> list[tuple[int, int]]:
 
 @given(st.lists(st.booleans(), min_size=10, max_size=900), st.integers(0, 255))
 def test_losses_between_the_first_and_the_last_message_are_counted(lost: list[bool], first: int) -> None:
-    arrivals = [one for one, n_lost in zip(sent(len(lost), first), lost, strict=True) if not n_lost]
+    arrivals = [message for message, is_lost in zip(sent(len(lost), first), lost, strict=True) if not is_lost]
     # A second without a message, where the number alone does not tell it, has tests of its own.
     if not arrivals or max((after[0] - before[0] for before, after in pairwise(arrivals)), default=0) > 1e6:
         return
@@ -36,7 +36,7 @@ def test_late_messages_are_not_lost_and_duplicates_count_once(order: list[int], 
     assert (counts.messages, counts.lost, counts.repeated) == (40, 0, 1)
 
 
-@pytest.mark.parametrize("gone", [40, 51, 200, 255, 256, 257, 700, 3000])
+@pytest.mark.parametrize("n_lost", [40, 51, 200, 255, 256, 257, 700, 3000])
 def test_losses_in_a_silence_of_more_than_256_messages_are_computed_from_the_rate(n_lost: int) -> None:
     arrivals = sent(5000)
     counts = count_messages(arrivals[:500] + arrivals[500 + n_lost :], 0)
