@@ -174,9 +174,9 @@ def _bytes_per(name: str, rows: Repeats) -> float:
 
 def _compare_sizes(what: str, of_a: float, of_b: float, tolerance: float) -> Iterator[Concern]:
     """Yield a concern if two sizes in bytes differ by more than `tolerance`, or if one of them is unknown (NaN)."""
-    known = int(np.isfinite([of_a, of_b]).sum())
-    if known == 1 or abs(of_a - of_b) > tolerance:
-        yield Concern(what, _bytes(of_a), _bytes(of_b), (), refuses=known == 2)
+    n_known = int(np.isfinite([of_a, of_b]).sum())
+    if n_known == 1 or abs(of_a - of_b) > tolerance:
+        yield Concern(what, _bytes(of_a), _bytes(of_b), (), refuses=n_known == 2)
 
 
 def _bytes(size: float) -> str:
@@ -184,8 +184,8 @@ def _bytes(size: float) -> str:
 
 
 def _median(values: Numbers) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else np.nan
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else np.nan
 
 
 def _offload_state(a: Repeats, b: Repeats) -> Iterator[Concern]:
@@ -197,7 +197,7 @@ def _offload_state(a: Repeats, b: Repeats) -> Iterator[Concern]:
 def _offload_text(rows: Repeats) -> str:
     """Return `on` if the captures of any repeat have frames that only offload creates, otherwise `off`."""
     frames = rows.numbers["tcp_superframes"]
-    known = frames[np.isfinite(frames)]
-    if not len(known):
+    finite = frames[np.isfinite(frames)]
+    if not len(finite):
         return UNKNOWN
-    return "on" if (known > 0).any() else "off"
+    return "on" if (finite > 0).any() else "off"

@@ -204,11 +204,11 @@ def _differences(
 
 
 def _values(rows: Repeats, quantity: Quantity) -> Numbers:
-    known = np.isfinite([rows.numbers[name] for name in quantity.columns]).all(axis=0)  # the same rows as in cells
+    has_all = np.isfinite([rows.numbers[name] for name in quantity.columns]).all(axis=0)  # the same rows as in cells
     if quantity.at_least is not None:
         values, _ = rows.observed(quantity)
         return values[np.isfinite(values)]
-    return rows.numbers[quantity.name][known]
+    return rows.numbers[quantity.name][has_all]
 
 
 def _interval(a: Estimate, b: Estimate) -> Interval | None:

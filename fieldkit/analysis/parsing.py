@@ -94,9 +94,9 @@ def contradiction(numbers: Mapping[str, ArrayLike], quantities: Iterable[Quantit
     for quantity in quantities:
         if quantity.kind is Kind.COUNTED and numbers.keys() >= set(quantity.columns):
             share, arrived, sent = (np.asarray(numbers[name], dtype=np.float64) for name in quantity.columns)
-            known = np.isfinite(share) & np.isfinite(arrived) & np.isfinite(sent)
-            counted = 1 - arrived / np.where(sent > 0, sent, np.nan)
-            if (known & ~np.isclose(share, counted, rtol=_TOLERANCE, atol=_TOLERANCE)).any():
+            is_complete = np.isfinite(share) & np.isfinite(arrived) & np.isfinite(sent)
+            expected = 1 - arrived / np.where(sent > 0, sent, np.nan)
+            if (is_complete & ~np.isclose(share, expected, rtol=_TOLERANCE, atol=_TOLERANCE)).any():
                 return quantity
     return None
 

@@ -219,20 +219,20 @@ def read(path: Path, system: int, ended_us: int) -> Tlog:
 
 
 def contradictions(
-    log: Tlog, said: RecorderSummary, sum_of_file: int, window: tuple[int, int] | None
+    log: Tlog, summary: RecorderSummary, sum_of_file: int, window: tuple[int, int] | None
 ) -> Iterator[str]:
     """Yield the contradictions between a log, the recorder's summary and the attempt, one sentence each.
 
     Args:
         log: The log.
-        said: Summary of the recorder.
+        summary: Summary of the recorder.
         sum_of_file: CRC-32 of the log's file.
         window: The recorder's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
     """
-    if said.crc32 is not None and said.crc32 != sum_of_file:
+    if summary.crc32 is not None and summary.crc32 != sum_of_file:
         yield "was changed: its checksum differs from the one that its recorder wrote"
-    if log.last_us > said.ended_us + _TIME_TOLERANCE_US:
-        yield f"has a frame {(log.last_us - said.ended_us) / 1e6:.3f} s after its recorder ended"
+    if log.last_us > summary.ended_us + _TIME_TOLERANCE_US:
+        yield f"has a frame {(log.last_us - summary.ended_us) / 1e6:.3f} s after its recorder ended"
     if log.back_us > _TIME_TOLERANCE_US:
         yield f"has a frame that is {log.back_us / 1e6:.3f} s earlier than the previous one"
     if window is not None and not window[0] // 1000 <= log.first_us <= log.last_us <= -(-window[1] // 1000):
