@@ -163,13 +163,13 @@ def cautions(cells: Sequence[Cell], names: Collection[str] | None = None) -> Ite
         cells: The cells that are shown.
         names: Names of the quantities that are shown; None for all.
     """
-    of_interest = [
+    selected = [
         (cell, estimate)
         for cell in cells
         for name, estimate in cell.estimates.items()
         if names is None or name in names
     ]
-    if few := sorted({estimate.n for _, estimate in of_interest if assumes_normal(estimate)}, reverse=True):
+    if few := sorted({estimate.n for _, estimate in selected if assumes_normal(estimate)}, reverse=True):
         coverage = ", ".join(f"{n} repeats give {100 * assured(n):.0f} %" for n in few)
         yield (
             f"* 95 % interval assuming a normal distribution; without that assumption {coverage}. "
@@ -178,7 +178,7 @@ def cautions(cells: Sequence[Cell], names: Collection[str] | None = None) -> Ite
     varying = [name for name in (cells[0].key if cells else ()) if len({cell.key[name] for cell in cells}) > 1]
     if dependent := [
         " ".join([estimate.quantity.label, *(key(cell, name) for name in varying)])
-        for cell, estimate in of_interest
+        for cell, estimate in selected
         if is_dependent(estimate)
     ]:
         more = f" and {len(dependent) - _MAX_LISTED} more" if len(dependent) > _MAX_LISTED else ""

@@ -216,5 +216,5 @@ def test_only_one_protocol_is_judged_and_a_missing_figure_is_undecided() -> None
         ("TCP", "2.00 ms", "[1.00, 3.00]", "holds"),
         ("UDP", "nothing", "", "undecided: 0 of 5 repeats have a value"),
     ]
-    (nobody,) = judgements.judge([expectations.parse("udp rtt_median_s < 5 ms", KNOWN)], cells[:1])
-    assert nobody.ruling is Ruling.OPEN
+    (judgement,) = judgements.judge([expectations.parse("udp rtt_median_s < 5 ms", KNOWN)], cells[:1])
+    assert judgement.ruling is Ruling.OPEN

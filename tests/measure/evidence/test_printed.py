@@ -144,7 +144,7 @@ def test_any_extracted_value_is_a_valid_cell_or_an_error(extracted: object, unit
 
 
 @pytest.mark.parametrize("where", ["(" * 5000 + "a" + ")" * 5000, "a" + "|a" * 5000])
-def test_a_path_that_is_nested_too_deeply_is_told(output: Path, where: str) -> None:
+def test_a_path_that_is_nested_too_deeply_is_an_error(output: Path, where: str) -> None:
     if reason := printed.problem_of_path(where):
         assert reason == "it is nested too deeply"
         return
