@@ -157,7 +157,7 @@ class Column:
             if not text or len(text) > _MAX_LENGTHS[attribute] or not text.isprintable():
                 return f"its {attribute} is not 1 to {_MAX_LENGTHS[attribute]} printable characters"
         if self.bounds is not None and not self.bounds[0] <= self.bounds[1]:
-            return f"its lower bound {self.bounds[0]:g} is above its upper bound {self.bounds[1]:g}"
+            return f"its bounds {self.bounds[0]:g} and {self.bounds[1]:g} are not in ascending order"
         return None if self.figure is None else self._figure_flaw(self.figure)
 
     def _figure_flaw(self, figure: Figure) -> str | None:

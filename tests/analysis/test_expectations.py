@@ -73,7 +73,7 @@ def test_the_text_of_an_expectation_is_parsed(
         ("ip_loss > 2 % of all packets", "only an upper bound of a counted loss"),
         ("every ip_loss < 2 % of all packets", "only an upper bound of a counted loss"),
         ("90 % of ip_loss < 2 % of all packets", "only an upper bound of a counted loss"),
-        ("file_loss < 2 %", "there is no figure 'file_loss'"),
+        ("file_loss < 2 %", "the expected figure 'file_loss' does not exist"),
         ("up.file_loss < 2", "has no unit"),
         ("up.file_loss < 2 ms", "unknown unit 'ms'"),
         ("rtt_median_s < fast", "is not a bound for rtt_median_s"),

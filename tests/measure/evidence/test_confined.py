@@ -71,9 +71,9 @@ confined.serve(answer)
         ([], None),
         ([signal.SIGKILL], None),  # as the kernel if memory is short
         ([signal.SIGTERM], None),
-        ([signal.SIGKILL, signal.SIGKILL], "ended twice by something else"),
-        ([signal.SIGXCPU], "takes longer than the 10 s"),
-        ([signal.SIGSEGV], "ended with exit code -11"),
+        ([signal.SIGKILL, signal.SIGKILL], "another process or the kernel stopped its reader twice"),
+        ([signal.SIGXCPU], "takes longer than 10 s"),
+        ([signal.SIGSEGV], "exited with code -11"),
     ],
 )
 def test_a_reader_that_is_killed_externally_is_restarted_and_leaves_no_files(
@@ -182,7 +182,7 @@ def test_a_database_whose_schema_never_ends_is_refused(tmp_path: Path, one_secon
             " WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
             " SELECT i AS schema_version FROM n WHERE i < 0;"
         )
-    with pytest.raises(EvidenceError, match="takes longer than the 1 s"):
+    with pytest.raises(EvidenceError, match="takes longer than 1 s"):
         bag.read(path)
     assert bag.read(write_ros2_bag(tmp_path / "other", "db3", {"/scan": 5})).messages == 5
 

@@ -70,7 +70,7 @@ def test_an_unindexed_bag_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_bag_without_messages_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="holds no message"):
+    with pytest.raises(EvidenceError, match="contains no message"):
         bag.read(write_bag(tmp_path / "scan.bag", {"/scan": 0}))
 
 
@@ -138,7 +138,7 @@ def test_a_ros2_bag_of_a_killed_recorder_is_an_error(suffix: str, tmp_path: Path
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_ros2_bag_without_messages_is_refused(suffix: str, tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="holds no message") as caught:
+    with pytest.raises(EvidenceError, match="contains no message") as caught:
         bag.read(write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 0}))
     assert "ros2 topic hz" in caught.value.remedy
 
@@ -148,7 +148,7 @@ def test_a_file_that_contradicts_its_metadata_is_refused(suffix: str, tmp_path: 
     path = write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 5})
     other = write_ros2_bag(tmp_path / "other" / "scan", suffix, {"/scan": 4})
     shutil.copy(other, path)
-    with pytest.raises(EvidenceError, match=r"holds 4 messages, metadata.yaml counts 5"):
+    with pytest.raises(EvidenceError, match=r"contains 4 messages, metadata.yaml states 5"):
         bag.read(path)
 
 

@@ -82,7 +82,7 @@ def test_a_test_that_did_not_start_has_an_error(version: str) -> None:
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
 def test_truncated_json_is_an_error(version: str, share: float) -> None:
     text = output(version, "udp", "server")
-    with pytest.raises(EvidenceError, match="or was cut"):
+    with pytest.raises(EvidenceError, match="or was truncated"):
         iperf3.parse(text[: int(share * len(text))])
 
 

@@ -112,11 +112,11 @@ def test_a_process_that_does_not_recover(tmp_path: Path) -> None:
     [
         (FaultKind.LINK_DOWN, pings(list(range(1, 60)), 59), "had no effect"),
         (FaultKind.REBOOT, pings([1, 2, 4, 5], 5), "had no effect"),
-        (FaultKind.LINK_DOWN, pings([], 59), "not there before"),
+        (FaultKind.LINK_DOWN, pings([], 59), "did not answer before"),
         (FaultKind.LINK_DOWN, pings(AWAY, 49).partition("\n\n")[0], "summary is missing"),
         (FaultKind.KILL, watched((5.0, "31"), (5.1, "31 32"), (5.2, "31")), "had no effect"),
-        (FaultKind.KILL, watched((5.0, ""), (5.1, "")), "not there before"),
-        (FaultKind.KILL, "", "not there before"),
+        (FaultKind.KILL, watched((5.0, ""), (5.1, "")), "did not answer before"),
+        (FaultKind.KILL, "", "did not answer before"),
     ],
 )
 def test_evidence_without_effect_of_the_fault_is_an_error(

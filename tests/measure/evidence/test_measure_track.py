@@ -106,7 +106,7 @@ def test_other_contents_are_refused(tmp_path: Path, other: str) -> None:
     assert other != TEXT
     path = tmp_path / "track.csv"
     path.write_text(other, encoding="ascii")
-    with pytest.raises(EvidenceError, match="where robots were"):
+    with pytest.raises(EvidenceError, match="is not a track of robots"):
         track.read(path)
 
 
