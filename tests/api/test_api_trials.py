@@ -225,7 +225,7 @@ def test_what_is_no_trial_is_refused_as_commands_refuse_it(tmp_path: Path) -> No
         fieldkit.load(tmp_path)
     other = tmp_path / "other.csv"
     other.write_text("a,b\n1,2\n", encoding="utf-8")
-    with pytest.warns(UserWarning, match="kept as text"), pytest.raises(ConfigurationError, match="no table of re"):
+    with pytest.warns(UserWarning, match="kept as text"), pytest.raises(ConfigurationError, match="not a table of"):
         fieldkit.load(other)
 
 

@@ -125,7 +125,7 @@ def test_a_journal_with_a_second_name_is_not_written(trial: Path, ours: Path) ->
     (trial / "journal.jsonl").unlink()
     (trial / "journal.jsonl").hardlink_to(ours)
     with (
-        pytest.raises(ConfigurationError, match="a hard link, and writing it would change that file too"),
+        pytest.raises(ConfigurationError, match="hard link, and writing would change that file too"),
         journal.claimed(trial),
     ):
         raise AssertionError("claimed")

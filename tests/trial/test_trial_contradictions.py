@@ -349,7 +349,7 @@ def test_a_robot_that_rebooted(attempt: Attempt) -> None:
             "capture itself",
             "turtlebot-2: its job capture exited before fieldkit stopped it",
         ),
-        ("sender", "capture asked 0", "capture limit 0", "turtlebot-1: its job capture did not end by itself"),
+        ("sender", "capture asked 0", "capture limit 0", "turtlebot-1: its job capture did not exit"),
         ("receiver", "listen itself 0", "listen itself 143", "its job listen was killed by SIGTERM, not by fieldkit"),
         ("sender", "send itself 0", "send itself 137", "its job send was killed by SIGKILL, not by fieldkit"),
         ("sender", "send itself 0 100000 1060.00", "send itself - 100000 -", "its job send was killed"),

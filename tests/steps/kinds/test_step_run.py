@@ -93,7 +93,7 @@ def test_distance_repeat_and_the_copied_program_are_filled_in(
         ("robot: sender\ncommand: echo 'a", 2, "cannot be split into words"),
         ("robot: sender\nargv: ['', a]", 2, "the program, is empty"),
         ("robot: sender\ncommand: ls | wc", 2, "no shell sees this command, and | is a shell's"),
-        ("robot: sender\ncommand: a {address.Receiver}", 1, "small letters"),
+        ("robot: sender\ncommand: a {address.Receiver}", 1, "lower-case letters"),
         ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V}", 4, "one of them"),
         ("robot: sender\ncommand: a\ncolumns:\n- {name: x, unit: V, json: 'a['}", 4, "no path into JSON"),
         ("robot: sender\ncommand: a\ncolumns:\n- name: x\n  unit: V\n  regex: 'a'", 6, "0 groups"),
