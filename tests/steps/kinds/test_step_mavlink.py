@@ -177,7 +177,7 @@ def test_degrees_stand_beside_a_place_on_the_earth(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("log", "said", "problem"),
     [
-        (flight(10)[:-3], {}, "is cut off"),
+        (flight(10)[:-3], {}, "is truncated"),
         (flight(10), {"frames": 9}, "mavlink.tlog has 203 frames, its recorder wrote 9"),
         (flight(10), {"left_out": 4}, "4 frames more came"),
         (flight(10), {"refused": {"1": 2}}, "does not send SYS_STATUS as asked"),
