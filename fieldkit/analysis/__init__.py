@@ -1,1 +1,1 @@
-"""From many repeats to what they say together."""
+"""Statistics over repeats: estimates, intervals, comparisons, expectations, and tables of them."""

@@ -1,4 +1,4 @@
-"""One-sided 95 % bounds that expectations are judged by: shares of repeats, and of packets lost in bursts."""
+"""One-sided 95 % bounds for expectations: share of repeats, and share of packets that are lost in bursts."""
 
 import math
 from collections.abc import Callable
@@ -10,55 +10,56 @@ from numpy.typing import ArrayLike
 from fieldkit.analysis.statistics import CONFIDENCE
 
 SHORTEST_BURST: Final = 10
-"""Packets. Shortest burst of losses that a bound assumes, whatever the data show.
+"""Shortest burst of losses that a bound assumes, in packets.
 
-A convention and no measurement: 0 losses show nothing about bursts. Where losses come in longer bursts that are so
-rare that none was in the run, the true loss may be above the bound.
+This is a convention, because data without losses contain no information about bursts. If losses occur in longer
+bursts that are so rare that none was in the run, the true loss can be above the bound.
 """
 
 _BISECTIONS: Final = 60
 
 
 def share_low(met: int, n: int) -> float:
-    """Return the lower bound of the share of all repeats that meet a demand.
+    """Return the one-sided lower bound of the share of all repeats that meet a requirement.
 
-    Exact (Clopper and Pearson 1934, Biometrika 26:404), one-sided: the share with which `met` or more of `n` repeats
-    meet it in 5 % of such samples.
+    Exact (Clopper and Pearson 1934, Biometrika 26:404): the share for which the probability of `met` or more among
+    `n` repeats is 5 %.
     """
     if met == 0:
         return 0.0
-    return _solve(lambda share: _at_most(n - met, n, 1 - share), 1 - CONFIDENCE)
+    return _solve(lambda share: _binomial_cdf(n - met, n, 1 - share), 1 - CONFIDENCE)
 
 
 def share_high(met: int, n: int) -> float:
-    """Return the upper bound of that share, likewise."""
+    """Return the one-sided upper bound of the share of all repeats that meet a requirement, as `share_low`."""
     return 1 - share_low(n - met, n)
 
 
 def repeats_for(share: float) -> int:
-    """Return the least number of repeats of which all must meet a demand, to show it for this share of all repeats.
+    """Return the number of repeats, all of which must meet a requirement, that show it for this share of all repeats.
 
-    From `share_low`: the least n with share^n <= 5 %.
+    From `share_low`: the smallest n with share^n <= 5 %.
     """
     return math.ceil(math.log(1 - CONFIDENCE) / math.log(share) * (1 - 1e-12))
 
 
 def loss_high(lost: ArrayLike, sent: ArrayLike) -> float:
-    """Return the upper bound of the share of packets lost, over the packets of all repeats.
+    """Return the one-sided upper bound of the share of lost packets, over the packets of all repeats.
 
-    Losses come in bursts. A burst is taken to be as long as the losses of the worst repeat, which is the longest that
-    these data allow, and `SHORTEST_BURST` at least. The number of bursts is then Poisson: with L packets in each, and
-    X of N packets lost, the bound is L/N times the 95 % quantile of the gamma distribution of shape X/L + 1 (Garwood
-    1936, Biometrika 28:437). Without losses it is 3 L/N: the rule of three with N/L for the number of trials.
+    Losses occur in bursts. The assumed length of a burst is the number of losses in the worst repeat, which is the
+    longest burst that the data allow, and at least `SHORTEST_BURST`. The number of bursts is assumed to be Poisson:
+    with L packets per burst, and X of N packets lost, the bound is L/N times the 95 % quantile of the gamma
+    distribution of shape X/L + 1 (Garwood 1936, Biometrika 28:437). Without losses it is 3 L/N: the rule of three
+    with N/L trials.
 
-    Fewer losses in any repeat never make the bound larger: it increases with X and with L.
+    The bound increases with X and with L, so fewer losses in any repeat never make it larger.
 
     Args:
-        lost: Packets lost by each repeat, shape (n,); below 0, where copies arrived, it is taken as 0.
-        sent: Of how many, same shape.
+        lost: Lost packets of each repeat, shape (n,); a negative number, caused by duplicates, counts as 0.
+        sent: Sent packets of each repeat, same shape.
 
     Returns:
-        1 at most; 1 where nothing was sent.
+        At most 1; 1 if no packet was sent.
     """
     losses = np.maximum(np.asarray(lost, dtype=np.float64), 0)
     total = float(np.sum(sent))
@@ -69,17 +70,17 @@ def loss_high(lost: ArrayLike, sent: ArrayLike) -> float:
 
 
 def packets_for(bound: float) -> int:
-    """Return the least number of packets, none of them lost, for which `loss_high` is below `bound`."""
+    """Return the smallest number of packets for which `loss_high` is below `bound` if no packet is lost."""
     return math.floor(SHORTEST_BURST * -math.log(1 - CONFIDENCE) / bound) + 1
 
 
 def _gamma_quantile(shape: float) -> float:
-    """Return the 95 % quantile of the gamma distribution of this shape, 1 or above, and scale 1."""
-    most = shape + 5 * math.sqrt(shape) + 5
-    return most * _solve(lambda part: _gamma_below(shape, most * part), CONFIDENCE)
+    """Return the 95 % quantile of the gamma distribution of this shape, at least 1, and scale 1."""
+    upper = shape + 5 * math.sqrt(shape) + 5
+    return upper * _solve(lambda part: _gamma_cdf(shape, upper * part), CONFIDENCE)
 
 
-def _gamma_below(shape: float, x: float) -> float:
+def _gamma_cdf(shape: float, x: float) -> float:
     """Return the regularized lower incomplete gamma function, by its series (Abramowitz and Stegun 1964, 6.5.29)."""
     if x <= 0:
         return 0.0
@@ -92,8 +93,8 @@ def _gamma_below(shape: float, x: float) -> float:
     return min(total, 1.0)
 
 
-def _at_most(k: int, n: int, share: float) -> float:
-    """Return the probability of `k` or fewer of `n`, each with this share."""
+def _binomial_cdf(k: int, n: int, share: float) -> float:
+    """Return the probability of at most `k` successes in `n` trials with the success probability `share`."""
     if share <= 0 or k >= n:
         return 1.0
     if share >= 1:
@@ -109,10 +110,10 @@ def _at_most(k: int, n: int, share: float) -> float:
     return min(math.fsum(map(math.exp, logs)), 1.0)
 
 
-def _solve(rising: Callable[[float], float], goal: float) -> float:
-    """Return where in 0..1 a function that rises there reaches `goal`."""
+def _solve(increasing: Callable[[float], float], goal: float) -> float:
+    """Return the argument in 0..1 at which an increasing function reaches `goal`, by bisection."""
     low, high = 0.0, 1.0
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2
-        low, high = (middle, high) if rising(middle) < goal else (low, middle)
+        low, high = (middle, high) if increasing(middle) < goal else (low, middle)
     return (low + high) / 2

@@ -1,4 +1,4 @@
-"""Cells: the repeats under one condition, put together into estimates with intervals."""
+"""Cells: the repeats under one condition, aggregated into estimates with intervals."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,14 +22,14 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class RepeatValues:
-    """The single repeats behind an estimate, each array of shape (n,).
+    """The values of the single repeats of an estimate, each array of shape (n,).
 
     Attributes:
-        low: The value of each; its lower bound where it is censored.
-        high: The largest that it can be: infinity where it is censored, and where a figure of what arrived has none
-            over all that was sent (see `columns.Figure.of_sent`).
-        lost: What was lost, or true; None unless counted or a flag.
-        sent: Of how many.
+        low: Value of each repeat; its lower bound if it is censored.
+        high: Upper bound of the value of each repeat: infinity if it is censored, or if the statistic over all sent
+            items (see `columns.Figure.of_sent`) is infinite.
+        lost: Number of lost items, or 1 for true; None unless the quantity is counted or a flag.
+        sent: Number of sent items, or 1 for a flag.
     """
 
     low: NDArray[np.float64]
@@ -40,33 +40,34 @@ class RepeatValues:
 
 @dataclass(frozen=True)
 class Estimate:
-    """One quantity of one cell.
+    """Estimate of one quantity in one cell.
 
     Attributes:
-        quantity: Which.
-        n: Valid repeats that have it.
-        value: The figure to quote, by the quantity's kind: share of all counted, mean or median.
-        low: Lower end of the 95 % interval to quote; the repeat is its unit. None for a single repeat.
-        high: Upper end; None for a single repeat, and where censored repeats leave it open.
-        assured: Share of such intervals that hold the truth whatever the distribution of the repeats; None unless a
-            median of two repeats at least.
-        p_order: How often repeats in no order would be as orderly in time as these, `order.p_values` corrected for
-            the number of all estimates; None where it was not tested.
-        wilson_low: Lower end of the 95 % Wilson interval, all counted taken as independent; None unless counted.
+        quantity: The quantity.
+        n: Number of valid repeats that have a value.
+        value: The estimate to quote, by the quantity's kind: share of all counted items, mean or median.
+        low: Lower end of the 95 % interval to quote, with repeats as sampling units; None for a single repeat.
+        high: Upper end; None for a single repeat, and if censored repeats leave it open.
+        assured: Coverage of the interval for any distribution of the repeats; None unless it is a median of at least
+            two repeats.
+        p_order: p-value of the independence of the repeats in time (`order.p_values`), corrected for the number of
+            all estimates; None if it was not tested.
+        wilson_low: Lower end of the 95 % Wilson interval, which assumes that all counted items are independent; None
+            unless counted.
         wilson_high: Upper end.
-        events: What was lost, or true; None unless counted or a flag.
-        trials: Of how many.
+        events: Number of lost items, or of repeats that are true; None unless the quantity is counted or a flag.
+        trials: Number of sent items, or of repeats.
         mean: Mean over repeats.
         median: Median over repeats.
         p95: 95th percentile over repeats.
-        minimum: The smallest of a single repeat.
-        maximum: The largest.
-        n_censored: Of n, the repeats of which only a lower bound is known.
+        minimum: Smallest value of a repeat.
+        maximum: Largest value of a repeat.
+        n_censored: Number of repeats among `n` with a right-censored value.
         is_lower_bound: Whether `value` is a lower bound because of them.
-        missing: Valid repeats of the cell that do not have it.
-        high_of_sent: Upper end of the interval where what was lost counts as later than all that arrived; None if
-            it is open. As `high` of figures that are not of what arrived alone.
-        sample: The single repeats; None of an estimate that was put together by hand.
+        missing: Number of valid repeats of the cell without a value.
+        high_of_sent: Upper end of the interval if lost items count as later than all received ones; None if it is
+            open. It equals `high` for quantities that are not computed from received items only.
+        sample: Values of the single repeats; None for an estimate that was not computed from repeats.
     """
 
     quantity: Quantity
@@ -93,7 +94,7 @@ class Estimate:
 
     @property
     def n_valid(self) -> int:
-        """Valid repeats of the cell."""
+        """Number of valid repeats of the cell."""
         return self.n + self.missing
 
 
@@ -102,16 +103,17 @@ class Cell:
     """The repeats under one condition.
 
     Attributes:
-        key: Value of each column that tells the condition, in the order asked for; "" or None where missing.
-        n_valid: Valid repeats; all estimates are of these.
-        n_void: Attempts whose evidence was not whole.
-        n_failed: Attempts that failed.
-        estimates: By name, of the quantities that any valid repeat has, in their order.
-        tallies: By name, of the columns of words that any valid repeat has, in their order.
+        key: Value of each column that identifies the condition, in the requested order; "" or None if missing.
+        n_valid: Number of valid repeats; all estimates are of these.
+        n_void: Number of attempts with incomplete evidence.
+        n_failed: Number of attempts that failed.
+        estimates: Estimates by name of the quantity, in the order of quantities; only those that any valid repeat
+            has.
+        tallies: Word counts by name of the column, in order; only those that any valid repeat has.
         payload_bytes: ICMP payload sizes of the valid repeats, ascending, by the name of each quantity that depends
             on them; see `Quantity.payload`.
-        lacking: Quantities that the valid repeats were measured for, and of which none has a value: the RTT of pings
-            that nothing answered; see `Quantity.implied_by`.
+        lacking: Quantities that were measured in the valid repeats, but have no value in any of them, for example the
+            RTT of pings without an answer; see `Quantity.implied_by`.
     """
 
     key: Mapping[str, str | float | None]
@@ -134,120 +136,125 @@ def aggregate(
     """Return one cell per condition, sorted by the columns `by` in their order, a distance by its length.
 
     Args:
-        repeats: Attempts at repeats, void and failed ones too.
-        by: Columns that tell one condition from another.
-        quantities: What to estimate; None for all that the repeats have.
-        words: Columns whose words to count; None for all that the repeats have.
+        repeats: Attempts of repeats, including void and failed ones.
+        by: Columns that identify a condition.
+        quantities: Quantities to estimate; None for all that the repeats have.
+        words: Columns whose words are counted; None for all that the repeats have.
     """
     keys, cells = _conditions(repeats, by)
     status = repeats.texts["status"]
-    valid, void, failed = (np.bincount(cells[status == one], minlength=len(keys)).tolist() for one in ENDED)
+    valid, void, failed = (np.bincount(cells[status == ending], minlength=len(keys)).tolist() for ending in ENDED)
     rows = np.argsort(cells, kind="stable")
     rows = rows[status[rows] == Status.VALID]
-    if "started_utc_ns" in repeats.numbers:  # the repeats of a cell in the order of time, unknown moments last
+    if "started_utc_ns" in repeats.numbers:  # the repeats of a cell in the order of time, unknown times last
         rows = rows[np.lexsort((repeats.numbers["started_utc_ns"][rows], cells[rows]))]
     estimates: list[dict[str, Estimate]] = [{} for _ in keys]
     for quantity in repeats.quantities if quantities is None else quantities:
         for cell, estimate in _estimates(repeats, quantity, rows, cells):
             estimates[cell][quantity.name] = replace(estimate, missing=valid[cell] - estimate.n)
-    _correct(estimates)
-    counted: list[dict[str, Tally]] = [{} for _ in keys]
+    _correct_p_values(estimates)
+    tallies_by_cell: list[dict[str, Tally]] = [{} for _ in keys]
     for column in repeats.worded if words is None else words:
-        given = zip(cells[rows].tolist(), repeats.texts[column.name][rows], strict=True)
-        for cell, tally in tallies(column, given):
-            counted[cell][column.name] = tally
-    named = (dict(zip(by, key, strict=True)) for key in keys)
-    known = repeats.quantities if quantities is None else quantities
-    ends = np.searchsorted(cells[rows], np.arange(1, len(keys)))  # the rows of a cell are side by side
+        words_with_cell = zip(cells[rows].tolist(), repeats.texts[column.name][rows], strict=True)
+        for cell, tally in tallies(column, words_with_cell):
+            tallies_by_cell[cell][column.name] = tally
+    named_keys = (dict(zip(by, key, strict=True)) for key in keys)
+    chosen = repeats.quantities if quantities is None else quantities
+    ends = np.searchsorted(cells[rows], np.arange(1, len(keys)))  # the rows of a cell are adjacent
     parts = np.split(rows, ends) if keys else []
-    payloads = [_payloads(repeats, known, part) for part in parts]
-    lacking = [_lacking(repeats, known, part, own) for part, own in zip(parts, estimates, strict=True)]
-    columns_of = zip(named, valid, void, failed, estimates, counted, payloads, lacking, strict=True)
+    payloads = [_payload_sizes(repeats, chosen, part) for part in parts]
+    lacking = [
+        _quantities_without_value(repeats, chosen, part, of_cell)
+        for part, of_cell in zip(parts, estimates, strict=True)
+    ]
+    columns_of = zip(named_keys, valid, void, failed, estimates, tallies_by_cell, payloads, lacking, strict=True)
     return tuple(Cell(*fields) for fields in columns_of)
 
 
-def _payloads(repeats: Repeats, known: Sequence[Quantity], rows: Indices) -> dict[str, tuple[int, ...]]:
+def _payload_sizes(repeats: Repeats, quantities: Sequence[Quantity], rows: Indices) -> dict[str, tuple[int, ...]]:
     """Return the ICMP payload sizes in `rows` by the name of each quantity that depends on them."""
     payloads: dict[str, tuple[int, ...]] = {}
-    for quantity in known:
+    for quantity in quantities:
         if quantity.payload is not None and quantity.payload in repeats.numbers:
             sizes = np.unique(repeats.numbers[quantity.payload][rows])
             payloads[quantity.name] = tuple(sizes[np.isfinite(sizes)].astype(int).tolist())
     return payloads
 
 
-def _lacking(
-    repeats: Repeats, known: Sequence[Quantity], rows: Indices, estimates: Mapping[str, Estimate]
+def _quantities_without_value(
+    repeats: Repeats, quantities: Sequence[Quantity], rows: Indices, estimates: Mapping[str, Estimate]
 ) -> tuple[Quantity, ...]:
-    """Return the quantities that were measured for in `rows`, and of which no row has a value."""
+    """Return the quantities that were measured in `rows`, but have no value in any of them."""
     return tuple(
         quantity
-        for quantity in known
+        for quantity in quantities
         if quantity.name not in estimates
         and (implied := repeats.numbers.get(quantity.implied_by or "")) is not None
         and np.isfinite(implied[rows]).any()
     )
 
 
-def _correct(estimates: Sequence[dict[str, Estimate]]) -> None:
-    """Correct every p-value of an order for the number of all."""
-    tested = [
-        (cell, difference) for cell in estimates for difference in cell.values() if difference.p_order is not None
-    ]
-    corrected = order.corrected(np.array([difference.p_order for _, difference in tested], dtype=np.float64)).tolist()
-    for (cell, one), p_order in zip(tested, corrected, strict=True):
-        cell[one.quantity.name] = replace(one, p_order=p_order)
+def _correct_p_values(estimates: Sequence[dict[str, Estimate]]) -> None:
+    """Correct the p-values `p_order` for the number of all estimates."""
+    tested = [(cell, estimate) for cell in estimates for estimate in cell.values() if estimate.p_order is not None]
+    corrected = order.corrected(np.array([estimate.p_order for _, estimate in tested], dtype=np.float64)).tolist()
+    for (cell, estimate), p_order in zip(tested, corrected, strict=True):
+        cell[estimate.quantity.name] = replace(estimate, p_order=p_order)
 
 
 def _conditions(repeats: Repeats, by: Sequence[str]) -> tuple[list[Key], Indices]:
-    """Return the keys of all cells, sorted, and which of them each row is of."""
+    """Return the sorted keys of all cells, and the index of the cell of each row."""
     _, firsts, condition = np.unique(repeats.codes(by), return_index=True, return_inverse=True)
     keys = repeats.where(firsts).keys(by)
-    ordered = sorted(range(len(keys)), key=lambda index: [_rank(*part) for part in zip(by, keys[index], strict=True)])
-    place = np.zeros(len(keys), np.int64)
-    place[ordered] = np.arange(len(keys))
-    return [keys[index] for index in ordered], place[condition]
+    ordered = sorted(
+        range(len(keys)), key=lambda index: [_sort_key(*part) for part in zip(by, keys[index], strict=True)]
+    )
+    position = np.zeros(len(keys), np.int64)
+    position[ordered] = np.arange(len(keys))
+    return [keys[index] for index in ordered], position[condition]
 
 
-def _rank(name: str, value: str | float | None) -> tuple[bool, float, str]:
-    """Return what a value is sorted by: what is missing comes first."""
+def _sort_key(name: str, value: str | float | None) -> tuple[bool, float, str]:
+    """Return the sort key of a value; missing values come first."""
     if not isinstance(value, str):
         return value is not None, value or 0.0, ""
     if name != "distance":
         return bool(value), 0.0, value
     try:
         return True, parse_distance(value).metres, value
-    except ConfigurationError:  # a word of somebody else's for a distance
+    except ConfigurationError:  # an edited table can contain any text as a distance
         return bool(value), 0.0, value
 
 
 def _estimates(repeats: Repeats, quantity: Quantity, rows: Indices, cells: Indices) -> Iterator[tuple[int, Estimate]]:
-    """Yield the cells that have a quantity with their estimates, those with equally many repeats together.
+    """Yield the index and the estimate of each cell that has a quantity.
+
+    Cells with the same number of repeats are computed together.
 
     Args:
         repeats: All repeats.
-        quantity: Which.
-        rows: The valid ones, those of a cell side by side.
+        quantity: The quantity.
+        rows: Indices of the valid repeats; those of a cell are adjacent.
         cells: Cell of each row of `repeats`.
     """
     rows = rows[np.isfinite(repeats.observed(quantity)[0][rows])]
-    for name in quantity.columns[1:]:  # a share whose counts are missing says nothing of how many it is of
+    for name in quantity.columns[1:]:  # a share without its counts cannot be summed over repeats
         rows = rows[np.isfinite(repeats.numbers[name][rows])]
-    of = cells[rows]
-    starts = np.flatnonzero(np.diff(of, prepend=-1))
+    cell_of_row = cells[rows]
+    starts = np.flatnonzero(np.diff(cell_of_row, prepend=-1))
     sizes = np.diff(starts, append=len(rows))
     for n in np.unique(sizes):
-        alike = starts[sizes == n]
-        chosen = rows[alike[:, None] + np.arange(n)]
-        yield from zip(of[alike].tolist(), _estimates_of(repeats, quantity, chosen), strict=True)
+        same_size = starts[sizes == n]
+        chosen = rows[same_size[:, None] + np.arange(n)]
+        yield from zip(cell_of_row[same_size].tolist(), _same_size_estimates(repeats, quantity, chosen), strict=True)
 
 
-def _estimates_of(repeats: Repeats, quantity: Quantity, chosen: Indices) -> Iterator[Estimate]:
-    """Yield the estimates of cells whose rows are `chosen`, shape (cells, n)."""
+def _same_size_estimates(repeats: Repeats, quantity: Quantity, chosen: Indices) -> Iterator[Estimate]:
+    """Yield the estimates of cells with the same number of repeats, whose rows are `chosen`, shape (cells, n)."""
     observed, is_bound = repeats.observed(quantity)
     values, censored = observed[chosen], is_bound[chosen]
     upper = np.where(censored, np.inf, values)
-    of_sent = _of_sent(repeats, quantity, chosen, upper)
+    of_sent = _upper_of_sent(repeats, quantity, chosen, upper)
     counts = _counts(repeats, quantity, chosen)
     mean, median, p95 = values.mean(axis=1), np.median(values, axis=1), np.percentile(values, 95, axis=1)
     if counts is not None:
@@ -256,22 +263,22 @@ def _estimates_of(repeats: Repeats, quantity: Quantity, chosen: Indices) -> Iter
         quoted = shares(*counts) if quantity.kind is Kind.COUNTED else pooled
         counted = [column.astype(np.int64).tolist() for column in (lost, sent)]
     else:
-        quoted = _quoted(quantity, values, upper)
+        quoted = _mean_or_median(quantity, values, upper)
         pooled = Intervals(quoted.value, *np.full((2, len(values)), np.nan))
         counted = [[None] * len(values)] * 2
-    high_of_sent = quoted.high if of_sent is upper else _quoted(quantity, values, of_sent).high
+    high_of_sent = quoted.high if of_sent is upper else _mean_or_median(quantity, values, of_sent).high
     n = values.shape[1]
-    sure = assured(n) if quantity.kind is Kind.MEDIAN and n > 1 else None
+    coverage = assured(n) if quantity.kind is Kind.MEDIAN and n > 1 else None
     samples = [
         RepeatValues(
-            values[cell], of_sent[cell], *((None, None) if counts is None else (one[cell] for one in counts))
+            values[cell], of_sent[cell], *((None, None) if counts is None else (count[cell] for count in counts))
         )
         for cell in range(len(values))
     ]
     for row in zip(
         quoted.value.tolist(),
         *map(_or_none, (quoted.low, quoted.high)),
-        [sure] * len(values),
+        [coverage] * len(values),
         _or_none(_p_order(repeats, quantity, chosen)),
         *map(_or_none, (pooled.low, pooled.high)),
         *counted,
@@ -286,41 +293,41 @@ def _estimates_of(repeats: Repeats, quantity: Quantity, chosen: Indices) -> Iter
         yield Estimate(quantity, n, *row)
 
 
-def _of_sent(
+def _upper_of_sent(
     repeats: Repeats, quantity: Quantity, chosen: Indices, upper: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the largest that values can be where what was lost counts as later than all that arrived."""
+    """Return upper bounds of the values if lost items count as later than all received ones; infinity if unknown."""
     if quantity.of_sent is None:
         return upper
-    # A table of an earlier version lacks the column: then nothing is known of what was lost.
-    known = repeats.numbers.get(quantity.of_sent)
-    given = np.full_like(upper, np.nan) if known is None else known[chosen]
-    return np.where(np.isnan(given), np.inf, np.maximum(given, upper))
+    column = repeats.numbers.get(quantity.of_sent)  # missing in tables of earlier versions
+    of_sent = np.full_like(upper, np.nan) if column is None else column[chosen]
+    return np.where(np.isnan(of_sent), np.inf, np.maximum(of_sent, upper))
 
 
-def _quoted(quantity: Quantity, values: NDArray[np.float64], upper: NDArray[np.float64]) -> Intervals:
-    """Return the mean or median over repeats of what is not counted."""
+def _mean_or_median(quantity: Quantity, values: NDArray[np.float64], upper: NDArray[np.float64]) -> Intervals:
+    """Return the mean or median over repeats, for quantities that are not counted."""
     least, most = quantity.possible
     if quantity.kind is Kind.MEDIAN:
         return medians(values, least, most, upper=upper)
     if quantity.unit == "share":
         return mean_shares(values)
-    found = means(values)
-    return Intervals(found.value, np.maximum(found.low, least), np.minimum(found.high, most))
+    mean = means(values)
+    return Intervals(mean.value, np.maximum(mean.low, least), np.minimum(mean.high, most))
 
 
 def _p_order(repeats: Repeats, quantity: Quantity, chosen: Indices) -> NDArray[np.float64]:
-    """Return the p-values of the order of cells; NaN where the moment of some repeat is not known, or for flags."""
+    """Return the p-value of independence in time of each cell; NaN if a start time is unknown, and for flags."""
     if quantity.kind is Kind.FLAG or "started_utc_ns" not in repeats.numbers:
         return np.full(len(chosen), np.nan)
-    found = order.p_values(repeats.observed(quantity)[0][chosen])
-    return np.where(np.isnan(repeats.numbers["started_utc_ns"][chosen]).any(axis=1), np.nan, found)
+    p_values = order.p_values(repeats.observed(quantity)[0][chosen])
+    return np.where(np.isnan(repeats.numbers["started_utc_ns"][chosen]).any(axis=1), np.nan, p_values)
 
 
 def _counts(repeats: Repeats, quantity: Quantity, chosen: Indices) -> tuple[NDArray[np.float64], ...] | None:
-    """Return what was lost, or true, of how many, per repeat; None unless that is counted.
+    """Return the numbers of lost and of sent items per repeat, or flags and ones; None for other quantities.
 
-    More may arrive than was sent: offload shows the paper's filter other frames at either end.
+    A number of lost items can be negative: with segmentation offload, the paper's filter matches other frames at
+    either end.
     """
     if quantity.kind is Kind.FLAG:
         flags = repeats.numbers[quantity.name][chosen]

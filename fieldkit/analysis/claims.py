@@ -1,4 +1,4 @@
-"""What the expectations of a trial need before they can hold: repeats, or packets. Known before anything runs."""
+"""Number of repeats or packets that the expectations of a trial need, computed before the trial runs."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -6,20 +6,20 @@ from collections.abc import Iterable, Iterator
 from fieldkit.analysis import bounds
 from fieldkit.analysis.expectations import Expectation, Scope
 from fieldkit.analysis.quantities import Quantity
-from fieldkit.analysis.statistics import CONFIDENCE, FEWEST_FOR_ORDER, NORMAL
+from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, NORMAL
 from fieldkit.core.columns import Kind
 
 _USUAL_SHARE = 0.9
-"""Share of further repeats for which a claim on every repeat is compared with one on a share of them."""
+"""Share of all repeats that is used to show the difference between `every` repeat of a trial and all repeats."""
 
 
 def shortfalls(expectations: Iterable[Expectation], figures: Iterable[Quantity], repeats: int) -> Iterator[str]:
-    """Yield what each expectation needs and a trial does not have, in a sentence.
+    """Yield a sentence for each expectation that needs more repeats or packets than a trial has.
 
     Args:
-        expectations: Of the trial.
-        figures: What its repeats measure, which every expectation is of.
-        repeats: How many it has per protocol.
+        expectations: Expectations of the trial.
+        figures: Quantities that its repeats measure, including those of the expectations.
+        repeats: Number of repeats per protocol.
     """
     by_name = {quantity.name: quantity for quantity in figures}
     for expectation in expectations:
@@ -34,8 +34,8 @@ def _needs(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
         return f"needs at least {packets} packets per condition for 95 % confidence, if none is lost"
     if expectation.scope is Scope.SHARE and expectation.share is not None:
         needed = bounds.repeats_for(expectation.share)
-        wanted = f"needs at least {needed} repeats for 95 % confidence, if all meet it; {has}"
-        return wanted if repeats < needed else ""
+        text = f"needs at least {needed} repeats for 95 % confidence, if all meet it; {has}"
+        return text if repeats < needed else ""
     if expectation.scope is Scope.EVERY:
         needed, shown = bounds.repeats_for(_USUAL_SHARE), bounds.share_low(repeats, repeats)
         return (
@@ -46,32 +46,32 @@ def _needs(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
         )
     needed = _for_interval(expectation, quantity)
     if repeats < needed:
-        otherwise = f"; for these packets alone: {expectation.text} of all packets"
-        gate = quantity.kind is Kind.COUNTED and expectation.is_below
-        return f"needs at least {needed} repeats for 95 % confidence, {_if(quantity)}; {has}" + (
-            otherwise if gate else ""
+        alternative = f"; for these packets alone: {expectation.text} of all packets"
+        has_alternative = quantity.kind is Kind.COUNTED and expectation.is_below
+        return f"needs at least {needed} repeats for 95 % confidence, {_best_case(quantity)}; {has}" + (
+            alternative if has_alternative else ""
         )
-    if quantity.kind is Kind.MEDIAN and repeats < FEWEST_FOR_ORDER:
-        held = f"{100 * CONFIDENCE:.0f} % confidence whatever the distribution of the repeats is"
-        return f"needs at least {FEWEST_FOR_ORDER} repeats for {held}; {has}"
+    if quantity.kind is Kind.MEDIAN and repeats < MIN_FOR_ORDER_STATISTICS:
+        coverage = f"{100 * CONFIDENCE:.0f} % confidence for any distribution of the repeats"
+        return f"needs at least {MIN_FOR_ORDER_STATISTICS} repeats for {coverage}; {has}"
     return ""
 
 
-def _if(quantity: Quantity) -> str:
-    """Return under which best results so few repeats are enough."""
+def _best_case(quantity: Quantity) -> str:
+    """Return a description of the best results, for which this number of repeats is enough."""
     if quantity.kind is Kind.FLAG:
-        return "if it is so in all of them"
+        return "if it is true in all of them"
     return "even if nothing is lost" if quantity.unit == "share" else "which give an interval"
 
 
 def _for_interval(expectation: Expectation, quantity: Quantity) -> int:
-    """Return the least number of repeats of which the 95 % interval of a figure can be within the bound.
+    """Return the smallest number of repeats with which the 95 % interval of a figure can be within the bound.
 
-    Of shares it is the score interval of repeats that all lost nothing (Wilson 1927), which ends at z²/(n + z²).
+    For shares this is the score interval of repeats without any loss (Wilson 1927), whose end is z²/(n + z²).
     """
     if quantity.unit != "share" or quantity.kind is Kind.MEDIAN:
         return 2
-    room = expectation.bound if expectation.is_below else 1 - expectation.bound
-    if not 0 < room < 1 or (quantity.kind is not Kind.FLAG and not expectation.is_below):
+    width = expectation.bound if expectation.is_below else 1 - expectation.bound
+    if not 0 < width < 1 or (quantity.kind is not Kind.FLAG and not expectation.is_below):
         return 2
-    return max(math.floor(NORMAL**2 * (1 / room - 1) * (1 + 1e-12)) + 1, 2)
+    return max(math.floor(NORMAL**2 * (1 / width - 1) * (1 + 1e-12)) + 1, 2)

@@ -1,4 +1,4 @@
-"""Comparability of two runs: what makes their numbers differ, other than what is being compared."""
+"""Comparability of two runs: differences in conditions that make their numbers incomparable."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -24,49 +24,49 @@ SAME: Final = (
     "paper_window_bytes",
     "tcp_congestion_control",
 )
-"""Columns that must hold the same values on both sides."""
+"""Columns that must have the same values in both runs."""
 
 VARIED: Final = frozenset({"distance_m"})
-"""Of these what may be all that differs: another protocol or topology brings other differences with it."""
+"""Columns among `SAME` that may be the variable of a comparison; another protocol or topology changes more."""
 
 _IDENTITY: Final = frozenset({"profiles_sha256", "procedure_sha256"})
 
 SIZE_TOLERANCE: Final = 0.05
-"""How far apart the median sizes of what was sent may be, as a share of the smaller."""
+"""Largest acceptable difference of the median sent sizes, as a share of the smaller one."""
 
 _MIXED: Final = (
     (
         "code_sha256",
         "schema_version",
-        "Several versions of fieldkit ran these trials: without rebuilding, each measured its own.",
+        "Different versions of fieldkit ran these trials; each trial was measured by its version unless rebuilt.",
     ),
-    ("profiles_sha256", "topology", "The robots or their profiles are not the same in all trials of a topology."),
-    ("procedure_sha256", "procedure", "A procedure is not the same in all its trials."),
+    ("profiles_sha256", "topology", "The robots or their profiles differ between trials of the same topology."),
+    ("procedure_sha256", "procedure", "A procedure differs between its trials."),
 )
-"""A column, within what it ought to be one, and what to say where it is not."""
+"""Column, column within whose values it must be unique, and message if it is not."""
 
 _PAYLOAD: Final = "rtt_payload_bytes"
 
 MIXED_BY: Final = frozenset((*(name for column, within, _ in _MIXED for name in (column, within)), _PAYLOAD))
-"""Columns that `mixtures` looks at, beside those that tell conditions."""
+"""Columns that `mixtures` needs in addition to those that identify conditions."""
 
 _MESSAGES: Final = 2
-"""How many messages more or less are no other size: a recorder subscribes and ends between two of them."""
+"""Acceptable difference of recorded sizes in messages, because a recorder starts and stops between two messages."""
 
 DATAGRAM_FACTOR: Final = 1.5
-"""How far apart the sizes of datagrams may be: the netcats send 8,192 or 16,384 bytes, and a file's last one less."""
+"""Largest acceptable ratio of datagram sizes: netcat sends 8,192 or 16,384 bytes, and less at the end of a file."""
 
 
 @dataclass(frozen=True)
 class Concern:
-    """Something in which two runs differ, or may.
+    """A known or possible difference between two runs.
 
     Attributes:
-        what: The column, or what was made of columns.
-        a: What A has, for people; `unknown` where its rows do not say.
-        b: What B has.
-        cells: Where, in words; empty for all.
-        refuses: Whether numbers so measured are not comparable; else it is worth knowing.
+        what: The column, or a description of a value that is computed from columns.
+        a: Value of A, formatted for people; `unknown` if its rows do not contain it.
+        b: Value of B.
+        cells: Names of the affected conditions; empty for all.
+        refuses: Whether the difference makes the runs incomparable; otherwise it is only a note.
     """
 
     what: str
@@ -84,95 +84,99 @@ class Concern:
 
 
 def concerns(pairs: Iterable[tuple[str, Repeats, Repeats]], by: Collection[str] = ()) -> tuple[Concern, ...]:
-    """Return what speaks against comparing, refusals first.
+    """Return the concerns about comparing two runs, refusals first.
 
-    One of `VARIED` that is not in `by` is what is compared where either run has one value of it: no refusal.
+    A column of `VARIED` that is not in `by` is the variable of the comparison if it has a single value in each run;
+    it causes no refusal then.
 
     Args:
-        pairs: Of each condition its name in words and the valid repeats of A and of B, at least one each.
-        by: Columns that tell one condition from another.
+        pairs: Name of each condition, and its valid repeats in A and in B, at least one each.
+        by: Columns that identify a condition.
     """
-    found: dict[Concern, list[str]] = {}
+    names_by_concern: dict[Concern, list[str]] = {}
     for name, a, b in pairs:
-        for concern in _of_pair(a, b, VARIED - set(by)):
-            found.setdefault(concern, []).append(name)
-    merged = (Concern(one.what, one.a, one.b, tuple(names), one.refuses) for one, names in found.items())
-    return tuple(sorted(merged, key=lambda one: not one.refuses))
+        for concern in _pair_concerns(a, b, VARIED - set(by)):
+            names_by_concern.setdefault(concern, []).append(name)
+    merged = (
+        Concern(concern.what, concern.a, concern.b, tuple(names), concern.refuses)
+        for concern, names in names_by_concern.items()
+    )
+    return tuple(sorted(merged, key=lambda concern: not concern.refuses))
 
 
 def mixtures(repeats: Repeats, by: Sequence[str] = DEFAULT_BY) -> Iterator[str]:
-    """Yield in a sentence each what was not the same in all of one run, though its names are.
+    """Yield a sentence for each setting that differs within one run although the names of conditions are the same.
 
     Args:
         repeats: All attempts of the run.
-        by: Columns that tell one condition from another.
+        by: Columns that identify a condition.
     """
-    for name, within, what in _MIXED:
+    for name, within, message in _MIXED:
         if len(set(repeats.keys((within, name)))) > len(set(repeats.column(within))):
-            yield what
-    for name in (one for one in repeats.numbers if plain_name(one) == _PAYLOAD):
+            yield message
+    for name in (column for column in repeats.numbers if plain_name(column) == _PAYLOAD):
         pinged = repeats.where(np.isfinite(repeats.numbers[name]))
         if len(set(pinged.keys((*by, name)))) > len(set(pinged.keys(by))):
-            yield "Echo requests of several sizes are in one condition: their round trips do not compare."
+            yield "A condition has echo requests of different sizes, whose round-trip times are not comparable."
             return
 
 
-def doubts(a: Repeats, b: Repeats) -> Iterator[Concern]:
-    """Yield what is worth knowing of all repeats: two versions of fieldkit measured, or attempts are in both runs."""
-    yield from _unlike("code_sha256", a, b, refuses=False)
-    if same := len(_attempts(a) & _attempts(b)):
-        yield Concern("attempts that the other has too", str(same), str(same), (), refuses=False)
+def notes(a: Repeats, b: Repeats) -> Iterator[Concern]:
+    """Yield notes on all repeats: different versions of fieldkit, or attempts that are in both runs."""
+    yield from _compare_column("code_sha256", a, b, refuses=False)
+    if common := len(_attempts(a) & _attempts(b)):
+        yield Concern("attempts that the other run has too", str(common), str(common), (), refuses=False)
 
 
 def _attempts(rows: Repeats) -> set[Key]:
     return {key for key in rows.keys(("trial", "protocol", "repeat", "attempt")) if key[0]}
 
 
-def _of_pair(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[Concern]:
+def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[Concern]:
     for name in SAME:
         is_varied = name in varied and all(len(set(rows.column(name))) == 1 for rows in (a, b))
-        yield from _unlike(name, a, b, refuses=not is_varied)
-    yield from _files(a, b)
-    yield from _datagrams(a, b)
-    yield from _offload(a, b)
+        yield from _compare_column(name, a, b, refuses=not is_varied)
+    yield from _file_sizes(a, b)
+    yield from _datagram_sizes(a, b)
+    yield from _offload_state(a, b)
 
 
-def _unlike(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iterator[Concern]:
+def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iterator[Concern]:
     of_a, of_b = _values(name, a), _values(name, b)
     unknown = UNKNOWN in {of_a, of_b}
-    # What neither side measured cannot tell them apart; that neither says what it is can.
+    # A column that is missing in both runs is no difference, unless it identifies robots or procedure.
     if of_a != of_b or (unknown and name in _IDENTITY):
         yield Concern(name, of_a, of_b, (), refuses and (not unknown or name in _IDENTITY))
 
 
 def _values(name: str, rows: Repeats) -> str:
-    found = set(rows.column(name)) - {"", None}
-    return ", ".join(sorted(map(cell, found))) or UNKNOWN
+    values = set(rows.column(name)) - {"", None}
+    return ", ".join(sorted(map(cell, values))) or UNKNOWN
 
 
-def _files(a: Repeats, b: Repeats) -> Iterator[Concern]:
+def _file_sizes(a: Repeats, b: Repeats) -> Iterator[Concern]:
     of_a, of_b = (_median(rows.numbers["sent_bytes"]) for rows in (a, b))
-    one_a, one_b = (_bytes_per("bag_messages", rows) for rows in (a, b))
-    room = np.fmax(SIZE_TOLERANCE * min(of_a, of_b), _MESSAGES * np.fmax(one_a, one_b))
-    yield from _apart("sent_bytes, median", of_a, of_b, room)
+    message_a, message_b = (_bytes_per("bag_messages", rows) for rows in (a, b))
+    tolerance = np.fmax(SIZE_TOLERANCE * min(of_a, of_b), _MESSAGES * np.fmax(message_a, message_b))
+    yield from _compare_sizes("sent_bytes, median", of_a, of_b, tolerance)
 
 
-def _datagrams(a: Repeats, b: Repeats) -> Iterator[Concern]:
+def _datagram_sizes(a: Repeats, b: Repeats) -> Iterator[Concern]:
     of_a, of_b = (_bytes_per("datagrams_sent", rows) for rows in (a, b))
-    yield from _apart("bytes per datagram", of_a, of_b, (DATAGRAM_FACTOR - 1) * min(of_a, of_b))
+    yield from _compare_sizes("bytes per datagram", of_a, of_b, (DATAGRAM_FACTOR - 1) * min(of_a, of_b))
 
 
 def _bytes_per(name: str, rows: Repeats) -> float:
-    """Return the median of the bytes sent for each of a count; NaN where none was counted."""
-    counted = rows.numbers[name]
-    return _median(rows.numbers["sent_bytes"] / np.where(counted > 0, counted, np.nan))
+    """Return the median of the sent bytes per item of a count column; NaN if the counts are 0 or missing."""
+    counts = rows.numbers[name]
+    return _median(rows.numbers["sent_bytes"] / np.where(counts > 0, counts, np.nan))
 
 
-def _apart(what: str, of_a: float, of_b: float, room: float) -> Iterator[Concern]:
-    """Yield two sizes in bytes, NaN where unknown, if they are more than `room` apart or one is unknown."""
-    known = int(np.isfinite([of_a, of_b]).sum())
-    if known == 1 or abs(of_a - of_b) > room:
-        yield Concern(what, _bytes(of_a), _bytes(of_b), (), refuses=known == 2)
+def _compare_sizes(what: str, of_a: float, of_b: float, tolerance: float) -> Iterator[Concern]:
+    """Yield a concern if two sizes in bytes differ by more than `tolerance`, or if one of them is unknown (NaN)."""
+    n_known = int(np.isfinite([of_a, of_b]).sum())
+    if n_known == 1 or abs(of_a - of_b) > tolerance:
+        yield Concern(what, _bytes(of_a), _bytes(of_b), (), refuses=n_known == 2)
 
 
 def _bytes(size: float) -> str:
@@ -180,20 +184,20 @@ def _bytes(size: float) -> str:
 
 
 def _median(values: Numbers) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else np.nan
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else np.nan
 
 
-def _offload(a: Repeats, b: Repeats) -> Iterator[Concern]:
-    of_a, of_b = (_superframes(rows) for rows in (a, b))
+def _offload_state(a: Repeats, b: Repeats) -> Iterator[Concern]:
+    of_a, of_b = (_offload_text(rows) for rows in (a, b))
     if of_a != of_b:
         yield Concern("segmentation offload", of_a, of_b, (), refuses=UNKNOWN not in {of_a, of_b})
 
 
-def _superframes(rows: Repeats) -> str:
-    """Return whether captures show frames that only offload makes: on if it was in any repeat."""
+def _offload_text(rows: Repeats) -> str:
+    """Return `on` if the captures of any repeat have frames that only offload creates, otherwise `off`."""
     frames = rows.numbers["tcp_superframes"]
-    known = frames[np.isfinite(frames)]
-    if not len(known):
+    finite = frames[np.isfinite(frames)]
+    if not len(finite):
         return UNKNOWN
-    return "on" if (known > 0).any() else "off"
+    return "on" if (finite > 0).any() else "off"

@@ -1,4 +1,4 @@
-"""Two runs beside each other: per condition and quantity, how far B is from A."""
+"""Comparison of two runs A and B: differences per condition and quantity."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,21 +17,21 @@ from fieldkit.core.columns import cell
 from fieldkit.core.model import Interval, Status
 
 PAIRED_BY: Final = ("scenario", "topology", "distance_m", "protocol")
-"""What must be alike for two cells to be compared: neither the backend nor a name."""
+"""Columns that must be equal for two cells to be compared; the backend and names may differ."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One quantity under one condition in both runs.
+    """Difference of one quantity under one condition between both runs.
 
     Attributes:
-        quantity: Which.
-        a: What A measured; None if it did not.
-        b: What B measured.
-        interval: B - A with its 95 % interval; None where one of the two has none.
-        cliffs_delta: Effect size over repeats, see `statistics.cliffs_delta`; None unless both measured.
-        p_holm: Of the difference, corrected for the number of all; None without an interval.
-        threshold: How far apart the two may be, None if nobody said.
+        quantity: The quantity.
+        a: Estimate of A; None if A did not measure it.
+        b: Estimate of B; None if B did not measure it.
+        interval: B - A with its 95 % interval; None if one of the estimates has no interval.
+        cliffs_delta: Effect size over repeats, see `statistics.cliffs_delta`; None unless both measured it.
+        p_holm: p-value, corrected for the number of all comparisons; None without an interval.
+        threshold: Largest acceptable difference; None if none was given.
     """
 
     quantity: Quantity
@@ -44,7 +44,7 @@ class Difference:
 
     @property
     def value(self) -> float | None:
-        """B - A; None unless both measured."""
+        """B - A; None unless both measured it."""
         return None if self.a is None or self.b is None else self.b.value - self.a.value
 
     @property
@@ -54,7 +54,7 @@ class Difference:
 
     @property
     def within(self) -> bool | None:
-        """Whether the whole interval is within the threshold; None without a threshold."""
+        """Whether the whole interval is within plus or minus the threshold; None without a threshold."""
         if self.threshold is None:
             return None
         return self.interval is not None and max(-self.interval.low, self.interval.high) <= self.threshold
@@ -62,14 +62,14 @@ class Difference:
 
 @dataclass(frozen=True)
 class Pair:
-    """One condition.
+    """One condition in both runs.
 
     Attributes:
-        name: The condition in words.
-        key: Value of each column that tells it.
+        name: Name of the condition, such as `los, master, 9.144 m, udp`.
+        key: Value of each column that identifies it.
         a: The cell of A; None if A has no such condition.
-        b: The cell of B.
-        differences: Of the quantities that either of them has.
+        b: The cell of B; None if B has no such condition.
+        differences: Differences of the quantities that either cell has.
     """
 
     name: str
@@ -80,25 +80,25 @@ class Pair:
 
     @property
     def missing_in(self) -> str:
-        """`A` or `B` where that run has no such condition, else empty."""
+        """`A` or `B` if that run has no such condition, otherwise empty."""
         return "A" if self.a is None else "B" if self.b is None else ""
 
     @property
     def words(self) -> tuple[tuple[Tally, Tally], ...]:
-        """Of each column of words that either of them has, what A and B have; no counts where one has none."""
+        """Word counts of A and B for each column of words that either cell has; without counts if one has none."""
         a, b = (cell.tallies if cell else {} for cell in (self.a, self.b))
-        none = {name: replace(one, counts={}) for name, one in (*a.items(), *b.items())}
-        return tuple((a.get(name, difference), b.get(name, difference)) for name, difference in none.items())
+        empty = {name: replace(tally, counts={}) for name, tally in (*a.items(), *b.items())}
+        return tuple((a.get(name, tally), b.get(name, tally)) for name, tally in empty.items())
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two runs.
+    """Comparison of two runs.
 
     Attributes:
-        by: Columns that tell one condition from another.
-        pairs: Every condition of either run, those of A first.
-        concerns: What speaks against comparing them, refusals first.
+        by: Columns that identify a condition.
+        pairs: All conditions of either run, those of A first.
+        concerns: Concerns about comparing the runs, refusals first.
     """
 
     by: tuple[str, ...]
@@ -112,17 +112,17 @@ class Comparison:
 
     @property
     def made(self) -> int:
-        """How many differences have an interval: the number that `p_holm` corrects for."""
+        """Number of differences that have an interval, for which `p_holm` is corrected."""
         return sum(difference.interval is not None for difference in self.differences)
 
     @property
     def refusals(self) -> tuple[Concern, ...]:
-        """Why the runs are not comparable; empty if they are."""
+        """Reasons why the runs are not comparable; empty if they are."""
         return tuple(concern for concern in self.concerns if concern.refuses)
 
     @property
     def varied(self) -> tuple[Concern, ...]:
-        """What is compared, because A has one value of it and B another, and conditions are not told by it."""
+        """Variables of the comparison: each run has one value, and they do not identify conditions."""
         return tuple(
             concern
             for concern in self.concerns
@@ -133,7 +133,7 @@ class Comparison:
 
     @property
     def missed(self) -> bool:
-        """Whether any quantity with a threshold, of any condition, is not shown to be within it."""
+        """Whether any difference with a threshold is not shown to be within it."""
         return any(difference.within is False for difference in self.differences)
 
 
@@ -144,13 +144,13 @@ def compare(
     *,
     thresholds: Mapping[str, float] | None = None,
 ) -> Comparison:
-    """Compare two runs; the repeat is the unit, and the two are taken as independent.
+    """Compare two runs, with repeats as sampling units; the runs are assumed to be independent.
 
     Args:
         a: All attempts of A.
         b: All attempts of B.
-        by: Columns that tell one condition from another.
-        thresholds: How far apart the two may be, per name of a quantity, in its unit.
+        by: Columns that identify a condition.
+        thresholds: Largest acceptable difference by name of the quantity, in its unit.
     """
     compared = _quantities(a, b)
     cells_a, cells_b = (_cells(rows, by) for rows in (a, b))
@@ -158,14 +158,14 @@ def compare(
     pairs = []
     for key in cells_a | cells_b:
         sides = cells_a.get(key), cells_b.get(key)
-        found = _differences(sides, (rows_a.get(key), rows_b.get(key)), compared, thresholds or {})
-        pairs.append(Pair(_in_words(by, key), dict(zip(by, key, strict=True)), *sides, found))
-    both = [(_in_words(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
-    return Comparison(tuple(by), _corrected(pairs), (*comparable.concerns(both, by), *comparable.doubts(a, b)))
+        differences = _differences(sides, (rows_a.get(key), rows_b.get(key)), compared, thresholds or {})
+        pairs.append(Pair(_condition_name(by, key), dict(zip(by, key, strict=True)), *sides, differences))
+    both = [(_condition_name(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
+    return Comparison(tuple(by), _with_holm(pairs), (*comparable.concerns(both, by), *comparable.notes(a, b)))
 
 
 def _quantities(a: Repeats, b: Repeats) -> tuple[Quantity, ...]:
-    """Return what either run has, in the order in which tables show it."""
+    """Return the quantities of either run, in the order of tables."""
     has_either = {quantity.name for rows in (a, b) for quantity in rows.quantities}
     columns = {column.name: column for column in (*b.columns, *a.columns)}
     ordered = dict.fromkeys(column.name for column in (*a.columns, *b.columns))
@@ -179,7 +179,7 @@ def _cells(rows: Repeats, by: Sequence[str]) -> dict[Key, Cell]:
 
 
 def _valid(rows: Repeats, by: Sequence[str]) -> dict[Key, Repeats]:
-    """Return the valid repeats of each condition that has any."""
+    """Return the valid repeats by condition."""
     valid = rows.where(rows.texts["status"] == Status.VALID)
     return {key: valid.where(rows_of_key) for key, rows_of_key in valid.groups(by).items()}
 
@@ -190,25 +190,25 @@ def _differences(
     compared: Iterable[Quantity],
     thresholds: Mapping[str, float],
 ) -> tuple[Difference, ...]:
-    found = []
+    differences = []
     for quantity in compared:
         a, b = (None if cell is None else cell.estimates.get(quantity.name) for cell in cells)
         if a is None and b is None:
             continue
-        one = Difference(quantity, a, b, threshold=thresholds.get(quantity.name))
+        difference = Difference(quantity, a, b, threshold=thresholds.get(quantity.name))
         if a is not None and b is not None and rows[0] is not None and rows[1] is not None:
-            delta = statistics.cliffs_delta(*(_measured(side, quantity) for side in rows if side is not None))
-            one = replace(one, interval=_interval(a, b), cliffs_delta=delta)
-        found.append(one)
-    return tuple(found)
+            delta = statistics.cliffs_delta(*(_values(side, quantity) for side in rows if side is not None))
+            difference = replace(difference, interval=_interval(a, b), cliffs_delta=delta)
+        differences.append(difference)
+    return tuple(differences)
 
 
-def _measured(rows: Repeats, quantity: Quantity) -> Numbers:
-    known = np.isfinite([rows.numbers[name] for name in quantity.columns]).all(axis=0)  # as cells take them
+def _values(rows: Repeats, quantity: Quantity) -> Numbers:
+    has_all = np.isfinite([rows.numbers[name] for name in quantity.columns]).all(axis=0)  # the same rows as in cells
     if quantity.at_least is not None:
         values, _ = rows.observed(quantity)
         return values[np.isfinite(values)]
-    return rows.numbers[quantity.name][known]
+    return rows.numbers[quantity.name][has_all]
 
 
 def _interval(a: Estimate, b: Estimate) -> Interval | None:
@@ -217,8 +217,8 @@ def _interval(a: Estimate, b: Estimate) -> Interval | None:
     return statistics.between(Interval(a.value, a.low, a.high), Interval(b.value, b.low, b.high))
 
 
-def _corrected(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
-    """Correct for the number of differences that all conditions have together."""
+def _with_holm(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
+    """Return pairs whose p-values are corrected for the number of the differences of all conditions."""
     intervals = [
         difference.interval for pair in pairs for difference in pair.differences if difference.interval is not None
     ]
@@ -235,8 +235,8 @@ def _corrected(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
     )
 
 
-def _in_words(by: Sequence[str], key: Key) -> str:
-    """Return a condition as `los, master, 9.144 m, udp`."""
+def _condition_name(by: Sequence[str], key: Key) -> str:
+    """Return the name of a condition: `los, master, 9.144 m, udp`."""
     units = {"distance_m": " m"}
     return ", ".join(
         f"no {name}" if value in {"", None} else f"{cell(value)}{units.get(name, '')}"

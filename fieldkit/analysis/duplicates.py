@@ -1,4 +1,4 @@
-"""Attempts that several tables hold: each is counted once, and tables that contradict each other are refused."""
+"""Removal of attempts that are in several tables; tables that contradict each other are an error."""
 
 from collections import Counter
 
@@ -10,13 +10,13 @@ from fieldkit.core.units import format_count
 
 
 def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
-    """Return each attempt once, where it is first, and a note on each source of which something was left out.
+    """Return the first row of each attempt, and a note on each source from which rows were removed.
 
     Raises:
-        ConfigurationError: Two sources say different things of an attempt.
+        ConfigurationError: Two sources have different values for an attempt.
     """
     attempts = repeats.codes(("trial", "protocol", "repeat", "attempt"))
-    # An attempt of no named trial cannot be distinguished from another.
+    # Attempts without the name of a trial cannot be identified, so all of them are kept.
     unnamed = repeats.texts["trial"] == ""
     attempts[unnamed] = len(repeats) + np.flatnonzero(unnamed)
     _, index, inverse = np.unique(attempts, return_index=True, return_inverse=True)
@@ -24,7 +24,7 @@ def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
     again = np.flatnonzero(firsts != np.arange(len(repeats)))
     if not len(again):
         return repeats, ()
-    _demand_equal(repeats.where(firsts[again]), repeats.where(again))
+    _check_equal(repeats.where(firsts[again]), repeats.where(again))
     pairs = Counter(zip(repeats.texts[SOURCE][again], repeats.texts[SOURCE][firsts[again]], strict=True))
     notes = tuple(
         f"{source}: {format_count(rows, 'row')} of {kept} again, counted once"
@@ -33,7 +33,7 @@ def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
     return repeats.where(np.setdiff1d(firsts, again)), notes
 
 
-def _demand_equal(kept: Repeats, other: Repeats) -> None:
+def _check_equal(kept: Repeats, other: Repeats) -> None:
     differ = {name: column != other.texts[name] for name, column in kept.texts.items() if name != SOURCE}
     for name, column in kept.numbers.items():
         differ[name] = (column != other.numbers[name]) & ~(np.isnan(column) & np.isnan(other.numbers[name]))

@@ -1,4 +1,4 @@
-"""Expectations: what a lab demands of the figures of a trial, as it writes it."""
+"""Expectations: requirements on the figures of a trial, and the parser of their text."""
 
 import re
 from collections.abc import Iterable
@@ -20,14 +20,14 @@ _TEXT: Final = re.compile(
 _FORMS: Final = "ip_loss < 2 %; every rtt_gap_s < 300 ms; 90 % of rtt_gap_s < 300 ms; ip_loss < 2 % of all packets"
 MOST_SHARE: Final = 0.9999
 """Largest share of all repeats that an expectation may demand."""
-_LEAST_LOSS: Final = 1e-9
+_MIN_LOSS: Final = 1e-9
 
 
 class Scope(StrEnum):
-    """What an expectation is about.
+    """Subject of an expectation.
 
-    `figure`: the figure that all repeats make, by its 95 % interval; `every`: every repeat of the trial; `share`: a
-    share of all repeats that could be run, with 95 % confidence; `packets`: the packets of all repeats together.
+    `figure`: the estimate over all repeats, by its 95 % interval; `every`: each repeat of the trial; `share`: a share
+    of all possible repeats, with 95 % confidence; `packets`: the packets of all repeats together.
     """
 
     FIGURE = "figure"
@@ -38,17 +38,17 @@ class Scope(StrEnum):
 
 @dataclass(frozen=True)
 class Expectation:
-    """A demand on a figure: `udp up.file_loss < 5 %`.
+    """A requirement on a figure: `udp up.file_loss < 5 %`.
 
     Attributes:
-        text: As it was written.
+        text: The text as written by the operator.
         quantity: Name of the figure.
-        is_below: Whether it must be below the bound, or else above it.
+        is_below: Whether the figure must be below the bound; otherwise above it.
         bound: The bound, in the figure's unit.
-        protocol: For the repeats of which protocol; None for all.
-        is_inclusive: Whether it may be the bound itself: `<=`, `>=`.
-        scope: What it is about.
-        share: Of which share of all repeats; None unless that is its scope.
+        protocol: Protocol of the repeats; None for all.
+        is_inclusive: Whether the figure may be equal to the bound: `<=`, `>=`.
+        scope: Subject of the expectation.
+        share: Required share of all repeats; None unless the scope is `share`.
     """
 
     text: str
@@ -61,23 +61,23 @@ class Expectation:
     share: float | None = None
 
     def is_met(self, value: float) -> bool:
-        """Return whether a value is where it must be."""
+        """Return True if a value satisfies the bound."""
         if value == self.bound:
             return self.is_inclusive
         return (value < self.bound) is self.is_below
 
 
 def parse(text: str, known: Iterable[Quantity]) -> Expectation:
-    """Return what an expectation says.
+    """Parse the text of an expectation.
 
     Args:
-        text: `NAME < AMOUNT`, with `<`, `<=`, `>` or `>=`; `every` before it for every repeat (or `max` with `<`,
-            `min` with `>`), `90 % of` for a share of all repeats, `of all packets` behind it for all packets
-            together; `tcp` or `udp` before all for one protocol alone.
-        known: The figures that there can be.
+        text: `NAME < AMOUNT`, with `<`, `<=`, `>` or `>=`. The prefix `every` means each repeat (or `max` with `<`,
+            `min` with `>`), the prefix `90 % of` a share of all repeats, the suffix `of all packets` all packets
+            together. `tcp` or `udp` at the start restricts it to one protocol.
+        known: The possible figures.
 
     Raises:
-        ConfigurationError: It is none of these, or of an unknown figure.
+        ConfigurationError: The text is not an expectation, or its figure is unknown.
     """
     by_name = {quantity.name: quantity for quantity in known}
     match = _TEXT.fullmatch(text.strip())
@@ -85,15 +85,15 @@ def parse(text: str, known: Iterable[Quantity]) -> Expectation:
         raise ConfigurationError(f"{text[:60]!r} is not an expectation", remedy=f"write for example: {_FORMS}")
     if (name := match["name"]) not in by_name:
         raise ConfigurationError(
-            f"there is no figure {name!r} to expect something of",
-            remedy=nearest(name, by_name, f"there are: {', '.join(by_name)}"),
+            f"the expected figure {name!r} does not exist",
+            remedy=nearest(name, by_name, f"figures are: {', '.join(by_name)}"),
         )
     quantity, amount = by_name[name], match["amount"].strip()
     is_below = match["sign"].startswith("<")
     scope, share = _scope(match, quantity, is_below=is_below)
     sign = -1.0 if amount.startswith("-") else 1.0
     bound = sign * parse_amount(amount.removeprefix("-"), quantity.unit, f"bound for {name}")
-    if scope is Scope.PACKETS and bound < _LEAST_LOSS:
+    if scope is Scope.PACKETS and bound < _MIN_LOSS:
         raise ConfigurationError(
             f"no number of packets shows a loss below {amount}", remedy=f"write for example: every {name} <= 0 %"
         )
@@ -110,11 +110,11 @@ def parse(text: str, known: Iterable[Quantity]) -> Expectation:
 
 
 def _scope(match: re.Match[str], quantity: Quantity, *, is_below: bool) -> tuple[Scope, float | None]:
-    """Return what a text is about, and of which share of repeats."""
+    """Return the scope of an expectation and its share of repeats."""
     if match["packets"]:
         if match["repeats"] or match["share"] or not is_below or quantity.kind is not Kind.COUNTED:
             raise ConfigurationError(
-                f"{match[0][:60]!r}: only an upper bound of a loss that is counted is over all packets",
+                f"{match[0][:60]!r}: only an upper bound of a counted loss can be `of all packets`",
                 remedy="write for example: ip_loss < 2 % of all packets",
             )
         return Scope.PACKETS, None
@@ -128,6 +128,7 @@ def _scope(match: re.Match[str], quantity: Quantity, *, is_below: bool) -> tuple
         return Scope.SHARE, share
     if match["repeats"] in {"max", "min"} and (match["repeats"] == "max") is not is_below:
         raise ConfigurationError(
-            f"{match[0][:60]!r}: that is about one repeat alone", remedy="write max with <, min with >, or every"
+            f"{match[0][:60]!r}: this would hold if a single repeat meets it",
+            remedy="write max with <, min with >, or every",
         )
     return (Scope.EVERY if match["repeats"] else Scope.FIGURE), None

@@ -1,4 +1,4 @@
-"""Lines of tables: which quantities a table shows, under which labels, and how a cell's figure is written."""
+"""Lines of tables: selection of quantities, their labels, and formatting of a cell's figure."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from fieldkit.analysis.quantities import Quantity, in_order
 from fieldkit.core.columns import plain_name, prefixed
 
 _RADIO: Final = ("ip_loss", "tcp_byte_loss")
-"""What the radio lost, per protocol: IP packets of UDP; bytes of TCP, which TCP then repaired."""
+"""Loss on the radio by protocol: IP packets of UDP; bytes of TCP, which TCP retransmitted."""
 
 _OPERATOR: Final = (
     "file_loss",
@@ -28,7 +28,7 @@ _OPERATOR: Final = (
     "sender_signal_median_dbm",
     "receiver_signal_median_dbm",
 )
-"""What an operator looks at beside the antenna, in this order."""
+"""Quantities for an operator during a trial, in this order."""
 
 _FAULT_ENDINGS: Final = ("_recovered", "_recovery_s")
 
@@ -39,7 +39,7 @@ _SENT: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "iperf3 datagrams sent": ("iperf3_loss",),
     }
 )
-"""Counts, and the counted losses that say of how many they are; the first that a cell has."""
+"""Label of a count, and the losses whose `trials` give it; the first one that a cell has is used."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class TableLine:
     """A row or a column of figures in a table.
 
     Attributes:
-        label: What it is.
-        quantities: Of these a cell shows the first that it has.
+        label: Label of the line.
+        quantities: Quantities, of which the first one that a cell has is shown.
         payload_bytes: ICMP payload sizes of the cells in this line; None for all cells.
     """
 
@@ -57,95 +57,98 @@ class TableLine:
     payload_bytes: tuple[int, ...] | None = None
 
     def estimate(self, cell: Cell) -> Estimate | None:
-        """Return a cell's figure, None if it has none in this line."""
-        if not self._covers(cell):
+        """Return a cell's estimate in this line; None if it has none."""
+        if not self._includes(cell):
             return None
-        return next((cell.estimates[one.name] for one in self.quantities if one.name in cell.estimates), None)
+        names = (quantity.name for quantity in self.quantities)
+        return next((cell.estimates[name] for name in names if name in cell.estimates), None)
 
     def is_lacking(self, cell: Cell) -> bool:
-        """Return whether no valid repeat of a cell has the figure, though each was measured for it."""
+        """Return True if the quantity was measured in a cell, but no valid repeat has a value."""
         return (
-            self._covers(cell)
+            self._includes(cell)
             and self.estimate(cell) is None
-            and any(one.name == missing.name for one in self.quantities for missing in cell.lacking)
+            and any(quantity.name == missing.name for quantity in self.quantities for missing in cell.lacking)
         )
 
     def scale(self, cells: Sequence[Cell]) -> wording.Scale:
-        """Return in what to write the figures of these cells."""
+        """Return the scale for the figures of these cells."""
         estimates = [estimate for cell in cells if (estimate := self.estimate(cell))]
         return wording.scale_of(self.quantities[0], [estimate.value for estimate in estimates])
 
     def number(self, cell: Cell, scale: wording.Scale) -> str:
-        """Return a cell's figure without its unit, with its interval: `3.33 [1.10, 6.70] (4 of 5)`."""
+        """Return a cell's figure with its interval, without unit: `3.33 [1.10, 6.70] (4 of 5)`."""
         estimate = self.estimate(cell)
         if estimate is None:
-            return self._none(cell)
+            return self._no_value(cell)
         return wording.quoted(wording.number(scale, estimate), scale, estimate)
 
     def amount(self, cell: Cell, scale: wording.Scale, between: str = " ") -> str:
-        """Return the same with its unit, and with `between` between the parts."""
+        """Return a cell's figure with its unit and interval; `between` separates the parts."""
         estimate = self.estimate(cell)
         if estimate is None:
-            return self._none(cell)
+            return self._no_value(cell)
         return wording.quoted(wording.amount(scale, estimate), scale, estimate, between)
 
-    def _none(self, cell: Cell) -> str:
+    def _no_value(self, cell: Cell) -> str:
         return f"none, 0 of {cell.n_valid}" if self.is_lacking(cell) else ""
 
-    def _covers(self, cell: Cell) -> bool:
+    def _includes(self, cell: Cell) -> bool:
         return self.payload_bytes is None or cell.payload_bytes.get(self.quantities[0].name, ()) == self.payload_bytes
 
 
 def part_of(n: int, cell: Cell) -> str:
-    """Return `4 of 5` where only some of a cell's valid repeats have a figure; empty where all have."""
+    """Return `4 of 5` if only some of a cell's valid repeats have a value; empty if all have."""
     return f"{n} of {cell.n_valid}" if n < cell.n_valid else ""
 
 
 def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -> list[TableLine]:
-    """Return a line per quantity that any of the cells has or lacks, in order; of an RTT one per payload size.
+    """Return a line per quantity that any of the cells has or lacks, in order, and per payload size for an RTT.
 
     Args:
-        cells: What the table shows.
-        quantities: Which quantities it shows; None for all.
+        cells: The cells of the table.
+        quantities: The quantities to show; None for all.
     """
-    # Not a set, whose order differs from run to run: quantities of equal rank keep the order of columns.
-    there = dict.fromkeys(estimate.quantity for cell in cells for estimate in cell.estimates.values())
-    there |= dict.fromkeys(quantity for cell in cells for quantity in cell.lacking)
-    shown = in_order(there) if quantities is None else [one for one in quantities if one in there]
-    return [line for quantity in shown for line in _lines_of(quantity, cells)]
+    # A dict keeps the order of columns for quantities of equal rank; the order of a set changes from run to run.
+    available = dict.fromkeys(estimate.quantity for cell in cells for estimate in cell.estimates.values())
+    available |= dict.fromkeys(quantity for cell in cells for quantity in cell.lacking)
+    shown = (
+        in_order(available) if quantities is None else [quantity for quantity in quantities if quantity in available]
+    )
+    return [line for quantity in shown for line in _quantity_lines(quantity, cells)]
 
 
-def _lines_of(quantity: Quantity, cells: Sequence[Cell]) -> Iterator[TableLine]:
+def _quantity_lines(quantity: Quantity, cells: Sequence[Cell]) -> Iterator[TableLine]:
     label = wording.label(quantity)
-    having = [cell for cell in cells if quantity.name in cell.estimates or quantity in cell.lacking]
-    sizes = sorted({cell.payload_bytes.get(quantity.name, ()) for cell in having})
+    concerned = [cell for cell in cells if quantity.name in cell.estimates or quantity in cell.lacking]
+    sizes = sorted({cell.payload_bytes.get(quantity.name, ()) for cell in concerned})
     if not any(sizes):
         yield TableLine(label, (quantity,))
         return
     for size in sizes:
-        yield TableLine(_with_payload(quantity, size), (quantity,), size)
+        yield TableLine(_payload_label(quantity, size), (quantity,), size)
 
 
-def _with_payload(quantity: Quantity, sizes: Sequence[int]) -> str:
-    """Return the label of round-trip times of pings of these sizes: `RTT, 8192-byte ping, median`."""
+def _payload_label(quantity: Quantity, sizes: Sequence[int]) -> str:
+    """Return the label of round-trip times for these payload sizes: `RTT, 8192-byte ping, median`."""
     size = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]}- to {sizes[-1]}" if sizes else "unknown"
     return wording.label(replace(quantity, label=f"{quantity.label}, {size}-byte ping"))
 
 
 def of_operator(cells: Sequence[Cell], expected: Collection[str] = ()) -> list[TableLine]:
-    """Return the lines that an operator looks at, in order; all lines where none of them is there.
+    """Return the lines for an operator during a trial, in order; all lines if there are none of these.
 
-    These are what arrived, how long it took and how strong the signal was; what is expected; and all that a procedure
-    measures because its lab asks for it.
+    These are losses, delays, throughput and signal; quantities with an expectation; and quantities that the lab added
+    to a procedure.
 
     Args:
-        cells: What the table shows.
+        cells: The cells of the table.
         expected: Names of quantities with an expectation.
     """
-    every = lines(cells)
-    chosen = [line for line in every if _is_for_operator(line.quantities[0], expected)]
-    chosen.sort(key=lambda line: _place(line.quantities[0]))
-    return chosen or every
+    all_lines = lines(cells)
+    chosen = [line for line in all_lines if _is_for_operator(line.quantities[0], expected)]
+    chosen.sort(key=lambda line: _operator_rank(line.quantities[0]))
+    return chosen or all_lines
 
 
 def _is_for_operator(quantity: Quantity, expected: Collection[str]) -> bool:
@@ -153,13 +156,13 @@ def _is_for_operator(quantity: Quantity, expected: Collection[str]) -> bool:
     return name in _OPERATOR or not quantity.is_own or name.endswith(_FAULT_ENDINGS) or quantity.name in expected
 
 
-def _place(quantity: Quantity) -> int:
+def _operator_rank(quantity: Quantity) -> int:
     name = plain_name(quantity.name)
     return _OPERATOR.index(name) if name in _OPERATOR else len(_OPERATOR)
 
 
 def with_radio_loss(chosen: Sequence[TableLine], cells: Sequence[Cell]) -> list[TableLine]:
-    """Return the lines, what the radio lost of UDP and of TCP in one per step, where no cell has both."""
+    """Return the lines, with the radio losses of UDP and of TCP merged into one line per step if no cell has both."""
     return list(_with_radio_loss(chosen, cells))
 
 
@@ -170,32 +173,32 @@ def _with_radio_loss(chosen: Sequence[TableLine], cells: Sequence[Cell]) -> Iter
             radio.setdefault(line.quantities[0].step, []).append(line)
     for line in chosen:
         step = line.quantities[0].step
-        same = radio.get(step, [])
-        are_apart = all(sum(part.estimate(cell) is not None for part in same) < 2 for cell in cells)
-        if line not in same or not are_apart:
+        losses = radio.get(step, [])
+        can_merge = all(sum(loss.estimate(cell) is not None for loss in losses) < 2 for cell in cells)
+        if line not in losses or not can_merge:
             yield line
-        elif line is same[0]:
-            yield TableLine(_named(step, "radio loss"), tuple(one.quantities[0] for one in same))
+        elif line is losses[0]:
+            yield TableLine(_with_step(step, "radio loss"), tuple(loss.quantities[0] for loss in losses))
 
 
 def sent(cells: Sequence[Cell]) -> dict[str, list[str]]:
-    """Return how much the valid repeats of each cell sent in all, by label; empty where a cell does not say."""
+    """Return the number of items that the valid repeats of each cell sent, by label; an empty text if unknown."""
     steps = dict.fromkeys(estimate.quantity.step for cell in cells for estimate in cell.estimates.values())
-    found: dict[str, list[str]] = {}
+    counts_by_label: dict[str, list[str]] = {}
     for step in steps:
         for label, names in _SENT.items():
-            counts = [_trials(cell, [prefixed(step, name) for name in names]) for cell in cells]
+            counts = [_trial_count(cell, [prefixed(step, name) for name in names]) for cell in cells]
             if any(counts):
-                found[_named(step, label)] = counts
-    return found
+                counts_by_label[_with_step(step, label)] = counts
+    return counts_by_label
 
 
-def _trials(cell: Cell, names: Sequence[str]) -> str:
-    """Return of how many the first of some counted quantities is that a cell has."""
+def _trial_count(cell: Cell, names: Sequence[str]) -> str:
+    """Return `trials` of the first of these counted quantities that a cell has."""
     trials = (cell.estimates[name].trials for name in names if name in cell.estimates)
     return next((f"{count}" for count in trials if count is not None), "")
 
 
-def _named(step: str, label: str) -> str:
-    """Return a label with the name of its step before it, as `columns.named` does."""
+def _with_step(step: str, label: str) -> str:
+    """Return a label with the name of its step as prefix, as in `columns.named`."""
     return f"{step}: {label}" if step else label

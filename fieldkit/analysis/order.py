@@ -1,8 +1,8 @@
-"""Independence of repeats: two rank tests of values in the order of time, for a trend and for runs of alike.
+"""Independence of repeats in time: two rank tests, for a trend and for positive autocorrelation.
 
-An interval over repeats takes each as an independent draw. Where the place, the weather or a battery changes slowly,
-each repeat says again what the one before said, and the interval is too narrow however right its formula is. Both
-tests hold for any distribution, ties included: their variances are those over all orders of the values at hand.
+An interval over repeats assumes that they are independent. If the place, the weather or a battery changes slowly,
+consecutive repeats are correlated, and the interval is too narrow. Both tests are valid for any distribution, ties
+included: their variances are those over all permutations of the values.
 """
 
 from math import erfc, sqrt
@@ -13,85 +13,86 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-FEWEST_FOR_TESTS: Final = 10
-"""Fewer repeats have too few orders for a test to tell anything among many."""
-_FEWEST_VALUES: Final = 5  # the orders of a few values are too coarse for a formula
+MIN_FOR_TESTS: Final = 10
+"""Minimum number of repeats; with fewer, the p-values cannot be small enough after correction for many tests."""
+_MIN_DISTINCT: Final = 5  # with fewer distinct values the approximation of the distribution is too coarse
 
 _erfc = np.frompyfunc(erfc, 1, 1)
 
 
 def p_values(values: Floats) -> Floats:
-    """Return how often repeats in no order at all would be as orderly as these, by the stricter of both tests.
+    """Return the p-values of both tests combined: twice the smaller one (Bonferroni).
 
-    Twice the smaller p-value (Bonferroni): of a trend up or down, and of neighbours that are alike.
+    The tests are two-sided for a trend, and one-sided for consecutive values that are too similar.
 
     Args:
         values: Shape (cells, n), in the order of time.
 
     Returns:
-        Shape (cells,); NaN where there are fewer than `FEWEST_FOR_TESTS` repeats, or five different values.
+        Shape (cells,); NaN for fewer than `MIN_FOR_TESTS` repeats or fewer than five distinct values.
     """
-    if values.shape[1] < FEWEST_FOR_TESTS:
+    if values.shape[1] < MIN_FOR_TESTS:
         return np.full(len(values), np.nan)
-    off = _ranks(values)
-    off -= off.mean(axis=1, keepdims=True)
+    centred = _ranks(values)
+    centred -= centred.mean(axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = np.minimum(2 * np.minimum(2 * _tail(*_trend(off)), _tail(*_alike(off))), 1)
+        trend, similarity = 2 * _upper_tail(*_spearman(centred)), _upper_tail(*_von_neumann(centred))
+        combined = np.minimum(2 * np.minimum(trend, similarity), 1)
     distinct = (np.diff(np.sort(values, axis=1), axis=1) != 0).sum(axis=1) + 1
-    return np.where(distinct < _FEWEST_VALUES, np.nan, found)
+    return np.where(distinct < _MIN_DISTINCT, np.nan, combined)
 
 
 def corrected(p_values: Floats) -> Floats:
-    """Return p-values corrected for their number, in their order (Benjamini and Hochberg 1995).
+    """Return p-values corrected for their number, in the same order (Benjamini and Hochberg 1995).
 
-    Where those below 0.05 are called, some call is made in about 5 % of the tables of independent repeats (4 to 9 in
-    simulations), and of all calls 5 % at most are false in the mean. J. R. Stat. Soc. B 57:289.
+    If values below 0.05 are reported, about 5 % of the tables of independent repeats have a report (4 to 9 % in
+    simulations), and on average at most 5 % of all reports are false. J. R. Stat. Soc. B 57:289.
 
     Args:
-        p_values: Shape (n,), none NaN.
+        p_values: Shape (n,), without NaN.
     """
     rank = np.argsort(p_values, kind="stable")
     scaled = p_values[rank] * len(p_values) / np.arange(1, len(p_values) + 1)
-    found = np.empty_like(p_values)
-    found[rank] = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1)
-    return found
+    result = np.empty_like(p_values)
+    result[rank] = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1)
+    return result
 
 
-def _trend(off: Floats) -> tuple[Floats, Floats]:
-    """Return the size of Spearman's correlation of ranks with time, and its variance.
+def _spearman(centred: Floats) -> tuple[Floats, Floats]:
+    """Return the absolute value of Spearman's correlation with time, and its variance.
 
     As a test of trend: Daniels 1950, J. R. Stat. Soc. B 12:171.
     """
-    n = off.shape[1]
+    n = centred.shape[1]
     time = np.arange(n) - (n - 1) / 2
-    correlation = (off @ time) / np.sqrt((off**2).sum(axis=1) * (time**2).sum())
-    return np.abs(correlation), np.full(len(off), 1 / (n - 1))
+    correlation = (centred @ time) / np.sqrt((centred**2).sum(axis=1) * (time**2).sum())
+    return np.abs(correlation), np.full(len(centred), 1 / (n - 1))
 
 
-def _alike(off: Floats) -> tuple[Floats, Floats]:
-    """Return 1 - half of the rank von Neumann ratio, and its variance (Bartels 1982, J. Am. Stat. Assoc. 77:40).
+def _von_neumann(centred: Floats) -> tuple[Floats, Floats]:
+    """Return 1 minus half of the rank von Neumann ratio, and its variance (Bartels 1982, J. Am. Stat. Assoc. 77:40).
 
-    The variance is over all orders of the centred ranks x, with S and Q their sums of squares and fourth powers: the
-    terms (x_i - x_j)^2 of the sum go by pairs that are the same, share one rank, or none.
+    The variance is over all permutations of the centred ranks x, with S and Q their sums of squares and of fourth
+    powers. The products of two terms (x_i - x_j)^2 are grouped by whether the pairs share both, one or no index.
     """
-    n = off.shape[1]
-    s, q = (off**2).sum(axis=1), (off**4).sum(axis=1)
+    n = centred.shape[1]
+    s, q = (centred**2).sum(axis=1), (centred**4).sum(axis=1)
     two, three, four = n * (n - 1), n * (n - 1) * (n - 2), n * (n - 1) * (n - 2) * (n - 3)
     squares, cubes = (s**2 - q) / two, -q / two  # means of x^2 y^2 and x^3 y over different ranks
-    pairs, all_four = (2 * q - s**2) / three, (3 * s**2 - 6 * q) / four  # of x^2 y z and x y z w
-    same = 2 * q / n - 8 * cubes + 6 * squares
-    sharing = 3 * squares + q / n - 4 * cubes
-    apart = 4 * (squares - 2 * pairs + all_four)
-    second = (n - 1) * same + 2 * (n - 2) * sharing + (n - 2) * (n - 3) * apart
-    ratio = (np.diff(off, axis=1) ** 2).sum(axis=1) / s
-    return 1 - ratio / 2, (second / s**2 - 4) / 4
+    pairs, all_four = (2 * q - s**2) / three, (3 * s**2 - 6 * q) / four  # means of x^2 y z and x y z w
+    share_both = 2 * q / n - 8 * cubes + 6 * squares
+    share_one = 3 * squares + q / n - 4 * cubes
+    share_none = 4 * (squares - 2 * pairs + all_four)
+    second_moment = (n - 1) * share_both + 2 * (n - 2) * share_one + (n - 2) * (n - 3) * share_none
+    ratio = (np.diff(centred, axis=1) ** 2).sum(axis=1) / s
+    return 1 - ratio / 2, (second_moment / s**2 - 4) / 4
 
 
-def _tail(statistic: Floats, variance: Floats) -> Floats:
-    """Return the share above a statistic of mean 0 between -1 and 1, taken as a correlation of that variance.
+def _upper_tail(statistic: Floats, variance: Floats) -> Floats:
+    """Return the upper tail probability of a statistic with mean 0 in -1..1, treated as a correlation coefficient.
 
-    It has Student's distribution then, with 1/variance - 1 degrees of freedom, whose tail is a normal one after
-    Wallace's transformation (1959, Ann. Math. Stat. 30:1121).
+    The coefficient is converted to Student's t with 1/variance - 1 degrees of freedom, whose tail is approximated by
+    that of a normal distribution after Wallace's transformation (1959, Ann. Math. Stat. 30:1121).
     """
     free = 1 / variance - 1
     size = np.minimum(np.abs(statistic), 1 - 1e-12)
@@ -101,14 +102,14 @@ def _tail(statistic: Floats, variance: Floats) -> Floats:
 
 
 def _ranks(values: Floats) -> Floats:
-    """Return the rank of each value among its row, the mean of ranks where several are equal."""
+    """Return the rank of each value in its row; equal values get the mean of their ranks."""
     order = np.argsort(values, axis=1, kind="stable")
     ordered = np.take_along_axis(values, order, axis=1)
-    place = np.broadcast_to(np.arange(values.shape[1]), values.shape)
-    begins = np.diff(ordered, axis=1, prepend=np.nan) != 0
-    first = np.maximum.accumulate(np.where(begins, place, 0), axis=1)
-    ends = np.append(begins[:, 1:], np.ones((len(values), 1), dtype=np.bool_), axis=1)
-    last = np.minimum.accumulate(np.where(ends, place, values.shape[1])[:, ::-1], axis=1)[:, ::-1]
+    position = np.broadcast_to(np.arange(values.shape[1]), values.shape)
+    starts_tie = np.diff(ordered, axis=1, prepend=np.nan) != 0
+    first = np.maximum.accumulate(np.where(starts_tie, position, 0), axis=1)
+    ends_tie = np.append(starts_tie[:, 1:], np.ones((len(values), 1), dtype=np.bool_), axis=1)
+    last = np.minimum.accumulate(np.where(ends_tie, position, values.shape[1])[:, ::-1], axis=1)[:, ::-1]
     ranks = np.empty_like(values, dtype=np.float64)
     np.put_along_axis(ranks, order, (first + last) / 2, axis=1)
     return ranks

@@ -1,4 +1,4 @@
-"""Lines of a CSV to columns, by pyarrow; a table that it refuses is read again by line, to tell what is wrong."""
+"""Conversion of CSV lines to columns by pyarrow; if it fails, the lines are read in order to find the error."""
 
 import csv
 import io
@@ -20,94 +20,94 @@ from fieldkit.core.text import unguarded
 Numbers = NDArray[np.float64]
 Texts = NDArray[np.object_]
 
-_SHOWN: Final = 40
-_AGREED: Final = 1e-6  # fewer digits than a table has
-_REMEDY: Final = "mend the line, or make the file again: fieldkit rebuild TRIAL"
-_SHORTENED: Final = (
-    "a spreadsheet has cut its digits: name the trial's own trial.csv, or make it again: fieldkit rebuild TRIAL; "
-    "in a spreadsheet open this column as text"
+_MAX_SHOWN: Final = 40
+_TOLERANCE: Final = 1e-6  # coarser than the digits of a table
+_REMEDY: Final = "correct the line, or create the file again: fieldkit rebuild TRIAL"
+_SPREADSHEET_REMEDY: Final = (
+    "a spreadsheet has removed digits: name the trial.csv in the trial's folder, or create it again: "
+    "fieldkit rebuild TRIAL; in a spreadsheet, open this column as text"
 )
 
 
 def columns(
     names: Sequence[str], body: bytes, declared: Mapping[str, Column]
 ) -> tuple[dict[str, Numbers], dict[str, Texts], int]:
-    """Return columns of numbers and of texts, as `repeats.Repeats` has them, and how many rows they have.
+    """Return columns of numbers and of texts, as in `repeats.Repeats`, and the number of rows.
 
     Args:
         names: All columns of the table, in order.
-        body: Its lines without the header, each with its end.
-        declared: The columns that are wanted; those that the table lacks are missing throughout.
+        body: Its lines without the header, each with its line end.
+        declared: The requested columns; those that the table does not have are missing in all rows.
 
     Raises:
-        ValueError: A line or a value is damaged.
+        ValueError: A line or a value is invalid.
     """
     present = [name for name in declared if name in names]
-    found: Mapping[str, pa.ChunkedArray] = {}
+    by_name: Mapping[str, pa.ChunkedArray] = {}
     rows = 0
     if body and present:
         table = pa.csv.read_csv(
             pa.BufferReader(body),
             read_options=pa.csv.ReadOptions(column_names=names, block_size=max(len(body) // 8, 1 << 20)),
             convert_options=pa.csv.ConvertOptions(
-                column_types={name: _type(declared[name]) for name in present},
+                column_types={name: _arrow_type(declared[name]) for name in present},
                 include_columns=present,
                 null_values=MISSING,
                 strings_can_be_null=False,
             ),
         )
-        found, rows = dict(zip(present, table.columns, strict=True)), len(table)
+        by_name, rows = dict(zip(present, table.columns, strict=True)), len(table)
     numbers: dict[str, Numbers] = {}
     texts: dict[str, Texts] = {}
     for name, declaration in declared.items():
-        column = found.get(name)
+        column = by_name.get(name)
         if declaration.type is str:
             texts[name] = np.full(rows, "", np.object_) if column is None else _texts(column)
         else:
             numbers[name] = (
-                np.asarray(np.full(rows, np.nan, _width(declaration))) if column is None else _numbers(column)
+                np.asarray(np.full(rows, np.nan, _numpy_type(declaration))) if column is None else _numbers(column)
             )
     return numbers, texts, rows
 
 
 def codes(column: Texts) -> NDArray[np.int64]:
-    """Return a number for each text of a column: the index of the first row with an equal one."""
+    """Return the index of the first row with an equal text, for each row of a column."""
     first: dict[str, int] = {}
     return np.fromiter(map(first.setdefault, column, count()), np.int64, len(column))
 
 
 def are_possible(values: Numbers, column: Column) -> bool:
-    """Return whether a column holds nothing but what it can, or what is missing; as `Column.problem`."""
-    known = values[~np.isnan(values)]
+    """Return True if all values of a column are possible or missing; the same condition as `Column.problem`."""
+    present = values[~np.isnan(values)]
     low, high = column.possible if column.type is not bool else (0, 1)
-    fits = (known >= low) & (known <= high)
-    return bool((fits & (known == np.floor(known))).all() if column.type is int else fits.all())
+    fits = (present >= low) & (present <= high)
+    return bool((fits & (present == np.floor(present))).all() if column.type is int else fits.all())
 
 
 def contradiction(numbers: Mapping[str, ArrayLike], quantities: Iterable[Quantity]) -> Quantity | None:
-    """Return a counted quantity whose share is not what its counts say; None where there is none.
+    """Return a counted quantity whose share contradicts its counts; None if there is no contradiction.
 
     Args:
-        numbers: Columns, or the numbers of one row; NaN where missing. Where one of three is, nothing is compared.
-        quantities: What to look at.
+        numbers: Columns, or the numbers of one row; NaN if missing. A share is compared only if both counts exist.
+        quantities: The quantities to check.
     """
     for quantity in quantities:
         if quantity.kind is Kind.COUNTED and numbers.keys() >= set(quantity.columns):
             share, arrived, sent = (np.asarray(numbers[name], dtype=np.float64) for name in quantity.columns)
-            known = np.isfinite(share) & np.isfinite(arrived) & np.isfinite(sent)
-            counted = 1 - arrived / np.where(sent > 0, sent, np.nan)
-            if (known & ~np.isclose(share, counted, rtol=_AGREED, atol=_AGREED)).any():
+            is_complete = np.isfinite(share) & np.isfinite(arrived) & np.isfinite(sent)
+            expected = 1 - arrived / np.where(sent > 0, sent, np.nan)
+            if (is_complete & ~np.isclose(share, expected, rtol=_TOLERANCE, atol=_TOLERANCE)).any():
                 return quantity
     return None
 
 
 def first_problem(where: str, content: bytes, declared: Mapping[str, Column]) -> FieldkitError | None:
-    """Return what is wrong with the first damaged line, None where every line is sound.
+    """Return the error of the first invalid line; None if all lines are valid.
 
     Args:
         where: The file, for messages.
         content: Its bytes.
-        declared: The columns that must be readable.
+        declared: The columns that must be valid.
     """
     try:
         text = content.decode("utf-8-sig")
@@ -118,47 +118,47 @@ def first_problem(where: str, content: bytes, declared: Mapping[str, Column]) ->
     try:
         names = next(reader)
         for row in reader:
-            found = row and _explain_row(f"{where}:{reader.line_num}", names, row, declared)
-            if found:
-                return found
+            problem = row and _explain_row(f"{where}:{reader.line_num}", names, row, declared)
+            if problem:
+                return problem
     except csv.Error as error:
-        return EvidenceError(f"this is no CSV: {error}", where=f"{where}:{reader.line_num}", remedy=_REMEDY)
+        return EvidenceError(f"this is not CSV: {error}", where=f"{where}:{reader.line_num}", remedy=_REMEDY)
     return None
 
 
-def _type(column: Column) -> pa.DataType:
+def _arrow_type(column: Column) -> pa.DataType:
     if column.type is str:
         return pa.dictionary(pa.int32(), pa.string())
     return {"bool": pa.bool_(), "ns": pa.int64()}.get(column.unit, pa.float64())
 
 
-def _width(column: Column) -> type[np.float64] | type[np.longdouble]:
-    """Return the type of a column's numbers: nanoseconds since 1970 have 61 bits, for which a double has no room."""
+def _numpy_type(column: Column) -> type[np.float64] | type[np.longdouble]:
+    """Return the type of a column's numbers; nanoseconds since 1970 need 61 bits, more than a double's precision."""
     return np.longdouble if column.unit == "ns" else np.float64
 
 
 def _texts(column: pa.ChunkedArray) -> Texts:
     encoded = column.unify_dictionaries().combine_chunks()
-    known = np.array([*map(unguarded, encoded.dictionary.to_pylist()), ""], dtype=np.object_)
-    return np.asarray(known[_plain(encoded.indices, np.int32)], dtype=np.object_)
+    distinct = np.array([*map(unguarded, encoded.dictionary.to_pylist()), ""], dtype=np.object_)
+    return np.asarray(distinct[_buffer_values(encoded.indices, np.int32)], dtype=np.object_)
 
 
 def _numbers(column: pa.ChunkedArray) -> Numbers:
     numbers: Numbers
     if column.type == pa.int64():
-        numbers = _plain(column.combine_chunks(), np.int64).astype(np.longdouble)
+        numbers = _buffer_values(column.combine_chunks(), np.int64).astype(np.longdouble)
     else:
         typed = column.cast(pa.uint8()) if column.type == pa.bool_() else column
-        numbers = _plain(typed.cast(pa.float64()).combine_chunks(), np.float64).copy()
+        numbers = _buffer_values(typed.cast(pa.float64()).combine_chunks(), np.float64).copy()
     if column.null_count:
-        numbers[_plain(column.is_null().cast(pa.uint8()).combine_chunks(), np.uint8) != 0] = np.nan
+        numbers[_buffer_values(column.is_null().cast(pa.uint8()).combine_chunks(), np.uint8) != 0] = np.nan
     return numbers
 
 
-def _plain(array: pa.Array, kind: type[np.generic]) -> NDArray[Any]:
-    """Return the values of an array where Arrow keeps them, whatever stands in place of those that are missing.
+def _buffer_values(array: pa.Array, kind: type[np.generic]) -> NDArray[Any]:
+    """Return the value buffer of an Arrow array without copying; missing values are arbitrary.
 
-    `to_numpy` would import pandas where that is installed, which takes longer than all else that reads a table.
+    `to_numpy` would import pandas if that is installed, which takes longer than reading a table.
     """
     _, values = array.buffers()
     return np.frombuffer(values, kind, len(array), array.offset * np.dtype(kind).itemsize)
@@ -173,31 +173,33 @@ def _explain_row(
     for name, column in declared.items():
         value = cells.get(name, "")
         if (problem := column.problem(value)) is not None:
-            remedy = _SHORTENED if column.unit == "ns" and "e" in value.lower() else _REMEDY
+            remedy = _SPREADSHEET_REMEDY if column.unit == "ns" and "e" in value.lower() else _REMEDY
             return EvidenceError(f"{name} is {shown(value)}, {problem}", where=where, remedy=remedy)
-    counted = (name for name, column in declared.items() if column.type in {int, float})
-    numbers = {name: float(cells.get(name) or "nan") for name in counted}
-    if (one := contradiction(numbers, quantities(declared.values()))) is not None:
-        share, arrived, sent = (cells[name] for name in one.columns)
-        what = f"{one.name} is {share}, but {one.arrived} is {arrived} of {sent}"
-        return EvidenceError(what, where=where, remedy=_REMEDY)
+    numeric = (name for name, column in declared.items() if column.type in {int, float})
+    numbers = {name: float(cells.get(name) or "nan") for name in numeric}
+    if (quantity := contradiction(numbers, quantities(declared.values()))) is not None:
+        share, arrived, sent = (cells[name] for name in quantity.columns)
+        message = f"{quantity.name} is {share}, but {quantity.arrived} is {arrived} of {sent}"
+        return EvidenceError(message, where=where, remedy=_REMEDY)
     if cells["schema_version"] not in MISSING and float(cells["schema_version"]) > SCHEMA_VERSION:
-        return _newer(where, float(cells["schema_version"]))
+        return _newer_schema_error(where, float(cells["schema_version"]))
     if cells["status"] not in ENDED:
-        known = ", ".join(sorted(ENDED))
-        return EvidenceError(f"status is {shown(cells['status'])}, none of: {known}", where=where, remedy=_REMEDY)
+        possible = ", ".join(sorted(ENDED))
+        return EvidenceError(
+            f"status is {shown(cells['status'])}, not one of: {possible}", where=where, remedy=_REMEDY
+        )
     return None
 
 
 def shown(text: str) -> str:
-    """Return a cell of whoever wrote the table in quotes, not longer than fits into a message."""
-    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
+    """Return a cell of a table in quotes, shortened for a message."""
+    return repr(text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}...")
 
 
-def _newer(where: str, version: float) -> FieldkitError:
-    """Return the error of a table that this fieldkit is too old for."""
+def _newer_schema_error(where: str, version: float) -> FieldkitError:
+    """Return the error of a table that a newer fieldkit wrote."""
     return ConfigurationError(
-        f"written by a newer fieldkit: its schema is {version:.0f}, this one knows {SCHEMA_VERSION}",
+        f"written by a newer fieldkit: its schema is {version:.0f}, this version reads up to {SCHEMA_VERSION}",
         where=where,
         remedy="upgrade fieldkit",
     )

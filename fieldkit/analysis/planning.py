@@ -1,4 +1,4 @@
-"""Plan repeats: the number that a cell needs more until its interval is as narrow as wanted."""
+"""Planning of repeats: the number of additional repeats that a cell needs for an interval of a wanted width."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,52 +8,53 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.statistics import FEWEST_FOR_ORDER, Intervals, student
+from fieldkit.analysis.statistics import MIN_FOR_ORDER_STATISTICS, Intervals, student
 from fieldkit.core.columns import Kind
 
-_BISECTIONS: Final = 60  # as many repeats as a float counts exactly
+_BISECTIONS: Final = 60  # enough for every number of repeats that a float represents exactly
 
 
 def more_wanted_of(cells: Sequence[Cell], half_widths: Mapping[str, float]) -> tuple[Mapping[str, int], ...]:
-    """Return `more_wanted` of all estimates: by quantity, per cell.
+    """Return `more_wanted` of all estimates: for each cell, by name of the quantity.
 
     Args:
-        cells: With estimates of any quantities.
-        half_widths: Wanted, by the unit of a quantity; quantities of other units have no number, nor have estimates
-            without an interval.
+        cells: Cells with estimates of any quantities.
+        half_widths: Wanted half-width by unit. Quantities with other units, and estimates without an interval, are
+            not in the result.
     """
-    found: tuple[dict[str, int], ...] = tuple({} for _ in cells)
+    more_by_cell: tuple[dict[str, int], ...] = tuple({} for _ in cells)
     quantities = {estimate.quantity for cell in cells for estimate in cell.estimates.values()}
-    for quantity in (one for one in quantities if one.unit in half_widths):
-        having = [index for index, cell in enumerate(cells) if quantity.name in cell.estimates]
-        estimates = [cells[index].estimates[quantity.name] for index in having]
+    for quantity in (quantity for quantity in quantities if quantity.unit in half_widths):
+        indices = [index for index, cell in enumerate(cells) if quantity.name in cell.estimates]
+        estimates = [cells[index].estimates[quantity.name] for index in indices]
         ends = np.array([(estimate.value, estimate.low, estimate.high) for estimate in estimates], dtype=np.float64)
         n = [estimate.n for estimate in estimates]
         more = more_wanted(Intervals(*ends.T), n, half_widths[quantity.unit], quantity.kind, quantity.unit)
-        for index, count in zip(having, more.tolist(), strict=True):
+        for index, count in zip(indices, more.tolist(), strict=True):
             if not math.isnan(count):
-                found[index][quantity.name] = int(count)
-    return found
+                more_by_cell[index][quantity.name] = int(count)
+    return more_by_cell
 
 
 def more_wanted(
     intervals: Intervals, n: ArrayLike, half_width: ArrayLike, kind: Kind, unit: str = "share"
 ) -> NDArray[np.float64]:
-    """Return how many repeats more make half of the interval's width `half_width` at most, 0 where it is.
+    """Return the number of additional repeats until the half-width of an interval is at most `half_width`.
 
-    It takes further repeats to spread as those that are there do, so from few of these it is a rough guess. What a
-    repeat is worth the interval tells: of a share by the score interval's formula, solved for the number of trials,
-    also where nothing was lost yet; of a median by the square of its width. Student's quantile shrinks besides.
+    It is assumed that further repeats have the same dispersion as the existing ones, so from few repeats the number
+    is a rough estimate. For a share, the effective number of trials per repeat follows from the formula of the score
+    interval, even without any loss. For other quantities, the width decreases with the square root of the number. The
+    decrease of Student's quantile is taken into account.
 
     Args:
-        intervals: As `statistics` or `cells` give them, shape (cells,).
-        n: Repeats that each is of.
-        half_width: Wanted, in the unit of the value.
-        kind: Of the quantity.
-        unit: Likewise.
+        intervals: Intervals as returned by `statistics` or `cells`, shape (cells,).
+        n: Number of repeats of each.
+        half_width: Wanted half-width, in the unit of the value.
+        kind: Kind of the quantity.
+        unit: Unit of the quantity.
 
     Returns:
-        Whole numbers, shape (cells,); NaN where there is no interval.
+        Whole numbers, shape (cells,); 0 if the interval is narrow enough, NaN without an interval.
 
     Raises:
         ValueError: A wanted half-width is not above 0.
@@ -65,20 +66,20 @@ def more_wanted(
     is_share = kind is not Kind.MEDIAN and unit == "share"
     bounded = is_share & (intervals.low >= 0) & (intervals.high <= 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(bounded, _weight(value, half) / _weight(value, wanted), (half / wanted) ** 2)
+        ratio = np.where(bounded, _inverse_trials(value, half) / _inverse_trials(value, wanted), (half / wanted) ** 2)
     ratio = np.maximum(ratio, 1)
-    # The others rest on a known distribution and not on an estimated variance: they have the normal quantile.
+    # Intervals that use no estimated variance have the normal quantile instead of Student's.
     if is_share:
         estimated = (kind is not Kind.FLAG) & (value > 0) & (value < 1)
     else:
-        estimated = (n < FEWEST_FOR_ORDER) | (kind is Kind.MEAN)
-    with_normal = np.ceil(n * ratio * (1 - 1e-12))  # a ratio of 1 is 1, whatever rounding says
+        estimated = (n < MIN_FOR_ORDER_STATISTICS) | (kind is Kind.MEAN)
+    with_normal = np.ceil(n * ratio * (1 - 1e-12))  # rounding must not increase a ratio of 1
     total = np.where(estimated, _with_student(n, ratio, with_normal), with_normal)
     return np.asarray(total - n)
 
 
-def _weight(share: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return quantile²/trials of a score interval of that half-width; none is 1/2 wide or wider."""
+def _inverse_trials(share: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return quantile²/trials of a score interval with a half-width, which is always below 1/2."""
     spread, square = share * (1 - share), half**2
     a, b = 0.25 - square, spread - 2 * square
     return np.where(half < 0.5, (np.sqrt(b * b + 4 * a * square) - b) / (2 * a), np.inf)
@@ -87,7 +88,7 @@ def _weight(share: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np
 def _with_student(
     n: NDArray[np.float64], ratio: NDArray[np.float64], enough: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the least N with quantile(N)²/N <= quantile(n)²/n / ratio; `enough` is one."""
+    """Return the smallest N with quantile(N)²/N <= quantile(n)²/n / ratio; `enough` is an upper bound of N."""
     low, high = np.broadcast_to(n, enough.shape), enough
     goal = student(np.maximum(n - 1, 1)) ** 2 / n / ratio * (1 + 1e-12)
     for _ in range(_BISECTIONS):

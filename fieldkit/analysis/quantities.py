@@ -1,4 +1,4 @@
-"""Quantities: columns of trial.csv that are put together over repeats, as those columns declare it."""
+"""Quantities: columns of trial.csv that are aggregated over repeats as declared by their figures."""
 
 import re
 import sys
@@ -19,19 +19,19 @@ _IMPLIED_BY: Final = MappingProxyType(
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of trial.csv that figures are made of.
+    """A column of trial.csv that is aggregated over repeats.
 
     Attributes:
-        name: The column.
-        label: In words, for tables and axes.
-        kind: How repeats are put together.
-        unit: The column's, `share` for what is true or false.
-        arrived: Column that counts what arrived; None unless counted.
-        sent: Column that counts of how many; None unless counted.
-        possible: Smallest and largest value of a repeat.
-        rank: Place among others, from the first.
-        at_least: Column of lower bounds of what had not ended, None if there is none; see `columns.Figure`.
-        of_sent: Column of the same statistic over all that was sent, likewise.
+        name: Name of the column.
+        label: Label in tables and on axes.
+        kind: Kind of aggregation.
+        unit: Unit of the column; `share` for a flag.
+        arrived: Column with the number of received items; None unless counted.
+        sent: Column with the number of sent items; None unless counted.
+        possible: Smallest and largest possible value of a repeat.
+        rank: Sort key in tables.
+        at_least: Column of lower bounds (right-censored values), None if there is none; see `columns.Figure`.
+        of_sent: Column of the same statistic over all sent items, None if there is none; see `columns.Figure`.
     """
 
     name: str
@@ -47,26 +47,26 @@ class Quantity:
 
     @classmethod
     def of(cls, column: Column) -> Self | None:
-        """Return the quantity that a column declares, None where it declares none, or words."""
-        one = column.figure
-        if one is None or one.kind is Kind.WORDS:
+        """Return the quantity of a column; None if the column has no figure, or one of kind `words`."""
+        figure = column.figure
+        if figure is None or figure.kind is Kind.WORDS:
             return None
         return cls(
             column.name,
-            one.label,
-            one.kind,
-            unit="share" if one.kind is Kind.FLAG else column.unit,
-            arrived=one.arrived,
-            sent=one.sent,
+            figure.label,
+            figure.kind,
+            unit="share" if figure.kind is Kind.FLAG else column.unit,
+            arrived=figure.arrived,
+            sent=figure.sent,
             possible=column.possible,
-            rank=one.rank,
-            at_least=one.at_least,
-            of_sent=one.of_sent,
+            rank=figure.rank,
+            at_least=figure.at_least,
+            of_sent=figure.of_sent,
         )
 
     @property
     def step(self) -> str:
-        """Name of the step that measures it, empty where that has none."""
+        """Name of the step that measures it; empty if the step has no name."""
         return self.name.rpartition(".")[0]
 
     @property
@@ -76,76 +76,79 @@ class Quantity:
 
     @property
     def is_own(self) -> bool:
-        """Whether every trial has it, or a step of a kind that every trial has, under a name."""
+        """Whether it is a built-in quantity, instead of one that another package or a lab declares."""
         return not FIRST_OF_OTHERS <= self.rank < BACKGROUND
 
     @property
     def payload(self) -> str | None:
-        """Column with the ICMP payload size, without which a round-trip time cannot be read; None for others."""
+        """Column with the ICMP payload size, on which a round-trip time depends; None for other quantities."""
         return prefixed(self.step, "rtt_payload_bytes") if plain_name(self.name) == "rtt_median_s" else None
 
     @property
     def implied_by(self) -> str | None:
-        """Column whose value shows that a repeat was measured for this quantity too; None if none is known."""
+        """Column whose value implies that this quantity was measured, even if it has no value; None if unknown."""
         name = _IMPLIED_BY.get(plain_name(self.name))
         return name and prefixed(self.step, name)
 
     @property
     def needed(self) -> tuple[str, ...]:
-        """All columns that a table of it is made of: `columns`, `companions`, and those that say how to read it."""
+        """All columns that a table of it needs: `columns`, `optional_columns`, `payload` and `implied_by`."""
         return (
             *self.columns,
-            *self.companions,
+            *self.optional_columns,
             *(name for name in (self.payload, self.implied_by) if name is not None),
         )
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns without which a repeat does not have it, itself first."""
+        """The columns that a repeat must have for a value, starting with the column of the quantity."""
         return tuple(name for name in (self.name, self.arrived, self.sent) if name is not None)
 
     @property
-    def companions(self) -> tuple[str, ...]:
-        """The columns that say more of it where they are there: lower bounds, the figure over all that was sent."""
+    def optional_columns(self) -> tuple[str, ...]:
+        """Additional columns of lower bounds and of the statistic over all sent items, which may be missing."""
         return tuple(name for name in (self.at_least, self.of_sent) if name is not None)
 
 
 def quantities(columns: Iterable[Column]) -> tuple[Quantity, ...]:
-    """Return the quantities of a table, in the order in which tables show them.
+    """Return the quantities of a table, in the order of tables.
 
     Args:
-        columns: The table's, in order.
+        columns: Columns of the table, in order.
     """
     return in_order(quantity for column in columns if (quantity := Quantity.of(column)) is not None)
 
 
-def alike(found: Iterable[Quantity], name: str) -> list[Quantity]:
-    """Return the quantities that are called `name` but for the names of their steps, that of no named step first."""
+def alike(quantities: Iterable[Quantity], name: str) -> list[Quantity]:
+    """Return the quantities with a name, disregarding the names of steps; that of an unnamed step comes first."""
     return sorted(
-        (quantity for quantity in found if plain_name(quantity.name) == name), key=lambda one: one.step != ""
+        (quantity for quantity in quantities if plain_name(quantity.name) == name),
+        key=lambda quantity: quantity.step != "",
     )
 
 
-def in_order(found: Iterable[Quantity]) -> tuple[Quantity, ...]:
-    """Return quantities, each once, in the order in which tables show them."""
-    return tuple(sorted(dict.fromkeys(found), key=lambda one: one.rank))
+def in_order(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
+    """Return quantities without duplicates, in the order of tables."""
+    return tuple(sorted(dict.fromkeys(quantities), key=lambda quantity: quantity.rank))
 
 
 def symbols(unit: str) -> tuple[str, ...]:
-    """Return how people write a unit of quantities, and of how far they are apart."""
-    return tuple(PER_UNIT[unit]) if unit in PER_UNIT else tuple(dict.fromkeys((unit, APART.get(unit, unit))))
+    """Return the symbols in which values of a unit, and differences of them, are written."""
+    return (
+        tuple(PER_UNIT[unit]) if unit in PER_UNIT else tuple(dict.fromkeys((unit, DIFFERENCE_UNITS.get(unit, unit))))
+    )
 
 
 def parse_amount(text: str, unit: str, what: str) -> float:
-    """Return an amount of a quantity, or of how far two are apart, in its unit: `2%`, `5ms`, `3 dB`.
+    """Return a value of a quantity, or a difference of values, in its unit: `2%`, `5ms`, `3 dB`.
 
     Args:
-        text: What somebody wrote. A unit that has one symbol alone may be left out.
-        unit: The quantity's.
-        what: For the message.
+        text: The text to parse. A unit with only one symbol may be omitted.
+        unit: Unit of the quantity.
+        what: Description of the value, for the message.
 
     Raises:
-        ConfigurationError: It is no such amount, or below 0.
+        ConfigurationError: The text is not a value in this unit, or below 0.
     """
     if unit in PER_UNIT:
         return parse_quantity(text, PER_UNIT[unit], what)
@@ -158,13 +161,13 @@ def parse_amount(text: str, unit: str, what: str) -> float:
 
 
 LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "ip_loss", "file_loss", "rtt_loss")
-"""Losses, what says most of a transfer first."""
+"""Losses, the most informative one first."""
 
 PER_UNIT: Final = MappingProxyType({"share": FRACTION_PER_UNIT, "s": SECONDS_PER_UNIT, "bit/s": BITS_PER_S_PER_UNIT})
-"""How people write amounts of quantities: of these units the symbols, with their factors; others as they are."""
+"""Symbols and factors of units that are written in several ways; other units are written as they are."""
 
-APART: Final = MappingProxyType({"share": "points", "dBm": "dB"})
-"""In what two values of a unit are apart, where that is another."""
+DIFFERENCE_UNITS: Final = MappingProxyType({"share": "points", "dBm": "dB"})
+"""Unit of the difference of two values, if it is not the unit of the values."""
 
 DEFAULT_BY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")
-"""Columns that tell one condition from another."""
+"""Columns that identify a condition by default."""

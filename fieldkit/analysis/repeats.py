@@ -1,4 +1,4 @@
-"""Attempts at repeats as columns: what trial.csv holds, of one trial or of thousands."""
+"""Attempts of repeats as columns: the contents of trial.csv of one trial or of thousands."""
 
 import csv
 from collections import Counter
@@ -27,28 +27,28 @@ Key = tuple[str | float | None, ...]
 SOURCE: Final = "source"
 """The column that `read` adds."""
 IDENTITY: Final = ("schema_version", "trial", "protocol", "repeat", "attempt", "status")
-"""What a table of repeats must have."""
+"""Columns that a table of repeats must have."""
 
-_SPREADSHEET: Final = {
-    b"schema_version;": ("its cells stand apart by semicolons", "with commas, and with points in numbers"),
-    b"schema_version\t": ("its cells stand apart by tabs", "with commas"),
-    b"s\x00c\x00h\x00e\x00m\x00a\x00": ("its letters are UTF-16", "as UTF-8"),
+_SPREADSHEET_MARKS: Final = {
+    b"schema_version;": ("its cells are separated by semicolons", "with commas, and with points in numbers"),
+    b"schema_version\t": ("its cells are separated by tabs", "with commas"),
+    b"s\x00c\x00h\x00e\x00m\x00a\x00": ("its encoding is UTF-16", "as UTF-8"),
 }
-"""Marks of a header that a spreadsheet wrote in its own way: what is wrong, and how to save it instead."""
+"""Start of a header that a spreadsheet wrote in another format; the problem, and how to save the file instead."""
 
 _BATCH_BYTES: Final = 1 << 25
-_MOST_HEADER_BYTES: Final = 1 << 20
+_MAX_HEADER_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Attempts at repeats, valid or not, one numpy column per column of trial.csv.
+    """Attempts of repeats, valid or not, as one numpy column per column of trial.csv.
 
     Attributes:
-        numbers: Float columns of shape (n,), NaN where missing; a bool is 0 or 1. Times in ns are long doubles.
-        texts: Columns of str, shape (n,), empty where missing; `source` is the trial's folder or the CSV that a row
-            was read from, empty for rows that come from no file.
-        columns: What each of them is, but for `source`.
+        numbers: Float columns of shape (n,), NaN if missing; a bool is 0 or 1. Times in ns are long doubles.
+        texts: Columns of str, shape (n,), empty if missing; `source` is the trial's folder or the CSV file of a row,
+            empty for rows that were not read from a file.
+        columns: Declarations of the columns, without `source`.
     """
 
     numbers: Mapping[str, Numbers]
@@ -57,9 +57,9 @@ class Repeats:
 
     @cached_property
     def quantities(self) -> tuple[Quantity, ...]:
-        """What figures can be made of, in the order in which tables show them."""
-        found = quantities(self.columns)
-        return tuple(quantity for quantity in found if self.numbers.keys() >= set(quantity.columns))
+        """The quantities whose columns exist, in the order of tables."""
+        all_quantities = quantities(self.columns)
+        return tuple(quantity for quantity in all_quantities if self.numbers.keys() >= set(quantity.columns))
 
     @cached_property
     def worded(self) -> tuple[Column, ...]:
@@ -70,7 +70,7 @@ class Repeats:
         return len(next(iter(self.texts.values())))
 
     def where(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Self:
-        """Return the rows of a mask, or those of an index in its order."""
+        """Return the rows of a mask, or the rows with these indices in their order."""
         return type(self)(
             {name: column[chosen] for name, column in self.numbers.items()},
             {name: column[chosen] for name, column in self.texts.items()},
@@ -78,17 +78,17 @@ class Repeats:
         )
 
     def column(self, name: str) -> list[str | float | None]:
-        """Return a column, a missing number as None."""
+        """Return the values of a column; a missing number is None."""
         if name in self.texts:
             return list(self.texts[name])
         numbers, missing = self.numbers[name], np.isnan(self.numbers[name])
-        known = np.where(missing, 0, numbers).astype(np.int64) if numbers.dtype == np.longdouble else numbers
-        values = known.astype(np.object_)
+        exact = np.where(missing, 0, numbers).astype(np.int64) if numbers.dtype == np.longdouble else numbers
+        values = exact.astype(np.object_)
         values[missing] = None
         return list(values)
 
     def observed(self, quantity: Quantity) -> tuple[Numbers, NDArray[np.bool_]]:
-        """Return a quantity row by row, and in which rows that is only a lower bound; NaN where it is missing."""
+        """Return the values of a quantity, NaN if missing, and a mask of the rows in which they are lower bounds."""
         values = self.numbers[quantity.name]
         bounds = self.numbers.get(quantity.at_least or "")
         if bounds is None:
@@ -97,51 +97,56 @@ class Repeats:
         return np.where(censored, bounds, values), censored
 
     def keys(self, names: Sequence[str]) -> list[Key]:
-        """Return what the columns `names` hold, row by row."""
+        """Return the values of the columns `names` for each row."""
         return list(zip(*map(self.column, names), strict=True)) if names else [()] * len(self)
 
     def codes(self, names: Sequence[str]) -> NDArray[np.int64]:
-        """Return a number per row, equal where the columns `names` hold the same, counted from 0."""
-        found = np.zeros(len(self), np.int64)
+        """Return a number per row, from 0, which is equal for rows with equal values in the columns `names`."""
+        codes = np.zeros(len(self), np.int64)
         for name in names:
             texts = self.texts.get(name)
-            own = np.unique(self.numbers[name], return_inverse=True)[1] if texts is None else parsing.codes(texts)
-            found = np.unique(found * (own.max(initial=0) + 1) + own, return_inverse=True)[1]
-        return found
+            of_column = (
+                np.unique(self.numbers[name], return_inverse=True)[1] if texts is None else parsing.codes(texts)
+            )
+            codes = np.unique(codes * (of_column.max(initial=0) + 1) + of_column, return_inverse=True)[1]
+        return codes
 
     def groups(self, names: Sequence[str]) -> dict[Key, NDArray[np.int64]]:
-        """Return the index of the rows of each key, both in the order of the rows."""
-        found: dict[Key, list[int]] = {}
+        """Return the indices of the rows by key; keys and rows are in the order of the rows."""
+        by_key: dict[Key, list[int]] = {}
         for row, key in enumerate(self.keys(names)):
-            found.setdefault(key, []).append(row)
-        return {key: np.array(rows) for key, rows in found.items()}
+            by_key.setdefault(key, []).append(row)
+        return {key: np.array(rows) for key, rows in by_key.items()}
 
     def name(self, row: int) -> str:
-        """Return what the repeat in a row is called: `udp-07`."""
+        """Return the name of the repeat in a row: `udp-07`."""
         number = self.numbers["repeat"][row]
         return f"{self.texts['protocol'][row]}-{'??' if np.isnan(number) else f'{number:02.0f}'}"
 
     def folder(self, row: int) -> str | None:
-        """Return the name of the folder of the attempt in a row: `udp-07`; None where its row names none."""
+        """Return the name of the folder of the attempt in a row: `udp-07`; None if the row has invalid values."""
         texts, numbers = self.texts, self.numbers
         try:
             repeat = RepeatId(Protocol(texts["protocol"][row]), int(numbers["repeat"][row]))
             return repeat.folder(Status(texts["status"][row]), int(numbers["attempt"][row]))
-        except ValueError:  # somebody edited the table
+        except ValueError:  # the table was edited
             return None
 
     @cached_property
     def _by_folder(self) -> Mapping[str, Sequence[int]]:
-        """Rows by the name of the attempt's folder, and by that behind the name of its trial."""
-        found: dict[str, list[int]] = {}
+        """Rows by the name of the attempt's folder, and by `TRIAL/FOLDER`."""
+        rows: dict[str, list[int]] = {}
         for row, trial in enumerate(self.texts["trial"]):
-            if name := self.folder(row):
-                for one in (name, f"{trial}/{name}"):
-                    found.setdefault(one, []).append(row)
-        return found
+            if folder := self.folder(row):
+                for name in (folder, f"{trial}/{folder}"):
+                    rows.setdefault(name, []).append(row)
+        return rows
 
     def row(self, attempt: str) -> int:
-        """Return the row of an attempt by its folder: `udp-07`, with `TRIAL/` before it where several have one.
+        """Return the row of an attempt.
+
+        Args:
+            attempt: Name of its folder, `udp-07`, with the prefix `TRIAL/` if several trials have this folder.
 
         Raises:
             ConfigurationError: There is no such attempt, or there are several.
@@ -161,24 +166,24 @@ class Repeats:
 
 
 def parse(content: bytes, declared: Iterable[Column], where: str = "trial.csv") -> Repeats:
-    """Return what a trial.csv holds; columns that it lacks are missing throughout.
+    """Return the rows of a trial.csv; columns that it does not have are missing in all rows.
 
     Raises:
-        EvidenceError: A value is not what its column is declared to hold.
+        EvidenceError: A value is not possible for its column.
     """
     header, _, body = content.partition(b"\n")
-    named = _named(declared)
+    named = _by_name(declared)
     try:
         return _parse(_names(header), body, named)
     except ValueError as error:
         raise parsing.first_problem(where, content, named) or EvidenceError(
-            f"its values are not what its columns are declared to hold: {error}",
+            f"its values do not agree with the declarations of its columns: {error}",
             where=where,
-            remedy="correct columns: of trial.yaml, which says what each is",
+            remedy="correct the declarations under columns: in trial.yaml",
         ) from error
 
 
-def _named(declared: Iterable[Column]) -> dict[str, Column]:
+def _by_name(declared: Iterable[Column]) -> dict[str, Column]:
     return {column.name: column for column in declared}
 
 
@@ -188,61 +193,61 @@ def read(
     columns: Collection[str] | None = None,
     content: Callable[[Path], bytes] = Path.read_bytes,
 ) -> Repeats:
-    """Return the rows of many tables, in the order of `paths`; columns that a table lacks are missing.
+    """Return the rows of many tables, in the order of `paths`; columns that a table does not have are missing.
 
-    Tables of one form are parsed together, some tens of megabytes at a time: it takes pyarrow longer to begin than to
-    parse the 40 rows of a trial.
+    Tables with the same header are parsed together, some tens of megabytes at a time, because the start of pyarrow's
+    parser takes longer than parsing the 40 rows of a trial.
 
     Args:
         paths: CSV files with the columns of trial.csv, of any schema version up to this fieldkit's.
         declared: The columns of trial.csv.
-        columns: Which of them to read, None for all; those of `IDENTITY` are read in any case.
-        content: How the bytes of a table are had.
+        columns: Names of the columns to read, None for all; those of `IDENTITY` are always read.
+        content: Function that reads the bytes of a table.
 
     Raises:
-        ConfigurationError: A file cannot be read, is no table of repeats, or comes from a newer fieldkit.
-        EvidenceError: A line is damaged.
+        ConfigurationError: A file cannot be read, is not a table of repeats, or was written by a newer fieldkit.
+        EvidenceError: A line is invalid.
     """
     wanted = None if columns is None else {*columns, *IDENTITY}
-    named = {name: column for name, column in _named(declared).items() if wanted is None or name in wanted}
+    named = {name: column for name, column in _by_name(declared).items() if wanted is None or name in wanted}
     batches: dict[bytes, _Batch] = {}
     parts: list[Repeats] = []
     order: list[NDArray[np.int64]] = []
 
-    def end(batch: _Batch) -> None:
+    def parse_batch(batch: _Batch) -> None:
         part, counts = batch.parse(named)
         parts.append(part)
         order.append(np.repeat(batch.numbers, counts))
 
     for number, path in enumerate(paths):
-        if content == Path.read_bytes and (large := _large(path, named)) is not None:
+        if content == Path.read_bytes and (large := _read_large(path, named)) is not None:
             parts.append(large)
             order.append(np.full(len(large), number))
             continue
         header, body = _split(path, content)
         if header not in batches:
             batches[header] = _Batch(header, _header(path, header))
-        _demand_end(path, body)
+        _check_line_end(path, body)
         batches[header].add(number, path, body)
         if batches[header].size >= _BATCH_BYTES:
-            end(batches.pop(header))
+            parse_batch(batches.pop(header))
     for batch in batches.values():
-        end(batch)
-    together = _concatenated(parts or [_parse((), b"", named)])
+        parse_batch(batch)
+    rows = _concatenated(parts or [_parse((), b"", named)])
     numbers = np.concatenate(order) if order else np.empty(0, np.int64)
-    return together if (np.diff(numbers) >= 0).all() else together.where(np.argsort(numbers, kind="stable"))
+    return rows if (np.diff(numbers) >= 0).all() else rows.where(np.argsort(numbers, kind="stable"))
 
 
-_UNDECLARED: Final = "Nobody declares it: as it stands in the table."
+_UNDECLARED: Final = "No declaration: the unchanged text of the table."
 
 
 def undeclared(name: str) -> Column:
-    """Return a column that a table has and nobody declares: text, as it stands there."""
+    """Return a text column for a column of a table that has no declaration."""
     return Column(name, "text", _UNDECLARED)
 
 
 def is_undeclared(column: Column) -> bool:
-    """Return whether nobody declares a column."""
+    """Return True if a column has no declaration."""
     return column.meaning == _UNDECLARED
 
 
@@ -253,7 +258,7 @@ def names(path: Path) -> tuple[str, ...]:
         ConfigurationError: The file cannot be read.
     """
     with _readable(path), path.open("rb") as file:
-        return _names(file.readline(_MOST_HEADER_BYTES))
+        return _names(file.readline(_MAX_HEADER_BYTES))
 
 
 @dataclass
@@ -274,52 +279,54 @@ class _Batch:
         self.size += len(body)
 
     def parse(self, declared: Mapping[str, Column]) -> tuple[Repeats, list[int]]:
-        """Return all rows, and how many come from each table."""
+        """Return the rows of all tables, and the number of rows of each table."""
         counts = [body.count(b"\n") for body in self.bodies]
         try:
             rows = _parse(self.names, b"".join(self.bodies), declared)
         except ValueError:
             rows = None
-        if rows is None or len(rows) != sum(counts) or not _is_sound(rows, declared):
-            singly = [self._alone(path, body, declared) for path, body in zip(self.paths, self.bodies, strict=True)]
-            rows, counts = _concatenated(singly), [len(one) for one in singly]
+        if rows is None or len(rows) != sum(counts) or not _is_valid(rows, declared):
+            tables = [
+                self._parse_single(path, body, declared) for path, body in zip(self.paths, self.bodies, strict=True)
+            ]
+            rows, counts = _concatenated(tables), [len(table) for table in tables]
         sources = np.array([_source(path) for path in self.paths], dtype=np.object_)
         return replace(rows, texts={**rows.texts, SOURCE: np.repeat(sources, counts)}), counts
 
-    def _alone(self, path: Path, body: bytes, declared: Mapping[str, Column]) -> Repeats:
+    def _parse_single(self, path: Path, body: bytes, declared: Mapping[str, Column]) -> Repeats:
         if (error := parsing.first_problem(str(path), self.header + b"\n" + body, declared)) is not None:
             raise error
         try:
             return _parse(self.names, body, declared)
         except ValueError as error:
-            raise EvidenceError(str(error), where=str(path), remedy="mend the file") from error
+            raise EvidenceError(str(error), where=str(path), remedy="correct the file") from error
 
 
-def _large(path: Path, declared: Mapping[str, Column]) -> Repeats | None:
-    """Return the rows of a large table, which is never in memory whole; None for a small one, or a damaged one.
+def _read_large(path: Path, declared: Mapping[str, Column]) -> Repeats | None:
+    """Return the rows of a large table, read in blocks; None for a small or an invalid table.
 
-    Errors of its header as `_header`.
+    Raises errors of the header as `_header`.
     """
     with _readable(path):
         if path.stat().st_size < 2 * _BATCH_BYTES:
             return None
         with path.open("rb") as file:
-            names = _header(path, file.readline(_MOST_HEADER_BYTES).removesuffix(b"\n"))
+            names = _header(path, file.readline(_MAX_HEADER_BYTES).removesuffix(b"\n"))
             parts = []
             while block := file.read(_BATCH_BYTES) + file.readline():
                 try:
                     rows = _parse(names, block, declared)
                 except ValueError:
                     return None
-                if len(rows) != block.count(b"\n") or not _is_sound(rows, declared):
+                if len(rows) != block.count(b"\n") or not _is_valid(rows, declared):
                     return None
                 parts.append(rows)
-    together = _concatenated(parts)
-    return replace(together, texts={**together.texts, SOURCE: np.full(len(together), _source(path), np.object_)})
+    table = _concatenated(parts)
+    return replace(table, texts={**table.texts, SOURCE: np.full(len(table), _source(path), np.object_)})
 
 
-def _is_sound(rows: Repeats, declared: Mapping[str, Column]) -> bool:
-    """Return whether all rows are of this fieldkit's schema or an older one, with an end, and possible numbers."""
+def _is_valid(rows: Repeats, declared: Mapping[str, Column]) -> bool:
+    """Return True if all rows have a known schema version, a final status, and possible and consistent numbers."""
     return (
         not (rows.numbers["schema_version"] > SCHEMA_VERSION).any()
         and set(ENDED).issuperset(rows.texts["status"])
@@ -334,7 +341,7 @@ def _source(path: Path) -> str:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Say which table the body could not read."""
+    """Convert an OSError of the body to a ConfigurationError that names the table."""
     try:
         yield
     except OSError as error:
@@ -344,28 +351,28 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _split(path: Path, content: Callable[[Path], bytes]) -> tuple[bytes, bytes]:
-    """Return the header line of a table and the lines below it, each with its end."""
+    """Return the header line of a table without its line end, and the lines below it."""
     with _readable(path):
         header, _, body = content(path).partition(b"\n")
     return header, body
 
 
-def _demand_end(path: Path, body: bytes) -> None:
-    """Demand that a table's last line has an end: of a cut one a number may be left that is a tenth of what it was.
+def _check_line_end(path: Path, body: bytes) -> None:
+    """Check that a table's last line has a line feed; the last number of a truncated line can lack digits.
 
     Raises:
-        EvidenceError: It has none.
+        EvidenceError: The line feed is missing.
     """
     if body and not body.endswith(b"\n"):
         raise EvidenceError(
-            "the last line has no end: the table may be cut",
+            "the last line has no line feed: the table may be truncated",
             where=f"{path}:{1 + len(body.splitlines())}",
-            remedy="make the file again: fieldkit rebuild TRIAL; or end its last line, if that is whole",
+            remedy="create the file again: fieldkit rebuild TRIAL; or add the line feed if the line is complete",
         )
 
 
 def _names(header: bytes) -> tuple[str, ...]:
-    """Return the names in a header line, none where one is of more than 128 kB, in whatever this is."""
+    """Return the names in a header line; an empty tuple if a name exceeds the 128 kB limit of the csv module."""
     try:
         return tuple(map(unguarded, next(csv.reader([header.decode("utf-8-sig", errors="replace")]), ())))
     except csv.Error:
@@ -374,15 +381,17 @@ def _names(header: bytes) -> tuple[str, ...]:
 
 def _header(path: Path, header: bytes) -> tuple[str, ...]:
     names = _names(header)
-    lacking = [name for name in IDENTITY if name not in names]
-    twice = sorted(name for name, times in Counter(names).items() if name and times > 1)
-    if lacking or twice:
-        what = f"it lacks {', '.join(lacking)}" if lacking else f"{', '.join(twice)} is there twice"
+    missing = [name for name in IDENTITY if name not in names]
+    duplicates = sorted(name for name, count in Counter(names).items() if name and count > 1)
+    if missing or duplicates:
+        reason = (
+            f"it lacks {', '.join(missing)}" if missing else f"it has more than one column {', '.join(duplicates)}"
+        )
         remedy = "name the folder of a trial or its trial.csv; its columns: fieldkit columns"
-        for mark, (said, instead) in _SPREADSHEET.items():
-            if lacking and mark in header.replace(b'"', b""):
-                what, remedy = said, f"save it anew {instead}, or name the trial's own trial.csv"
-        raise ConfigurationError(f"this is no table of repeats: {what}", where=str(path), remedy=remedy)
+        for mark, (problem, instead) in _SPREADSHEET_MARKS.items():
+            if missing and mark in header.replace(b'"', b""):
+                reason, remedy = problem, f"save it again {instead}, or name the trial.csv in the trial's folder"
+        raise ConfigurationError(f"this is not a table of repeats: {reason}", where=str(path), remedy=remedy)
     return names
 
 
@@ -392,7 +401,7 @@ def _parse(names: Sequence[str], body: bytes, declared: Mapping[str, Column]) ->
 
 
 def _concatenated(parts: Sequence[Repeats]) -> Repeats:
-    """Return the rows of all parts; a column of the parts is freed as soon as it is joined, as large as all are."""
+    """Return the rows of all parts; each column of the parts is freed after it was joined, to save memory."""
     numbers, texts = ([dict(getattr(part, kind)) for part in parts] for kind in ("numbers", "texts"))
     names, words, columns = list(numbers[0]), list(texts[0]), parts[0].columns
     return Repeats(

@@ -1,4 +1,4 @@
-"""Cells and comparisons as tables: CSV and JSON for programs, Markdown for GitHub, LaTeX for a paper."""
+"""Cells and comparisons as tables in CSV, JSON, Markdown and LaTeX."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ from fieldkit.core.text import json_text, one_line
 
 MORE: Final = "more_wanted"
 _MARKUP: Final = re.compile(r"[\\|`*]|<(?=[A-Za-z/!?])|(?<=\])[(\[:]")
-_ACROSS: Final = ("scenario", "protocol")
+_ACROSS_COLUMNS: Final = ("scenario", "protocol")
 _LATEX_AT_LEAST: Final = r"$\geq$ "
 _LATEX_SPECIAL: Final = {
     "\\": r"\textbackslash{}",
@@ -28,14 +28,20 @@ _LATEX_SPECIAL: Final = {
 
 
 def estimate_rows(cell: Cell) -> Iterator[EstimateRow]:
-    """Yield what stands in a table of one cell: a row per quantity and word; one where it has none."""
+    """Yield the table rows of a cell: one per quantity and word, or a single row if it has none."""
     counts: dict[str, Any] = {"n_valid": cell.n_valid, "n_void": cell.n_void, "n_failed": cell.n_failed}
     if not cell.estimates and not cell.tallies:
         yield EstimateRow(**counts)
     for name, estimate in cell.estimates.items():
-        same = {item.name: getattr(estimate, item.name, None) for item in fields(EstimateRow)}
+        values = {item.name: getattr(estimate, item.name, None) for item in fields(EstimateRow)}
         yield EstimateRow(
-            **{**same, **counts, "quantity": name, "unit": estimate.quantity.unit, "estimate": estimate.quantity.kind}
+            **{
+                **values,
+                **counts,
+                "quantity": name,
+                "unit": estimate.quantity.unit,
+                "estimate": estimate.quantity.kind,
+            }
         )
     for tally in cell.tallies.values():
         for word, events in tally.counts.items():
@@ -52,12 +58,12 @@ def estimate_rows(cell: Cell) -> Iterator[EstimateRow]:
 
 
 def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str, int]] = ()) -> str:
-    """Return cells as CSV: the columns `by` that tell them apart, then those of `EstimateRow`.
+    """Return cells as CSV: the columns `by` that identify them, then those of `EstimateRow`.
 
     Args:
-        by: Columns that tell cells apart.
-        cells: What to tell of.
-        more: By cell and quantity, the repeats that are wanted beside those that are there: the last column, if any.
+        by: Columns that identify cells.
+        cells: The cells.
+        more: Number of additional repeats by quantity, for each cell; they are the last column, if given.
     """
     names = [column.name for column in declared(EstimateRow)]
     wanted = more or ({},) * len(cells)
@@ -71,20 +77,20 @@ def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str,
 
 
 def to_json(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str, int]] = ()) -> str:
-    """Return cells as one JSON object; names, units and digits as in `to_csv`, what is missing is null."""
+    """Return cells as one JSON object with the names, units and digits of `to_csv`; missing values are null."""
     wanted = more or ({},) * len(cells)
-    listed = [_object(cell, counts if more else None) for cell, counts in zip(cells, wanted, strict=True)]
+    listed = [_cell_object(cell, counts if more else None) for cell, counts in zip(cells, wanted, strict=True)]
     cautions = list(wording.cautions(cells))
-    whole = {"schema_version": SCHEMA_VERSION, "by": list(by), "cautions": cautions, "cells": listed}
-    return json_text(whole, indent=1, allow_nan=False) + "\n"
+    document = {"schema_version": SCHEMA_VERSION, "by": list(by), "cautions": cautions, "cells": listed}
+    return json_text(document, indent=1, allow_nan=False) + "\n"
 
 
-def _object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
+def _cell_object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
     counts = ("n_valid", "n_void", "n_failed")
     estimates = {}
     for row in estimate_rows(cell):
         if row.quantity is not None:
-            values = {name: _rounded(value) for name, value in asdict(row).items()}
+            values = {name: _round(value) for name, value in asdict(row).items()}
             wanted = {} if more is None else {MORE: more.get(row.quantity)}
             estimates[values.pop("quantity")] = {
                 name: value for name, value in (values | wanted).items() if name not in counts
@@ -92,22 +98,22 @@ def _object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
     return {"key": dict(cell.key), **{name: getattr(cell, name) for name in counts}, "estimates": estimates}
 
 
-def _rounded(value: object) -> Any:  # noqa: ANN401 (any JSON value)
-    """Return a number to the digits that a CSV has of it."""
+def _round(value: object) -> Any:  # noqa: ANN401 (any JSON value)
+    """Return a number rounded to the digits of a CSV."""
     return float(f"{value:.9g}") if isinstance(value, float) else value
 
 
 def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRow]]:
-    """Yield every condition with a row per quantity, or with one without any where neither run measured."""
+    """Yield each condition with each of its rows: one per quantity, or a single row if neither run measured one."""
     for pair in comparison.pairs:
         missing_in = pair.missing_in or None
-        found = [_difference_row(difference, missing_in, comparison.made) for difference in pair.differences]
-        found += [row for a, b in pair.words for row in _word_rows(a, b, missing_in)]
-        yield from ((pair, row) for row in found or [DifferenceRow(missing_in=missing_in)])
+        rows = [_difference_row(difference, missing_in, comparison.made) for difference in pair.differences]
+        rows += [row for a, b in pair.words for row in _word_rows(a, b, missing_in)]
+        yield from ((pair, row) for row in rows or [DifferenceRow(missing_in=missing_in)])
 
 
 def comparison_csv(comparison: Comparison) -> str:
-    """Return a comparison as CSV: the columns that tell conditions apart, then those of `DifferenceRow`."""
+    """Return a comparison as CSV: the columns that identify conditions, then those of `DifferenceRow`."""
     names = [column.name for column in declared(DifferenceRow)]
     rows = (
         [*pair.key.values(), *(getattr(row, name) for name in names)] for pair, row in difference_rows(comparison)
@@ -116,7 +122,7 @@ def comparison_csv(comparison: Comparison) -> str:
 
 
 def comparison_json(comparison: Comparison) -> str:
-    """Return a comparison as one JSON object: conclusions in words, concerns, and differences as in the CSV."""
+    """Return a comparison as one JSON object: conclusions, concerns, and differences as in the CSV."""
     text = json_text(
         {
             "schema_version": SCHEMA_VERSION,
@@ -125,7 +131,7 @@ def comparison_json(comparison: Comparison) -> str:
             "concerns": [asdict(concern) for concern in comparison.concerns],
             "missed": comparison.missed,
             "differences": [
-                {**pair.key, **{name: _rounded(value) for name, value in asdict(row).items()}}
+                {**pair.key, **{name: _round(value) for name, value in asdict(row).items()}}
                 for pair, row in difference_rows(comparison)
             ],
         },
@@ -135,24 +141,24 @@ def comparison_json(comparison: Comparison) -> str:
     return f"{text}\n"
 
 
-def _difference_row(one: Difference, missing_in: str | None, made: int) -> DifferenceRow:
+def _difference_row(difference: Difference, missing_in: str | None, comparisons: int) -> DifferenceRow:
     return DifferenceRow(
         missing_in=missing_in,
-        quantity=one.quantity.name,
-        unit=one.quantity.unit,
-        estimate=one.quantity.kind,
-        n_a=one.a.n if one.a else None,
-        n_b=one.b.n if one.b else None,
-        a=one.a.value if one.a else None,
-        b=one.b.value if one.b else None,
-        difference=one.value,
-        low=one.interval.low if one.interval else None,
-        high=one.interval.high if one.interval else None,
-        cliffs_delta=one.cliffs_delta,
-        p_holm=one.p_holm,
-        threshold=one.threshold,
-        within=one.within,
-        verdict=wording.verdict(one, made),
+        quantity=difference.quantity.name,
+        unit=difference.quantity.unit,
+        estimate=difference.quantity.kind,
+        n_a=difference.a.n if difference.a else None,
+        n_b=difference.b.n if difference.b else None,
+        a=difference.a.value if difference.a else None,
+        b=difference.b.value if difference.b else None,
+        difference=difference.value,
+        low=difference.interval.low if difference.interval else None,
+        high=difference.interval.high if difference.interval else None,
+        cliffs_delta=difference.cliffs_delta,
+        p_holm=difference.p_holm,
+        threshold=difference.threshold,
+        within=difference.within,
+        verdict=wording.verdict(difference, comparisons),
     )
 
 
@@ -175,55 +181,55 @@ def _word_rows(a: Tally, b: Tally, missing_in: str | None) -> Iterator[Differenc
 
 
 def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
-    """Return a table of the figures to quote, each with its interval; what all cells share stands above it.
+    """Return a Markdown table of the estimates to quote with their intervals, followed by word counts.
 
-    The columns of words that cells have follow.
+    The values that all cells have in common are in a line above the table.
     """
-    apart, common = wording.told_by(by, cells)
+    varying, common = wording.told_by(by, cells)
     shown = [(line, line.scale(cells)) for line in lines(cells, quantities)]
     words = wording.worded(cells)
-    head = [*apart, "repeats", *(scale.head(line.label) for line, scale in shown), *words.values()]
-    marks = ["---"] * (len(apart) + 1) + ["---:"] * len(shown) + ["---"] * len(words)
+    head = [*varying, "repeats", *(scale.head(line.label) for line, scale in shown), *words.values()]
+    marks = ["---"] * (len(varying) + 1) + ["---:"] * len(shown) + ["---"] * len(words)
     rows = [markdown_line(head), markdown_line(marks)]
     for cell in cells:
-        conditions = (wording.key(cell, name) for name in apart)
+        conditions = (wording.key(cell, name) for name in varying)
         figures = (line.number(cell, scale) for line, scale in shown)
-        said = (wording.tally(cell, name) for name in words)
-        rows.append(markdown_line([*conditions, wording.counts(cell), *figures, *said]))
-    above = markdown_escaped(", ".join(f"{name} {wording.key(cells[0], name)}" for name in common))
-    how = f"{above}; each value with its 95 % interval" if above else "Each value with its 95 % interval"
+        tallies = (wording.tally(cell, name) for name in words)
+        rows.append(markdown_line([*conditions, wording.counts(cell), *figures, *tallies]))
+    values = markdown_escaped(", ".join(f"{name} {wording.key(cells[0], name)}" for name in common))
+    above = f"{values}; each value with its 95 % interval" if values else "Each value with its 95 % interval"
     below = "".join(f"\n{markdown_escaped(caution)}.\n" for caution in wording.cautions(cells))
-    return f"{how}.\n\n" + "".join(rows) + below
+    return f"{above}.\n\n" + "".join(rows) + below
 
 
 def markdown_line(parts: Iterable[str]) -> str:
-    """Return a line of a table."""
+    """Return a line of a Markdown table."""
     return f"| {' | '.join(map(markdown_escaped, parts))} |\n"
 
 
 def markdown_escaped(text: str) -> str:
-    """Return a text, of whoever wrote the evidence, that neither ends a cell nor is markup, a link or HTML."""
+    """Return an untrusted text escaped for a table cell, so that it is not markup, a link or HTML."""
     return _MARKUP.sub(r"\\\g<0>", one_line(text))
 
 
 @dataclass(frozen=True)
 class _Column:
-    """One column of figures; its head has a line for each of these, empty where cells are not told apart by it."""
+    """One column of figures; its head has a line per attribute, empty if the cells are not distinguished by it."""
 
     scenario: str
     line: TableLine
     protocol: str
 
     def has(self, cell: Cell) -> bool:
-        is_there = self.line.estimate(cell) is not None or self.line.is_lacking(cell)
-        return is_there and (self.scenario, self.protocol) == _across(cell)
+        has_figure = self.line.estimate(cell) is not None or self.line.is_lacking(cell)
+        return has_figure and (self.scenario, self.protocol) == _scenario_and_protocol(cell)
 
 
 def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
-    """Return a `table` as wide as a column; it needs booktabs and graphicx. Columns without a figure are left out."""
-    down, common = ([name for name in names if name not in _ACROSS] for names in wording.told_by(by, cells))
+    """Return a LaTeX `table` of column width (needs booktabs and graphicx); columns without a figure are omitted."""
+    down, common = ([name for name in names if name not in _ACROSS_COLUMNS] for names in wording.told_by(by, cells))
     scales = {line: line.scale(cells) for line in lines(cells, quantities)}
-    scenarios, protocols = (dict.fromkeys(values) for values in zip(*map(_across, cells), strict=True))
+    scenarios, protocols = (dict.fromkeys(values) for values in zip(*map(_scenario_and_protocol, cells), strict=True))
     columns = [
         column
         for column in (
@@ -254,8 +260,8 @@ def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quan
     return "\n".join(parts) + "\n"
 
 
-def _across(cell: Cell) -> tuple[str, str]:
-    scenario, protocol = (wording.key(cell, name).upper() if name in cell.key else "" for name in _ACROSS)
+def _scenario_and_protocol(cell: Cell) -> tuple[str, str]:
+    scenario, protocol = (wording.key(cell, name).upper() if name in cell.key else "" for name in _ACROSS_COLUMNS)
     return scenario, protocol
 
 
@@ -270,22 +276,22 @@ def _latex_caption(common: Sequence[str], cells: Sequence[Cell]) -> str:
 def _latex_head(
     down: Sequence[str], columns: Sequence[_Column], scales: Mapping[TableLine, wording.Scale]
 ) -> Iterator[str]:
-    """Yield the lines of the head: what stands over several columns is ruled off below."""
-    named = [scales[column.line].head(column.line.label) for column in columns]
+    """Yield the lines of the head; a cell over several columns has a rule below it."""
+    labels = [scales[column.line].head(column.line.label) for column in columns]
     levels: list[list[tuple[str, ...]]] = [
         [(column.scenario,) for column in columns],
-        [(column.scenario, name) for column, name in zip(columns, named, strict=True)],
-        [(column.scenario, name, column.protocol) for column, name in zip(columns, named, strict=True)],
+        [(column.scenario, label) for column, label in zip(columns, labels, strict=True)],
+        [(column.scenario, label, column.protocol) for column, label in zip(columns, labels, strict=True)],
     ]
     levels = [level for level in levels if any(path[-1] for path in level)]
     for level in levels:
         is_last = level is levels[-1]
-        parts, rules, at = [], [], len(down) + 1
+        parts, rules, first = [], [], len(down) + 1
         for path, group in groupby(level):
             width = len(list(group))
             parts.append(rf"\multicolumn{{{width}}}{{c}}{{{_latex_escaped(path[-1])}}}")
-            rules.append(rf"\cmidrule(lr){{{at}-{at + width - 1}}}")
-            at += width
+            rules.append(rf"\cmidrule(lr){{{first}-{first + width - 1}}}")
+            first += width
         yield _latex_line([*(_latex_escaped(name) if is_last else "" for name in down), *parts])
         if not is_last:
             yield " ".join(rules)

@@ -1,4 +1,4 @@
-"""Estimates and comparisons as people read them: in per cent and milliseconds, with what tells conditions apart."""
+"""Texts for people about estimates, judgements and comparisons: numbers with units, intervals, verdicts, cautions."""
 
 import math
 import re
@@ -10,36 +10,36 @@ from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.compare import Comparison, Difference
 from fieldkit.analysis.expectations import Scope
 from fieldkit.analysis.judgements import Judgement
-from fieldkit.analysis.quantities import APART, Quantity, in_order
-from fieldkit.analysis.statistics import CONFIDENCE, FEWEST_FOR_ORDER, assured
+from fieldkit.analysis.quantities import DIFFERENCE_UNITS, Quantity, in_order
+from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, assured
 from fieldkit.analysis.words import Tally
 from fieldkit.core import columns
 from fieldkit.core.columns import Kind
 from fieldkit.core.model import ENDED, Status
 from fieldkit.core.units import format_count
 
-_SECONDS_FROM_S: Final = 10.0
-_MBIT_FROM_BIT_S: Final = 1e6
-_WHOLE_FROM: Final = 100.0
-_MOST_DECIMALS: Final = 9
+_MIN_IN_SECONDS_S: Final = 10.0
+_MIN_IN_MBIT_BIT_S: Final = 1e6
+_MIN_WITHOUT_DECIMALS: Final = 100.0
+_MAX_DECIMALS: Final = 9
 _UNITLESS: Final = frozenset(("count", "number"))
-_NAMED: Final = 3
-_MOST_WORDS: Final = 5
-_LONGEST_WORD: Final = 30
-_PLAIN: Final = re.compile(r"[A-Za-z](?:[\w -]*[A-Za-z])?")
+_MAX_LISTED: Final = 3
+_MAX_WORDS: Final = 5
+_MAX_WORD_LENGTH: Final = 30
+_PLAIN_WORD: Final = re.compile(r"[A-Za-z](?:[\w -]*[A-Za-z])?")
 
 NOT_JUDGED: Final = "words are counted, not judged"
-"""What a comparison comes to that has no interval."""
+"""Verdict of a comparison of word counts, which has no interval."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How the numbers of a quantity are written.
+    """Unit and number of decimals in which the numbers of a quantity are written.
 
     Attributes:
-        factor: From SI.
-        unit: What is written behind them; empty for counts.
-        decimals: How many there are below a hundred; none from there on.
+        factor: Factor from the SI unit.
+        unit: Unit symbol; empty for counts.
+        decimals: Decimals of numbers below 100; larger numbers have none.
     """
 
     factor: float
@@ -51,172 +51,173 @@ class Scale:
         if value is None:
             return ""
         scaled = self.factor * value
-        return f"{scaled:.{self.decimals}f}" if abs(scaled) < _WHOLE_FROM else f"{scaled:.0f}"
+        return f"{scaled:.{self.decimals}f}" if abs(scaled) < _MIN_WITHOUT_DECIMALS else f"{scaled:.0f}"
 
     def amount(self, value: float) -> str:
         """Return a number with its unit."""
         return f"{self.number(value)} {self.unit}".rstrip()
 
     def head(self, label: str) -> str:
-        """Return what stands above numbers: `RTT, median (ms)`."""
+        """Return the head of a column of numbers: `RTT, median (ms)`."""
         return f"{label} ({self.unit})" if self.unit else label
 
     def interval(self, low: float | None, high: float | None) -> str:
-        """Return `[low, high]`, `[low, ...)` where the upper end is open, empty without an interval."""
+        """Return `[low, high]`, `[low, ...)` if the upper end is open, or an empty text without an interval."""
         if low is None:
             return ""
         return f"[{self.number(low)}, ...)" if high is None else f"[{self.number(low)}, {self.number(high)}]"
 
 
-def interval(scale: Scale, found: Estimate) -> str:
-    """Return the interval of an estimate, marked `*` and `!` as `cautions` explains; empty without one."""
-    said = scale.interval(found.low, found.high)
-    return said and said + ("*" if is_few(found) else "") + ("!" if hangs_together(found) else "")
+def interval(scale: Scale, estimate: Estimate) -> str:
+    """Return the interval of an estimate with the marks `*` and `!` that `cautions` explains; empty without one."""
+    text = scale.interval(estimate.low, estimate.high)
+    return text and text + ("*" if assumes_normal(estimate) else "") + ("!" if is_dependent(estimate) else "")
 
 
-def number(scale: Scale, found: Estimate, other: float | None = None) -> str:
-    """Return the figure to quote without its unit, `>= 2.30` where only a lower bound is known.
+def number(scale: Scale, estimate: Estimate, other: float | None = None) -> str:
+    """Return the value to quote without its unit, as `>= 2.30` if it is a lower bound.
 
     Args:
-        scale: How it is written.
-        found: The estimate.
-        other: Its mean or 95th percentile instead, which any censored repeat makes a lower bound.
+        scale: Scale of the number.
+        estimate: The estimate.
+        other: Its mean or 95th percentile, to be used instead; a lower bound if any repeat is censored.
     """
     if other is not None:
-        return f"{_at_least(found.n_censored > 0)}{scale.number(other)}"
-    return f"{_at_least(found.is_lower_bound)}{scale.number(found.value)}"
+        return f"{_at_least(estimate.n_censored > 0)}{scale.number(other)}"
+    return f"{_at_least(estimate.is_lower_bound)}{scale.number(estimate.value)}"
 
 
-def amount(scale: Scale, found: Estimate) -> str:
-    """Return the same with its unit."""
-    return f"{_at_least(found.is_lower_bound)}{scale.amount(found.value)}"
+def amount(scale: Scale, estimate: Estimate) -> str:
+    """Return the value to quote with its unit, as `>= 2.30 s` if it is a lower bound."""
+    return f"{_at_least(estimate.is_lower_bound)}{scale.amount(estimate.value)}"
 
 
 def _at_least(is_bound: bool) -> str:
     return ">= " if is_bound else ""
 
 
-def incomplete(found: Estimate) -> str:
-    """Return of how many repeats a figure is, `7 of 10`, and of how many there are lower bounds; empty if of all."""
+def incomplete(estimate: Estimate) -> str:
+    """Return the number of repeats with a value, `7 of 10`, and of censored ones; empty if all have a value."""
     parts = []
-    if found.missing:
-        parts.append(f"{found.n} of {found.n_valid}")
-    if found.n_censored:
-        parts.append(f"{found.n_censored} of {found.n} not ended")
+    if estimate.missing:
+        parts.append(f"{estimate.n} of {estimate.n_valid}")
+    if estimate.n_censored:
+        parts.append(f"{estimate.n_censored} of {estimate.n} not ended")
     return ", ".join(parts)
 
 
-def quoted(figure: str, scale: Scale, found: Estimate, between: str = " ") -> str:
-    """Return a figure with its interval, and with of how many repeats it is if not of all.
+def quoted(figure: str, scale: Scale, estimate: Estimate, between: str = " ") -> str:
+    """Return a figure with its interval, and with the number of repeats unless all have a value.
 
     Args:
-        figure: As `number` or `amount` give it.
-        scale: How it is written.
-        found: The estimate.
-        between: What is between the parts.
+        figure: Result of `number` or `amount`.
+        scale: Scale of the interval.
+        estimate: The estimate.
+        between: Separator of the parts.
     """
-    of = incomplete(found)
-    return between.join(filter(None, (figure, interval(scale, found), f"({of})" if of else "")))
+    part = incomplete(estimate)
+    return between.join(filter(None, (figure, interval(scale, estimate), f"({part})" if part else "")))
 
 
-def judged(one: Judgement) -> tuple[str, str, str, str, str]:
-    """Return an expectation, of what it is, what was measured with its interval, and the ruling, in words."""
-    of = str((one.cell and one.cell.key.get("protocol")) or one.expectation.protocol or "").upper()
-    ruling = f"{one.ruling}: {one.why}" if one.why else str(one.ruling)
-    if one.found is None:
-        return one.expectation.text, of, "nothing", "", ruling
-    measured, bounds = _measured(one, one.found)
-    part = incomplete(one.found)
-    return one.expectation.text, of, f"{measured} ({part})" if part else measured, bounds, ruling
+def judged(judgement: Judgement) -> tuple[str, str, str, str, str]:
+    """Return texts of the expectation, the protocol, the measured value, its interval, and the ruling."""
+    expectation = judgement.expectation
+    protocol = str((judgement.cell and judgement.cell.key.get("protocol")) or expectation.protocol or "").upper()
+    ruling = f"{judgement.ruling}: {judgement.why}" if judgement.why else str(judgement.ruling)
+    if judgement.found is None:
+        return expectation.text, protocol, "nothing", "", ruling
+    value, bounds = _measured(judgement, judgement.found)
+    part = incomplete(judgement.found)
+    return expectation.text, protocol, f"{value} ({part})" if part else value, bounds, ruling
 
 
-def _measured(one: Judgement, found: Estimate) -> tuple[str, str]:
-    """Return what was measured for a judgement, and the interval or bound by which it was judged."""
-    expectation = one.expectation
-    how = scale_of(found.quantity, [found.value])
+def _measured(judgement: Judgement, estimate: Estimate) -> tuple[str, str]:
+    """Return the measured value of a judgement, and the interval or bound that decided it."""
+    expectation = judgement.expectation
+    value_scale = scale_of(estimate.quantity, [estimate.value])
     if expectation.scope is Scope.EVERY:
-        worst = found.maximum if expectation.is_below else found.minimum
-        how = scale_of(found.quantity, [worst])
-        return f"{_at_least(expectation.is_below and found.n_censored > 0)}{how.amount(worst)}", ""
-    if expectation.scope is Scope.SHARE and one.met is not None and one.limit is not None:
-        return f"{one.met} of {found.n} repeats", f"{Scale(100.0, '%').amount(one.limit)} or more"
-    if expectation.scope is Scope.PACKETS and one.limit is not None:
-        return how.amount(found.value), f"{how.amount(one.limit)} or less"
-    return amount(how, found), interval(how, found)
+        worst = estimate.maximum if expectation.is_below else estimate.minimum
+        worst_scale = scale_of(estimate.quantity, [worst])
+        return f"{_at_least(expectation.is_below and estimate.n_censored > 0)}{worst_scale.amount(worst)}", ""
+    if expectation.scope is Scope.SHARE and judgement.met is not None and judgement.limit is not None:
+        return f"{judgement.met} of {estimate.n} repeats", f"{Scale(100.0, '%').amount(judgement.limit)} or more"
+    if expectation.scope is Scope.PACKETS and judgement.limit is not None:
+        return value_scale.amount(estimate.value), f"{value_scale.amount(judgement.limit)} or less"
+    return amount(value_scale, estimate), interval(value_scale, estimate)
 
 
-def is_few(found: Estimate) -> bool:
-    """Return whether an interval holds its 95 % only where repeats are normal."""
-    return found.assured is not None and found.assured < CONFIDENCE
+def assumes_normal(estimate: Estimate) -> bool:
+    """Return True if the 95 % coverage of an interval assumes a normal distribution."""
+    return estimate.assured is not None and estimate.assured < CONFIDENCE
 
 
-def hangs_together(found: Estimate) -> bool:
-    """Return whether repeats follow each other in time as independent ones hardly do."""
-    return found.p_order is not None and found.p_order < 1 - CONFIDENCE
+def is_dependent(estimate: Estimate) -> bool:
+    """Return True if the repeats are not independent in time (p-value below 5 %)."""
+    return estimate.p_order is not None and estimate.p_order < 1 - CONFIDENCE
 
 
 def cautions(cells: Sequence[Cell], names: Collection[str] | None = None) -> Iterator[str]:
-    """Yield what the marks of intervals mean, each with what to do.
+    """Yield the explanation of each mark of intervals, with advice.
 
     Args:
-        cells: What is shown.
-        names: Which quantities of them; None for all.
+        cells: The cells that are shown.
+        names: Names of the quantities that are shown; None for all.
     """
-    every = [
+    selected = [
         (cell, estimate)
         for cell in cells
         for name, estimate in cell.estimates.items()
         if names is None or name in names
     ]
-    if few := sorted({estimate.n for _, estimate in every if is_few(estimate)}, reverse=True):
-        held = ", ".join(f"{n} repeats give {100 * assured(n):.0f} %" for n in few)
+    if few := sorted({estimate.n for _, estimate in selected if assumes_normal(estimate)}, reverse=True):
+        coverage = ", ".join(f"{n} repeats give {100 * assured(n):.0f} %" for n in few)
         yield (
-            f"* 95 % interval assuming a normal distribution; without that assumption {held}. "
-            f"Use {FEWEST_FOR_ORDER} or more repeats"
+            f"* 95 % interval assuming a normal distribution; without that assumption {coverage}. "
+            f"Use {MIN_FOR_ORDER_STATISTICS} or more repeats"
         )
-    apart = [name for name in (cells[0].key if cells else ()) if len({cell.key[name] for cell in cells}) > 1]
-    if together := [
-        " ".join([estimate.quantity.label, *(key(cell, name) for name in apart)])
-        for cell, estimate in every
-        if hangs_together(estimate)
+    varying = [name for name in (cells[0].key if cells else ()) if len({cell.key[name] for cell in cells}) > 1]
+    if dependent := [
+        " ".join([estimate.quantity.label, *(key(cell, name) for name in varying)])
+        for cell, estimate in selected
+        if is_dependent(estimate)
     ]:
-        more = f" and {len(together) - _NAMED} more" if len(together) > _NAMED else ""
+        more = f" and {len(dependent) - _MAX_LISTED} more" if len(dependent) > _MAX_LISTED else ""
         yield (
             f"! repeats are not independent in time (trend or autocorrelation): "
-            f"{'; '.join(together[:_NAMED])}{more}. Their intervals are too narrow. Randomize the order of "
+            f"{'; '.join(dependent[:_MAX_LISTED])}{more}. Their intervals are too narrow. Randomize the order of "
             "conditions, as a campaign does, and measure on "
             "several days"
         )
 
 
 def scale(quantity: Quantity, cells: Sequence[Cell]) -> Scale:
-    """Return in what to write a quantity of these cells."""
+    """Return the scale for a quantity of these cells."""
     return scale_of(
         quantity, [cell.estimates[quantity.name].value for cell in cells if quantity.name in cell.estimates]
     )
 
 
 def scale_of(quantity: Quantity, values: Sequence[float]) -> Scale:
-    """Return in what to write values of a quantity that stand together: shares in per cent."""
+    """Return the common scale for values of a quantity; shares are in per cent."""
     largest = max(map(abs, values), default=0.0)
     if quantity.unit == "bit/s":
-        return Scale(1e-6, "Mbit/s") if largest >= _MBIT_FROM_BIT_S else Scale(1e-3, "kbit/s")
+        return Scale(1e-6, "Mbit/s") if largest >= _MIN_IN_MBIT_BIT_S else Scale(1e-3, "kbit/s")
     if quantity.unit == "share":
         return Scale(100.0, "%")
     if quantity.unit == "s":
         return time_scale(largest)
-    # Of small numbers as many digits as of large ones.
+    # Small numbers have as many significant digits as large ones.
     decimals = 2 - math.floor(math.log10(largest)) if 0 < largest < 1 else 2
-    return Scale(1.0, "" if quantity.unit in _UNITLESS else quantity.unit, min(decimals, _MOST_DECIMALS))
+    return Scale(1.0, "" if quantity.unit in _UNITLESS else quantity.unit, min(decimals, _MAX_DECIMALS))
 
 
 def time_scale(time_s: float) -> Scale:
-    """Return in what to write times like this one: milliseconds, from ten seconds on seconds."""
-    return Scale(1e3, "ms") if time_s < _SECONDS_FROM_S else Scale(1.0, "s")
+    """Return the scale for times of this magnitude: milliseconds, or seconds from 10 s."""
+    return Scale(1e3, "ms") if time_s < _MIN_IN_SECONDS_S else Scale(1.0, "s")
 
 
 def label(quantity: Quantity) -> str:
-    """Return what the figure to quote is, in words."""
+    """Return the label of the estimate to quote."""
     return f"{quantity.label}, median" if quantity.kind is Kind.MEDIAN else quantity.label
 
 
@@ -231,98 +232,100 @@ def measured(cells: Sequence[Cell]) -> tuple[Quantity, ...]:
 
 
 def key(cell: Cell, name: str) -> str:
-    """Return the value of a column that tells conditions, `-` where it is missing."""
+    """Return the text of a value in a cell's key, `-` if it is missing."""
     return columns.cell(cell.key[name]) or "-"
 
 
 def told_by(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:
-    """Return the columns in which the cells differ, and those in which all agree.
+    """Return the columns in which the cells differ, and those in which all are equal.
 
-    A column that only says again what another says is in neither: metres beside the operator's own word for a
-    distance, a procedure that is called as its scenario.
+    Redundant columns are in neither: the distance in metres if the operator's text is there, and a procedure with the
+    name of its scenario.
     """
-    again = {"distance_m"} if "distance" in by else set()
+    redundant = {"distance_m"} if "distance" in by else set()
     if {"procedure", "scenario"} <= set(by) and all(cell.key["procedure"] == cell.key["scenario"] for cell in cells):
-        again.add("procedure")
-    values = {name: {cell.key[name] for cell in cells} for name in by if name not in again}
+        redundant.add("procedure")
+    values = {name: {cell.key[name] for cell in cells} for name in by if name not in redundant}
     return [name for name in values if len(values[name]) > 1], [name for name in values if len(values[name]) == 1]
 
 
 def counts(cell: Cell) -> str:
-    """Return how the attempts of a cell ended: `20 valid, 1 void`."""
+    """Return the number of attempts of a cell by final status: `20 valid, 1 void`."""
     return ended({Status.VALID: cell.n_valid, Status.VOID: cell.n_void, Status.FAILED: cell.n_failed})
 
 
 def worded(cells: Sequence[Cell]) -> dict[str, str]:
-    """Return the labels of the columns of words that any of the cells has, by name and in order."""
+    """Return the labels of the word columns that any of the cells has, by name and in order."""
     return {name: tally.label for cell in cells for name, tally in cell.tallies.items()}
 
 
 def tally(cell: Cell, name: str, between: str = ", ") -> str:
-    """Return how many valid repeats of a cell have each word of a column: `wet 12, dry 7, 1 without`."""
-    found = cell.tallies.get(name)
-    if found is None:
+    """Return the number of valid repeats of a cell for each word of a column: `wet 12, dry 7, 1 without`."""
+    words = cell.tallies.get(name)
+    if words is None:
         return ""
-    without = cell.n_valid - found.n
-    return between.join((*_counted(found), *([f"{without} without"] if without else [])))
+    without = cell.n_valid - words.n
+    return between.join((*_word_counts(words), *([f"{without} without"] if without else [])))
 
 
-def tallied(found: Tally) -> str:
-    """Return how many repeats have each word: `wet 12, dry 7`."""
-    return ", ".join(_counted(found))
+def tallied(words: Tally) -> str:
+    """Return the number of repeats for each word: `wet 12, dry 7`."""
+    return ", ".join(_word_counts(words))
 
 
-def _counted(found: Tally) -> Iterator[str]:
-    """Yield the most frequent words with how often each is there, and how many others there are."""
-    listed = list(found.counts.items())
-    shown = _MOST_WORDS if len(listed) > _MOST_WORDS + 1 else len(listed)
-    for word, times in listed[:shown]:
-        text = word if len(word) <= _LONGEST_WORD else f"{word[:_LONGEST_WORD]}..."
-        yield f"{text if _PLAIN.fullmatch(text) else repr(text)} {times}"
-    if others := listed[shown:]:
-        yield f"{len(others)} others {sum(times for _, times in others)}"
+def _word_counts(words: Tally) -> Iterator[str]:
+    """Yield the most frequent words with their counts, and the number and count of all others."""
+    listed = list(words.counts.items())
+    n_shown = _MAX_WORDS if len(listed) > _MAX_WORDS + 1 else len(listed)
+    for word, count in listed[:n_shown]:
+        text = word if len(word) <= _MAX_WORD_LENGTH else f"{word[:_MAX_WORD_LENGTH]}..."
+        yield f"{text if _PLAIN_WORD.fullmatch(text) else repr(text)} {count}"
+    if others := listed[n_shown:]:
+        yield f"{len(others)} others {sum(count for _, count in others)}"
 
 
 def ended(numbers: Mapping[str, int]) -> str:
-    """Return how many attempts ended in each way, the same way."""
+    """Return the numbers of attempts by final status: `20 valid, 1 void`."""
     return ", ".join(f"{numbers[status]} {status}" for status in ENDED if numbers.get(status)) or "none"
 
 
-def verdict(one: Difference, comparisons: int) -> str:
-    """Return what a difference comes to: `B 3.10 points more [1.20, 5.00]`.
+def verdict(difference: Difference, comparisons: int) -> str:
+    """Return the verdict on a difference: `B 3.10 points more [1.20, 5.00]`.
 
     Args:
-        one: The difference.
-        comparisons: How many were made with it.
+        difference: The difference.
+        comparisons: Number of all comparisons.
     """
-    if one.value is None:
-        said = f"only {'B' if one.a is None else 'A'} has it"
-    elif one.interval is None:
-        said = "no interval, so no verdict"
-    elif one.seen:
-        low, high = sorted((abs(one.interval.low), abs(one.interval.high)))
-        more = "more" if one.value > 0 else "less"
-        said = f"B {_amount(abs(one.value), one)} {more} {comparison_scale(one).interval(low, high)}"
-        if not holds(one):
-            said += f"; may be chance among {comparisons}"
+    if difference.value is None:
+        text = f"only {'B' if difference.a is None else 'A'} has it"
+    elif difference.interval is None:
+        text = "no interval, so no verdict"
+    elif difference.seen:
+        low, high = sorted((abs(difference.interval.low), abs(difference.interval.high)))
+        more = "more" if difference.value > 0 else "less"
+        interval_text = comparison_scale(difference).interval(low, high)
+        text = f"B {_amount(abs(difference.value), difference)} {more} {interval_text}"
+        if not is_significant(difference):
+            text += f"; may be chance among {comparisons}"
     else:
-        most = max(abs(one.interval.low), abs(one.interval.high))
-        said = f"no difference seen; up to {_amount(most, one)} possible"
-    return said + _threshold(one)
+        most = max(abs(difference.interval.low), abs(difference.interval.high))
+        text = f"no difference seen; up to {_amount(most, difference)} possible"
+    return text + _threshold(difference)
 
 
-def holds(one: Difference) -> bool:
-    """Return whether a difference is still one after correction for the number of all."""
-    return one.p_holm is not None and one.p_holm < 1 - CONFIDENCE
+def is_significant(difference: Difference) -> bool:
+    """Return True if a difference is significant after correction for the number of comparisons."""
+    return difference.p_holm is not None and difference.p_holm < 1 - CONFIDENCE
 
 
 def conclusions(comparison: Comparison) -> Iterator[str]:
-    """Yield what the whole comes to, and what of it could not be compared."""
-    made, every = comparison.made, comparison.differences
-    seen, held = sum(estimate.seen for estimate in every), sum(holds(estimate) for estimate in every)
+    """Yield the conclusions of a comparison, and the conditions that could not be compared."""
+    comparisons, differences = comparison.made, comparison.differences
+    seen = sum(difference.seen for difference in differences)
+    significant = sum(is_significant(difference) for difference in differences)
     yield (
-        f"{format_count(made, 'comparison')}: {format_count(seen, 'difference')} seen, {held} after correction "
-        f"for their number; were there none, about {(1 - CONFIDENCE) * made:.1f} would be seen"
+        f"{format_count(comparisons, 'comparison')}: {format_count(seen, 'difference')} seen, {significant} after "
+        f"correction for their number; were there none, about {(1 - CONFIDENCE) * comparisons:.1f} would be seen"
     )
     for pair in comparison.pairs:
         if pair.missing_in:
@@ -336,32 +339,33 @@ def conclusions(comparison: Comparison) -> Iterator[str]:
     missed = [(name, difference) for name, difference in limited if not difference.within]
     if limited:
         yield f"shown to be within its threshold: {len(limited) - len(missed)} of {len(limited)}"
-    for name, one in missed:
-        yield f"not shown to be within {_limit(one)}: {one.quantity.name} in {name}"
+    for name, difference in missed:
+        yield f"not shown to be within {_limit(difference)}: {difference.quantity.name} in {name}"
     sides = (("A", [pair.a for pair in comparison.pairs]), ("B", [pair.b for pair in comparison.pairs]))
     for side, cells in sides:
         yield from (f"{side}: {caution[2:]}" for caution in cautions([cell for cell in cells if cell is not None]))
 
 
-def _threshold(one: Difference) -> str:
-    if one.within is None:
+def _threshold(difference: Difference) -> str:
+    if difference.within is None:
         return ""
-    return f"; {'within' if one.within else 'may exceed'} {_limit(one)}"
+    return f"; {'within' if difference.within else 'may exceed'} {_limit(difference)}"
 
 
-def comparison_scale(one: Difference) -> Scale:
-    """Return in what to write the values of A and B."""
-    return scale_of(one.quantity, [side.value for side in (one.a, one.b) if side])
+def comparison_scale(difference: Difference) -> Scale:
+    """Return the scale for the values of A and B."""
+    return scale_of(difference.quantity, [side.value for side in (difference.a, difference.b) if side])
 
 
-def _limit(one: Difference) -> str:
-    return f"{comparison_scale(one).factor * (one.threshold or 0):.6g} {_unit(one)}".rstrip()
+def _limit(difference: Difference) -> str:
+    limit = comparison_scale(difference).factor * (difference.threshold or 0)
+    return f"{limit:.6g} {_unit(difference)}".rstrip()
 
 
-def _amount(amount: float, one: Difference) -> str:
-    return f"{comparison_scale(one).number(amount)} {_unit(one)}".rstrip()
+def _amount(amount: float, difference: Difference) -> str:
+    return f"{comparison_scale(difference).number(amount)} {_unit(difference)}".rstrip()
 
 
-def _unit(one: Difference) -> str:
-    """Return the unit of how far two values are apart: shares, percentage points."""
-    return APART.get(one.quantity.unit, comparison_scale(one).unit)
+def _unit(difference: Difference) -> str:
+    """Return the unit of a difference, such as percentage points for shares."""
+    return DIFFERENCE_UNITS.get(difference.quantity.unit, comparison_scale(difference).unit)

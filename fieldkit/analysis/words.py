@@ -1,7 +1,7 @@
-"""Columns of words, which have no mean: how often each word was given under a condition.
+"""Counts of the words in a text column under a condition.
 
-They are counted and not judged: a word may have been given once for all repeats of a trial, and then these are one
-observation, however many they are. So a share of words has no interval, and a difference of two has no p-value.
+Words have no statistical inference: a word may have been entered once for all repeats of a trial, which are then one
+observation. Therefore a share of words has no interval, and a difference of shares has no p-value.
 """
 
 from collections import Counter
@@ -11,18 +11,18 @@ from typing import Final
 
 from fieldkit.core.columns import Column, Kind
 
-_OF: Final = "="
-"""Between a column and one of its words, where a table has a line for each: `grass=wet`. No column's name has it."""
+_SEPARATOR: Final = "="
+"""Separator of column and word in a table with a line per word: `grass=wet`. Names of columns cannot contain it."""
 
 
 @dataclass(frozen=True)
 class Tally:
-    """The words of one column under one condition.
+    """Counts of the words of one column under one condition.
 
     Attributes:
-        name: The column.
-        label: What people call it.
-        counts: How many valid repeats have each word, the most frequent first, else in the order of the alphabet.
+        name: Name of the column.
+        label: Its label.
+        counts: Number of valid repeats by word, sorted by decreasing count, then alphabetically.
     """
 
     name: str
@@ -31,16 +31,16 @@ class Tally:
 
     @property
     def n(self) -> int:
-        """Valid repeats that have a word."""
+        """Number of valid repeats that have a word."""
         return sum(self.counts.values())
 
     def share(self, word: str) -> float | None:
-        """Return the share of these that have one word; None where none has any."""
+        """Return the share of the `n` repeats that have this word; None if no repeat has a word."""
         return self.counts.get(word, 0) / self.n if self.n else None
 
     def quantity(self, word: str) -> str:
-        """Return what a line of a table is of that says how often a word was given: `grass=wet`."""
-        return f"{self.name}{_OF}{word}"
+        """Return the name of a word's line in a table: `grass=wet`."""
+        return f"{self.name}{_SEPARATOR}{word}"
 
 
 def worded(columns: Iterable[Column]) -> tuple[Column, ...]:
@@ -49,16 +49,16 @@ def worded(columns: Iterable[Column]) -> tuple[Column, ...]:
 
 
 def tallies(column: Column, given: Iterable[tuple[int, str]]) -> Iterator[tuple[int, Tally]]:
-    """Yield the cells in which a column has words, with what they are.
+    """Yield the index of each cell in which a column has words, with their counts.
 
     Args:
-        column: Which.
-        given: Cell and word of each valid repeat, the word empty where it is missing.
+        column: The column.
+        given: Cell and word of each valid repeat; the word is empty if missing.
     """
     counts: dict[int, Counter[str]] = {}
     for cell, word in given:
         if word:
             counts.setdefault(cell, Counter())[word] += 1
     label = column.figure.label if column.figure else column.name
-    for cell, found in counts.items():
-        yield cell, Tally(column.name, label, dict(sorted(found.items(), key=lambda one: (-one[1], one[0]))))
+    for cell, counter in counts.items():
+        yield cell, Tally(column.name, label, dict(sorted(counter.items(), key=lambda item: (-item[1], item[0]))))

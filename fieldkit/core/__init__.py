@@ -1,1 +1,1 @@
-"""Basics that every room shares: data types, units, errors, deadlines, events, files."""
+"""Basics that all packages share: data types, units, errors, deadlines, events, files."""

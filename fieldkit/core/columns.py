@@ -1,6 +1,7 @@
-"""CSV columns, each declared once: name, unit, meaning, how it is missing, how repeats make one number of it.
+"""Declarations of CSV columns: name, unit, meaning, possible values, and how the repeats are aggregated.
 
-A kind of step declares the columns that it measures; `trial.columns` puts them together. Missing is empty, never 0.
+Each step type declares the columns that it measures; `trial.columns` combines them. A missing value is an empty cell,
+never 0.
 """
 
 import csv
@@ -22,48 +23,48 @@ SCHEMA_VERSION: Final = 6
 Value = int | float | bool | str
 
 _TYPES: Final = {"text": str, "hash": str, "bool": bool, "count": int, "B": int, "ns": int}
-_WHOLE: Final = (0, 2**53)  # what a float, and with it every other program, counts exactly
-_CENTURIES_S: Final = 1e10
-_POSSIBLE: Final[Mapping[str, tuple[float, float]]] = {
-    "count": _WHOLE,
-    "B": _WHOLE,
+_EXACT_INTEGERS: Final = (0, 2**53)  # a float represents these exactly, so every program reads them correctly
+_MAX_TIME_S: Final = 1e10
+_UNIT_BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
+    "count": _EXACT_INTEGERS,
+    "B": _EXACT_INTEGERS,
     "ns": (0, 2**63 - 1),
     "share": (0, 1),
-    "s": (0, _CENTURIES_S),
+    "s": (0, _MAX_TIME_S),
     "m": (0, 1e9),
     "m/s": (0, 299_792_458),
     "bit/s": (0, 1e15),
     "ppm": (-1e6, 1e6),
 }
-"""What values of a unit can be; those of another unit can be any finite number."""
+"""Smallest and largest possible value by unit; values of other units can be any finite number."""
 
 OVERCOUNTED: Final = (-1000.0, 1.0)
-"""What a loss can be where more may be counted as arrived than as sent: copies of datagrams, or segments of one
-super-frame, of which the largest hold some hundred."""
-EITHER_WAY_S: Final = (-_CENTURIES_S, _CENTURIES_S)
-"""What a difference of two clocks can be."""
+"""Bounds of a loss that may be negative because more can be counted as received than as sent: duplicated datagrams,
+or the segments of one super-frame (at most about a hundred)."""
+EITHER_WAY_S: Final = (-_MAX_TIME_S, _MAX_TIME_S)
+"""Bounds of the difference between two clocks."""
 
-# Each digit has one place in it: no two parts share out a long run of them.
+# No two adjacent parts match the same digits, so matching takes linear time.
 _NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_DIGITS: Final = 19  # of the largest 64-bit integer
-_FLAGS: Final = frozenset(("true", "True", "TRUE", "1", "false", "False", "FALSE", "0"))
+_MAX_INT_DIGITS: Final = 19  # digits of the largest 64-bit integer
+_BOOL_TEXTS: Final = frozenset(("true", "True", "TRUE", "1", "false", "False", "FALSE", "0"))
 MISSING: Final = ("", "nan", "NaN")
-"""How a cell says that there is no value; fieldkit itself leaves it empty."""
+"""Texts of a cell without a value; fieldkit itself writes the empty text."""
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]*(?:\.[a-z][a-z0-9_]*)*")
-_MOST_OF: Final = {"name": 100, "unit": 20, "meaning": 1000, "label": 100}
-"""Characters that people can still read."""
+_MAX_LENGTHS: Final = {"name": 100, "unit": 20, "meaning": 1000, "label": 100}
+"""Maximum length in characters, so that tables stay readable."""
 
 Bounds = tuple[float, float]
 """Smallest and largest value."""
 
 
 class Kind(StrEnum):
-    """How the repeats of a condition are put together.
+    """How the repeats of a condition are aggregated.
 
-    `counted`: a share of things counted over all repeats, each lost or not; `mean`: the mean of a number per repeat;
-    `median`: the median of a number per repeat; `flag`: the share of the repeats for which it is true; `words`: how
-    many repeats have each word of a text.
+    `counted`: lost items divided by sent items, summed over all repeats; `mean`: mean of one number per repeat;
+    `median`: median of one number per repeat; `flag`: share of the repeats in which it is true; `words`: number of
+    repeats per distinct text.
     """
 
     COUNTED = "counted"
@@ -74,28 +75,28 @@ class Kind(StrEnum):
 
 
 FIRST_OF_OTHERS: Final = 100
-"""Rank of the first figure that is not fieldkit's own."""
+"""Lowest rank of a figure that another package declares."""
 BACKGROUND: Final = 1000
-"""Rank from which on figures are fieldkit's own again: what every trial has beside what it is about comes last."""
+"""Lowest rank of fieldkit's background figures, which every trial has; they are listed last."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """How repeats make one number of a column, for summaries, comparisons and reports.
+    """How the repeats of a column are aggregated into one number for summaries, comparisons and reports.
 
     Attributes:
-        label: What it is in words, for tables and axes.
-        kind: How repeats are put together.
-        arrived: Column that counts what arrived; None unless counted.
-        sent: Column that counts of how many; None unless counted.
-        rank: Place among the figures of a table, from the first; equal ranks keep the order of columns. fieldkit's
-            own are below `FIRST_OF_OTHERS`, or from `BACKGROUND` on.
-        at_least: Column with the observed length of what had not ended (a right-censored value). It has a number in
-            a repeat in which the figure's own column is empty for that reason, and is empty in every other. Medians
-            only, and of the same unit; it has no figure of its own.
-        of_sent: Column with the same statistic over all that was sent, where what was lost counts as later than all
-            that arrived; empty where that is infinite. For statistics of what arrived alone: a median RTT. An
-            expectation `NAME < AMOUNT` is judged by both. Medians only, and of the same unit.
+        label: Label in tables and on axes.
+        kind: Kind of aggregation.
+        arrived: Column with the number of received items; None unless the kind is `counted`.
+        sent: Column with the number of sent items; None unless the kind is `counted`.
+        rank: Sort key among the figures of a table; equal ranks keep the order of columns. The ranks of fieldkit's
+            figures are below `FIRST_OF_OTHERS`, or `BACKGROUND` and above.
+        at_least: Column with the observed duration if the event had not ended (a right-censored value). It has a
+            value only in repeats in which the figure's column is empty for this reason. Only for medians; it has the
+            same unit and no figure.
+        of_sent: Column with the same statistic over all sent items, in which a lost item is later than every received
+            one; empty if the result is infinite. For a figure that is computed from received items only, such as a
+            median RTT. An expectation `NAME < AMOUNT` must hold for both. Only for medians; it has the same unit.
     """
 
     label: str
@@ -117,12 +118,12 @@ class Column:
 
     Attributes:
         name: Column name.
-        unit: Unit, or the kind of value where it has none.
-        meaning: What it says, and when it is empty.
-        rank: Place among the columns of trial.csv, from the left; equal ranks keep the order of declaration. Columns
-            that came with version 1 or 2 of the schema have ranks below 100, so that their order never changes.
-        bounds: Smallest and largest value that is possible, where the unit does not tell.
-        figure: How repeats make one number of it; None where they make none.
+        unit: Unit, or the kind of value if it has no unit.
+        meaning: What the value is, and when it is empty.
+        rank: Sort key among the columns of trial.csv, from the left; equal ranks keep the order of declaration.
+            Columns of schema versions 1 and 2 have ranks below 100, so that their order never changes.
+        bounds: Smallest and largest possible value, if narrower than the bounds of the unit.
+        figure: How the repeats are aggregated; None if they are not.
     """
 
     name: str
@@ -134,56 +135,56 @@ class Column:
 
     @property
     def type(self) -> type[int] | type[float] | type[bool] | type[str]:
-        """Type of its values, as the unit tells."""
+        """Type of the values, derived from the unit."""
         return _TYPES.get(self.unit, float)
 
     @property
     def possible(self) -> Bounds:
-        """Smallest and largest value that is possible, both included, and what a CSV makes of them."""
-        low, high = self.bounds or _POSSIBLE.get(self.unit, (-sys.float_info.max, sys.float_info.max))
+        """Smallest and largest possible value, both included, after rounding as in the CSV."""
+        low, high = self.bounds or _UNIT_BOUNDS.get(self.unit, (-sys.float_info.max, sys.float_info.max))
         if self.type is float:
             return min(low, float(cell(float(low)))), max(high, float(cell(float(high))))
         return low, high
 
     def flaw(self) -> str | None:
-        """Return what keeps others from reading or showing such a column, None where nothing does."""
+        """Return why other programs cannot read or show the column, or None if they can."""
         if not _NAME.fullmatch(self.name):
             return "its name is not made of lower-case letters, digits and _, with points between parts"
         texts = {"name": self.name, "unit": self.unit, "meaning": self.meaning}
         if self.figure is not None:
             texts["label"] = self.figure.label
-        for what, text in texts.items():
-            if not text or len(text) > _MOST_OF[what] or not text.isprintable():
-                return f"its {what} is not 1 to {_MOST_OF[what]} printable characters"
+        for attribute, text in texts.items():
+            if not text or len(text) > _MAX_LENGTHS[attribute] or not text.isprintable():
+                return f"its {attribute} is not 1 to {_MAX_LENGTHS[attribute]} printable characters"
         if self.bounds is not None and not self.bounds[0] <= self.bounds[1]:
-            return f"no value is from {self.bounds[0]:g} to {self.bounds[1]:g}"
-        return None if self.figure is None else self._flaw_of(self.figure)
+            return f"its bounds {self.bounds[0]:g} and {self.bounds[1]:g} are not in ascending order"
+        return None if self.figure is None else self._figure_flaw(self.figure)
 
-    def _flaw_of(self, figure: Figure) -> str | None:
-        """Return why repeats cannot be put together so."""
+    def _figure_flaw(self, figure: Figure) -> str | None:
+        """Return why the repeats cannot be aggregated by this figure, or None if they can."""
         if (figure.kind is Kind.WORDS) is not (self.type is str):
-            return "repeats of a text make words, and of nothing else"
+            return "a text column needs a figure of kind words, and no other column can have one"
         if (figure.kind is Kind.FLAG) is not (self.type is bool):
-            return "repeats of what is true or false make a flag, and of nothing else"
+            return "a bool column needs a figure of kind flag, and no other column can have one"
         if figure.kind is not Kind.MEDIAN and (figure.at_least or figure.of_sent):
-            return "only a median has lower bounds, or a figure over all that was sent"
+            return "only a median can have a column of lower bounds (at_least) or of all sent items (of_sent)"
         is_counted = figure.kind is Kind.COUNTED
         if (figure.arrived is not None) is not is_counted or (figure.sent is not None) is not is_counted:
-            return "what is counted, and nothing else, has columns of what arrived and what was sent"
-        return "what is counted is a share" if is_counted and self.unit != "share" else None
+            return "a counted figure needs the columns arrived and sent, and no other figure can have them"
+        return "the unit of a counted figure must be share" if is_counted and self.unit != "share" else None
 
     def problem(self, text: str) -> str | None:
-        """Return what a cell's text is not, `not a number`; None where it is a possible value, or missing."""
+        """Return why a cell's text is not a possible value, such as `not a number`; None if it is one, or missing."""
         if self.type is str or text in MISSING:
             return None
         if self.type is bool:
-            return None if text in _FLAGS else "not true or false"
-        said = text.strip(" \t")
-        if not _NUMBER.fullmatch(said):
+            return None if text in _BOOL_TEXTS else "not true or false"
+        stripped = text.strip(" \t")
+        if not _NUMBER.fullmatch(stripped):
             return "not a number"
-        # A double has no room for nanoseconds; other numbers are read as one.
-        is_integer = said.removeprefix("-").isdigit()
-        value: float = int(said) if is_integer and len(said) <= _DIGITS else float(said)
+        # Nanoseconds since 1970 need more digits than a float has, so short integers are read as int.
+        is_integer = stripped.removeprefix("-").isdigit()
+        value: float = int(stripped) if is_integer and len(stripped) <= _MAX_INT_DIGITS else float(stripped)
         if self.type is int and not (is_integer if self.unit == "ns" else value in {math.inf, value // 1}):
             return "not a whole number"
         low, high = self.possible
@@ -197,21 +198,20 @@ def columns(
     """Return columns of one rank.
 
     Args:
-        rank: As `Column.rank`.
-        declared: Of each its name, unit and meaning; its figure where it has one; its bounds where the unit does not
-            tell them.
+        rank: `Column.rank`.
+        declared: Name, unit and meaning of each column, then optionally its figure and its bounds.
     """
-    return tuple(_declared(rank, *parts) for parts in declared)
+    return tuple(_make_column(rank, *parts) for parts in declared)
 
 
-def _declared(rank: int, name: str, unit: str, meaning: str, *more: Figure | Bounds) -> Column:
-    figure = next((part for part in more if isinstance(part, Figure)), None)
-    bounds = next((part for part in more if not isinstance(part, Figure)), None)
+def _make_column(rank: int, name: str, unit: str, meaning: str, *optional: Figure | Bounds) -> Column:
+    figure = next((part for part in optional if isinstance(part, Figure)), None)
+    bounds = next((part for part in optional if not isinstance(part, Figure)), None)
     return Column(name, unit, meaning, rank, bounds, figure)
 
 
 def named(name: str, column: Column) -> Column:
-    """Return a column of a step that has a name, `up.file_loss`; of one without, the column as it is."""
+    """Return a column with the name of its step as prefix, `up.file_loss`; unchanged if the step has no name."""
     if not name:
         return column
     figure = column.figure
@@ -226,28 +226,28 @@ def named(name: str, column: Column) -> Column:
 
 
 def plain_name(name: str) -> str:
-    """Return what a column is called without the name of its step."""
+    """Return the name of a column without the name of its step."""
     return name.rpartition(".")[2]
 
 
-def prefixed(name: str, what: str) -> str:
-    """Return what a column, a job or a file of a step of this name is called: `up.file_loss`; `what` without one."""
-    return f"{name}.{what}" if name else what
+def prefixed(name: str, plain: str) -> str:
+    """Return the name of a step's column, job or file: `up.file_loss`; `plain` if the step has no name."""
+    return f"{name}.{plain}" if name else plain
 
 
-def of_fault(kind: FaultKind, what: str) -> str:
-    """Return the name of the column that says `what` of a kind of fault: `outage_s`, `recovery_s`, `recovered`."""
-    return f"{kind.replace('-', '_')}_{what}"
+def of_fault(kind: FaultKind, quantity: str) -> str:
+    """Return the name of a fault's column; `quantity` is for example `outage_s`, `recovery_s` or `recovered`."""
+    return f"{kind.replace('-', '_')}_{quantity}"
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Values of columns, and why others have none.
+    """Measured values of columns, and the reasons why other columns are empty.
 
     Attributes:
-        values: By column; never None.
-        missing: Reason by column, for those that the evidence rightly leaves empty. A declared column that is in
-            neither is a figure that got lost, and no repeat is valid without it.
+        values: Value by column; never None.
+        missing: Reason by column, for columns that are legitimately empty. A repeat is invalid if a declared column
+            is in neither mapping.
     """
 
     values: Mapping[str, Value] = field(default_factory=dict)
@@ -255,7 +255,7 @@ class Measured:
 
     @classmethod
     def of(cls, values: Mapping[str, Value | None], reason: str) -> Self:
-        """Return the values that are there; the others are missing for `reason`."""
+        """Return the values that are not None; the other columns are missing for `reason`."""
         return cls(
             {name: value for name, value in values.items() if value is not None},
             {name: reason for name, value in values.items() if value is None},
@@ -263,125 +263,132 @@ class Measured:
 
     @classmethod
     def nothing(cls, declared: Iterable[Column], reason: str) -> Self:
-        """Return that all of these columns are missing for `reason`."""
+        """Return a result in which all of these columns are missing for `reason`."""
         return cls(missing={column.name: reason for column in declared})
 
     def named(self, name: str) -> Self:
-        """Return the same as the columns of a step of this name; see `prefixed`."""
+        """Return a copy whose columns have the name of a step as prefix (see `prefixed`)."""
         values = {prefixed(name, column): value for column, value in self.values.items()}
-        return type(self)(values, {prefixed(name, column): why for column, why in self.missing.items()})
+        return type(self)(values, {prefixed(name, column): reason for column, reason in self.missing.items()})
 
     def without(self, reasons: Mapping[str, str]) -> Self:
-        """Return all but some columns, which are missing for a reason each."""
+        """Return a copy in which some columns are missing.
+
+        Args:
+            reasons: Reason by column that becomes missing.
+        """
         values = {name: value for name, value in self.values.items() if name not in reasons}
         return type(self)(values, {**self.missing, **reasons})
 
     def __or__(self, other: "Measured") -> "Measured":
-        """Return both together.
+        """Return the union of both.
 
         Raises:
-            ValueError: Both give a value to one column.
+            ValueError: A column has a value in both.
         """
-        if twice := sorted(self.values.keys() & other.values.keys()):
-            raise ValueError(f"measured twice: {', '.join(twice)}")
+        if duplicates := sorted(self.values.keys() & other.values.keys()):
+            raise ValueError(f"measured twice: {', '.join(duplicates)}")
         values = {**self.values, **other.values}
         missing = {**other.missing, **self.missing}
-        return Measured(values, {name: why for name, why in missing.items() if name not in values})
+        return Measured(values, {name: reason for name, reason in missing.items() if name not in values})
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateRow:
-    """What summary.csv says of one quantity under one condition, after the columns that name the condition.
+    """Row of summary.csv: one quantity under one condition, after the columns that identify the condition.
 
     Computed by `analysis.cells`.
     """
 
     quantity: str | None = _column(
-        "text", "Column of trial.csv that the numbers are of; for each word of a text `grass=wet`."
+        "text", "Column of trial.csv that was summarized; for a text column one row per word: `grass=wet`."
     )
-    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s, share, or the column's own.")
+    unit: str | None = _column("text", "Unit of all numbers except counts: s, bit/s, share, or that of the column.")
     n_valid: int | None = _column("count", "Valid repeats.")
-    n_void: int | None = _column("count", "Attempts whose evidence was not whole.")
+    n_void: int | None = _column("count", "Attempts with incomplete evidence.")
     n_failed: int | None = _column("count", "Attempts that failed.")
-    n: int | None = _column("count", "Valid repeats that have the quantity; all numbers are of these.")
+    n: int | None = _column("count", "Valid repeats that have a value of the quantity; all numbers are of these.")
     value: float | None = _column(
-        "unit", "The figure to quote: share of all that was counted, mean over repeats, or median over repeats."
+        "unit", "Estimate to quote: share of all counted items, mean over repeats, or median over repeats."
     )
     low: float | None = _column(
-        "unit", "Lower end of its 95 % interval, the repeat being the unit; empty for a single repeat."
+        "unit", "Lower end of the 95 % interval, with repeats as sampling units; empty for a single repeat."
     )
-    high: float | None = _column("unit", "Upper end of its 95 % interval.")
+    high: float | None = _column("unit", "Upper end of the 95 % interval.")
     assured: float | None = _column(
         "share",
-        "Share of such intervals that hold the truth whatever the distribution of the repeats: below 0.95, the "
-        "interval takes them as normal. Medians only.",
+        "Coverage of the interval for any distribution of the repeats. Below 0.95, its 95 % coverage assumes a "
+        "normal distribution. Medians only.",
     )
     p_order: float | None = _column(
         "share",
-        "How often repeats in no order would be as orderly in time as these, corrected for the number of all rows: "
-        "below 0.05 they hang together, and the interval is too narrow. Empty of fewer than 10, or 5 values.",
+        "p-value of a test for a trend or autocorrelation of the repeats in time, corrected for the number of all "
+        "rows. Below 0.05 the repeats are not independent and the interval is too narrow. Empty below 10 repeats or "
+        "5 distinct values.",
     )
     estimate: str | None = _column(
         "text",
-        "What value is: counted, mean, median; or flag, words: share of the repeats, that of words without interval.",
+        "Kind of `value`: counted, mean, median, or share of the repeats (flag; words, which has no interval).",
     )
     wilson_low: float | None = _column(
         "unit",
-        "Lower end of the 95 % Wilson interval, as if all that was counted were independent. Empty unless counted, "
-        "and where more arrived than was sent, as offload lets the paper's filter see.",
+        "Lower end of the 95 % Wilson interval, which assumes that all counted items are independent. Only if "
+        "counted; empty if more items arrived than were sent, which offload causes for the paper's filter.",
     )
     wilson_high: float | None = _column("unit", "Upper end of the 95 % Wilson interval.")
-    events: int | None = _column("count", "What was lost, or true, or has the word; empty of means and medians.")
-    trials: int | None = _column("count", "Of how many.")
+    events: int | None = _column(
+        "count", "Items that were lost, repeats that are true or have the word; empty for means and medians."
+    )
+    trials: int | None = _column("count", "Number of items or repeats that `events` is a part of.")
     mean: float | None = _column("unit", "Mean over repeats.")
     median: float | None = _column("unit", "Median over repeats.")
     p95: float | None = _column("unit", "95th percentile over repeats.")
-    minimum: float | None = _column("unit", "Smallest of a single repeat.")
-    maximum: float | None = _column("unit", "Largest of a single repeat.")
+    minimum: float | None = _column("unit", "Smallest value of a repeat.")
+    maximum: float | None = _column("unit", "Largest value of a repeat.")
     n_censored: int | None = _column(
         "count",
-        "Of n, the repeats of which only a lower bound is known, since what was timed had not ended. Above 0, mean, "
-        "p95 and maximum are lower bounds, and `high` is empty where the data give no upper end.",
+        "Repeats among n with a right-censored value: a lower bound, because the timed event had not ended. If above "
+        "0, mean, p95 and maximum are lower bounds, and `high` is empty if the data give no upper end.",
     )
-    is_lower_bound: bool | None = _column("bool", "Whether `value` and `median` are lower bounds, too.")
+    is_lower_bound: bool | None = _column("bool", "Whether `value` and `median` are lower bounds as well.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DifferenceRow:
-    """What a comparison of two runs says of one quantity under one condition, after the columns that name it.
+    """Row of a comparison of two runs: one quantity under one condition, after the columns that identify it.
 
     Computed by `analysis.compare`.
     """
 
     missing_in: str | None = _column("text", "A or B if that run has no such condition; empty if both have.")
-    quantity: str | None = _column("text", "Column of trial.csv that the numbers are of.")
-    unit: str | None = _column("text", "Unit of all numbers but the counts: s, bit/s, share, or the column's own.")
-    estimate: str | None = _column("text", "What a and b are: counted, mean, median, or flag (share of the repeats).")
-    n_a: int | None = _column("count", "Valid repeats of A that have the quantity.")
-    n_b: int | None = _column("count", "Valid repeats of B that have it.")
-    a: float | None = _column("unit", "What A measured, as `value` of summary.csv; empty if it did not.")
-    b: float | None = _column("unit", "What B measured.")
+    quantity: str | None = _column("text", "Column of trial.csv that was compared.")
+    unit: str | None = _column("text", "Unit of all numbers except counts: s, bit/s, share, or that of the column.")
+    estimate: str | None = _column("text", "Kind of a and b: counted, mean, median, or flag (share of the repeats).")
+    n_a: int | None = _column("count", "Valid repeats of A that have a value of the quantity.")
+    n_b: int | None = _column("count", "Valid repeats of B that have a value of the quantity.")
+    a: float | None = _column("unit", "Estimate of A, as `value` of summary.csv; empty if A did not measure it.")
+    b: float | None = _column("unit", "Estimate of B.")
     difference: float | None = _column("unit", "b - a.")
-    low: float | None = _column("unit", "Lower end of its 95 % interval; empty where a or b has no interval.")
-    high: float | None = _column("unit", "Upper end of its 95 % interval.")
+    low: float | None = _column("unit", "Lower end of the 95 % interval of the difference; empty if a or b has none.")
+    high: float | None = _column("unit", "Upper end of the 95 % interval of the difference.")
     cliffs_delta: float | None = _column(
-        "share", "Pairs of repeats in which B is the larger, less those in which it is the smaller: -1 to 1."
+        "share", "Share of pairs of repeats in which B is larger, minus the share in which it is smaller: -1 to 1."
     )
     p_holm: float | None = _column(
-        "share", "p-value of the difference, corrected by Holm for the number of all that were compared."
+        "share", "p-value of the difference, corrected by Holm's method for the number of all comparisons."
     )
-    threshold: float | None = _column("unit", "How far apart a and b may be; empty if nobody said.")
+    threshold: float | None = _column("unit", "Largest acceptable distance of a and b; empty if none was given.")
     within: bool | None = _column("bool", "Whether the whole interval is within the threshold.")
-    verdict: str | None = _column("text", "All of it in words.")
+    verdict: str | None = _column("text", "Result in words.")
 
 
 def declared(row: type[Any]) -> tuple[Column, ...]:
-    """Return the columns that a dataclass declares by its fields."""
+    """Return the columns that a data class declares by its fields."""
     return tuple(Column(item.name, item.metadata["unit"], item.metadata["meaning"]) for item in fields(row))
 
 
 def cell(value: object) -> str:
-    """Return `value` as text: empty for None, `true`/`false`, floats to 9 digits, text in one printable line."""
+    """Return `value` as the text of a cell: empty for None, `true`/`false`, floats to 9 digits, text in one line."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -395,7 +402,7 @@ def csv_text(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 
 
 def csv_line(values: Iterable[object]) -> str:
-    """Return a line of values as CSV, with its end; texts that a spreadsheet takes for formulas are `guarded`."""
+    """Return values as one CSV line with line end; text that a spreadsheet would read as a formula is `guarded`."""
     out = io.StringIO()
     cells = (guarded(cell(value)) if isinstance(value, str) else cell(value) for value in values)
     csv.writer(out, lineterminator="\n").writerow(cells)

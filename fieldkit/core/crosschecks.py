@@ -1,4 +1,4 @@
-"""Declarations of which sources of evidence a quantity has, and what follows if they contradict each other."""
+"""Declarations of the independent sources of a quantity, and of the consequence if they contradict each other."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -21,12 +21,12 @@ class CrossCheck:
     """A quantity, its source, and the independent sources that it is compared with.
 
     Attributes:
-        quantity: The quantity, in words.
+        quantity: Description of the quantity.
         columns: Columns of trial.csv that depend on it; patterns of `fnmatch`.
         source: File and field that the columns are computed from; ROLE stands for a role.
         against: Independent sources; empty only if the quantity is unchecked.
-        tolerance: Differences that are legitimate, with the reason; for an unchecked quantity why it has one source.
-        outcome: What a larger difference causes.
+        tolerance: Legitimate differences, with the reason; for an unchecked quantity, why it has only one source.
+        outcome: Consequence of a larger difference.
     """
 
     quantity: str

@@ -1,4 +1,4 @@
-"""One deadline object, made at the edge and passed down: every wait ends."""
+"""A deadline that the caller creates and every function below receives, so that each wait is limited."""
 
 import threading
 import time
@@ -8,17 +8,17 @@ from typing import Final, TypeVar
 
 T = TypeVar("T")
 
-_LOOK_S: Final = 0.1
-_STOOD_STILL_S: Final = 5.0
-"""A wait that took so much longer than it was to: somebody stopped this process for a while, as Ctrl-Z does."""
+_POLL_INTERVAL_S: Final = 0.1
+_MIN_SUSPENDED_S: Final = 5.0
+"""A wait that exceeds its time-out by this much means that this process was suspended, for example by Ctrl-Z."""
 
 
 @dataclass(frozen=True)
 class Deadline:
-    """A moment on the monotonic clock after which waiting is pointless.
+    """A time on the monotonic clock at which a wait must end.
 
     Attributes:
-        at_s: The moment, in seconds of `time.monotonic`.
+        at_s: The time, in seconds of `time.monotonic`.
     """
 
     at_s: float
@@ -35,7 +35,7 @@ class Deadline:
 
     @property
     def expired(self) -> bool:
-        """Whether the moment has passed."""
+        """Whether the deadline has passed."""
         return time.monotonic() >= self.at_s
 
     def sooner(self, seconds: float) -> "Deadline":
@@ -47,30 +47,34 @@ class Deadline:
         return Deadline(max(self.at_s, time.monotonic() + seconds))
 
     def after_wait(self, began_s: float, wait_s: float) -> "Deadline":
-        """Return the deadline after a wait of `wait_s` at most: later by how long this process stood still in it.
+        """Return the deadline, extended by the time for which this process was suspended during a wait.
 
-        Its own pause is none of those it waits for, whose answer may be here already.
+        The suspension says nothing about the awaited program, whose answer may have arrived already.
+
+        Args:
+            began_s: Start of the wait, in seconds of `time.monotonic`.
+            wait_s: Time-out of the wait.
         """
-        still_s = time.monotonic() - began_s - wait_s
-        return Deadline(self.at_s + still_s) if still_s > _STOOD_STILL_S else self
+        suspended_s = time.monotonic() - began_s - wait_s
+        return Deadline(self.at_s + suspended_s) if suspended_s > _MIN_SUSPENDED_S else self
 
 
 class ExpiredError(TimeoutError):
-    """A wait met our own deadline; a `TimeoutError` of the system may tell of a dead connection instead.
+    """A fieldkit deadline has passed, in contrast to a `TimeoutError` of the system, as of a dead connection.
 
     Args:
-        what: What did not happen, for messages: `start`.
+        what: What did not happen in time, for messages: `start`.
     """
 
 
 def bounded(call: Callable[[], T], deadline: Deadline, ended: threading.Event, *, what: str = "answer") -> T:
-    """Return what `call` returns or raise what it raises; for a wait that knows no time-out, like a name look-up.
+    """Call a function that has no time-out parameter, such as a name look-up; return its result or raise its error.
 
     Args:
-        call: Runs in a thread of its own, which is left behind when it takes too long.
-        deadline: When to give up.
-        ended: Set by another thread to give up sooner, which takes 0.1 s.
-        what: For the error.
+        call: The function. It runs in a daemon thread, which continues if the deadline passes.
+        deadline: When to stop waiting.
+        ended: Another thread sets this event to stop the wait earlier, within 0.1 s.
+        what: What did not happen, for the error.
 
     Raises:
         ExpiredError: The deadline passed, or `ended` was set.
@@ -82,13 +86,13 @@ def bounded(call: Callable[[], T], deadline: Deadline, ended: threading.Event, *
     def work() -> None:
         try:
             results.append(call())
-        except BaseException as error:  # noqa: BLE001 (raised again by the one who waits)
+        except BaseException as error:  # noqa: BLE001 (raised again in the waiting thread)
             errors.append(error)
         done.set()
 
     threading.Thread(target=work, daemon=True).start()
     while not ended.is_set() and not deadline.expired:
-        began_s, wait_s = time.monotonic(), min(_LOOK_S, deadline.remaining_s)
+        began_s, wait_s = time.monotonic(), min(_POLL_INTERVAL_S, deadline.remaining_s)
         is_done = done.wait(wait_s)
         deadline = deadline.after_wait(began_s, wait_s)
         if is_done:

@@ -1,4 +1,4 @@
-"""One root error, one family per cause; each knows its exit code and what the operator can do about it."""
+"""Errors for the operator: one base class and one subclass per cause, each with an exit code and a remedy."""
 
 import difflib
 import shlex
@@ -7,17 +7,17 @@ from typing import ClassVar
 
 
 class FieldkitError(Exception):
-    """Something went wrong that the operator can understand.
+    """Base class of all errors that are shown to the operator without a traceback.
 
     Args:
         what: What happened, in one sentence without a full stop.
-        where: File and line, robot, or repeat concerned; empty when `what` says it.
-        remedy: What to do about it, if anything; a command to type where there is one.
+        where: File and line, robot, or repeat; empty if `what` contains it.
+        remedy: What the operator can do, if anything; preferably a command.
     """
 
     exit_code: ClassVar[int] = 1
     ends_trial: ClassVar[bool] = False
-    """Whether going on with the next repeat would be wrong."""
+    """Whether the trial must stop, instead of continuing with the next repeat."""
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
         super().__init__(what)
@@ -35,7 +35,7 @@ class FieldkitError(Exception):
 
 
 class ConfigurationError(FieldkitError):
-    """Usage or configuration: an option, a file, or something missing on this machine."""
+    """Error in an option, a file, or the setup of this machine."""
 
     exit_code = 2
 
@@ -47,7 +47,7 @@ class RobotError(FieldkitError):
 
 
 class LockLostError(RobotError):
-    """Somebody else took the robot, or broke its lock: the trial ends, its repeat is not tried again."""
+    """Another user locked the robot or broke its lock: the trial ends, and the repeat is not retried."""
 
     ends_trial = True
 
@@ -63,7 +63,7 @@ class MotionHeldError(RobotError):
 
 
 class HostKeyError(RobotError):
-    """Another machine answers for the robot, or it was reinstalled: nothing goes on until a person has looked."""
+    """The robot's SSH host key has changed: another machine, or a new installation; a person must check it."""
 
     ends_trial = True
 
@@ -75,11 +75,11 @@ class LinkError(FieldkitError):
 
 
 class LinkLostError(LinkError):
-    """The connection broke or could not be made: what was asked may or may not have been done."""
+    """The connection broke or could not be opened: the requested action may or may not have happened."""
 
 
 class TestbedLostError(LinkError):
-    """A process that the robots need has ended and does not come back: the trial stops, its repeat is redone."""
+    """A process that the robots need has exited permanently: the trial stops, and its repeat is run again later."""
 
     ends_trial = True
 
@@ -91,19 +91,19 @@ class EvidenceError(FieldkitError):
 
 
 def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
-    """Return the remedy for a name that is none of `known`: what was probably meant, or `otherwise`.
+    """Return the remedy for an unknown name: `did you mean 'rtt_loss'?`, or `otherwise` if no known name is similar.
 
-    That is every name of which `name` is a whole word, as `rtt` of `rtt_loss`, or the end, behind a step's name,
-    as of `up.rtt`; else the one that is most alike, whatever its case.
+    Similar are all names that contain `name` as a whole word, as `rtt_loss` contains `rtt`, or that end with it after
+    the name of a step, as `up.rtt`; otherwise the closest match. The case of letters is ignored.
     """
-    names = {one.lower(): one for one in known}
+    names = {candidate.lower(): candidate for candidate in known}
     typed = name.lower()
-    near = [one for lower, one in names.items() if typed in lower.split("_") or lower.endswith(f".{typed}")] or [
-        names[lower] for lower in difflib.get_close_matches(typed, names, n=1)
-    ]
-    return f"did you mean {' or '.join(map(repr, near))}?" if near else otherwise
+    matches = [
+        candidate for lower, candidate in names.items() if typed in lower.split("_") or lower.endswith(f".{typed}")
+    ] or [names[lower] for lower in difflib.get_close_matches(typed, names, n=1)]
+    return f"did you mean {' or '.join(map(repr, matches))}?" if matches else otherwise
 
 
 def typed(*words: object) -> str:
-    """Return a command as it is typed in a shell, for a remedy: names of files may have blanks."""
+    """Return a command line with shell quoting, for a remedy; file names may contain blanks."""
     return shlex.join(map(str, words))

@@ -1,4 +1,4 @@
-"""Events of a trial, a campaign or a computation: a stream that display, log and `--json` subscribe to."""
+"""Events of a trial, a campaign or a computation, which the display, the log and `--json` receive."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from fieldkit.core.model import Status, Verdict
 
 @dataclass(frozen=True)
 class Note:
-    """Something that the operator should know.
+    """A message for the operator.
 
     Attributes:
         text: One line.
@@ -20,11 +20,11 @@ class Note:
 
 @dataclass(frozen=True)
 class Request:
-    """The operator is asked to do something; nothing goes on before the answer.
+    """The operator must do something; the trial waits for the answer.
 
     Attributes:
         text: What to do.
-        may_skip: Whether it can be left for later.
+        may_skip: Whether it can be postponed.
     """
 
     text: str
@@ -36,8 +36,8 @@ class Answered:
     """The operator answered the last request.
 
     Attributes:
-        skip: Whether it is left for later.
-        note: What was noted.
+        skip: Whether it is postponed.
+        note: Note of the operator; empty if none.
     """
 
     skip: bool
@@ -46,11 +46,11 @@ class Answered:
 
 @dataclass(frozen=True)
 class Asked:
-    """The operator is asked for a number or a word; nothing goes on before the answer.
+    """The operator must enter a number or a word; the trial waits for the answer.
 
     Attributes:
         text: The question.
-        how: What can be answered, in words.
+        how: Description of the possible answers.
     """
 
     text: str
@@ -70,12 +70,12 @@ class Entered:
 
 @dataclass(frozen=True)
 class Placed:
-    """The robots stand where a trial wants them, or the operator left that for later.
+    """The robots are at their positions of the trial, or the operator postponed placing them.
 
     Attributes:
-        skipped: Whether it was left.
-        note: What the operator noted.
-        took_s: How long it took.
+        skipped: Whether it was postponed.
+        note: Note of the operator; empty if none.
+        took_s: Duration of the placement.
     """
 
     skipped: bool
@@ -85,12 +85,12 @@ class Placed:
 
 @dataclass(frozen=True)
 class PhaseStarted:
-    """A phase of work began.
+    """A phase of work started.
 
     Attributes:
         name: For example `record`, `transfer`, `start robots`.
-        repeat: The repeat it belongs to, or empty.
-        expected_s: How long it should take, None when unknown.
+        repeat: The repeat to which it belongs, or empty.
+        expected_s: Expected duration; None if unknown.
     """
 
     name: str
@@ -100,14 +100,14 @@ class PhaseStarted:
 
 @dataclass(frozen=True)
 class Progress:
-    """A computation came further.
+    """A computation has made progress.
 
     Attributes:
-        what: What is computed, in a few words.
-        done: How much of it is done.
-        total: Of how much, above 0.
-        unit: What both are counted in: `s` of simulated time, `runs`.
-        left_s: Estimated time left, None when unknown.
+        what: Short description of the computation.
+        done: Finished amount.
+        total: Total amount, above 0.
+        unit: Unit of both amounts: `s` of simulated time, `runs`.
+        left_s: Estimated remaining time; None if unknown.
     """
 
     what: str
@@ -119,16 +119,16 @@ class Progress:
 
 @dataclass(frozen=True)
 class CommandPlanned:
-    """A dry run came to a command of a repeat.
+    """A command that a repeat would run, reported by a dry run.
 
     Attributes:
         protocol: `tcp` or `udp`.
         robot: Name of the robot.
         role: Its role.
-        folder: Where it runs, below the robot's home.
-        number: Its place in the order of starting, from 0.
-        name: For example `record`.
-        command: As a person would type it there.
+        folder: Working directory, relative to the robot's home directory.
+        number: Index in the order of starting, from 0.
+        name: Name of the job, for example `record`.
+        command: The command line for a shell.
     """
 
     protocol: str
@@ -146,10 +146,10 @@ class Finding:
 
     Attributes:
         robot: Name of the robot, or `laptop`.
-        check: What was looked at.
-        status: What it came to.
-        detail: What was found, printable.
-        remedy: What to do about it, a command to type where there is one; empty when the check passed.
+        check: Name of the check.
+        status: Its outcome.
+        detail: Details, in printable characters.
+        remedy: What to do, preferably a command; empty if the check passed.
     """
 
     robot: str
@@ -160,7 +160,7 @@ class Finding:
 
 
 NOTHING_ARRIVED: Final = "NOTHING ARRIVED"
-"""How the summary of a repeat begins that lost all that it sent."""
+"""Start of the summary of a repeat in which all sent data was lost."""
 
 
 @dataclass(frozen=True)
@@ -169,15 +169,15 @@ class RepeatEnded:
 
     Attributes:
         repeat: For example `udp-07`.
-        attempt: 1 for the first try.
+        attempt: Number of the attempt, from 1.
         status: Valid, void or failed.
-        reason: Why it is not valid; empty when it is.
-        summary: What was measured, in a few words.
-        done: Repeats finished for good so far.
-        total: Repeats planned.
-        left_s: Estimated time left.
-        remedy: What to do about a step that failed, where the step says it.
-        left_most_s: What that may come to, repeats that have to be redone apart.
+        reason: Why it is not valid; empty if it is.
+        summary: Summary of the measured values.
+        done: Number of repeats that are finished and not run again.
+        total: Number of planned repeats.
+        left_s: Estimated remaining time.
+        remedy: What to do about a failed step, if the step states it.
+        left_most_s: Upper estimate of the remaining time, without repeats that must be run again.
     """
 
     repeat: str
@@ -194,12 +194,12 @@ class RepeatEnded:
 
 @dataclass(frozen=True)
 class TrialStarted:
-    """A trial began, or is continued.
+    """A trial started or was resumed.
 
     Attributes:
         folder: Its folder.
-        done: Repeats that were over before.
-        total: Repeats planned.
+        done: Number of repeats that were finished before.
+        total: Number of planned repeats.
     """
 
     folder: str
@@ -209,18 +209,18 @@ class TrialStarted:
 
 @dataclass(frozen=True)
 class ExpectationJudged:
-    """An expectation of a trial was judged by the repeats of one protocol.
+    """An expectation of a trial was evaluated for the repeats of one protocol.
 
     Attributes:
-        expectation: As it was written.
-        protocol: Of the repeats; empty where there are none.
+        expectation: The expectation as written in the procedure.
+        protocol: Protocol of the repeats; empty if there are no repeats.
         ruling: `holds`, `does not hold` or `undecided`.
-        why: Why it does not hold, beside the numbers; empty where they say it.
-        measured: What was measured, for people.
-        interval: Its interval or bound, likewise; empty without one.
-        n: Valid repeats that have the figure.
-        n_valid: Valid repeats.
-        n_censored: Of n, the ones of which only a lower bound is known.
+        why: Reason of the ruling that the numbers do not show; empty if they show it.
+        measured: Measured value, formatted for people.
+        interval: Its interval or bound, formatted for people; empty without one.
+        n: Number of valid repeats that have the figure.
+        n_valid: Number of valid repeats.
+        n_censored: Number of repeats among `n` with a right-censored value.
     """
 
     expectation: str
@@ -236,7 +236,7 @@ class ExpectationJudged:
 
 @dataclass(frozen=True)
 class TrialEnded:
-    """The trial ended; its folder is complete.
+    """The trial is finished; its folder is complete.
 
     Attributes:
         folder: Its folder.
@@ -257,8 +257,8 @@ class TrialStopped:
 
     Attributes:
         folder: Its folder.
-        done: Repeats that are over.
-        total: Repeats planned.
+        done: Number of finished repeats.
+        total: Number of planned repeats.
     """
 
     folder: str
@@ -268,18 +268,18 @@ class TrialStopped:
 
 @dataclass(frozen=True)
 class CampaignPlanned:
-    """What a campaign has to do.
+    """The remaining work of a campaign.
 
     Attributes:
         name: Its name.
-        trials: The trials that are left, in order.
-        done: Trials that are over.
-        total: All trials.
-        walk_m: The way of the robots that are carried, in metres.
+        trials: The remaining trials, in order.
+        done: Number of finished trials.
+        total: Number of all trials.
+        walk_m: Distance for which robots must be carried, in metres.
         left_s: Estimated time.
-        needed_bytes: What their evidence may need on this machine.
-        free_bytes: What is free there.
-        left_most_s: What `left_s` may come to, repeats that have to be redone apart.
+        needed_bytes: Disk space on this machine that the evidence may need.
+        free_bytes: Free disk space on this machine.
+        left_most_s: Upper estimate of `left_s`, without repeats that must be run again.
     """
 
     name: str
@@ -295,12 +295,12 @@ class CampaignPlanned:
 
 @dataclass(frozen=True)
 class CampaignTrial:
-    """A campaign comes to a trial.
+    """A campaign starts a trial.
 
     Attributes:
-        trial: Which.
-        number: Its number among those that are run, from 1.
-        total: All trials.
+        trial: Name of the trial.
+        number: Its number among the trials that are run, from 1.
+        total: Number of all trials.
     """
 
     trial: str
@@ -310,14 +310,14 @@ class CampaignTrial:
 
 @dataclass(frozen=True)
 class CampaignWent:
-    """A trial of a campaign is over, or was left for later.
+    """A trial of a campaign is finished, or was postponed.
 
     Attributes:
-        trial: Which.
-        done: Trials that are over.
-        total: All trials.
-        left_s: Estimated time left.
-        left_most_s: What that may come to, repeats that have to be redone apart.
+        trial: Name of the trial.
+        done: Number of finished trials.
+        total: Number of all trials.
+        left_s: Estimated remaining time.
+        left_most_s: Upper estimate of the remaining time, without repeats that must be run again.
     """
 
     trial: str
@@ -329,12 +329,12 @@ class CampaignWent:
 
 @dataclass(frozen=True)
 class CampaignEnded:
-    """The campaign ended or stopped; the same command continues it.
+    """The campaign is finished or was stopped; the same command continues it.
 
     Attributes:
         folder: Its folder.
-        done: Trials that are over.
-        total: All trials.
+        done: Number of finished trials.
+        total: Number of all trials.
     """
 
     folder: str

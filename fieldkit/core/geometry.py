@@ -1,4 +1,4 @@
-"""Geometry of a placement: the places of its robots, and the directions in which they move."""
+"""Geometry of a placement: positions, headings and paths of its robots."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,37 +8,37 @@ from fieldkit.core.model import Leg, Move, Placement, Role, Topology, Vector
 
 
 def positions_m(placement: Placement) -> Mapping[Role, Vector]:
-    """Return where each role stands, in metres east, north, up.
+    """Return the position of each role, in metres east, north, up.
 
-    Master: the relay at the origin, the stations on opposite sides of it, each the distance away. Masterless: the
-    sender at the origin, the receiver the distance east of it; a relay takes no part. Robots in roles of the
-    procedure's own stand where their posts are.
+    Master: the relay is at the origin, and the stations are on opposite sides of it, each at the placement's
+    distance. Masterless: the sender is at the origin, and the receiver is the distance east of it; there is no relay.
+    Robots in additional roles are at their posts.
     """
     distance_m = placement.distance.metres
     if placement.topology is Topology.MASTER:
         east_m = {Role.RELAY: 0.0, Role.SENDER: -distance_m, Role.RECEIVER: distance_m}
     else:
         east_m = {Role.SENDER: 0.0, Role.RECEIVER: distance_m}
-    places_m: dict[Role, Vector] = {role: (at_m, 0.0, 0.0) for role, at_m in east_m.items()}
+    by_role: dict[Role, Vector] = {role: (x_m, 0.0, 0.0) for role, x_m in east_m.items()}
     for post in placement.posts:
-        along_m, left_m = _from_m(post.near, post.leg)
-        places_m[post.role] = (east_m[post.near] + along_m, left_m, 0.0)
-    return places_m
+        along_m, left_m = _leg_vector_m(post.near, post.leg)
+        by_role[post.role] = (east_m[post.near] + along_m, left_m, 0.0)
+    return by_role
 
 
-def _from_m(role: Role, leg: Leg) -> tuple[float, float]:
-    """Return where a leg from a robot ends: so far along the line from sender to receiver, and to its left."""
-    # The sender looks away from the others along the line, so its left is the line's right.
+def _leg_vector_m(role: Role, leg: Leg) -> tuple[float, float]:
+    """Return a leg of a robot as a vector: metres along the line from sender to receiver, and metres to its left."""
+    # The sender faces against the direction of the line, so its left is the right side of the line.
     sign = -1.0 if role == Role.SENDER else 1.0
     return sign * leg.away_m, sign * leg.left_m
 
 
 def heading_rad(role: Role, facing: str) -> float:
-    """Return where a robot faces, from the line from sender to receiver towards its left.
+    """Return the heading of a robot in radians, counterclockwise from the line from sender to receiver.
 
     Args:
-        role: Whose robot.
-        facing: `away`, `towards`, `left` or `right`, as who looks away from the other end of its link sees it.
+        role: The robot's role.
+        facing: `away`, `towards`, `left` or `right`, relative to the direction away from the other end of its link.
     """
     turned_rad = {"away": 0.0, "left": math.pi / 2, "towards": math.pi, "right": -math.pi / 2}[facing]
     return turned_rad + (math.pi if role == Role.SENDER else 0.0)
@@ -54,29 +54,31 @@ def other_end(role: Role, topology: Topology) -> Role:
 
 
 def way_m(move: Move) -> tuple[tuple[float, float], ...]:
-    """Return the corners of a way, the first where the robot stands.
+    """Return the corners of a path; the first is the robot's initial position, (0, 0).
 
-    Each is so many metres from there along the line from sender to receiver, and so many to its left.
+    Each is given in metres along the line from sender to receiver, and metres to its left.
     """
-    steps = (_from_m(move.role, leg) for leg in move.legs)
-    return tuple(accumulate(steps, lambda at, step: (at[0] + step[0], at[1] + step[1]), initial=(0.0, 0.0)))
+    steps = (_leg_vector_m(move.role, leg) for leg in move.legs)
+    return tuple(
+        accumulate(steps, lambda corner, step: (corner[0] + step[0], corner[1] + step[1]), initial=(0.0, 0.0))
+    )
 
 
 def within(legs: Sequence[Leg], radius_m: float) -> tuple[Leg, ...]:
-    """Return the part of a way that leads no farther than a distance from where it begins; it ends at that distance.
+    """Return the part of a path before it first leaves a circle around its start.
 
     Args:
-        legs: The way.
-        radius_m: The distance.
+        legs: The path.
+        radius_m: Radius of the circle.
     """
     kept: list[Leg] = []
     x, y = 0.0, 0.0
     for leg in legs:
         dx, dy = leg.away_m, leg.left_m
         if math.hypot(x + dx, y + dy) > radius_m:
-            # The larger s with |(x, y) + s (dx, dy)| = radius: the place is inside, so the smaller one is behind it.
-            along, long = x * dx + y * dy, dx**2 + dy**2
-            share = (math.sqrt(along**2 + long * (radius_m**2 - x**2 - y**2)) - along) / long
+            # Solve |(x, y) + share (dx, dy)| = radius. (x, y) is inside, so the larger solution is the positive one.
+            dot, squared_length = x * dx + y * dy, dx**2 + dy**2
+            share = (math.sqrt(dot**2 + squared_length * (radius_m**2 - x**2 - y**2)) - dot) / squared_length
             return (*kept, Leg(share * dx, share * dy)) if share > 0 else tuple(kept)
         kept.append(leg)
         x, y = x + dx, y + dy
@@ -84,22 +86,24 @@ def within(legs: Sequence[Leg], radius_m: float) -> tuple[Leg, ...]:
 
 
 def farthest_m(legs: Sequence[Leg]) -> float:
-    """Return how far a way leads at most from where it begins."""
-    corners = accumulate(legs, lambda at, leg: (at[0] + leg.away_m, at[1] + leg.left_m), initial=(0.0, 0.0))
+    """Return the largest distance of a path from its start, in metres."""
+    corners = accumulate(
+        legs, lambda corner, leg: (corner[0] + leg.away_m, corner[1] + leg.left_m), initial=(0.0, 0.0)
+    )
     return max(math.hypot(*corner) for corner in corners)
 
 
 def length_m(move: Move) -> float:
-    """Return how long a way is."""
+    """Return the length of a path in metres."""
     return sum(math.hypot(leg.away_m, leg.left_m) for leg in move.legs)
 
 
 def in_words(move: Move) -> str:
-    """Return a way and its speed in words: `10 m away, then 2 m left, at 0.2 m/s`."""
+    """Return a description of a path and its speed: `10 m away, then 2 m left, at 0.2 m/s`."""
     return f"{', then '.join(map(leg_in_words, move.legs))}, at {move.speed_m_s:g} m/s"
 
 
 def leg_in_words(leg: Leg) -> str:
-    """Return a straight piece of a way in words: `10 m away and 2 m left`."""
+    """Return a description of one leg of a path: `10 m away and 2 m left`."""
     directions = (leg.away_m, ("away", "towards")), (leg.left_m, ("left", "right"))
     return " and ".join(f"{abs(metres):g} m {words[metres < 0]}" for metres, words in directions if metres)

@@ -1,4 +1,4 @@
-"""A file of JSON lines that only grows: on disk before anything goes on, readable after any crash."""
+"""An append-only file of JSON lines: each line is on disk before the caller continues, and a crash is tolerated."""
 
 import errno
 import fcntl
@@ -15,22 +15,22 @@ from fieldkit.core.text import JSON_ERRORS
 
 Entry = TypeVar("Entry")
 Parse = Callable[[Any], Entry]
-"""Makes an entry of a JSON value; raises ValueError, KeyError or TypeError for what is none."""
+"""Converts a JSON value to an entry; raises ValueError, KeyError or TypeError for any other value."""
 
 _LIMIT_BYTES: Final = 1 << 28
-"""A line of a journal has some 120 bytes, so this holds far more than any trial."""
+"""Size limit. A line of a journal has about 120 bytes, so no trial reaches it."""
 
 
 @contextmanager
 def claimed(path: Path, what: str) -> Iterator[None]:
-    """Keep every other fieldkit off a file while the body runs.
+    """Lock a file against other fieldkit processes while the body runs.
 
     Args:
-        path: The file; made if there is none.
-        what: What it is the journal of, for the message.
+        path: The file; created if it does not exist.
+        what: What the file is the journal of, for the message: `trial`.
 
     Raises:
-        ConfigurationError: Another one has it, or it cannot be written.
+        ConfigurationError: Another process holds the lock, or the file cannot be written.
     """
     try:
         descriptor = files.open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -38,7 +38,7 @@ def claimed(path: Path, what: str) -> Iterator[None]:
         raise ConfigurationError(
             f"cannot be written: {error.strerror}",
             where=str(path),
-            remedy="mend that, or go on in a copy of it",
+            remedy="make it writable, or continue in a copy of the folder",
         ) from error
     try:
         try:
@@ -47,7 +47,7 @@ def claimed(path: Path, what: str) -> Iterator[None]:
             raise ConfigurationError(
                 f"another fieldkit runs this {what}",
                 where=str(path.parent),
-                remedy="wait until it has ended, or end it",
+                remedy="wait until it has exited, or stop it",
             ) from error
         yield
     finally:
@@ -55,10 +55,10 @@ def claimed(path: Path, what: str) -> Iterator[None]:
 
 
 def append(path: Path, *records: Mapping[str, Any]) -> None:
-    """Add a line per record and wait until they are on disk.
+    """Append one line per record and wait until the lines are on disk.
 
     Raises:
-        OSError: The disk is full or gone; the file is as it was before.
+        OSError: The disk is full or unavailable; the file is unchanged.
     """
     lines = "".join(json.dumps(record) + "\n" for record in records).encode()
     descriptor = files.open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -73,7 +73,7 @@ def append(path: Path, *records: Mapping[str, Any]) -> None:
 
 
 def mend(path: Path, parse: Parse[object]) -> None:
-    """Take a last line that a crash has torn off the file, so that the next one begins a line of its own."""
+    """Remove an incomplete last line that a crash left, or add its missing line feed, before lines are appended."""
     try:
         content = files.read(path, _LIMIT_BYTES)
     except FileNotFoundError:
@@ -91,15 +91,15 @@ def mend(path: Path, parse: Parse[object]) -> None:
 
 
 def read(path: Path, parse: Parse[Entry], *, remedy: str) -> list[Entry]:
-    """Return the entries of a file; a last line torn by a crash is left out.
+    """Return the entries of a file, without an incomplete last line that a crash left.
 
     Args:
         path: The file.
-        parse: Makes an entry of a line.
-        remedy: What to do when there is no such file.
+        parse: Converts the JSON value of a line to an entry.
+        remedy: What to do if the file does not exist.
 
     Raises:
-        EvidenceError: There is no such file, or a line that no crash has torn cannot be read.
+        EvidenceError: The file does not exist, or a complete line cannot be read.
     """
     try:
         content = files.read(path, _LIMIT_BYTES)

@@ -1,7 +1,7 @@
-"""Names of files in an attempt's folder that only the laptop writes, for itself or for its testbed.
+"""Names of the files in an attempt's folder that only the laptop writes, for itself or for its testbed.
 
-The modules that write these files take the names from here, and a robot's archive with one of them is refused: a
-robot cannot provide what a testbed's oracle, or the operator, is to say.
+The modules that write these files import the names. An archive from a robot that contains one of them is refused,
+because a robot must not provide the data of a testbed's oracle or of the operator.
 """
 
 import re
@@ -11,24 +11,24 @@ TRACK: Final = "track.csv"
 LINK: Final = "link.csv"
 LATENESS: Final = "lateness.txt"
 MEDIUM: Final = "medium.txt"
-"""Of each transfer, its name before it."""
+"""File of each transfer; the name of the transfer is its prefix."""
 AIR: Final = ("air.pcap", "air.csv")
-"""What a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
+"""Files that a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
 POSITIONS: Final = "positions.json"
 UNFETCHED: Final = "unfetched.txt"
-"""Of each robot: `ROLE-unfetched.txt`."""
+"""File of each robot: `ROLE-unfetched.txt`."""
 ANSWER: Final = "answer-"
 PLAN: Final = "trial.yaml"
 JOURNAL: Final = "journal.jsonl"
 CAMPAIGN: Final = "campaign.yaml"
-"""In the folder of a campaign, beside its trials."""
+"""In the folder of a campaign, next to the folders of its trials."""
 MOTION: Final = "motion.jsonl"
 MANIFEST: Final = "MANIFEST.sha256"
 TRIAL_CSV: Final = "trial.csv"
 SUMMARY_CSV: Final = "summary.csv"
 PREFLIGHT: Final = "preflight.txt"
 STEP_ERROR: Final = "step-error.log"
-"""The traceback of a kind of step that raised an exception."""
+"""Traceback of an exception that a step raised."""
 
 _NAMES: Final = (
     *(TRACK, LINK, LATENESS, MEDIUM, *AIR, POSITIONS),
@@ -42,10 +42,10 @@ _RESERVED: Final = re.compile(
 
 
 def answer(column: str) -> str:
-    """Return the file of what the operator answered for a column."""
+    """Return the name of the file with the operator's answer for a column."""
     return f"{ANSWER}{column}.txt"
 
 
 def reserved(name: str) -> bool:
-    """Return whether only the laptop writes a file of this name, in whatever case, behind whatever folders."""
+    """Return True if any part of a path is a name that only the laptop writes; the case of letters is ignored."""
     return any(_RESERVED.match(part.strip()) for part in re.split(r"[/\\]", name))

@@ -1,4 +1,4 @@
-"""The data types that everything shares: frozen, without behaviour."""
+"""Immutable data types that all packages share."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -8,16 +8,16 @@ from typing import Any, ClassVar, Final
 
 
 class Role(str):
-    """What a robot does in a trial; procedures speak of roles, never of hosts.
+    """Role of a robot in a trial; procedures name roles, never hosts.
 
-    Three have a meaning of their own; beside them a procedure may have others, for robots that it places. There is
-    one object per role, however it is made.
+    Three roles are predefined (`FIXED_ROLES`). A procedure can define additional roles for robots that it places.
+    Equal names give the same object.
 
     Args:
-        name: `rival`, `rival-2`.
+        name: For example `rival`.
 
     Raises:
-        ValueError: It is no name of a role.
+        ValueError: It is not a valid name of a role.
     """
 
     SENDER: ClassVar["Role"]
@@ -26,15 +26,15 @@ class Role(str):
 
     PATTERN: Final = r"[a-z][a-z0-9_]{0,30}"
     __slots__ = ()
-    _made: ClassVar[dict[str, "Role"]] = {}
+    _instances: ClassVar[dict[str, "Role"]] = {}
 
     def __new__(cls, name: str) -> "Role":
-        """See the class."""
-        if (known := cls._made.get(name)) is None:
+        """Return the object of this name."""
+        if (role := cls._instances.get(name)) is None:
             if not re.fullmatch(cls.PATTERN, name):
-                raise ValueError("a role is named by small letters, digits and _, a letter first")
-            known = cls._made.setdefault(str(name), super().__new__(cls, name))
-        return known
+                raise ValueError("the name of a role consists of lower-case letters, digits and _, a letter first")
+            role = cls._instances.setdefault(str(name), super().__new__(cls, name))
+        return role
 
     @classmethod
     def __get_pydantic_core_schema__(cls, _: Any, handler: Any) -> Any:  # noqa: ANN401 (of pydantic, not imported here)
@@ -48,21 +48,21 @@ class Role(str):
 Role.SENDER, Role.RECEIVER, Role.RELAY = map(Role, ("sender", "receiver", "relay"))
 
 FIXED_ROLES: Final = (Role.SENDER, Role.RECEIVER, Role.RELAY)
-"""The roles that have a meaning of their own, in the order in which they are listed."""
+"""The predefined roles, in the order in which they are listed."""
 
 
 def in_order(roles: Iterable[Role]) -> list[Role]:
-    """Return roles in the order in which they are listed: those of `FIXED_ROLES`, then a lab's own by name."""
+    """Return roles in the order in which they are listed: those of `FIXED_ROLES`, then additional roles by name."""
     return sorted(
         roles, key=lambda role: (FIXED_ROLES.index(role) if role in FIXED_ROLES else len(FIXED_ROLES), role)
     )
 
 
 ROS_MASTER_PORT: Final = 11311
-"""Where every ROS 1 master listens unless it is told otherwise (wiki.ros.org/roscore)."""
+"""Default TCP port of a ROS 1 master (wiki.ros.org/roscore)."""
 
 BRIDGE_IS_UP: Final = "the bridge is up"
-"""What `fieldkit bridge` says once it carries, for who waits for it."""
+"""Line that `fieldkit bridge` prints when it forwards packets; other programs wait for it."""
 
 
 class Protocol(StrEnum):
@@ -73,30 +73,30 @@ class Protocol(StrEnum):
 
 
 class Scenario(StrEnum):
-    """Whether an obstacle stands between the robots."""
+    """Line of sight (`los`), or an obstacle between the robots (`nlos`)."""
 
     LOS = "los"
     NLOS = "nlos"
 
 
 class Topology(StrEnum):
-    """Whether traffic passes the relay's access point or goes directly."""
+    """Whether traffic passes through the relay's access point or directly between the robots."""
 
     MASTER = "master"
     MASTERLESS = "masterless"
 
 
 class Control(StrEnum):
-    """Which way SSH takes to the robots: a network of its own, or the radio under test."""
+    """Network of the SSH connections to the robots: a separate network, or the radio under test."""
 
     SEPARATE = "separate"
     RADIO = "radio"
 
 
 class Status(StrEnum):
-    """How a repeat stands.
+    """Status of a repeat.
 
-    `measured`: its steps are done and its evidence is on the robots; `void`: its evidence is not whole.
+    `measured`: its steps are done and its evidence is still on the robots; `void`: its evidence is incomplete.
     """
 
     PLANNED = "planned"
@@ -108,14 +108,14 @@ class Status(StrEnum):
 
 
 MOST_REPEATS: Final = 100_000
-"""Repeats per protocol of one trial: weeks, and what a plan can list in a moment."""
+"""Largest number of repeats per protocol of one trial; they would take weeks."""
 
 ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
-"""How an attempt may end."""
+"""Final states of an attempt."""
 
 
 class Verdict(StrEnum):
-    """What a check came to; `warn` lets the trial go on, `fail` does not."""
+    """Outcome of a check; the trial continues after `warn`, but not after `fail`."""
 
     OK = "ok"
     WARN = "warn"
@@ -124,11 +124,11 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Distance:
-    """A distance with the operator's own label.
+    """A distance with the text that the operator wrote.
 
     Attributes:
         metres: The distance in metres, above zero.
-        label: As the operator wrote it, for example `30ft`.
+        label: The operator's text, for example `30ft`.
     """
 
     metres: float
@@ -137,14 +137,14 @@ class Distance:
 
 @dataclass(frozen=True)
 class Placement:
-    """Places where the robots are to stand.
+    """Positions at which the robots must be placed.
 
     Attributes:
         scenario: With or without an obstacle.
-        topology: Which robots the distance is between: `master`, each station and the relay (stations on
-            opposite sides of it); `masterless`, sender and receiver.
+        topology: Robots between which the distance is measured: `master`, each station and the relay (the stations
+            are on opposite sides of it); `masterless`, sender and receiver.
         distance: The distance.
-        posts: Places of robots in roles of the procedure's own.
+        posts: Positions of the robots in additional roles.
     """
 
     scenario: Scenario
@@ -154,7 +154,7 @@ class Placement:
 
 
 class FaultKind(StrEnum):
-    """What is done to a robot on purpose."""
+    """Kind of an injected fault."""
 
     LINK_DOWN = "link-down"
     REBOOT = "reboot"
@@ -164,13 +164,13 @@ class FaultKind(StrEnum):
 
 @dataclass(frozen=True)
 class Fault:
-    """Something done to a robot on purpose, to see the network heal.
+    """A fault that is injected into a robot in order to measure how the network recovers.
 
     Attributes:
-        kind: What.
-        role: To which robot.
-        duration_s: How long it lasts, in seconds; 0 for a reboot or a kill, which last as long as they do.
-        process: Name of the process killed; empty for the other kinds.
+        kind: Kind of the fault.
+        role: Role of the affected robot.
+        duration_s: Duration in seconds; 0 for a reboot or a kill, whose duration is not controlled.
+        process: Name of the process that is killed; empty for the other kinds.
     """
 
     kind: FaultKind
@@ -180,7 +180,7 @@ class Fault:
 
 
 class OnAbort(StrEnum):
-    """What becomes of a drone whose trial is cut short: it comes down where it is, or where it rose."""
+    """Action of a drone whose trial is aborted: land at its position, or return to its take-off position and land."""
 
     LAND = "land"
     RETURN = "return"
@@ -188,11 +188,11 @@ class OnAbort(StrEnum):
 
 @dataclass(frozen=True)
 class Leg:
-    """A straight piece of a way, relative to where the piece before it ends.
+    """A straight segment of a path, relative to the end of the previous segment.
 
     Attributes:
-        away_m: So far away from the robot at the other end of the link, in metres; negative for towards it.
-        left_m: So far to the left of who looks away from it; negative for to the right.
+        away_m: Metres away from the robot at the other end of the link; negative towards it.
+        left_m: Metres to the left when facing away from that robot; negative to the right.
     """
 
     away_m: float = 0.0
@@ -201,12 +201,12 @@ class Leg:
 
 @dataclass(frozen=True)
 class Post:
-    """Place of a robot in a role of a procedure's own.
+    """Position of a robot in an additional role.
 
     Attributes:
-        role: Whose.
-        near: Which of the robots under test it stands near to, in one of `FIXED_ROLES`.
-        leg: Where from there; away is away from the other end of that robot's link.
+        role: Role of the robot.
+        near: Reference robot, one of `FIXED_ROLES`.
+        leg: Position relative to the reference robot; "away" means away from the other end of that robot's link.
     """
 
     role: Role
@@ -216,12 +216,12 @@ class Post:
 
 @dataclass(frozen=True)
 class Move:
-    """A robot moves from its place along a way.
+    """Motion of a robot along a path that starts at its position.
 
     Attributes:
-        role: Which robot.
-        legs: The way.
-        speed_m_s: How fast, along all of it.
+        role: Role of the robot.
+        legs: The path.
+        speed_m_s: Constant speed along the path.
     """
 
     role: Role
@@ -231,17 +231,17 @@ class Move:
 
 @dataclass(frozen=True)
 class MotionOrigin:
-    """Place and heading of a robot at its first start in a trial: centre of its fence, reference of all directions.
+    """Position and heading of a robot at its first start in a trial: centre of its fence, reference of directions.
 
     Attributes:
         frame: Frame of the coordinates: `odometry`, or `local` for MAVLink's LOCAL_POSITION_NED.
-        frame_id: Identifies the life of that frame, for example the boot ID of the robot; a frame that was lost and
-            made anew has another one.
+        frame_id: Identifies one instance of that frame, for example by the boot ID of the robot. A frame that was
+            lost and created again has another one.
         x_m: x of `nav_msgs/Odometry`, or metres north.
         y_m: y of `nav_msgs/Odometry`, or metres east.
-        heading_rad: Where the robot faces, from x towards y: counterclockwise in `odometry`, clockwise in `local`.
-        latitude_deg: Latitude of the place (WGS 84); None if unknown.
-        longitude_deg: Its longitude; None if unknown.
+        heading_rad: Heading from x towards y: counterclockwise in `odometry`, clockwise in `local`.
+        latitude_deg: Latitude (WGS 84); None if unknown.
+        longitude_deg: Longitude (WGS 84); None if unknown.
     """
 
     frame: str
@@ -259,13 +259,13 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Place of a robot from a moment on, until the next of it.
+    """Position and velocity of a robot, valid until the next entry of the same robot.
 
     Attributes:
-        utc_ns: From when, nanoseconds since 1970 UTC by the laptop's clock.
-        role: Which robot.
-        position_m: Where its antenna was, in metres; None where nobody heard it.
-        velocity_m_s: How it moved.
+        utc_ns: Start of the validity, nanoseconds since 1970 UTC by the laptop's clock.
+        role: Role of the robot.
+        position_m: Position of its antenna, in metres; None while it was out of range of all robots.
+        velocity_m_s: Its velocity.
     """
 
     utc_ns: int
@@ -276,18 +276,18 @@ class Whereabouts:
 
 @dataclass(frozen=True)
 class StationSample:
-    """What a radio knows of another that it sends to; None where it does not tell. Counters go on from any number.
+    """Statistics that a radio reports of one peer station; None if not reported. Counters start at any number.
 
     Attributes:
-        station: Which one: its address, or its name where an emulator tells.
-        signal_dbm: How strong it arrives.
-        tx_rate_bit_s: Rate of the last frame to it.
-        rx_rate_bit_s: Rate of the last frame from it.
-        tx_packets: Packets that went on the air to it.
-        rx_packets: Packets that came from it.
-        tx_retries: Frames sent again to it.
-        tx_failures: Packets to it that were given up.
-        beacon_losses: Times that its beacons stayed away.
+        station: MAC address of the station, or its name if the sample is of an emulator.
+        signal_dbm: Received signal strength.
+        tx_rate_bit_s: PHY rate of the last frame to it.
+        rx_rate_bit_s: PHY rate of the last frame from it.
+        tx_packets: Packets that were transmitted to it.
+        rx_packets: Packets that were received from it.
+        tx_retries: Frames that were retransmitted to it.
+        tx_failures: Packets to it that were dropped after the last retry.
+        beacon_losses: Number of times that its beacons were lost.
     """
 
     station: str
@@ -303,15 +303,15 @@ class StationSample:
 
 @dataclass(frozen=True)
 class LinkSample:
-    """What a radio told at one moment; None where it did not.
+    """Statistics that a radio reported at one time; None if not reported.
 
     Attributes:
-        utc_ns: When, nanoseconds since 1970 UTC by the robot's clock.
-        stations: What it knows of others.
-        cell: Address of the access point that it is joined to.
-        noise_dbm: Noise in its channel.
+        utc_ns: Time of the sample, nanoseconds since 1970 UTC by the robot's clock.
+        stations: Statistics of its peer stations.
+        cell: BSSID of the access point with which it is associated.
+        noise_dbm: Noise level in its channel.
         active_ns: Counter of the time for which it listened to its channel.
-        busy_ns: Of that, the time in which it found the channel busy.
+        busy_ns: Part of that time in which the channel was busy.
     """
 
     utc_ns: int
@@ -324,7 +324,7 @@ class LinkSample:
 
 @dataclass(frozen=True, order=True)
 class RepeatId:
-    """One planned pass of a procedure; `str` gives its folder name, `udp-07`."""
+    """Identifier of one planned repeat of a procedure; `str` gives its folder name, `udp-07`."""
 
     protocol: Protocol
     number: int
@@ -333,20 +333,20 @@ class RepeatId:
         return f"{self.protocol}-{self.number:02d}"
 
     def folder(self, status: Status, attempt: int) -> str:
-        """Return the name of an attempt's folder: `udp-07`, or `udp-07.void1` for one that was redone."""
+        """Return the name of an attempt's folder: `udp-07` if it is valid, or for example `udp-07.void1`."""
         return str(self) if status is Status.VALID else f"{self}.{status}{attempt}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class DelayParts:
-    """What packets that went one way were delayed by, in the four parts of the paper's eq. 2, summed over them.
+    """One-way delay of packets in the four components of the paper's eq. 2, each summed over all packets.
 
     Attributes:
-        packets: How many they are.
-        processing_ns: What the stations themselves took.
-        transmission_ns: What their bits took at the rate of the link.
-        propagation_ns: What the way took once they had left.
-        queuing_ns: What they waited for others before them.
+        packets: Number of packets.
+        processing_ns: Processing time in the stations.
+        transmission_ns: Transmission time of the bits at the rate of the link.
+        propagation_ns: Propagation time on the medium.
+        queuing_ns: Time for which they waited for earlier packets.
     """
 
     packets: int
@@ -358,11 +358,11 @@ class DelayParts:
 
 @dataclass(frozen=True, kw_only=True)
 class Lateness:
-    """Time by which packets reached their robots after the moment that a model of the air says.
+    """Lateness with which an emulator delivered packets, compared with the delivery times of its radio model.
 
     Attributes:
-        bound_ns: Where one packet is later than this, the model was not kept.
-        packets: How many packets were late by at most so many ns, rounded up by an eighth at most; each once.
+        bound_ns: Maximum lateness. If any packet is later, the emulation did not follow the model.
+        packets: Number of packets by lateness in ns (a histogram); a lateness is rounded up by at most an eighth.
     """
 
     bound_ns: int

@@ -1,4 +1,4 @@
-"""Installed packages: their versions, and the backends, steps and commands that they add by entry points."""
+"""Installed packages: their versions, and the backends, steps and commands that they add through entry points."""
 
 from importlib import metadata
 from importlib.metadata import EntryPoint
@@ -39,7 +39,7 @@ def load(point: EntryPoint) -> Any:  # noqa: ANN401 (any object of another packa
     """Return the object that an entry point names.
 
     Raises:
-        ConfigurationError: It cannot be imported, whatever exception its package raises.
+        ConfigurationError: The import raised any exception.
     """
     try:
         return point.load()
@@ -50,5 +50,5 @@ def load(point: EntryPoint) -> Any:  # noqa: ANN401 (any object of another packa
 
 
 def where(point: EntryPoint) -> str:
-    """Return the name of an entry point in error messages."""
+    """Return the description of an entry point for error messages."""
     return f"entry point {point.name} = {point.value}"

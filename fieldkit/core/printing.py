@@ -1,4 +1,4 @@
-"""Print on standard output: the one way for commands that need no table, colour or live line."""
+"""Plain text on standard output, for commands without tables, colours or a live line."""
 
 import sys
 
@@ -6,7 +6,7 @@ from fieldkit.core.text import harmless
 
 
 def say(text: object = "", *, end: str = "\n", flush: bool = False) -> None:
-    """Print a text without control characters; a tab stays, because files that are shown may have some."""
+    """Print a text with its control characters replaced, except tabs, which files that are shown may contain."""
     sys.stdout.write("\t".join(map(harmless, str(text).split("\t"))) + end)
     if flush:
         sys.stdout.flush()

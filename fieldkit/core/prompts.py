@@ -1,9 +1,11 @@
-"""Asking the operator: one interface for a person at a terminal, for a script, and for nobody."""
+"""Questions to the operator: one interface for a person at a terminal, for answers from a file, and for `--yes`."""
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Protocol
+
+from typing_extensions import override
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Answered, Asked, Entered, Request, Sink
@@ -12,16 +14,16 @@ from fieldkit.core.text import harmless
 SKIP: Final = "s"
 NOTE: Final = "n "
 UNKNOWN: Final = "-"
-"""What who does not know enters."""
+"""Answer that means "unknown"."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What the operator said when a request was done.
+    """Answer of the operator to a request.
 
     Attributes:
-        skip: Leave it for later.
-        note: Kept with the trial; empty for none.
+        skip: Whether the request is postponed.
+        note: Note that is stored with the trial; empty if none.
     """
 
     skip: bool = False
@@ -33,14 +35,14 @@ DONE: Final = Answer()
 
 @dataclass(frozen=True)
 class Question:
-    """Something that the operator sees: a number, or one of several words.
+    """A question to the operator for a number, or for one of several words.
 
     Attributes:
         text: The question, without a question mark.
-        unit: Of the number; empty where it has none.
-        choices: The words; empty for a number.
-        bounds: Smallest and largest number that is possible.
-        usual: What an empty line says; empty where it says nothing.
+        unit: Unit of the number; empty if it has none.
+        choices: The possible words; empty for a number.
+        bounds: Smallest and largest possible number.
+        usual: Answer that an empty line means; empty if there is no default.
     """
 
     text: str
@@ -50,15 +52,15 @@ class Question:
     usual: str = ""
 
     def read(self, line: str) -> str | None:
-        """Return what a typed line says: a number, a word, `UNKNOWN`, or None where it says nothing of that."""
-        said = line.strip() or self.usual
-        if not said or said == UNKNOWN:
-            return said or None
+        """Return the answer in a typed line: a number, a word or `UNKNOWN`; None if the line is not an answer."""
+        text = line.strip() or self.usual
+        if not text or text == UNKNOWN:
+            return text or None
         if self.choices:
             by_number = {str(number): choice for number, choice in enumerate(self.choices, start=1)}
-            return said if said in self.choices else by_number.get(said)
+            return text if text in self.choices else by_number.get(text)
         try:
-            value = float(said.removesuffix(self.unit))
+            value = float(text.removesuffix(self.unit))
         except ValueError:
             return None
         low, high = self.bounds
@@ -66,7 +68,7 @@ class Question:
 
     @property
     def how(self) -> str:
-        """What can be answered, in words."""
+        """Description of the possible answers."""
         if self.choices:
             words = ", ".join(f"{number} {choice}" for number, choice in enumerate(self.choices, start=1))
         else:
@@ -74,54 +76,54 @@ class Question:
             least = f" from {low:g}" if math.isfinite(low) else ""
             most = f" to {high:g}" if math.isfinite(high) else ""
             words = f"a number{f' in {self.unit}' if self.unit else ''}{least}{most}"
-        return f"{words}; {UNKNOWN} if nobody knows{f'; Enter for {self.usual}' if self.usual else ''}"
+        return f"{words}; {UNKNOWN} if unknown{f'; Enter for {self.usual}' if self.usual else ''}"
 
 
 class Operator(Protocol):
-    """Person who carries robots."""
+    """The person who places the robots and answers questions, or a substitute."""
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
-        """Show a request and return when it is done, or left.
+        """Show a request and return the answer when it is done or postponed.
 
         Args:
             request: What to do, in the imperative, without a full stop: `put turtlebot-1 ...`.
             may_skip: Whether `Answer.skip` is a possible answer.
 
         Raises:
-            ConfigurationError: There is nobody to ask.
+            ConfigurationError: No answer is available.
         """
         ...
 
     def enter(self, question: Question) -> str:
-        """Show a question and return what was answered, as `Question.read`. Errors as `ask`."""
+        """Show a question and return its answer, as `Question.read`; raises as `ask`."""
         ...
 
 
-class Nobody:
-    """The operator who said `--yes`: everything is as it should be."""
+class Nobody(Operator):
+    """Substitute for the operator with `--yes`: each request is done, and each question has its default answer."""
 
-    def ask(self, request: str, *, may_skip: bool = False) -> Answer:  # noqa: ARG002 (nobody listens)
-        """See `Operator.ask`."""
+    @override
+    def ask(self, request: str, *, may_skip: bool = False) -> Answer:
         return DONE
 
+    @override
     def enter(self, question: Question) -> str:
-        """See `Operator.enter`; who is not asked does not know."""
         return question.usual or UNKNOWN
 
 
 NOBODY: Final = Nobody()
 
 
-class Script:
-    """Answers from lines written beforehand, one per request.
+class Script(Operator):
+    """Operator whose answers are lines of a file or pipe, one per request.
 
-    An empty line says done, `s` skips, `n TEXT` says done and keeps a note. A line is read only after its request
-    was told, so that a program at the other end of a pipe can answer what it is asked.
+    An empty line means done, `s` means postponed, and `n TEXT` means done with a note. A line is read only after its
+    request was reported, so that a program at the other end of a pipe can answer it.
 
     Args:
         lines: The answers.
-        source: Where they come from, for messages.
-        sink: Told each request and its answer.
+        source: Source of the lines, for messages.
+        sink: Receives each request and its answer.
     """
 
     def __init__(self, lines: Iterator[str], source: str, sink: Sink) -> None:
@@ -130,8 +132,8 @@ class Script:
         self._sink = sink
         self._asked = 0
 
+    @override
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
-        """See `Operator.ask`."""
         self._sink(Request(request, may_skip))
         line = self._next(request)
         answer = parse(line, may_skip=may_skip)
@@ -140,8 +142,8 @@ class Script:
         self._sink(Answered(answer.skip, answer.note))
         return answer
 
+    @override
     def enter(self, question: Question) -> str:
-        """See `Operator.enter`."""
         self._sink(Asked(question.text, question.how))
         line = self._next(question.text)
         answer = question.read(line)
@@ -160,7 +162,9 @@ class Script:
         return line
 
     def _no_answer(self, line: str, request: str, remedy: str) -> ConfigurationError:
-        return ConfigurationError(f"{line.strip()!r} is no answer to: {request}", where=self._where, remedy=remedy)
+        return ConfigurationError(
+            f"{line.strip()!r} is not an answer to: {request}", where=self._where, remedy=remedy
+        )
 
     @property
     def _where(self) -> str:
@@ -168,12 +172,12 @@ class Script:
 
 
 def how(*, may_skip: bool) -> str:
-    """Return what can be answered, in words."""
+    """Return a description of the possible answers to a request."""
     return f"Enter when done, {f'{SKIP} to leave it for later, ' * may_skip}{NOTE}TEXT when done, with a note"
 
 
 def parse(line: str, *, may_skip: bool) -> Answer | None:
-    """Return what a typed line means, None when it means nothing."""
+    """Return the answer in a typed line, or None if the line is not an answer."""
     text = line.strip()
     if not text:
         return DONE

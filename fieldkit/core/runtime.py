@@ -1,7 +1,7 @@
-"""Names that one process of a user holds at a time: lock files in a folder that no other user can write.
+"""Named locks between the processes of one user: lock files in a folder to which no other user can write.
 
-A lock is a `flock`, which the kernel gives back however its process ends. So a file that kill -9 left behind holds
-nothing, and the next process that takes a name removes it.
+A lock is a `flock`, which the kernel releases when its process exits, even after kill -9. A file that was left behind
+is therefore not locked, and the next process that takes any lock removes it.
 """
 
 import fcntl
@@ -18,22 +18,22 @@ from typing import Final, NoReturn
 
 from fieldkit.core.errors import ConfigurationError, typed
 
-_LONGEST_BASE_BYTES: Final = 60
-"""Of a base folder: the name of a Unix socket below it has at most 107 bytes (unix(7))."""
+_MAX_BASE_BYTES: Final = 60
+"""Maximum length of the base folder's path, because the path of a Unix socket has at most 107 bytes (unix(7))."""
 
 _SUFFIX: Final = ".lock"
 
-_TRIES: Final = 10
-_PAUSE_S: Final = 0.02
-"""A program that removes unlocked files must lock each for a moment."""
+_LOCK_TRIES: Final = 10
+_RETRY_INTERVAL_S: Final = 0.02
+"""Retries are needed because a process that removes unlocked files locks each of them briefly."""
 
 
 class NameHeldError(ConfigurationError):
-    """Another process holds the name."""
+    """Another process holds the lock."""
 
 
 def me() -> str:
-    """Return `user@laptop`, as it is named on robots."""
+    """Return `user@laptop`, the name of the lock holder on robots."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user id without an account
@@ -42,24 +42,25 @@ def me() -> str:
 
 
 def base_folder() -> Path:
-    """Return the folder for this user's files that live as long as a process.
+    """Return the base folder for this user's files that exist only while a process runs.
 
-    The first of: `XDG_RUNTIME_DIR`, `/run/user/UID` (freedesktop.org Base Directory Specification), for root `/run`,
-    `~/.cache`, if it is this user's and no other user may write there; otherwise the folder of temporary files.
+    This is the first of `XDG_RUNTIME_DIR`, `/run/user/UID` (freedesktop.org Base Directory Specification), `/run` for
+    root, and `~/.cache`, that belongs to this user and to which no other user can write; otherwise the folder of
+    temporary files.
     """
     user = os.geteuid()
-    named = filter(None, (os.environ.get("XDG_RUNTIME_DIR"), f"/run/user/{user}", "/run" if user == 0 else ""))
-    candidates = [*map(Path, named), *_home_cache()]
+    names = filter(None, (os.environ.get("XDG_RUNTIME_DIR"), f"/run/user/{user}", "/run" if user == 0 else ""))
+    candidates = [*map(Path, names), *_home_cache()]
     temporary = Path(tempfile.gettempdir())
-    return next((path for path in candidates if _only_ours_to_write(path)), temporary)
+    return next((path for path in candidates if _is_safe_base(path)), temporary)
 
 
 def _home_cache() -> Iterator[Path]:
-    with suppress(RuntimeError):  # a user without a home
+    with suppress(RuntimeError):  # the user has no home directory
         yield Path.home() / ".cache"
 
 
-def _only_ours_to_write(path: Path) -> bool:
+def _is_safe_base(path: Path) -> bool:
     try:
         status = path.stat()
     except OSError:
@@ -67,43 +68,43 @@ def _only_ours_to_write(path: Path) -> bool:
     return (
         path.is_absolute()
         and stat.S_ISDIR(status.st_mode)
-        and status.st_uid == os.geteuid()  # after sudo the variables still name another user's folder
+        and status.st_uid == os.geteuid()  # after sudo, the variables can contain another user's folder
         and not status.st_mode & 0o022
         and os.access(path, os.W_OK | os.X_OK)
-        and len(os.fsencode(path)) <= _LONGEST_BASE_BYTES
+        and len(os.fsencode(path)) <= _MAX_BASE_BYTES
     )
 
 
 def is_private(status: os.stat_result) -> bool:
-    """Return whether this is a folder of this user's that no other user can enter."""
+    """Return True if this is a folder of this user to which no other user has access."""
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077
 
 
 def not_private(path: Path) -> ConfigurationError:
-    """Return the error for a path where another user has put something, or can."""
-    remedy = f"remove it, or set XDG_RUNTIME_DIR to a folder of your own: {typed('ls', '-ld', path)}"
-    return ConfigurationError("is not this user's alone", where=str(path), remedy=remedy)
+    """Return the error for a path that another user owns or has access to."""
+    remedy = f"remove it, or set XDG_RUNTIME_DIR to your private folder: {typed('ls', '-ld', path)}"
+    return ConfigurationError("other users own it or have access to it", where=str(path), remedy=remedy)
 
 
 @contextmanager
 def held(name: str) -> Iterator[None]:
-    """Hold a name while the body runs; nothing is left of it then.
+    """Hold a named lock while the body runs; its file is removed afterwards.
 
     Args:
-        name: A file name, of letters, digits and `._@-`, at most 200 bytes.
+        name: A file name of letters, digits and `._@-`, at most 200 bytes.
 
     Raises:
-        NameHeldError: Another process holds it.
-        ConfigurationError: The folder for it cannot be made, or is another user's.
+        NameHeldError: Another process holds the lock.
+        ConfigurationError: The folder of lock files cannot be created, or is another user's.
     """
     path = base_folder() / f"fieldkit-{os.geteuid()}"
     try:
-        folder, lock = _taken(path, f"{name}{_SUFFIX}")
+        folder, lock = _open_and_lock(path, f"{name}{_SUFFIX}")
     except OSError as error:
         raise ConfigurationError(
-            f"no lock can be held there: {error.strerror or error}",
+            f"cannot create a lock file there: {error.strerror or error}",
             where=str(path),
-            remedy="set XDG_RUNTIME_DIR to a folder of your own, of mode 700",
+            remedy="set XDG_RUNTIME_DIR to your private folder with mode 700",
         ) from error
     try:
         _remove_stale(folder)
@@ -113,23 +114,23 @@ def held(name: str) -> Iterator[None]:
             os.unlink(f"{name}{_SUFFIX}", dir_fd=folder)
         os.close(lock)
         os.close(folder)
-        with suppress(OSError):  # others hold names there
+        with suppress(OSError):  # not empty if other processes hold locks
             path.rmdir()
 
 
-def _taken(path: Path, file: str) -> tuple[int, int]:
-    """Return descriptors of the folder and of the lock file, which is locked and has its name."""
+def _open_and_lock(path: Path, file: str) -> tuple[int, int]:
+    """Return descriptors of the folder and of the locked file, after checking that the file still has its name."""
     while True:
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
         try:
             folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         except FileNotFoundError:
-            continue  # the process that held the last file there has removed it
+            continue  # the process that held the last lock has removed the folder
         except NotADirectoryError as error:
             raise not_private(path) from error
         try:
-            lock = _locked(folder, file) if is_private(os.fstat(folder)) else _refused(path)
+            lock = _try_lock_file(folder, file) if is_private(os.fstat(folder)) else _raise_not_private(path)
         except BaseException:
             os.close(folder)
             raise
@@ -138,15 +139,15 @@ def _taken(path: Path, file: str) -> tuple[int, int]:
         os.close(folder)
 
 
-def _refused(path: Path) -> NoReturn:
+def _raise_not_private(path: Path) -> NoReturn:
     raise not_private(path)
 
 
-def _locked(folder: int, file: str, tries: int = _TRIES) -> int | None:
-    """Return the descriptor of a lock file, locked; None if its name or its folder was removed meanwhile.
+def _try_lock_file(folder: int, file: str, tries: int = _LOCK_TRIES) -> int | None:
+    """Return the descriptor of a locked file, or None if the file or its folder was removed in the meantime.
 
     Raises:
-        NameHeldError: Another process holds it.
+        NameHeldError: Another process holds the lock.
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
@@ -154,7 +155,7 @@ def _locked(folder: int, file: str, tries: int = _TRIES) -> int | None:
     except FileNotFoundError:
         return None
     try:
-        _lock(lock, file, tries)
+        _lock_with_retries(lock, file, tries)
         if _has_name(lock, file, folder):
             return lock
     except BaseException:
@@ -164,14 +165,14 @@ def _locked(folder: int, file: str, tries: int = _TRIES) -> int | None:
     return None
 
 
-def _lock(lock: int, file: str, tries: int) -> None:
-    for left in reversed(range(tries)):
+def _lock_with_retries(lock: int, file: str, tries: int) -> None:
+    for tries_left in reversed(range(tries)):
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            if not left:
+            if not tries_left:
                 raise NameHeldError("another process holds it", where=file) from error
-            time.sleep(_PAUSE_S)
+            time.sleep(_RETRY_INTERVAL_S)
         else:
             return
 
@@ -184,12 +185,12 @@ def _has_name(lock: int, file: str, folder: int) -> bool:
 
 
 def _remove_stale(folder: int) -> None:
-    """Remove the lock files that no process holds."""
+    """Remove the files that no process has locked."""
     for file in os.listdir(folder):
         if not file.endswith(_SUFFIX):
             continue
         with suppress(OSError, NameHeldError):
-            lock = _locked(folder, file, tries=1)
+            lock = _try_lock_file(folder, file, tries=1)
             if lock is not None:
                 os.unlink(file, dir_fd=folder)
                 os.close(lock)

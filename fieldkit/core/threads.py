@@ -1,4 +1,4 @@
-"""Calls side by side, one thread each."""
+"""Concurrent calls in one thread each, and a signal that ends their waits."""
 
 from collections.abc import Callable, Collection
 from threading import Event, Thread
@@ -10,38 +10,38 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 T = TypeVar("T")
 
-_HUNG_UP_S: Final = 10.0
-_WAKE_S: Final = 0.5
+_HANG_UP_WAIT_S: Final = 10.0
+_POLL_INTERVAL_S: Final = 0.5
 
 
 class Halt:
-    """Ends the waits of what runs at the same time, where it is not to go on."""
+    """Signal that ends the waits of concurrent work; it can have child signals."""
 
     def __init__(self) -> None:
         self._event = Event()
-        self._inner: list[Halt] = []
+        self._children: list[Halt] = []
 
     @property
     def called(self) -> bool:
-        """Whether nothing is to wait any more."""
+        """Whether the signal is set."""
         return self._event.is_set()
 
     def call(self) -> None:
-        """End all waits, those of what runs inside too; there may be none."""
+        """Set the signal and its children, which ends all waits."""
         self._event.set()
-        for halt in self._inner:
-            halt.call()
+        for child in self._children:
+            child.call()
 
     def inside(self) -> "Halt":
-        """Return one of what runs inside, which is called with this one, and may be called by itself."""
-        inner = Halt()
-        self._inner.append(inner)
+        """Return a child signal, which is set together with this one and can also be set alone."""
+        child = Halt()
+        self._children.append(child)
         if self.called:
-            inner.call()
-        return inner
+            child.call()
+        return child
 
     def wait(self, duration_s: float) -> bool:
-        """Wait for so long; return whether it was called, which ends the wait at once."""
+        """Wait for a duration or until the signal is set; return True if it is set."""
         return self._event.wait(duration_s)
 
 
@@ -52,41 +52,45 @@ def together(
     hang_up: Callable[[], None] | None = None,
     end_others: Callable[[], None] | None = None,
 ) -> list[T]:
-    """Call `call` with each of `items` at once, one thread each; return the results, or raise the first error.
+    """Call `call` with each of `items` in a separate thread; return the results, or raise the first error.
 
-    Ctrl-C does not wait for the threads: who catches it ends what they wait for. With `hang_up`, which ends that, it
-    does for a while, so that what they write is not touched before.
-
-    With `end_others`, which ends what calls wait for, the first that fails ends all: it is called again until they
-    have ended, and what they raise is its work. Without it each is waited for.
+    Args:
+        call: The function.
+        items: Its arguments, one per thread.
+        hang_up: Ends the waits of the calls after Ctrl-C, for example by closing connections. The threads then have
+            10 s to return, so that they no longer write to files. Without it, Ctrl-C does not wait for the threads.
+        end_others: Ends the waits of all calls after one has failed. It is called repeatedly until all threads have
+            returned, and their errors are ignored. Without it, all calls run to their end.
     """
     from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait  # noqa: PLC0415 (logging, 5 ms)
 
-    # Made before any thread is: Ctrl-C in the midst of starting one must not lose sight of it.
+    # All futures exist before the first thread starts, so that Ctrl-C while a thread starts does not lose its future.
     futures: list[Future[T]] = [Future() for _ in items]
     failed: Future[T] | None = None
     try:
         for future, item in zip(futures, items, strict=True):
-            Thread(target=_answer, args=(future, call, item), daemon=True).start()
-        # Python sees a Ctrl-C that came just before it blocked only when it wakes.
-        while wait(futures, _WAKE_S, ALL_COMPLETED if end_others is None or failed else FIRST_EXCEPTION).not_done:
+            Thread(target=_run_call, args=(future, call, item), daemon=True).start()
+        # Python handles a Ctrl-C that arrived just before a blocking wait only when the wait returns.
+        while wait(
+            futures, _POLL_INTERVAL_S, ALL_COMPLETED if end_others is None or failed else FIRST_EXCEPTION
+        ).not_done:
             if end_others is not None:
-                failed = failed or next((one for one in futures if one.done() and one.exception()), None)
+                failed = failed or next((future for future in futures if future.done() and future.exception()), None)
                 if failed is not None:
                     end_others()
     except BaseException:
         if hang_up is not None:
             running = [future for future in futures if not future.cancel()]
             hang_up()
-            wait(running, _HUNG_UP_S)
+            wait(running, _HANG_UP_WAIT_S)
         raise
     return [future.result() for future in ([failed] if failed else futures)]
 
 
-def _answer(future: "Future[T]", call: Callable[[Item], T], item: Item) -> None:
+def _run_call(future: "Future[T]", call: Callable[[Item], T], item: Item) -> None:
     if not future.set_running_or_notify_cancel():
         return
     try:
         future.set_result(call(item))
-    except BaseException as error:  # noqa: BLE001 (whoever asks for the result gets it)
+    except BaseException as error:  # noqa: BLE001 (raised again by `Future.result`)
         future.set_exception(error)

@@ -1,4 +1,4 @@
-"""Quantities as people write them (`30ft`, `200ms`, `20Mbit/s`), SI inside."""
+"""Parsing and formatting of quantities with units, such as `30ft`, `200ms` and `20Mbit/s`; values are in SI units."""
 
 import re
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ BITS_PER_S_PER_UNIT: Final = {"bit/s": 1.0, "kbit/s": 1e3, "Mbit/s": 1e6, "Gbit/
 BYTES_PER_UNIT: Final = {"B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "KiB": 1024.0, "MiB": 2.0**20, "GiB": 2.0**30}
 FRACTION_PER_UNIT: Final = {"%": 0.01}
 
-_MOST: Final = 1e11
-"""Bound on any quantity, in its unit of factor 1: what is above it, 3,000 years, makes clocks and timers overflow."""
+_MAX_VALUE: Final = 1e11
+"""Upper bound of any quantity, in its unit of factor 1: larger times, above 3,000 years, make timers overflow."""
 
 _QUANTITY: Final = re.compile(
-    # Possessive: of many blanks each way to share them out would be tried.
+    # Possessive quantifiers prevent backtracking over long runs of blanks.
     r"\s*+(?P<number>\d{1,15}(?:\.\d{1,30})?|\.\d{1,30})\s*+(?P<unit>[A-Za-z%/]*+)\s*+\Z",
     re.ASCII,
 )
@@ -35,7 +35,7 @@ def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
         what: The kind of quantity, for the message.
 
     Raises:
-        ConfigurationError: No number, no unit, a unit that is not in `units`, or more than `_MOST`.
+        ConfigurationError: The number or the unit is missing, the unit is unknown, or the value exceeds `_MAX_VALUE`.
     """
     match = _QUANTITY.match(text)
     example = f"write for example {_example(match['number'] if match else '15', units)}; units are {', '.join(units)}"
@@ -48,23 +48,23 @@ def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
     if match["unit"] not in units:
         raise ConfigurationError(f"{what} {text!r} has the unknown unit {match['unit']!r}", remedy=example)
     value = float(match["number"]) * units[match["unit"]]
-    if value > _MOST:
-        raise ConfigurationError(f"{what} {text[:40]!r} is too large", remedy="is the unit right?")
+    if value > _MAX_VALUE:
+        raise ConfigurationError(f"{what} {text[:40]!r} is too large", remedy="check the unit")
     return value
 
 
 def _example(number: str, units: dict[str, float]) -> str:
-    """Return what somebody may have meant who wrote a number without a unit: `30m or 30ft`."""
+    """Return the number with units, as a suggestion: `30m or 30ft`."""
     if next(iter(units)) == "%" and float(number) < 1:
-        return f"{100 * float(number):g}%"  # a share, written as one
+        return f"{100 * float(number):g}%"  # the number is probably a fraction
     return " or ".join(f"{number[:20]}{unit}" for unit in list(units)[:2])
 
 
 def parse_distance(text: str) -> Distance:
-    """Return a distance that keeps the operator's label, spaces removed.
+    """Return a distance whose label is the operator's text without spaces.
 
     Raises:
-        ConfigurationError: `text` is no length with a unit, or not above zero.
+        ConfigurationError: `text` is not a length with a unit, or not above zero.
     """
     metres = parse_quantity(text, METRES_PER_UNIT, "distance")
     if metres <= 0:
@@ -73,16 +73,16 @@ def parse_distance(text: str) -> Distance:
 
 
 def parse_offset_m(text: str) -> float:
-    """Return a length in metres that may go the other way, `-30ft`; raises as `parse_quantity`."""
+    """Return a length in metres that may be negative, `-30ft`; raises as `parse_quantity`."""
     length_m = parse_quantity(text.removeprefix("-"), METRES_PER_UNIT, "length")
     return -length_m if text.startswith("-") else length_m
 
 
 def format_distance(distance: Distance) -> str:
-    """Return a distance in the operator's own unit, and in metres: `40 ft (12.19 m)`."""
-    own = re.sub(r"(?<=[\d.])(?=[a-z])", " ", distance.label)
+    """Return a distance in the operator's unit, and in metres: `40 ft (12.19 m)`."""
+    label = re.sub(r"(?<=[\d.])(?=[a-z])", " ", distance.label)
     metres = f"{distance.metres:.2f} m"
-    return own if own.endswith(" m") else f"{own} ({metres})"
+    return label if label.endswith(" m") else f"{label} ({metres})"
 
 
 def parse_duration_s(text: str) -> float:
@@ -107,17 +107,17 @@ def format_duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
-_CLEARLY: Final = 1.2
-"""Upper ends beyond this multiple of the likely time are stated beside it."""
+_CERTAIN_RATIO: Final = 1.2
+"""An upper estimate is shown if it is above this multiple of the likely duration."""
 
 
 @dataclass(frozen=True)
 class TimeEstimate:
-    """A duration that is not known yet.
+    """Estimate of a duration.
 
     Attributes:
-        likely_s: What is expected.
-        most_s: What it may come to, repeats that have to be redone apart.
+        likely_s: Expected duration.
+        most_s: Upper estimate, without repeats that must be run again.
     """
 
     likely_s: float
@@ -125,11 +125,11 @@ class TimeEstimate:
 
     @property
     def is_certain(self) -> bool:
-        """Whether it may come to little more than what is expected."""
-        return self.most_s <= _CLEARLY * self.likely_s
+        """Whether the upper estimate is close to the expected duration."""
+        return self.most_s <= _CERTAIN_RATIO * self.likely_s
 
     def __str__(self) -> str:
-        """Return it for people: `4 min 00 s`, with `, up to 19 min 00 s` where that is clearly more."""
+        """Return the text for people: `4 min 00 s`, followed by `, up to 19 min 00 s` if that is clearly more."""
         most = "" if self.is_certain else f", up to {format_duration(self.most_s)}"
         return f"{format_duration(self.likely_s)}{most}"
 

@@ -39,7 +39,7 @@ def summarize(rows: Sequence[RepeatRow]) -> tuple[Cell, ...]:
     return aggregate(parsed(rows))
 
 
-def test_counts_are_pooled_and_the_spread_is_over_repeats() -> None:
+def test_counts_are_summed_and_intervals_are_over_repeats() -> None:
     (cell,) = summarize([UDP, WORSE])
     loss = cell.estimates["ip_loss"]
     pooled = wilson(40, 432)
@@ -68,14 +68,14 @@ def test_shares_of_bytes_and_times_vary_by_the_repeat() -> None:
     assert 1.0 <= time.low < time.value == 5.0 < time.high <= 9.0
 
 
-def test_only_valid_rows_are_measured_and_all_are_counted() -> None:
+def test_estimates_use_valid_rows_and_all_rows_are_counted() -> None:
     void, failed = replace(WORSE, status=Status.VOID), replace(WORSE, status="failed")
     (cell,) = summarize([UDP, void, void, failed])
     assert (cell.n_valid, cell.n_void, cell.n_failed) == (1, 2, 1)
     assert cell.estimates["ip_loss"].value == 10 / 216
 
 
-def test_a_cell_without_a_valid_row_is_empty_but_there() -> None:
+def test_a_cell_without_a_valid_row_is_kept_without_estimates() -> None:
     cells = summarize([replace(UDP, status="failed")])
     assert cells[0].estimates == {}
     header, line = tables.to_csv(DEFAULT_BY, cells).splitlines()
@@ -102,20 +102,20 @@ def test_a_single_repeat_has_no_interval_over_repeats() -> None:
     assert cell.estimates["ip_loss"].wilson_low is not None
 
 
-def test_a_filter_that_offload_deceives_gives_no_interval() -> None:
+def test_more_arrivals_than_sent_because_of_offload_give_no_interval() -> None:
     (cell,) = summarize([replace(UDP, paper_packets=22, paper_received=209, paper_loss=1 - 209 / 22)])
     loss = cell.estimates["paper_loss"]
     assert (loss.value, loss.low, loss.wilson_low, loss.wilson_high) == (1 - 209 / 22, None, None, None)
 
 
-def test_missing_measures_are_left_out_of_the_pool() -> None:
+def test_missing_values_are_omitted_from_sums() -> None:
     blind = replace(WORSE, ip_packets_received=None, ip_loss=None, transfer_s=None)
     (cell,) = summarize([UDP, blind])
     assert (cell.estimates["ip_loss"].value, cell.estimates["ip_loss"].n) == (10 / 216, 1)
     assert cell.estimates["transfer_s"].value == 1.0
 
 
-def test_conditions_are_kept_apart_and_sorted() -> None:
+def test_conditions_are_separate_and_sorted() -> None:
     rows = [
         replace(UDP, distance=label, distance_m=metres, protocol=protocol, scenario=scenario)
         for label, metres in (("100ft", 30.48), ("9.1m", 9.1), ("30ft", 9.144))
@@ -123,8 +123,10 @@ def test_conditions_are_kept_apart_and_sorted() -> None:
         for scenario in ("nlos", "los")
     ]
     cells = summarize([*rows, UDP])
-    told = [(*(cell.key[name] for name in ("scenario", "distance", "protocol")), cell.n_valid) for cell in cells]
-    assert told == [
+    conditions = [
+        (*(cell.key[name] for name in ("scenario", "distance", "protocol")), cell.n_valid) for cell in cells
+    ]
+    assert conditions == [
         (scenario, distance, protocol, 1 + ((scenario, distance, protocol) == ("los", "30ft", "udp")))
         for scenario in ("los", "nlos")
         for distance in ("9.1m", "30ft", "100ft")
@@ -132,7 +134,7 @@ def test_conditions_are_kept_apart_and_sorted() -> None:
     ]
 
 
-def test_any_column_tells_conditions_and_one_that_is_missing_comes_first() -> None:
+def test_any_column_can_identify_conditions_and_missing_values_come_first() -> None:
     rows = [
         replace(UDP, repeat=2),
         replace(UDP, repeat=None),
@@ -148,7 +150,7 @@ def test_any_column_tells_conditions_and_one_that_is_missing_comes_first() -> No
     assert [cell.n_valid for cell in aggregate(parsed(rows), [])] == [4]
 
 
-def test_intervals_depend_on_the_cells_own_rows_alone() -> None:
+def test_intervals_depend_only_on_the_rows_of_their_cell() -> None:
     rows = [replace(UDP, transfer_s=float(n) ** 1.5, byte_loss=n / 97) for n in range(12)]
     (alone,) = summarize(rows)
     among = summarize([replace(UDP, distance="1m"), *rows])[1]
@@ -159,7 +161,7 @@ def test_no_rows_give_no_cells() -> None:
     assert summarize([]) == ()
 
 
-def test_an_older_table_lacks_columns_and_they_are_missing() -> None:
+def test_columns_that_an_older_table_lacks_are_missing() -> None:
     read = parse(b"protocol,status,transfer_s,hash_match\nudp,valid,1.5,true\nudp,void,,\n", trial_columns())
     assert read.column("transfer_s") == [1.5, None]
     assert read.column("hash_match") == [1.0, None]

@@ -1,4 +1,4 @@
-"""Two runs beside each other: what is paired, found, and what speaks against comparing."""
+"""Comparison of two runs: pairing of conditions, differences, and concerns about comparability."""
 
 import dataclasses
 import random
@@ -26,77 +26,83 @@ def compared(a: Sequence[RepeatRow], b: Sequence[RepeatRow], **options: Any) -> 
 
 
 def only(comparison: Comparison, quantity: str) -> Difference:
-    (found,) = (one for one in comparison.differences if one.quantity.name == quantity)
-    return found
+    (result,) = (difference for difference in comparison.differences if difference.quantity.name == quantity)
+    return result
 
 
 def moved(rows: Sequence[RepeatRow], **changes: Any) -> list[RepeatRow]:  # noqa: ANN401 (as replace)
     return [replace(row, **changes) for row in rows]
 
 
-def test_a_run_against_itself_differs_in_nothing() -> None:
-    found = compared(UDP, UDP)
-    assert found.concerns == ()
-    assert {one.value for one in found.differences} == {0.0}
-    assert {one.cliffs_delta for one in found.differences} == {0.0}
-    assert {one.p_holm for one in found.differences} == {1.0}
-    assert not any(one.seen for one in found.differences)
+def test_a_run_compared_with_itself_has_no_difference() -> None:
+    result = compared(UDP, UDP)
+    assert result.concerns == ()
+    assert {difference.value for difference in result.differences} == {0.0}
+    assert {difference.cliffs_delta for difference in result.differences} == {0.0}
+    assert {difference.p_holm for difference in result.differences} == {1.0}
+    assert not any(difference.seen for difference in result.differences)
 
 
-def test_a_known_shift_is_found() -> None:
+def test_a_known_shift_is_detected() -> None:
     slower = [replace(row, rtt_median_s=(row.rtt_median_s or 0) + 0.005) for row in UDP]
-    one = only(compared(UDP, slower), "rtt_median_s")
-    assert one.interval is not None
-    assert one.value == pytest.approx(0.005)
-    assert one.interval.low < 0.005 < one.interval.high
-    assert one.seen
-    assert one.cliffs_delta is not None
-    assert one.cliffs_delta > 0.5
+    difference = only(compared(UDP, slower), "rtt_median_s")
+    assert difference.interval is not None
+    assert difference.value == pytest.approx(0.005)
+    assert difference.interval.low < 0.005 < difference.interval.high
+    assert difference.seen
+    assert difference.cliffs_delta is not None
+    assert difference.cliffs_delta > 0.5
 
 
-def test_a_share_without_its_counts_is_in_no_effect_size() -> None:
+def test_a_share_without_its_counts_is_not_in_the_effect_size() -> None:
     rows = bursty(COMPARABLE, 10, seed=1)
     lost = replace(rows[0], repeat=11, ip_packets_sent=None, ip_packets_received=None, ip_loss=1.0)
-    found = only(compared(rows, [*rows, lost]), "ip_loss")
-    assert (found.b and found.b.n, found.value, found.cliffs_delta) == (10, 0.0, 0.0)
+    result = only(compared(rows, [*rows, lost]), "ip_loss")
+    assert (result.b and result.b.n, result.value, result.cliffs_delta) == (10, 0.0, 0.0)
 
 
-def test_a_condition_of_one_run_alone_is_kept() -> None:
+def test_a_condition_of_only_one_run_is_kept() -> None:
     far, tcp = moved(UDP, distance="55ft", distance_m=16.764), moved(UDP, protocol="tcp")
-    found = compared([*UDP, *far], [*tcp, *UDP])
-    assert [(pair.name, pair.missing_in) for pair in found.pairs] == [
+    result = compared([*UDP, *far], [*tcp, *UDP])
+    assert [(pair.name, pair.missing_in) for pair in result.pairs] == [
         ("los, master, 9.144 m, udp", ""),
         ("los, master, 16.764 m, udp", "B"),
         ("los, master, 9.144 m, tcp", "A"),
     ]
-    assert all(one.value is None for pair in found.pairs[1:] for one in pair.differences)
+    assert all(difference.value is None for pair in result.pairs[1:] for difference in pair.differences)
 
 
-def test_a_quantity_of_one_run_alone_is_kept() -> None:
-    one = only(compared(UDP, moved(UDP, transfer_s=None)), "transfer_s")
-    assert (one.b, one.value, one.interval, one.cliffs_delta, one.p_holm) == (None, None, None, None, None)
+def test_a_quantity_of_only_one_run_is_kept() -> None:
+    difference = only(compared(UDP, moved(UDP, transfer_s=None)), "transfer_s")
+    assert (difference.b, difference.value, difference.interval, difference.cliffs_delta, difference.p_holm) == (
+        None,
+        None,
+        None,
+        None,
+        None,
+    )
 
 
 def test_a_condition_without_valid_repeats_is_kept() -> None:
-    found = compared(UDP, moved(UDP, status="void"))
-    assert [pair.missing_in for pair in found.pairs] == [""]
-    assert all(one.b is None for one in found.differences)
-    assert found.refusals == ()
+    result = compared(UDP, moved(UDP, status="void"))
+    assert [pair.missing_in for pair in result.pairs] == [""]
+    assert all(difference.b is None for difference in result.differences)
+    assert result.refusals == ()
 
 
 def test_void_repeats_change_nothing() -> None:
     void = moved(UDP, status="void", rtt_median_s=9.0, sent_bytes=1)
-    found = compared(UDP, [*UDP, *void])
-    assert found.concerns == ()
-    assert [dataclasses.replace(one, b=None) for one in found.differences] == [
-        dataclasses.replace(one, b=None) for one in compared(UDP, UDP).differences
+    result = compared(UDP, [*UDP, *void])
+    assert result.concerns == ()
+    assert [dataclasses.replace(difference, b=None) for difference in result.differences] == [
+        dataclasses.replace(difference, b=None) for difference in compared(UDP, UDP).differences
     ]
 
 
 def test_a_single_repeat_has_a_difference_and_no_interval() -> None:
-    one = only(compared(UDP, UDP[:1]), "transfer_s")
-    assert one.value is not None
-    assert (one.interval, one.p_holm) == (None, None)
+    difference = only(compared(UDP, UDP[:1]), "transfer_s")
+    assert difference.value is not None
+    assert (difference.interval, difference.p_holm) == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -104,20 +110,20 @@ def test_a_single_repeat_has_a_difference_and_no_interval() -> None:
     [(0.1, 20, True), (1e-6, 20, False), (0.1, 1, False)],
     ids=["wide", "narrow", "no interval"],
 )
-def test_a_threshold_holds_the_whole_interval(limit_s: float, repeats: int, *, within: bool) -> None:
-    found = compared(UDP, UDP[:repeats], thresholds={"rtt_median_s": limit_s})
-    assert only(found, "rtt_median_s").within is within
-    assert found.missed is not within
+def test_the_whole_interval_must_be_within_a_threshold(limit_s: float, repeats: int, *, within: bool) -> None:
+    result = compared(UDP, UDP[:repeats], thresholds={"rtt_median_s": limit_s})
+    assert only(result, "rtt_median_s").within is within
+    assert result.missed is not within
 
 
 def test_a_point_within_a_threshold_is_not_enough() -> None:
-    one = only(compared(UDP, UDP), "rtt_median_s")
-    assert one.interval is not None
-    assert compared(UDP, UDP, thresholds={"rtt_median_s": 0.99 * one.interval.high}).missed
-    assert not compared(UDP, UDP, thresholds={"rtt_median_s": 1.01 * one.interval.high}).missed
+    difference = only(compared(UDP, UDP), "rtt_median_s")
+    assert difference.interval is not None
+    assert compared(UDP, UDP, thresholds={"rtt_median_s": 0.99 * difference.interval.high}).missed
+    assert not compared(UDP, UDP, thresholds={"rtt_median_s": 1.01 * difference.interval.high}).missed
 
 
-def test_a_condition_of_one_run_alone_misses_the_threshold() -> None:
+def test_a_condition_of_only_one_run_is_not_within_the_threshold() -> None:
     far = moved(UDP, distance="55ft", distance_m=16.764)
     assert compared([*UDP, *far], UDP, thresholds={"rtt_median_s": 1.0}).missed
     assert compared(UDP, [*UDP, *far], thresholds={"rtt_median_s": 1.0}).missed
@@ -126,7 +132,7 @@ def test_a_condition_of_one_run_alone_misses_the_threshold() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"profiles_sha256": "ffff"}, "profiles_sha256: A has aaaa, B has ffff (los, master, 9.144 m, udp)"),
         ({"procedure_sha256": "ffff"}, "procedure_sha256: A has bbbb, B has ffff (los, master, 9.144 m, udp)"),
@@ -143,12 +149,12 @@ def test_a_condition_of_one_run_alone_misses_the_threshold() -> None:
         ),
     ],
 )
-def test_runs_that_are_not_comparable_say_why(changes: dict[str, Any], said: str) -> None:
-    found = compared(UDP, moved(UDP, **changes))
-    assert [str(one) for one in found.refusals] == [said]
+def test_incomparable_runs_have_a_reason(changes: dict[str, Any], message: str) -> None:
+    result = compared(UDP, moved(UDP, **changes))
+    assert [str(concern) for concern in result.refusals] == [message]
 
 
-def test_runs_with_other_congestion_controls_do_not_compare() -> None:
+def test_runs_with_different_congestion_controls_are_not_comparable() -> None:
     cubic, bbr = (moved(UDP, tcp_congestion_control=name) for name in ("cubic", "bbr"))
     (refusal,) = compared(cubic, bbr).refusals
     assert str(refusal) == "tcp_congestion_control: A has cubic, B has bbr (los, master, 9.144 m, udp)"
@@ -156,7 +162,7 @@ def test_runs_with_other_congestion_controls_do_not_compare() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"code_sha256": "ffff"}, "code_sha256: A has cccc, B has ffff"),
         ({"sent_bytes": 235_000}, None),
@@ -164,33 +170,33 @@ def test_runs_with_other_congestion_controls_do_not_compare() -> None:
         ({"rtt_payload_bytes": None}, "rtt_payload_bytes: A has 8192, B has unknown (los, master, 9.144 m, udp)"),
     ],
 )
-def test_what_may_matter_is_said_and_refuses_nothing(changes: dict[str, Any], said: str | None) -> None:
-    found = compared(UDP, moved(UDP, **changes))
-    assert found.refusals == ()
-    assert [str(one) for one in found.concerns][:1] == ([said] if said else [])
+def test_a_possible_difference_is_only_a_note(changes: dict[str, Any], message: str | None) -> None:
+    result = compared(UDP, moved(UDP, **changes))
+    assert result.refusals == ()
+    assert [str(concern) for concern in result.concerns][:1] == ([message] if message else [])
 
 
-def test_attempts_that_both_runs_have_are_said() -> None:
+def test_attempts_in_both_runs_are_reported() -> None:
     (concern,) = compare(parsed(UDP), parsed(UDP[:7])).concerns
-    assert str(concern) == "attempts that the other has too: A has 7, B has 7"
+    assert str(concern) == "attempts that the other run has too: A has 7, B has 7"
     assert not concern.refuses
 
 
 @pytest.mark.parametrize(
-    ("frames", "said", "refused"),
+    ("frames", "message", "refused"),
     [
         (0, [], False),
         (7, ["segmentation offload: A has off, B has on (los, master, 9.144 m, udp)"], True),
         (None, ["segmentation offload: A has off, B has unknown (los, master, 9.144 m, udp)"], False),
     ],
 )
-def test_offload_in_one_of_two_runs_is_refused(frames: int | None, said: list[str], *, refused: bool) -> None:
+def test_offload_in_one_of_two_runs_is_refused(frames: int | None, message: list[str], *, refused: bool) -> None:
     without = moved(UDP, tcp_superframes=0)
-    found = compared(
+    result = compared(
         without, [*moved(UDP[:1], tcp_superframes=frames), *moved(UDP[1:], tcp_superframes=frames and 0)]
     )
-    assert [str(one) for one in found.concerns] == said
-    assert bool(found.refusals) is refused
+    assert [str(concern) for concern in result.concerns] == message
+    assert bool(result.refusals) is refused
 
 
 @pytest.mark.parametrize(("messages", "comparable"), [(5, True), (8, False)])
@@ -200,34 +206,34 @@ def test_a_short_recording_may_be_some_messages_longer(messages: int, *, compara
     assert (not compared(short, longer).refusals) is comparable
 
 
-def test_runs_that_do_not_say_what_they_are_are_refused() -> None:
+def test_runs_without_hashes_are_refused() -> None:
     old = moved(UDP, profiles_sha256=None, procedure_sha256=None)
-    assert [one.what for one in compared(old, old).refusals] == ["profiles_sha256", "procedure_sha256"]
+    assert [concern.what for concern in compared(old, old).refusals] == ["profiles_sha256", "procedure_sha256"]
 
 
-def test_cells_of_different_mixtures_are_refused() -> None:
+def test_cells_with_different_mixtures_are_refused() -> None:
     behind = moved(UDP, scenario="nlos")
     (refusal,) = compared([*UDP, *behind], UDP, by=("protocol",)).refusals
     assert str(refusal) == "scenario: A has los, nlos, B has los (udp)"
 
 
-def test_the_same_concern_of_many_conditions_is_said_once() -> None:
+def test_the_same_concern_of_many_conditions_is_reported_once() -> None:
     rows = [*UDP, *moved(UDP, protocol="tcp"), *moved(UDP, scenario="nlos")]
     (refusal,) = compared(rows, moved(rows, procedure_sha256="ffff")).refusals
     assert str(refusal).endswith("(los, master, 9.144 m, udp and 2 more)")
 
 
 @given(st.integers(0, 50), st.integers(2, 12), st.integers(2, 12))
-def test_swapping_the_runs_flips_every_sign(seed: int, n: int, m: int) -> None:
+def test_swapping_the_runs_changes_all_signs(seed: int, n: int, m: int) -> None:
     a, b = bursty(COMPARABLE, n, seed=seed), bursty(COMPARABLE, m, seed=seed + 1)
     there, back = (compared(*runs, thresholds={"ip_loss": 0.1, "rtt_median_s": 0.002}) for runs in ((a, b), (b, a)))
     assert there.missed == back.missed
-    for one, other in zip(there.differences, back.differences, strict=True):
-        assert one.value == -(other.value or 0)
-        assert one.cliffs_delta == -(other.cliffs_delta or 0)
-        assert one.p_holm == other.p_holm
-        if one.interval is not None and other.interval is not None:
-            assert (one.interval.low, one.interval.high) == (-other.interval.high, -other.interval.low)
+    for difference, other in zip(there.differences, back.differences, strict=True):
+        assert difference.value == -(other.value or 0)
+        assert difference.cliffs_delta == -(other.cliffs_delta or 0)
+        assert difference.p_holm == other.p_holm
+        if difference.interval is not None and other.interval is not None:
+            assert (difference.interval.low, difference.interval.high) == (-other.interval.high, -other.interval.low)
 
 
 @pytest.mark.parametrize("seed", range(3))

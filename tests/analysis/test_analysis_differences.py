@@ -23,20 +23,20 @@ from tests.helpers.single import wilson
         ((10, 10, 0, 20), (0.6791, 1.0000)),
     ],
 )
-def test_of_wilson_intervals_it_is_newcombes_tenth_method(
+def test_for_wilson_intervals_it_is_newcombes_tenth_method(
     counts: tuple[int, int, int, int], bounds: tuple[float, float]
 ) -> None:
     """Newcombe 1998, Stat. Med. 17:873, table II, row 10."""
-    found = between(wilson(counts[2], counts[3]), wilson(counts[0], counts[1]))
-    assert (found.low, found.high) == pytest.approx(bounds, abs=6e-5)
+    interval = between(wilson(counts[2], counts[3]), wilson(counts[0], counts[1]))
+    assert (interval.low, interval.high) == pytest.approx(bounds, abs=6e-5)
 
 
-def test_of_normal_intervals_it_is_the_normal_one() -> None:
-    found = between(Interval(10, 7, 13), Interval(20, 16, 24))
-    assert (found.value, found.low, found.high) == (10, 5, 15)
+def test_for_normal_intervals_it_is_the_normal_one() -> None:
+    interval = between(Interval(10, 7, 13), Interval(20, 16, 24))
+    assert (interval.value, interval.low, interval.high) == (10, 5, 15)
 
 
-def test_a_bound_at_zero_is_a_p_value_of_one_in_twenty() -> None:
+def test_an_interval_that_ends_at_zero_has_a_p_value_of_5_percent() -> None:
     assert p_value(Interval(2.0, 0.0, 9.0)) == pytest.approx(0.05)
     assert p_value(Interval(-2.0, -9.0, 0.0)) == pytest.approx(0.05)
 
@@ -52,15 +52,15 @@ def test_an_interval_without_width_is_certain(difference: Interval, p: float) ->
     assert p_value(difference) == p
 
 
-def test_holms_own_procedure_on_four() -> None:
-    """By hand: 0.005 * 4, 0.01 * 3, 0.03 * 2, and 0.04, which may not be below the one before it."""
+def test_holms_procedure_with_four_p_values() -> None:
+    """By hand: 0.005 * 4, 0.01 * 3, 0.03 * 2, and 0.04, which may not be below the previous one."""
     assert holm((0.01, 0.04, 0.03, 0.005)) == pytest.approx((0.03, 0.06, 0.06, 0.02))
 
 
 @given(st.lists(st.floats(0, 1), max_size=20))
 def test_holm_rejects_where_the_sequential_procedure_does(p_values: list[float]) -> None:
     rejected = set()
-    for rank, index in enumerate(sorted(range(len(p_values)), key=lambda one: p_values[one])):
+    for rank, index in enumerate(sorted(range(len(p_values)), key=lambda position: p_values[position])):
         if p_values[index] * (len(p_values) - rank) >= 0.05:
             break
         rejected.add(index)

@@ -1,4 +1,4 @@
-"""How many more repeats, against intervals of that many and against search one by one."""
+"""Number of additional repeats, compared with intervals of that number and with a linear search."""
 
 import math
 from itertools import count
@@ -22,7 +22,7 @@ def half(interval: Interval | None) -> float:
 
 
 @given(st.integers(0, 30), st.integers(1, 30), st.floats(0.01, 0.6))
-def test_a_flag_needs_as_many_as_wilson_says(true: int, untrue: int, wanted: float) -> None:
+def test_a_flag_needs_the_number_of_wilsons_formula(true: int, untrue: int, wanted: float) -> None:
     n = true + untrue
     p, z = true / n, stats.norm.ppf(0.975)
     total = next(
@@ -34,7 +34,7 @@ def test_a_flag_needs_as_many_as_wilson_says(true: int, untrue: int, wanted: flo
 
 
 @given(st.integers(2, 25), st.floats(0.2, 1.5))
-def test_of_few_times_students_quantile_shrinks_with_them(n: int, part: float) -> None:
+def test_students_quantile_decreases_with_more_repeats(n: int, part: float) -> None:
     times = np.random.default_rng(n).normal(10, 1, n)
     interval = median(times)
     now = half(interval)
@@ -49,8 +49,8 @@ def test_of_few_times_students_quantile_shrinks_with_them(n: int, part: float) -
 
 
 @pytest.mark.parametrize(("rate", "spread"), [(0.02, 40), (0.35, 8), (0.97, 30)])
-def test_with_so_many_more_the_interval_is_as_narrow_as_wanted(rate: float, spread: float) -> None:
-    """In the middle: half of the cells have less spread than they will have, half have more."""
+def test_the_planned_number_gives_the_wanted_width(rate: float, spread: float) -> None:
+    """In the median over cells, because half of them underestimate the final dispersion."""
     random = np.random.default_rng(6)
 
     def cells(n: int) -> Intervals:
@@ -73,14 +73,14 @@ def test_where_nothing_was_lost_that_many_clean_repeats_are_enough() -> None:
 
 
 @pytest.mark.parametrize("kind", list(Kind))
-def test_enough_is_enough(kind: Kind) -> None:
+def test_no_more_repeats_are_needed_for_a_narrow_interval(kind: Kind) -> None:
     interval = Interval(0.2, 0.1, 0.4)
     assert more_wanted(interval, 20, 0.15, kind) == 0
     assert more_wanted(interval, 20, 5.0, kind) == 0
     assert more_wanted(interval, 20, 0.1499, kind) == 1
 
 
-def test_a_single_repeat_does_not_tell() -> None:
+def test_a_single_repeat_gives_no_number() -> None:
     assert np.isnan(planning.more_wanted(shares([[3]], [[36]]), 1, 0.1, Kind.COUNTED)).all()
 
 

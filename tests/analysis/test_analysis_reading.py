@@ -20,29 +20,29 @@ from fieldkit.trial.rows import to_csv
 from tests.helpers.tables import ROW, parsed, repeats, replace, write
 
 
-def same(one: Repeats, other: Repeats) -> bool:
-    texts = all((column == other.texts[name]).all() for name, column in one.texts.items() if name != "source")
+def same(first: Repeats, second: Repeats) -> bool:
+    texts = all((column == second.texts[name]).all() for name, column in first.texts.items() if name != "source")
     return texts and all(
-        np.array_equal(column, other.numbers[name], equal_nan=True) for name, column in one.numbers.items()
+        np.array_equal(column, second.numbers[name], equal_nan=True) for name, column in first.numbers.items()
     )
 
 
-def test_rows_say_where_they_come_from(tmp_path: Path) -> None:
+def test_rows_have_their_source(tmp_path: Path) -> None:
     paths = [write(tmp_path / "a", repeats(ROW, 2)), write(tmp_path, repeats(ROW, 1), "b.csv")]
     assert list(read(paths, trial_columns()).texts["source"]) == [str(tmp_path / "a")] * 2 + [str(tmp_path / "b.csv")]
 
 
-def test_tables_of_other_versions_come_in_the_order_of_the_paths(tmp_path: Path) -> None:
+def test_tables_of_other_versions_are_in_the_order_of_the_paths(tmp_path: Path) -> None:
     rows = repeats(ROW, 6)
     paths = [write(tmp_path / str(n), [row]) for n, row in enumerate(rows)]
     short = ("schema_version", "trial", "protocol", "repeat", "attempt", "status", "transfer_s")
     for path, row in list(zip(paths, rows, strict=True))[::2]:
         values = [str(getattr(row, name)) for name in short]
         path.write_text(f"{','.join(short)}\n{','.join(values)}\n", encoding="utf-8")
-    found = read(paths, trial_columns())
-    assert found.column("transfer_s") == pytest.approx([row.transfer_s for row in rows])
-    assert found.column("scenario") == ["", "los"] * 3
-    assert found.column("file_loss") == [None, 0.2] * 3
+    rows_read = read(paths, trial_columns())
+    assert rows_read.column("transfer_s") == pytest.approx([row.transfer_s for row in rows])
+    assert rows_read.column("scenario") == ["", "los"] * 3
+    assert rows_read.column("file_loss") == [None, 0.2] * 3
 
 
 UNITS = {column.name: column.unit for column in trial_columns()}
@@ -66,13 +66,13 @@ def rows_of_anything(draw: st.DrawFn) -> list[dict[str, Any]]:
 
 
 @given(rows_of_anything())
-def test_rows_are_what_their_table_is_read_as(rows: list[dict[str, Any]]) -> None:
+def test_rows_equal_those_read_from_their_table(rows: list[dict[str, Any]]) -> None:
     made, read_back = parsed(rows), parse(to_csv(rows, trial_columns()).encode(), trial_columns())
     assert len(made) == len(rows)
     assert same(made, read_back)
-    for one, other in ((made.numbers, read_back.numbers), (made.texts, read_back.texts)):
-        assert [(name, column.dtype) for name, column in one.items()] == [
-            (name, column.dtype) for name, column in other.items()
+    for first, second in ((made.numbers, read_back.numbers), (made.texts, read_back.texts)):
+        assert [(name, column.dtype) for name, column in first.items()] == [
+            (name, column.dtype) for name, column in second.items()
         ]
 
 
@@ -80,15 +80,15 @@ splits = st.lists(st.integers(0, 12), max_size=5).map(sorted)
 
 
 @given(splits)
-def test_any_split_into_files_is_read_as_the_whole(cuts: list[int]) -> None:
+def test_any_split_into_files_gives_the_same_rows(cuts: list[int]) -> None:
     rows = [*repeats(ROW, 6), *repeats(replace(ROW, protocol="tcp", reason='a "quoted", reason'), 6)]
     parts = [rows[low:high] for low, high in zip([0, *cuts], [*cuts, 12], strict=True)]
     contents = [to_csv(part, trial_columns()).encode() for part in parts]
-    found = read(
+    rows_read = read(
         [Path(str(n)) for n in range(len(parts))], trial_columns(), content=lambda path: contents[int(path.name)]
     )
-    assert same(found, parsed(rows))
-    assert aggregate(found) == aggregate(parsed(rows))
+    assert same(rows_read, parsed(rows))
+    assert aggregate(rows_read) == aggregate(parsed(rows))
 
 
 @pytest.mark.parametrize(
@@ -101,40 +101,40 @@ def test_any_split_into_files_is_read_as_the_whole(cuts: list[int]) -> None:
     ],
     ids=["Windows", "byte order mark", "empty lines", "quotes"],
 )
-def test_what_a_spreadsheet_makes_of_a_table_is_read(tmp_path: Path, spell: Callable[[str], str]) -> None:
+def test_a_table_saved_by_a_spreadsheet_is_read(tmp_path: Path, spell: Callable[[str], str]) -> None:
     paths = [write(tmp_path / name, repeats(replace(ROW, trial=name), 3)) for name in "ab"]
     before = read(paths, trial_columns())
     paths[0].write_text(spell(paths[0].read_text(encoding="utf-8")), encoding="utf-8", newline="")
-    found = read(paths, trial_columns())
-    assert same(found, before)
-    assert list(found.texts["source"]) == list(before.texts["source"])
+    rows_read = read(paths, trial_columns())
+    assert same(rows_read, before)
+    assert list(rows_read.texts["source"]) == list(before.texts["source"])
 
 
 @pytest.mark.parametrize(
-    ("damage", "line", "what"),
+    ("damage", "line", "message"),
     [
         (lambda lines: [*lines[:3], lines[3][:40], *lines[4:]], 4, "cells in a table of"),
         (lambda lines: [*lines[:2], lines[2].replace("valid", "fine"), *lines[3:]], 3, "status is 'fine'"),
         (lambda lines: [*lines[:2], lines[2].replace("9.144", "near"), *lines[3:]], 3, "distance_m is 'near'"),
         (lambda lines: [*lines[:2], lines[2].replace("9.144", "inf"), *lines[3:]], 3, "distance_m is 'inf'"),
         (lambda lines: [*lines[:2], lines[2].replace("los", "l\udcffs"), *lines[3:]], 3, "not UTF-8"),
-        (lambda lines: [*lines[:4], lines[4].replace("valid", '"valid')], 5, "no CSV"),
+        (lambda lines: [*lines[:4], lines[4].replace("valid", '"valid')], 5, "not CSV"),
     ],
     ids=["torn", "status", "number", "infinite", "bytes", "quote"],
 )
-def test_a_damaged_line_is_told_by_file_and_line(
-    tmp_path: Path, damage: Callable[[list[str]], list[str]], line: int, what: str
+def test_the_error_of_a_damaged_line_names_file_and_line(
+    tmp_path: Path, damage: Callable[[list[str]], list[str]], line: int, message: str
 ) -> None:
     paths = [write(tmp_path / name, repeats(replace(ROW, trial=name), 4)) for name in "abc"]
     lines = damage(paths[1].read_text(encoding="utf-8").splitlines())
     paths[1].write_text("\n".join([*lines, ""]), encoding="utf-8", errors="surrogateescape")
-    with pytest.raises(EvidenceError, match=what) as told:
+    with pytest.raises(EvidenceError, match=message) as caught:
         read(paths, trial_columns())
-    assert told.value.where == f"{paths[1]}:{line}"
+    assert caught.value.where == f"{paths[1]}:{line}"
 
 
-def test_a_table_cut_at_any_byte_of_its_last_line_is_refused_or_lacks_that_line(tmp_path: Path) -> None:
-    """The last cell of a row may be cut to another number: 15336791.6 to 1533679."""
+def test_a_table_truncated_in_its_last_line_is_refused_or_lacks_that_line(tmp_path: Path) -> None:
+    """A truncated last cell of a row can be another valid number: 1533679 of 15336791.6."""
     path = write(tmp_path / "a", repeats(ROW, 2))
     whole = path.read_bytes()
     last = whole.rindex(b"\n", 0, -1) + 1
@@ -143,40 +143,42 @@ def test_a_table_cut_at_any_byte_of_its_last_line_is_refused_or_lacks_that_line(
         if end == last:
             assert len(read([path], trial_columns())) == 1
             continue
-        with pytest.raises(EvidenceError, match="the last line has no end: the table may be cut") as told:
+        with pytest.raises(
+            EvidenceError, match="the last line has no line feed: the table may be truncated"
+        ) as caught:
             read([path], trial_columns())
-        assert told.value.where == f"{path}:3"
+        assert caught.value.where == f"{path}:3"
 
 
-def test_a_newer_schema_asks_for_a_newer_fieldkit(tmp_path: Path) -> None:
+def test_a_newer_schema_requires_a_newer_fieldkit(tmp_path: Path) -> None:
     path = write(tmp_path, repeats(replace(ROW, schema_version=SCHEMA_VERSION + 1), 2))
-    with pytest.raises(ConfigurationError, match="newer fieldkit") as told:
+    with pytest.raises(ConfigurationError, match="newer fieldkit") as caught:
         read([path], trial_columns())
-    assert told.value.remedy == "upgrade fieldkit"
+    assert caught.value.remedy == "upgrade fieldkit"
 
 
 @pytest.mark.parametrize(
-    ("text", "what"),
+    ("text", "message"),
     [
         ("", "lacks schema_version, trial"),
         ("time,x\n1,2\n", "lacks"),
-        ("{header},status\n", "status is there twice"),
+        ("{header},status\n", "it has more than one column status"),
         ("{header}" + 140_000 * "x", "lacks schema_version, trial"),
     ],
 )
-def test_a_table_of_something_else_is_refused(tmp_path: Path, text: str, what: str) -> None:
+def test_a_table_of_something_else_is_refused(tmp_path: Path, text: str, message: str) -> None:
     header = to_csv([], trial_columns()).strip()
     path = tmp_path / "other.csv"
     path.write_text(text.format(header=header), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=what):
+    with pytest.raises(ConfigurationError, match=message):
         read([path], trial_columns())
 
 
-def test_a_trial_that_is_there_twice_counts_once(tmp_path: Path) -> None:
+def test_a_trial_in_two_tables_counts_once(tmp_path: Path) -> None:
     rows = repeats(ROW, 3)
     paths = [write(tmp_path / "a", rows[:2]), write(tmp_path / "copy", rows)]
-    found, notes = deduplicated(read(paths, trial_columns()))
-    assert found.column("repeat") == [1, 2, 3]
+    rows_read, notes = deduplicated(read(paths, trial_columns()))
+    assert rows_read.column("repeat") == [1, 2, 3]
     assert notes == (f"{tmp_path / 'copy'}: 2 rows of {tmp_path / 'a'} again, counted once",)
 
 
@@ -187,10 +189,10 @@ def test_two_tables_that_contradict_each_other_are_refused(tmp_path: Path) -> No
         deduplicated(read(paths, trial_columns()))
 
 
-def test_only_the_columns_asked_for_are_read(tmp_path: Path) -> None:
-    found = read([write(tmp_path, repeats(ROW, 2))], trial_columns(), ["distance", "transfer_s"])
-    assert found.numbers.keys() == {"schema_version", "repeat", "attempt", "transfer_s"}
-    assert found.texts.keys() == {"trial", "protocol", "status", "distance", "source"}
+def test_only_the_requested_columns_are_read(tmp_path: Path) -> None:
+    rows_read = read([write(tmp_path, repeats(ROW, 2))], trial_columns(), ["distance", "transfer_s"])
+    assert rows_read.numbers.keys() == {"schema_version", "repeat", "attempt", "transfer_s"}
+    assert rows_read.texts.keys() == {"trial", "protocol", "status", "distance", "source"}
 
 
 def test_no_table_gives_no_row() -> None:
@@ -221,7 +223,7 @@ def test_a_damaged_line_of_a_large_table_has_its_number_in_the_whole_file(
 
 
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.sampled_from([1.0, 2.0, None])), min_size=1))
-def test_rows_have_the_same_code_exactly_where_columns_hold_the_same(keys: list[tuple[str, float | None]]) -> None:
+def test_rows_have_equal_codes_exactly_if_their_columns_are_equal(keys: list[tuple[str, float | None]]) -> None:
     table = [replace(ROW, repeat=1 + n, sender=text, distance_m=metres) for n, (text, metres) in enumerate(keys)]
     codes = parse(to_csv(table, trial_columns()).encode(), trial_columns()).codes(("sender", "distance_m")).tolist()
     assert [[a == b for b in codes] for a in codes] == [[a == b for b in keys] for a in keys]

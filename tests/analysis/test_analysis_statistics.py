@@ -1,4 +1,4 @@
-"""Intervals against scipy and closed forms. How often they cover is in test_coverage.py."""
+"""Intervals compared with scipy and closed forms. Their coverage is tested in test_coverage.py."""
 
 import numpy as np
 import pytest
@@ -42,9 +42,9 @@ def test_nothing_lost_of_36_still_allows_ten_per_cent() -> None:
     assert interval.high == pytest.approx(0.0964, abs=1e-4)
 
 
-def test_counts_that_are_none_have_no_interval() -> None:
-    found = wilsons([-1, 6, 2], [5, 5, 5])
-    assert np.isnan(found.low).tolist() == np.isnan(found.high).tolist() == [True, True, False]
+def test_impossible_counts_have_no_interval() -> None:
+    intervals = wilsons([-1, 6, 2], [5, 5, 5])
+    assert np.isnan(intervals.low).tolist() == np.isnan(intervals.high).tolist() == [True, True, False]
 
 
 def test_student_equals_scipy() -> None:
@@ -54,7 +54,7 @@ def test_student_equals_scipy() -> None:
 
 
 @pytest.mark.parametrize("sent", [np.full(20, 36), np.arange(33, 53)], ids=["equal", "unequal"])
-def test_a_share_holds_the_values_that_a_score_test_keeps(sent: np.ndarray) -> None:
+def test_a_share_s_interval_contains_the_values_that_a_score_test_accepts(sent: np.ndarray) -> None:
     """The bounds solve |share - p| = t sqrt(p (1 - p) / trials), found here by bisection."""
     interval = there(share(BURSTY, sent))
     rate = BURSTY.sum() / sent.sum()
@@ -77,35 +77,35 @@ def test_bursts_make_the_interval_wider_than_wilsons() -> None:
     assert bursty.high - bursty.low > 3 * (spread.high - spread.low)
 
 
-def test_repeats_that_agree_tell_as_much_as_wilson() -> None:
-    """The square of a t quantile beside a normal one is all that is left of the difference."""
+def test_repeats_that_agree_give_nearly_wilsons_interval() -> None:
+    """Only the squared ratio of the t quantile to the normal quantile remains as a difference."""
     lost = np.random.default_rng(1).binomial(1000, 0.1, size=5000)
     ours, theirs = there(share(lost, [1000] * 5000)), wilson(int(lost.sum()), 5_000_000)
     assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), rel=1e-3)
 
 
 @pytest.mark.parametrize("n", [2, 3, 20])
-def test_where_nothing_or_all_is_lost_a_repeat_is_one_trial(n: int) -> None:
+def test_if_nothing_or_all_is_lost_a_repeat_is_one_trial(n: int) -> None:
     assert share([0] * n, [36] * n) == wilson(0, n)
     assert share([36] * n, [36] * n) == wilson(n, n)
     assert mean_share([0.0] * n) == wilson(0, n)
 
 
-def test_one_repeat_that_lost_everything_can_be_chance_or_the_place() -> None:
+def test_one_repeat_that_lost_everything_gives_a_wide_interval() -> None:
     interval = there(share([36] + [0] * 19, [36] * 20))
     assert interval.value == 0.05
     assert 0 < interval.low < 0.005
     assert 0.3 < interval.high < 0.7
 
 
-@pytest.mark.parametrize(("lost", "sent"), [(1, 36), (7, 157)])  # of which the second cannot be told in binary
+@pytest.mark.parametrize(("lost", "sent"), [(1, 36), (7, 157)])  # the second share is not exact in binary
 def test_two_equal_repeats_are_not_certain(lost: int, sent: int) -> None:
     interval = there(share([lost, lost], [sent, sent]))
     assert interval.low < interval.value / 5
     assert interval.high > 5 * interval.value
 
 
-def test_many_small_repeats_beside_a_large_one_count_as_few() -> None:
+def test_many_small_repeats_and_a_large_one_count_as_few() -> None:
     """Kish: (30 + 19)^2 / (30^2 + 19) trials, not 20."""
     interval = there(share([0] * 20, [30] + [1] * 19))
     assert interval.high == pytest.approx(wilson(0, 1000).high * 1000 / (49**2 / 919), rel=0.7)
@@ -122,8 +122,8 @@ def test_bounds_of_a_share_enclose_it(some: list[tuple[int, int]]) -> None:
 
 
 @pytest.mark.parametrize("lost", [7, 15])
-def test_repeats_that_agree_are_not_told_apart_by_rounding(lost: int) -> None:
-    """22 times a share of 15/22 is not exactly 15; the losses are then taken as independent."""
+def test_equal_repeats_are_not_distinguished_by_rounding(lost: int) -> None:
+    """22 times a share of 15/22 is not exactly 15; the losses are then assumed to be independent."""
     interval = there(share([lost] * 2, [22] * 2))
     assert interval.high - interval.low > 0.5
 
@@ -133,7 +133,7 @@ def test_a_share_outside_its_bounds_has_no_interval() -> None:
     assert share([0, 0], [0, 0]) is None
 
 
-def test_shares_are_means_where_one_is_no_share() -> None:
+def test_shares_are_means_if_one_is_outside_of_0_to_1() -> None:
     """A listener that wrote a duplicate has a negative file_loss."""
     assert mean_share([0.1, -0.01, 0.2]) == mean([0.1, -0.01, 0.2])
 
@@ -145,7 +145,7 @@ def test_without_skewness_a_mean_has_students_interval() -> None:
 
 
 def test_a_mean_has_the_bootstrap_t_interval() -> None:
-    """Drawn here: repeats with replacement, each draw's mean over its own standard error."""
+    """Computed here by resampling: the mean of each sample divided by its standard error."""
     drawn = SKEWED[np.random.default_rng(4).integers(60, size=(40_000, 60))]
     t = (drawn.mean(axis=1) - SKEWED.mean()) / stats.sem(drawn, axis=1)
     high, low = SKEWED.mean() - np.quantile(t, (0.025, 0.975)) * stats.sem(SKEWED)
@@ -155,7 +155,7 @@ def test_a_mean_has_the_bootstrap_t_interval() -> None:
 
 
 @given(values, st.floats(-100, 100), st.floats(0.01, 100))
-def test_a_mean_moves_with_its_values(some: list[float], shift: float, factor: float) -> None:
+def test_a_mean_is_shifted_and_scaled_with_its_values(some: list[float], shift: float, factor: float) -> None:
     plain, moved = there(mean(some)), there(mean(shift + factor * np.array(some)))
     assert plain.low <= plain.value <= plain.high
     size = factor * (np.abs(some).max() + abs(shift) + 1)
@@ -199,7 +199,7 @@ def test_bounds_enclose_a_median(some: list[float]) -> None:
     assert interval.low <= interval.value <= interval.high
 
 
-def test_cells_at_once_are_cells_one_by_one() -> None:
+def test_vectorized_cells_equal_single_cells() -> None:
     random = np.random.default_rng(8)
     lost, sent = random.integers(0, 5, (7, 20)), random.integers(5, 40, (7, 20))
     times = random.lognormal(size=(7, 20))

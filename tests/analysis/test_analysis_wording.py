@@ -1,4 +1,4 @@
-"""Verdicts on differences, in words."""
+"""Texts of verdicts on differences."""
 
 from dataclasses import replace
 
@@ -10,22 +10,22 @@ from fieldkit.core.model import Interval
 from tests.helpers.tables import COMPARABLE, bursty, parsed
 
 ROWS = parsed(bursty(COMPARABLE, 3, seed=1))
-BY_NAME = {one.quantity.name: one for one in compare(ROWS, ROWS).differences}
+BY_NAME = {change.quantity.name: change for change in compare(ROWS, ROWS).differences}
 
 
 def between(
     quantity: str, interval: Interval | None, p_holm: float | None = None, threshold: float | None = None
 ) -> Difference:
-    """Return a difference from nothing at all."""
-    one = BY_NAME[quantity]
-    assert one.a is not None
-    assert one.b is not None
-    a, b = replace(one.a, value=0.0), replace(one.b, value=interval.value if interval else 0.0)
-    return replace(one, a=a, b=b, interval=interval, p_holm=p_holm, threshold=threshold)
+    """Return a difference from 0."""
+    change = BY_NAME[quantity]
+    assert change.a is not None
+    assert change.b is not None
+    a, b = replace(change.a, value=0.0), replace(change.b, value=interval.value if interval else 0.0)
+    return replace(change, a=a, b=b, interval=interval, p_holm=p_holm, threshold=threshold)
 
 
 @pytest.mark.parametrize(
-    ("one", "said"),
+    ("change", "expected"),
     [
         (between("ip_loss", Interval(0.031, 0.012, 0.05), 0.01), "B 3.10 points more [1.20, 5.00]"),
         (between("ip_loss", Interval(-0.031, -0.05, -0.012), 0.01), "B 3.10 points less [1.20, 5.00]"),
@@ -48,5 +48,5 @@ def between(
         (replace(between("ip_loss", None), b=None, threshold=0.02), "only A has it; may exceed 2 points"),
     ],
 )
-def test_a_difference_in_words(one: Difference, said: str) -> None:
-    assert wording.verdict(one, 20) == said
+def test_the_verdict_on_a_difference(change: Difference, expected: str) -> None:
+    assert wording.verdict(change, 20) == expected

@@ -1,4 +1,4 @@
-"""Repeats of which only a lower bound is known: what their medians, intervals and tables say, and never say."""
+"""Right-censored repeats in medians, intervals, tables and judgements."""
 
 import json
 import math
@@ -38,7 +38,7 @@ def repeats_of(declared: Sequence[Column], **values: Sequence[Known]) -> Repeats
 
 
 def gaps(ended: Sequence[float], still_open: Sequence[float] = (), missing: int = 0) -> Cell:
-    """Return the cell of repeats whose longest gap ended, those in which it did not, and those without any."""
+    """Return the cell of repeats with an ended, an open or no longest gap."""
     none = [None] * missing
     (cell,) = aggregate(
         repeats_of(
@@ -52,20 +52,20 @@ def gaps(ended: Sequence[float], still_open: Sequence[float] = (), missing: int 
 
 
 def judged(text: str, cell: Cell, declared: Sequence[Column] = GAP) -> Judgement:
-    (found,) = judgements.judge([expectations.parse(text, quantities(declared))], [cell])
-    return found
+    (result,) = judgements.judge([expectations.parse(text, quantities(declared))], [cell])
+    return result
 
 
-def test_open_outages_count_with_their_observed_length() -> None:
+def test_open_gaps_count_with_their_observed_length() -> None:
     estimate = gaps([0.2] * 7, [2.3, 2.5, 2.8]).estimates["rtt_gap_s"]
     assert (estimate.n, estimate.n_censored, estimate.missing) == (10, 3, 0)
-    # Three of ten are above all others, so the median is known; the upper end of its interval is not.
+    # Three censored of ten are above all others, so the median is known, but not the upper end of its interval.
     assert (estimate.value, estimate.is_lower_bound) == (0.2, False)
     assert (estimate.low, estimate.high) == (0.2, None)
     assert estimate.maximum == 2.8
 
 
-def test_a_median_among_open_outages_is_a_lower_bound() -> None:
+def test_a_median_of_open_gaps_is_a_lower_bound() -> None:
     estimate = gaps([0.2] * 4, [2.0, 2.5, 2.8, 2.9, 3.0, 3.1]).estimates["rtt_gap_s"]
     assert (estimate.value, estimate.is_lower_bound) == (2.25, True)
     scale = wording.scale_of(estimate.quantity, [estimate.value])
@@ -76,36 +76,36 @@ def test_a_median_among_open_outages_is_a_lower_bound() -> None:
 @given(
     st.lists(st.tuples(st.floats(0, 10), st.floats(0, 10), st.booleans()), min_size=2, max_size=25),
 )
-def test_an_interval_holds_that_of_all_values_if_these_were_known(drawn: list[tuple[float, float, bool]]) -> None:
+def test_an_interval_contains_that_of_the_uncensored_values(drawn: list[tuple[float, float, bool]]) -> None:
     """The oracle is the interval of the true values, of which the test observes less."""
     true = np.array([[start + more for start, more, _ in drawn]])
     is_open = np.array([[is_open for _, _, is_open in drawn]])
     seen = np.where(is_open, [[start for start, _, _ in drawn]], true)
-    found = medians(seen, 0, upper=np.where(is_open, np.inf, true))
+    result = medians(seen, 0, upper=np.where(is_open, np.inf, true))
     oracle = medians(true, 0)
-    assert found.value <= oracle.value
+    assert result.value <= oracle.value
     if len(drawn) >= 6:
-        assert found.low <= oracle.low
-    assert found.high >= oracle.high if len(drawn) >= 6 else found.high >= true[~is_open].max(initial=0)
+        assert result.low <= oracle.low
+    assert result.high >= oracle.high if len(drawn) >= 6 else result.high >= true[~is_open].max(initial=0)
     if not is_open.any():
-        assert (found.value, found.low, found.high) == (oracle.value, oracle.low, oracle.high)
+        assert (result.value, result.low, result.high) == (oracle.value, oracle.low, oracle.high)
 
 
-def test_the_worst_repeats_do_not_make_an_expectation_hold() -> None:
+def test_censored_repeats_do_not_make_an_expectation_hold() -> None:
     """The case of issue 21: in 3 of 10 repeats the link was down when the ping ended."""
-    found = judged("rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8]))
-    assert found.ruling is Ruling.OPEN
-    assert found.why == "in 3 of 10 repeats it had not ended, so that they give lower bounds"
+    result = judged("rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8]))
+    assert result.ruling is Ruling.OPEN
+    assert result.why == "in 3 of 10 repeats it had not ended, so they give only lower bounds"
     assert judged("every rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8])).ruling is Ruling.FAILS
     assert judged("max rtt_gap_s < 2 s", gaps([0.2] * 7, [1.3])).ruling is Ruling.OPEN
     assert judged("rtt_gap_s < 2 s", gaps([], [5.0] * 4)).ruling is Ruling.FAILS
 
 
-def test_missing_repeats_are_counted_wherever_they_are_shown() -> None:
+def test_missing_repeats_are_counted_in_all_outputs() -> None:
     cell = gaps([0.2] * 8, missing=2)
-    found = judged("rtt_gap_s < 2 s", cell)
-    assert (found.ruling, found.why) == (Ruling.OPEN, "2 of 10 repeats have no value")
-    assert wording.judged(found)[2] == "200 ms (8 of 10)"
+    result = judged("rtt_gap_s < 2 s", cell)
+    assert (result.ruling, result.why) == (Ruling.OPEN, "2 of 10 repeats have no value")
+    assert wording.judged(result)[2] == "200 ms (8 of 10)"
     shown = [Quantity.of(column) for column in GAP]
     markdown = tables.to_markdown(BY, [cell], [quantity for quantity in shown if quantity])
     assert "(8 of 10)" in markdown
@@ -114,7 +114,7 @@ def test_missing_repeats_are_counted_wherever_they_are_shown() -> None:
     assert (written["n_valid"], written["estimates"]["rtt_gap_s"]["n"]) == (10, 8)
 
 
-def test_open_outages_are_in_every_form_of_table() -> None:
+def test_open_gaps_are_in_every_table_format() -> None:
     cell = gaps([0.2] * 2, [1.5] * 5)
     (written,) = json.loads(tables.to_json(BY, [cell]))["cells"]
     estimate = written["estimates"]["rtt_gap_s"]
@@ -141,10 +141,10 @@ def test_no_expectation_holds_on_missing_or_open_repeats(
 ) -> None:
     if not (ended or still_open or missing):
         return
-    found = judged(text, gaps(ended, still_open, missing))
+    result = judged(text, gaps(ended, still_open, missing))
     if still_open or missing:
-        assert not found.holds
-        assert "of" in found.why
+        assert not result.holds
+        assert "of" in result.why
 
 
 def rtt(medians_s: Sequence[Known], of_sent_s: Sequence[Known]) -> Cell:
@@ -157,34 +157,34 @@ def rtt(medians_s: Sequence[Known], of_sent_s: Sequence[Known]) -> Cell:
     [
         ([0.1] * 10, Ruling.HOLDS, ""),
         ([0.15] * 10, Ruling.HOLDS, ""),
-        ([0.3] * 10, Ruling.OPEN, "counting what was lost as late, the interval goes beyond it"),
+        ([0.3] * 10, Ruling.OPEN, "if lost items count as late, the interval extends beyond it"),
         (
             [None] + [0.1] * 9,
             Ruling.OPEN,
-            "in 1 of 10 repeats it has no value over all that was sent: too much was lost",
+            "in 1 of 10 repeats too much was lost for a value over all sent items",
         ),
-        ([None] * 10, Ruling.OPEN, "in 10 of 10 repeats it has no value over all that was sent: too much was lost"),
+        ([None] * 10, Ruling.OPEN, "in 10 of 10 repeats too much was lost for a value over all sent items"),
     ],
 )
 def test_a_median_rtt_of_the_answers_is_judged_over_all_requests(
     of_sent_s: list[Known], ruling: Ruling, why: str
 ) -> None:
     cell = rtt([0.1] * 10, of_sent_s)
-    found = judged("rtt_median_s < 200 ms", cell, RTT)
-    assert (found.ruling, found.why) == (ruling, why)
-    assert found.found is not None
-    assert (found.found.value, found.found.high) == (0.1, 0.1), "the figure itself keeps its meaning"
+    result = judged("rtt_median_s < 200 ms", cell, RTT)
+    assert (result.ruling, result.why) == (ruling, why)
+    assert result.found is not None
+    assert (result.found.value, result.found.high) == (0.1, 0.1), "the figure itself is unchanged"
     assert judged("rtt_median_s < 50 ms", cell, RTT).ruling is Ruling.FAILS
     every = judged("every rtt_median_s < 200 ms", cell, RTT)
     assert every.holds is (ruling is Ruling.HOLDS)
 
 
 def test_repeats_without_any_answer_are_missing() -> None:
-    found = judged("rtt_median_s < 200 ms", rtt([0.1] * 6 + [None] * 4, [0.1] * 6 + [None] * 4), RTT)
-    assert (found.ruling, found.why) == (Ruling.OPEN, "4 of 10 repeats have no value")
+    result = judged("rtt_median_s < 200 ms", rtt([0.1] * 6 + [None] * 4, [0.1] * 6 + [None] * 4), RTT)
+    assert (result.ruling, result.why) == (Ruling.OPEN, "4 of 10 repeats have no value")
 
 
-def test_a_table_that_does_not_know_what_was_lost_decides_nothing() -> None:
+def test_a_table_without_the_median_of_all_requests_gives_no_decision() -> None:
     repeats = repeats_of(RTT, rtt_median_s=[0.1] * 10)
     (cell,) = aggregate(
         Repeats({"rtt_median_s": repeats.numbers["rtt_median_s"]}, repeats.texts, repeats.columns), BY
@@ -192,7 +192,7 @@ def test_a_table_that_does_not_know_what_was_lost_decides_nothing() -> None:
     assert judged("rtt_median_s < 200 ms", cell, RTT).ruling is Ruling.OPEN
 
 
-def test_steps_that_have_names_have_companions_of_their_own() -> None:
+def test_steps_with_names_have_separate_optional_columns() -> None:
     (gap, *_) = (named("up", column) for column in GAP)
     assert gap.figure is not None
     assert gap.figure.at_least == "up.rtt_gap_at_least_s"
@@ -200,4 +200,5 @@ def test_steps_that_have_names_have_companions_of_their_own() -> None:
 
 def test_means_have_no_lower_bounds() -> None:
     (column,) = columns(100, ("stalls", "count", "Stalls.", Figure("stalls", Kind.MEAN, at_least="other")))
-    assert column.flaw() == "only a median has lower bounds, or a figure over all that was sent"
+    flaw = "only a median can have a column of lower bounds (at_least) or of all sent items (of_sent)"
+    assert column.flaw() == flaw

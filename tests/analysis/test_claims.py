@@ -1,4 +1,4 @@
-"""What expectations need before a trial runs, against trials in which everything goes as well as it can."""
+"""Repeats and packets that expectations need, compared with judgements of trials with the best possible results."""
 
 import pytest
 from hypothesis import given
@@ -17,7 +17,7 @@ RETRIES = Quantity("retries", "retries", Kind.MEAN, "count")
 KNOWN = (PACKETS, GAP, BACK, RATE, RETRIES)
 
 
-def said(text: str, repeats: int) -> str:
+def warning(text: str, repeats: int) -> str:
     return " ".join(claims.shortfalls([expectations.parse(text, KNOWN)], KNOWN, repeats))
 
 
@@ -55,14 +55,14 @@ def said(text: str, repeats: int) -> str:
         (
             "link_down_recovered > 90 %",
             20,
-            "needs at least 35 repeats for 95 % confidence, if it is so in all of them; this trial has 20",
+            "needs at least 35 repeats for 95 % confidence, if it is true in all of them; this trial has 20",
         ),
         ("rtt_gap_s < 300 ms", 6, ""),
         (
             "rtt_gap_s < 300 ms",
             5,
             (
-                "needs at least 6 repeats for 95 % confidence whatever the distribution of the repeats is; this "
+                "needs at least 6 repeats for 95 % confidence for any distribution of the repeats; this "
                 "trial has 5"
             ),
         ),
@@ -74,12 +74,12 @@ def said(text: str, repeats: int) -> str:
         ("retries < 3", 2, ""),
     ],
 )  # fmt: skip
-def test_what_a_claim_needs_is_said_before_a_run(text: str, repeats: int, shown: str) -> None:
-    assert said(text, repeats) == (shown and f"expected {text}: {shown}")
+def test_the_needs_of_an_expectation_are_reported_before_a_trial(text: str, repeats: int, shown: str) -> None:
+    assert warning(text, repeats) == (shown and f"expected {text}: {shown}")
 
 
 @given(st.integers(1, 60), st.integers(1, 60))
 def test_without_a_warning_a_perfect_trial_holds_and_with_one_it_does_not(percent: int, repeats: int) -> None:
     for text in (f"ip_loss < {percent} %", f"{percent} % of ip_loss < 1 %"):
-        (found,) = judgements.judge([expectations.parse(text, KNOWN)], [losses(*[0] * repeats)])
-        assert (found.ruling is Ruling.HOLDS) is (said(text, repeats) == "")
+        (judgement,) = judgements.judge([expectations.parse(text, KNOWN)], [losses(*[0] * repeats)])
+        assert (judgement.ruling is Ruling.HOLDS) is (warning(text, repeats) == "")

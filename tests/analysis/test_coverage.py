@@ -16,12 +16,12 @@ from tests.helpers.paths import ROOT
 CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
 REPEATS: Final = 20
 ORDERED: Final = 98.6
-"""Order statistics are some steps apart: their intervals hold more than 95 % rather than less."""
+"""Order statistics are discrete, so the coverage of their intervals is above 95 %."""
 BAND: Final = (93.0, 97.0)
-BURSTS: Final = (0, 1, 5, 20)  # mean number of losses in a row; 0: each by itself, 1: never two in a row
+BURSTS: Final = (0, 1, 5, 20)  # mean length of a burst; 0: independent losses, 1: never two in a row
 RATES: Final = (0.01, 0.05, 0.35)
-# Seven losses are expected in a whole cell, or two bursts at most: losing nothing is no surprise, so an interval can
-# only miss on one side.
+# At most seven losses or two bursts are expected in a cell, so a cell without losses is likely, and an interval can
+# miss the true value only on one side.
 RARE: Final = {(36, 0.01)}
 METHOD: Final = ROOT / "docs" / "method-intervals.md"
 
@@ -32,7 +32,7 @@ Draw = Callable[[np.random.Generator, tuple[int, int]], Floats]
 def lost_in_bursts(
     random: np.random.Generator, rate: float, burst: int, shape: tuple[int, int], packets: int
 ) -> NDArray[np.int64]:
-    """Return how many of `packets` each repeat loses on a Gilbert-Elliott link, whose bad state loses everything."""
+    """Return the number of lost packets per repeat on a Gilbert-Elliott link, whose bad state loses all packets."""
     if burst == 0:
         return random.binomial(packets, rate, shape)
     recovers = 1 / burst
@@ -46,14 +46,14 @@ def lost_in_bursts(
     return lost
 
 
-def covered(found: Intervals, truth: float) -> float:
-    """Return in how many per cent of the cells the truth is inside, rounding apart."""
+def covered(intervals: Intervals, truth: float) -> float:
+    """Return the percentage of cells whose interval contains the true value, with a tolerance for rounding."""
     slack = 1e-9
-    return 100 * float(np.mean((found.low <= truth + slack) & (truth - slack <= found.high)))
+    return 100 * float(np.mean((intervals.low <= truth + slack) & (truth - slack <= intervals.high)))
 
 
 def in_method(*key: str) -> list[float]:
-    """Return the numbers of the row of docs/method-intervals.md that begins with these cells."""
+    """Return the numbers of the row of docs/method-intervals.md that starts with these cells."""
     begin = re.escape("| " + " | ".join(key) + " |")
     (row,) = re.findall(rf"^{begin}(.*)\|$", METHOD.read_text(encoding="utf-8"), re.MULTILINE)
     return [float(number) for number in row.split("|")]
@@ -61,33 +61,31 @@ def in_method(*key: str) -> list[float]:
 
 @pytest.mark.parametrize("rate", others_at_night(RATES))
 @pytest.mark.parametrize("packets", others_at_night([36, 215]))
-def test_shares_cover_whatever_the_bursts(
+def test_shares_cover_for_any_burst_length(
     packets: int, rate: float, record_property: Callable[[str, object], None]
 ) -> None:
     random = np.random.default_rng(11)
-    found, naive = [], []
+    coverages, naive = [], []
     for burst in BURSTS:
         lost = lost_in_bursts(random, rate, burst, (CELLS, REPEATS), packets)
         sent = np.full(lost.shape, packets)
-        found.append(covered(shares(lost, sent), rate))
+        coverages.append(covered(shares(lost, sent), rate))
         naive.append(covered(wilsons(lost.sum(axis=1), sent.sum(axis=1)), rate))
-    record_property("said", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {rounded(found)}")
+    record_property("said", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {rounded(coverages)}")
     record_property("said", f"the same by Wilson: {rounded(naive)}")
     low, high = (96.0, 99.5) if (packets, rate) in RARE else BAND
-    assert all(low <= one <= high for one in found)
+    assert all(low <= percentage <= high for percentage in coverages)
     assert BAND[0] <= naive[0] <= BAND[1], "Wilson, of losses each by itself"
     assert naive[-1] < 75, "Wilson, of long bursts"
     assert in_method(f"{packets}", f"{rate:.0%}".replace("%", " %")) == pytest.approx(
-        [*found, naive[0], naive[-1]], abs=0.8
+        [*coverages, naive[0], naive[-1]], abs=0.8
     )
 
 
 @pytest.mark.parametrize("n", others_at_night([2, 3, 5, 10]))
-def test_shares_of_few_repeats_cover_at_least_nearly_as_often(
-    n: int, record_property: Callable[[str, object], None]
-) -> None:
+def test_shares_of_few_repeats_cover_nearly_as_often(n: int, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(12)
-    found = [
+    coverages = [
         covered(
             shares(lost_in_bursts(random, rate, burst, (CELLS, n), 36), np.full((CELLS, n), 36)),
             rate,
@@ -95,39 +93,39 @@ def test_shares_of_few_repeats_cover_at_least_nearly_as_often(
         for rate in RATES
         for burst in BURSTS
     ]
-    record_property("said", f"share, {n} repeats of 36: {min(found):.1f} to {max(found):.1f} %")
-    assert min(found) > 92
+    record_property("said", f"share, {n} repeats of 36: {min(coverages):.1f} to {max(coverages):.1f} %")
+    assert min(coverages) > 92
 
 
 @pytest.mark.parametrize("burst", others_at_night(BURSTS, in_ci=[5]))
-def test_shares_cover_where_repeats_send_unequally(
+def test_shares_cover_if_repeats_send_different_numbers(
     burst: int, record_property: Callable[[str, object], None]
 ) -> None:
     random = np.random.default_rng(13)
     sent = np.concatenate([np.full((CELLS, 10), size) for size in (36, 215)], axis=1)
     lost = np.concatenate([lost_in_bursts(random, 0.05, burst, (CELLS, 10), size) for size in (36, 215)], axis=1)
-    found = covered(shares(lost, sent), 0.05)
-    record_property("said", f"share, 10 repeats of 36 and 10 of 215, 5 % lost, bursts of {burst}: {found:.1f} %")
-    assert BAND[0] <= found <= BAND[1]
+    coverages = covered(shares(lost, sent), 0.05)
+    record_property("said", f"share, 10 repeats of 36 and 10 of 215, 5 % lost, bursts of {burst}: {coverages:.1f} %")
+    assert BAND[0] <= coverages <= BAND[1]
 
 
 @pytest.mark.parametrize("rate", others_at_night([0.05, 0.35]))
 @pytest.mark.parametrize("largest", others_at_night([36, 540]))
-def test_shares_cover_less_where_repeats_differ_by_far(
+def test_shares_cover_less_if_repeats_differ_strongly(
     rate: float, largest: int, record_property: Callable[[str, object], None]
 ) -> None:
-    """Each repeat has a share of its own, from a beta distribution with an intraclass correlation of 0.3."""
+    """Each repeat has another share, from a beta distribution with an intraclass correlation of 0.3."""
     random, prior = np.random.default_rng(17), 1 / 0.3 - 1
-    found = []
+    coverages = []
     for n in (5, 10, 20, 40):
         sent = np.broadcast_to(np.where(np.arange(n) % 2, largest, 36), (CELLS, n))
         lost = random.binomial(sent, random.beta(prior * rate, prior * (1 - rate), sent.shape))
-        found.append(covered(shares(lost, sent), rate))
-    what = f"{rate:.0%} lost, ".replace("%", " %") + (
+        coverages.append(covered(shares(lost, sent), rate))
+    label = f"{rate:.0%} lost, ".replace("%", " %") + (
         "all of 36" if largest == 36 else f"half of 36, half of {largest}"
     )
-    record_property("said", f"share, repeats that differ by far, {what}: {rounded(found)}")
-    assert in_method(what) == pytest.approx(found, abs=0.8)
+    record_property("said", f"share, repeats that differ by far, {label}: {rounded(coverages)}")
+    assert in_method(label) == pytest.approx(coverages, abs=0.8)
 
 
 def lognormal(sigma: float) -> Draw:
@@ -160,7 +158,7 @@ def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Call
     record_property("said", f"mean, {name}, 5, 10, 20 repeats: {rounded(of_mean)}, percentile bootstrap {plain:.1f}")
     record_property("said", f"median, {name}, 5, 10, 20 repeats: {rounded(of_median)}")
     assert BAND[0] <= of_mean[-1] <= BAND[1]
-    assert all(BAND[0] <= one <= ORDERED for one in of_median)
+    assert all(BAND[0] <= percentage <= ORDERED for percentage in of_median)
     assert abs(of_mean[-1] - 95) < abs(plain - 95)
     assert in_method(name) == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
 
@@ -175,13 +173,13 @@ def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Call
     of_median = [covered(medians(values), middle) for values in drawn]
     plain = covered(percentile_bootstrap(random, drawn[-1]), rate)
     record_property("said", f"shares lost, bursts of {burst}: mean {rounded(of_mean)}, median {rounded(of_median)}")
-    assert all(BAND[0] <= one <= BAND[1] for one in of_mean)
-    assert all(BAND[0] <= one <= ORDERED for one in of_median)
+    assert all(BAND[0] <= percentage <= BAND[1] for percentage in of_mean)
+    assert all(BAND[0] <= percentage <= ORDERED for percentage in of_median)
     assert in_method(f"share lost, bursts of {burst}") == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
 
 
 def humps(share: float, apart: float) -> tuple[Draw, float]:
-    """Two normal humps, `share` in the lower; the median is in it, or between both if they are alike."""
+    """Mixture of two normal distributions, `share` in the lower one; the median is in it, or between equal ones."""
 
     def draw(random: np.random.Generator, shape: tuple[int, ...]) -> Floats:
         return np.where(random.random(shape) < share, random.normal(0, 1, shape), random.normal(apart, 1, shape))
@@ -202,16 +200,16 @@ FEW_AND_MANY: Final = (2, 3, 4, 5, 6, 7, 10, 20, 30)
 
 
 @pytest.mark.parametrize("name", others_at_night(SHAPES, in_ci=["two humps, 60:40"]))
-def test_medians_hold_what_is_assured_whatever_the_shape(
+def test_medians_have_the_assured_coverage_for_any_distribution(
     name: str, record_property: Callable[[str, object], None]
 ) -> None:
     random = np.random.default_rng(16)
     draw, middle = SHAPES[name]
-    found = {n: covered(medians(draw(random, (CELLS, n))), middle) for n in FEW_AND_MANY}
-    record_property("said", f"median, {name}, of {FEW_AND_MANY}: {rounded(list(found.values()))}")
-    assert all(one >= 100 * assured(n) - 1 for n, one in found.items())
-    assert in_method(f"median, {name}") == pytest.approx(list(found.values()), abs=0.8)
+    coverages = {n: covered(medians(draw(random, (CELLS, n))), middle) for n in FEW_AND_MANY}
+    record_property("said", f"median, {name}, of {FEW_AND_MANY}: {rounded(list(coverages.values()))}")
+    assert all(percentage >= 100 * assured(n) - 1 for n, percentage in coverages.items())
+    assert in_method(f"median, {name}") == pytest.approx(list(coverages.values()), abs=0.8)
 
 
-def rounded(found: list[float]) -> str:
-    return ", ".join(f"{one:.1f}" for one in found)
+def rounded(coverages: list[float]) -> str:
+    return ", ".join(f"{percentage:.1f}" for percentage in coverages)

@@ -1,4 +1,4 @@
-"""How often the interval of a difference holds the true one, and how often equal runs are called different."""
+"""Coverage of intervals of differences, and rate of false positives for equal runs."""
 
 from collections.abc import Callable
 
@@ -45,8 +45,8 @@ def lost(values: Floats) -> Intervals:
 
 
 def differences(a: Intervals, b: Intervals) -> list[Interval]:
-    sides = [[Interval(*one) for one in zip(side.value, side.low, side.high, strict=True)] for side in (a, b)]
-    return [between(one, other) for one, other in zip(*sides, strict=True)]
+    sides = [[Interval(*ends) for ends in zip(side.value, side.low, side.high, strict=True)] for side in (a, b)]
+    return [between(first, second) for first, second in zip(*sides, strict=True)]
 
 
 def mean(draw: Draw) -> float:
@@ -69,8 +69,12 @@ def test_an_interval_of_twenty_repeats_each_covers(
     a: Draw, b: Draw, estimates: Callable[[Floats], Intervals], true: float
 ) -> None:
     random = np.random.default_rng(1)
-    found = differences(estimates(a(random, (RUNS, 20))), estimates(b(random, (RUNS, 20))))
-    assert 0.93 <= np.mean([one.low <= true <= one.high for one in found]) <= (0.98 if estimates is medians else 0.97)
+    intervals = differences(estimates(a(random, (RUNS, 20))), estimates(b(random, (RUNS, 20))))
+    assert (
+        0.93
+        <= np.mean([interval.low <= true <= interval.high for interval in intervals])
+        <= (0.98 if estimates is medians else 0.97)
+    )
 
 
 @pytest.mark.parametrize(
@@ -78,11 +82,11 @@ def test_an_interval_of_twenty_repeats_each_covers(
     [(bursts(0.05, 8), lost), (drifting(0.05), lost), (times(0.01, 0.3), medians)],
     ids=["bursts", "drift", "times"],
 )
-def test_of_twenty_comparisons_of_equals_any_is_called_a_difference_in_one_of_twenty(
+def test_twenty_comparisons_of_equal_runs_have_a_false_positive_in_5_percent(
     draw: Draw, estimates: Callable[[Floats], Intervals]
 ) -> None:
     random = np.random.default_rng(2)
-    found = differences(*(estimates(draw(random, (20 * 800, 20))) for _ in "AB"))
-    families = np.reshape([p_value(one) for one in found], (800, 20))
+    intervals = differences(*(estimates(draw(random, (20 * 800, 20))) for _ in "AB"))
+    families = np.reshape([p_value(interval) for interval in intervals], (800, 20))
     assert (families.min(axis=1) < 0.05).mean() > 0.3
     assert np.mean([min(holm(family)) < 0.05 for family in families]) < 0.075

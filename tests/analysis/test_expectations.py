@@ -1,4 +1,4 @@
-"""Expectations: what can be written, and how intervals decide."""
+"""Expectations: parsing of their text, and decisions by intervals."""
 
 from types import MappingProxyType
 
@@ -29,8 +29,8 @@ def estimate(quantity: Quantity, value: float, low: float | None, high: float | 
     )  # fmt: skip
 
 
-def cell(protocol: str, *found: Estimate) -> Cell:
-    return Cell({"protocol": protocol}, 5, 0, 0, MappingProxyType({one.quantity.name: one for one in found}))
+def cell(protocol: str, *estimates: Estimate) -> Cell:
+    return Cell({"protocol": protocol}, 5, 0, 0, MappingProxyType({item.quantity.name: item for item in estimates}))
 
 
 @pytest.mark.parametrize(
@@ -42,14 +42,16 @@ def cell(protocol: str, *found: Estimate) -> Cell:
         ("signal_dbm > -70 dBm", "signal_dbm", False, -70.0, None),
     ],
 )
-def test_what_can_be_demanded(text: str, name: str, is_below: bool, bound: float, protocol: str | None) -> None:
-    found = expectations.parse(text, KNOWN)
-    assert (found.quantity, found.is_below, found.protocol) == (name, is_below, protocol)
-    assert found.bound == pytest.approx(bound)
+def test_the_text_of_an_expectation_is_parsed(
+    text: str, name: str, is_below: bool, bound: float, protocol: str | None
+) -> None:
+    result = expectations.parse(text, KNOWN)
+    assert (result.quantity, result.is_below, result.protocol) == (name, is_below, protocol)
+    assert result.bound == pytest.approx(bound)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "is not an expectation"),
         ("up.file_loss", "is not an expectation"),
@@ -60,25 +62,25 @@ def test_what_can_be_demanded(text: str, name: str, is_below: bool, bound: float
         ("icmp up.file_loss < 2 %", "is not an expectation"),
         ("median up.file_loss < 2 %", "is not an expectation"),
         ("90 of up.file_loss < 2 %", "is not an expectation"),
-        ("max up.file_loss > 2 %", "about one repeat alone"),
-        ("min rtt_median_s <= 2 ms", "about one repeat alone"),
+        ("max up.file_loss > 2 %", "would hold if a single repeat meets it"),
+        ("min rtt_median_s <= 2 ms", "would hold if a single repeat meets it"),
         ("100 % of rtt_median_s < 2 ms", "not a share that repeats can show"),
         ("0 % of rtt_median_s < 2 ms", "not a share that repeats can show"),
         ("120 % of rtt_median_s < 2 ms", "not a share that repeats can show"),
         ("ip_loss <= 0 % of all packets", "no number of packets shows a loss below 0 %"),
         ("ip_loss < -2 % of all packets", "no number of packets shows a loss below -2 %"),
-        ("up.file_loss < 2 % of all packets", "a loss that is counted is over all packets"),
-        ("ip_loss > 2 % of all packets", "a loss that is counted is over all packets"),
-        ("every ip_loss < 2 % of all packets", "a loss that is counted is over all packets"),
-        ("90 % of ip_loss < 2 % of all packets", "a loss that is counted is over all packets"),
-        ("file_loss < 2 %", "there is no figure 'file_loss'"),
+        ("up.file_loss < 2 % of all packets", "only an upper bound of a counted loss"),
+        ("ip_loss > 2 % of all packets", "only an upper bound of a counted loss"),
+        ("every ip_loss < 2 % of all packets", "only an upper bound of a counted loss"),
+        ("90 % of ip_loss < 2 % of all packets", "only an upper bound of a counted loss"),
+        ("file_loss < 2 %", "the expected figure 'file_loss' does not exist"),
         ("up.file_loss < 2", "has no unit"),
         ("up.file_loss < 2 ms", "unknown unit 'ms'"),
         ("rtt_median_s < fast", "is not a bound for rtt_median_s"),
     ],
 )
-def test_what_cannot_is_refused_with_a_remedy(text: str, said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said) as caught:
+def test_an_invalid_text_is_an_error_with_a_remedy(text: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         expectations.parse(text, KNOWN)
     assert caught.value.remedy
 
@@ -95,16 +97,16 @@ def test_what_cannot_is_refused_with_a_remedy(text: str, said: str) -> None:
 )
 def test_the_whole_interval_decides(low: float | None, high: float | None, below: Ruling, above: Ruling) -> None:
     demanded = [expectations.parse(f"up.file_loss {sign} 2 %", KNOWN) for sign in "<>"]
-    found = judgements.judge(demanded, [cell("tcp", estimate(LOSS, 0.01, low, high))])
-    assert [one.ruling for one in found] == [below, above]
+    result = judgements.judge(demanded, [cell("tcp", estimate(LOSS, 0.01, low, high))])
+    assert [item.ruling for item in result] == [below, above]
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(0, 1))
-def test_nothing_both_holds_and_fails(one: float, other: float, bound: float) -> None:
-    low, high = sorted((one, other))
+def test_nothing_both_holds_and_fails(first: float, second: float, bound: float) -> None:
+    low, high = sorted((first, second))
     demanded = [expectations.parse(f"signal_dbm {sign} {bound:.6f} dBm", KNOWN) for sign in "<>"]
     cells = [cell("tcp", estimate(SIGNAL, low, low, high))]
-    below, above = (one.ruling for one in judgements.judge(demanded, cells))
+    below, above = (item.ruling for item in judgements.judge(demanded, cells))
     assert not (below is Ruling.HOLDS and above is Ruling.HOLDS)
     assert (below is Ruling.HOLDS) == (high < float(f"{bound:.6f}"))
     assert (above is Ruling.HOLDS) == (low > float(f"{bound:.6f}"))
@@ -124,27 +126,27 @@ def test_nothing_both_holds_and_fails(one: float, other: float, bound: float) ->
         ("ip_loss <= 2% of  all packets", Scope.PACKETS, True, None),
     ],
 )
-def test_what_an_expectation_is_about(text: str, scope: Scope, is_inclusive: bool, share: float | None) -> None:
-    found = expectations.parse(text, KNOWN)
-    assert (found.scope, found.is_inclusive, found.share) == (scope, is_inclusive, share)
+def test_the_scope_of_an_expectation(text: str, scope: Scope, is_inclusive: bool, share: float | None) -> None:
+    result = expectations.parse(text, KNOWN)
+    assert (result.scope, result.is_inclusive, result.share) == (scope, is_inclusive, share)
 
 
 def losses(*lost: int, sent: int = 1250) -> Cell:
-    """The cell of UDP repeats that lost so many of `sent` packets each."""
+    """The cell of UDP repeats that lost these numbers of `sent` packets each."""
     rows = [
-        replace(ROW, repeat=number, ip_packets_sent=sent, ip_packets_received=sent - one, ip_loss=one / sent)
-        for number, one in enumerate(lost, 1)
+        replace(ROW, repeat=number, ip_packets_sent=sent, ip_packets_received=sent - item, ip_loss=item / sent)
+        for number, item in enumerate(lost, 1)
     ]
     (made,) = aggregate(parsed(rows), ("protocol",), quantities=[PACKETS])
     return made
 
 
-def ruling(text: str, found: Cell) -> Ruling:
-    (said,) = judgements.judge([expectations.parse(text, KNOWN)], [found])
-    return said.ruling
+def ruling(text: str, cell_: Cell) -> Ruling:
+    (judgement,) = judgements.judge([expectations.parse(text, KNOWN)], [cell_])
+    return judgement.ruling
 
 
-def test_a_perfect_link_passes_a_gate_over_all_packets() -> None:
+def test_a_perfect_link_meets_an_expectation_of_all_packets() -> None:
     """Issue 21: 0 of 7,500 datagrams lost in 6 repeats of 3 s was undecided, while 0.5 % of loss passed."""
     gate = "ip_loss < 2 % of all packets"
     assert ruling(gate, losses(0, 0, 0, 0, 0, 0)) is Ruling.HOLDS
@@ -155,7 +157,7 @@ def test_a_perfect_link_passes_a_gate_over_all_packets() -> None:
     assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "a statement on other repeats"
     (few,) = judgements.judge([expectations.parse(gate, KNOWN)], [losses(0, 0, sent=100)])
     assert wording.judged(few)[2:] == (
-        "0.00 %", "14.98 % or less", "undecided: 200 of 1498 packets that it needs at least",
+        "0.00 %", "14.98 % or less", "undecided: 200 packets were sent, at least 1498 are needed",
     )  # fmt: skip
 
 
@@ -187,7 +189,7 @@ def test_every_repeat_and_a_share_of_them(lost: list[int], every: Ruling, most: 
     assert ruling("90 % of ip_loss < 2 %", losses(*lost)) is most
 
 
-def test_what_was_measured_is_shown_for_each_form() -> None:
+def test_the_measured_value_is_shown_for_each_scope() -> None:
     cells = losses(0, 0, 0, 50)
     shown = {
         text: wording.judged(judgements.judge([expectations.parse(text, KNOWN)], [cells])[0])[2:]
@@ -204,15 +206,15 @@ def test_what_was_measured_is_shown_for_each_form() -> None:
     }
 
 
-def test_a_protocol_alone_is_judged_and_what_is_not_there_cannot_be_told() -> None:
+def test_only_one_protocol_is_judged_and_a_missing_figure_is_undecided() -> None:
     cells = [cell("tcp", estimate(RTT, 0.002, 0.001, 0.003)), cell("udp")]
     (alone,) = judgements.judge([expectations.parse("tcp rtt_median_s < 5 ms", KNOWN)], cells)
     assert alone.holds
     both = judgements.judge([expectations.parse("rtt_median_s < 5 ms", KNOWN)], cells)
-    assert [one.ruling for one in both] == [Ruling.HOLDS, Ruling.OPEN]
-    assert [wording.judged(one)[1:] for one in both] == [
+    assert [item.ruling for item in both] == [Ruling.HOLDS, Ruling.OPEN]
+    assert [wording.judged(item)[1:] for item in both] == [
         ("TCP", "2.00 ms", "[1.00, 3.00]", "holds"),
         ("UDP", "nothing", "", "undecided: 0 of 5 repeats have a value"),
     ]
-    (nobody,) = judgements.judge([expectations.parse("udp rtt_median_s < 5 ms", KNOWN)], cells[:1])
-    assert nobody.ruling is Ruling.OPEN
+    (judgement,) = judgements.judge([expectations.parse("udp rtt_median_s < 5 ms", KNOWN)], cells[:1])
+    assert judgement.ruling is Ruling.OPEN

@@ -1,4 +1,4 @@
-"""Tables with holes and with values that cannot be: told by file, line and column, or missing; never nan or inf."""
+"""Tables with missing and impossible values: errors name file, line and column; no output has nan or inf."""
 
 import csv
 import io
@@ -55,7 +55,7 @@ COLUMNS = {column.name: column for column in trial_columns()}
         ("goodput_bit_s", "-1", "not from 0 to 1e+15"),
     ],
 )
-def test_an_impossible_value_is_refused_with_its_place(tmp_path: Path, name: str, text: str, why: str) -> None:
+def test_the_error_of_an_impossible_value_names_its_place(tmp_path: Path, name: str, text: str, why: str) -> None:
     path = write(tmp_path, repeats(ROW, 4))
     with path.open(encoding="utf-8", newline="") as file:
         lines = list(csv.DictReader(file))
@@ -64,62 +64,64 @@ def test_an_impossible_value_is_refused_with_its_place(tmp_path: Path, name: str
         writer = csv.DictWriter(file, lines[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines)
-    with pytest.raises(EvidenceError) as told:
+    with pytest.raises(EvidenceError) as caught:
         read([path], trial_columns())
-    assert told.value.where == f"{path}:4"
-    assert told.value.what.startswith(f"{name} is '{text[:40]}")
-    assert told.value.what.endswith(f", {why}")
-    assert "fieldkit rebuild TRIAL" in told.value.remedy
+    assert caught.value.where == f"{path}:4"
+    assert caught.value.what.startswith(f"{name} is '{text[:40]}")
+    assert caught.value.what.endswith(f", {why}")
+    assert "fieldkit rebuild TRIAL" in caught.value.remedy
 
 
 def test_a_share_that_its_counts_contradict_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, [*repeats(ROW, 2), replace(ROW, repeat=3, ip_loss=0.5)])
-    with pytest.raises(EvidenceError, match=r"ip_loss is 0\.5, but ip_packets_received is 206 of 216") as told:
+    with pytest.raises(EvidenceError, match=r"ip_loss is 0\.5, but ip_packets_received is 206 of 216") as caught:
         read([path], trial_columns())
-    assert told.value.where == f"{path}:4"
+    assert caught.value.where == f"{path}:4"
 
 
 @pytest.mark.parametrize(
-    ("spoil", "what"),
+    ("spoil", "message"),
     [
-        (lambda text: text.replace(",", ";").encode(), "its cells stand apart by semicolons"),
-        (lambda text: quoted(text, ";").encode(), "its cells stand apart by semicolons"),
-        (lambda text: text.replace(",", "\t").encode(), "its cells stand apart by tabs"),
-        (lambda text: text.encode("utf-16"), "its letters are UTF-16"),
+        (lambda text: text.replace(",", ";").encode(), "its cells are separated by semicolons"),
+        (lambda text: quoted(text, ";").encode(), "its cells are separated by semicolons"),
+        (lambda text: text.replace(",", "\t").encode(), "its cells are separated by tabs"),
+        (lambda text: text.encode("utf-16"), "its encoding is UTF-16"),
         (lambda text: b'"' + b"x" * 200_000 + text.encode(), "it lacks schema_version"),
     ],
     ids=["semicolons", "semicolons, quoted", "tabs", "UTF-16", "no table"],
 )
-def test_what_a_spreadsheet_spoiled_is_told(tmp_path: Path, spoil: Callable[[str], bytes], what: str) -> None:
+def test_a_table_that_a_spreadsheet_changed_is_an_error(
+    tmp_path: Path, spoil: Callable[[str], bytes], message: str
+) -> None:
     path = tmp_path / "saved.csv"
     path.write_bytes(spoil(as_csv(repeats(ROW, 2))))
-    with pytest.raises(ConfigurationError, match=what):
+    with pytest.raises(ConfigurationError, match=message):
         read([path], trial_columns())
 
 
 def quoted(text: str, delimiter: str) -> str:
-    """A table as a spreadsheet saves it that puts every cell in quotes."""
+    """A table in which every cell is in quotes, as some spreadsheets save it."""
     out = io.StringIO()
     csv.writer(out, delimiter=delimiter, quoting=csv.QUOTE_ALL).writerows(csv.reader(io.StringIO(text)))
     return out.getvalue()
 
 
-def test_columns_without_a_name_are_left_out(tmp_path: Path) -> None:
+def test_columns_without_a_name_are_omitted(tmp_path: Path) -> None:
     path = tmp_path / "saved.csv"
     path.write_text("".join(f"{line},,\n" for line in as_csv(repeats(ROW, 2)).splitlines()), encoding="utf-8")
     assert len(read([path], trial_columns())) == 2
 
 
-def test_a_moment_that_a_spreadsheet_shortened_is_told_with_the_way_out(tmp_path: Path) -> None:
+def test_the_error_of_a_shortened_time_has_a_remedy(tmp_path: Path) -> None:
     path = tmp_path / "saved.csv"
     table = as_csv([replace(ROW, started_utc_ns=1_795_309_790_492_337_123)])
     path.write_text(table.replace("1795309790492337123", "1.79531E+18"), encoding="utf-8")
-    with pytest.raises(EvidenceError, match="not a whole number") as told:
+    with pytest.raises(EvidenceError, match="not a whole number") as caught:
         read([path], trial_columns())
-    assert "a spreadsheet has cut its digits" in told.value.remedy
+    assert "a spreadsheet has removed digits" in caught.value.remedy
 
 
-def test_a_moment_keeps_its_nanoseconds_beside_a_hole(tmp_path: Path) -> None:
+def test_a_time_keeps_its_nanoseconds_next_to_a_missing_value(tmp_path: Path) -> None:
     at_ns = 1_795_309_790_492_337_123
     path = write(tmp_path, [replace(ROW, started_utc_ns=at_ns), replace(ROW, repeat=2)])
     assert read([path], trial_columns()).column("started_utc_ns") == [at_ns, None]
@@ -138,7 +140,7 @@ def test_a_share_without_its_counts_is_missing(tmp_path: Path, capsys: pytest.Ca
 
 
 def likely(column: Column) -> st.SearchStrategy[str]:
-    """Cells of a column: empty, possible values, its ends, and what somebody's program or hand might leave there."""
+    """Cells of a column: empty, possible values, its bounds, and errors of other programs or people."""
     low, high = column.possible
     hostile = st.sampled_from(
         ["nan", "NaN", "inf", "-1", "2.5", "1e308", "-38460", "true", "TRUE", "NA", "9" * 400, "\x1b[31m<b>|&%", "0"]
@@ -153,7 +155,7 @@ def likely(column: Column) -> st.SearchStrategy[str]:
 
 
 def holed(column: Column) -> st.SearchStrategy[str]:
-    """Cells of a column that are possible, or empty."""
+    """Possible or empty cells of a column."""
     return likely(column).filter(lambda text: column.problem(text) is None)
 
 
@@ -164,7 +166,7 @@ CHOSEN = (
     "one_way_withheld", "rtt_sent", "rtt_received", "rtt_loss", "paper_loss", "paper_packets", "paper_received",
     "reboot_recovered", "reboot_recovery_s", "ip_packets_sent",
 )  # fmt: skip
-"""Columns that tables, figures and words are made of."""
+"""Columns that are used in tables."""
 
 
 @st.composite
@@ -200,7 +202,7 @@ def _strict(text: str) -> Any:  # noqa: ANN401 (any JSON)
 
 
 def _numbers_are_numbers(text: str) -> None:
-    """No number column of a CSV says nan or inf."""
+    """Check that no number column of a CSV contains nan or inf."""
     for line in csv.DictReader(io.StringIO(text)):
         for name, cell in line.items():
             if cell and (name not in COLUMNS or COLUMNS[name].type is not str) and name not in WORDS:
@@ -212,46 +214,46 @@ WORDS = frozenset(("quantity", "unit", "estimate", "missing_in", "verdict"))
 
 @given(hostile_tables(), hostile_tables())
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-def test_no_command_ends_otherwise_than_it_promises(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], one: str, other: str
+def test_commands_only_exit_with_documented_codes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], first: str, second: str
 ) -> None:
     a, b = tmp_path / "a.csv", tmp_path / "b.csv"
-    a.write_text(one, encoding="utf-8")
-    b.write_text(other, encoding="utf-8")
+    a.write_text(first, encoding="utf-8")
+    b.write_text(second, encoding="utf-8")
 
-    def said(*words: str) -> str:
+    def run(*words: str) -> str:
         code = main(list(words))
         out = capsys.readouterr().out
         assert code in {0, 1, 2, 4}, (words, code)
         return out if code in {0, 1} else ""
 
     for form in ("json", "csv", "table", "markdown", "latex"):
-        aggregated = said("aggregate", str(a), "--format", form)
-        compared = said("compare", str(a), str(b), "--force", "--format", form) if form != "latex" else ""
+        aggregated = run("aggregate", str(a), "--format", form)
+        compared = run("compare", str(a), str(b), "--force", "--format", form) if form != "latex" else ""
         for text in filter(None, (aggregated, compared)):
             if form == "json":
                 _strict(text)
             elif form == "csv":
                 _numbers_are_numbers(text)
     (tmp_path / "out.csv").unlink(missing_ok=True)
-    if said("export", str(a), "--format", "csv", "-o", str(tmp_path / "out.csv")):
+    if run("export", str(a), "--format", "csv", "-o", str(tmp_path / "out.csv")):
         _numbers_are_numbers((tmp_path / "out.csv").read_text(encoding="utf-8"))
     (tmp_path / "out.parquet").unlink(missing_ok=True)
-    if said("export", str(a), "--format", "parquet", "-o", str(tmp_path / "out.parquet")):
+    if run("export", str(a), "--format", "parquet", "-o", str(tmp_path / "out.parquet")):
         for name, column in zip(*_columns(tmp_path / "out.parquet"), strict=True):
             assert COLUMNS[name].type is str or all(value is None or math.isfinite(value) for value in column), name
 
 
 def _columns(path: Path) -> tuple[list[str], list[list[Any]]]:
-    found = pa.parquet.read_table(path)
-    return found.column_names, [column.to_pylist() for column in found.columns]
+    table_read = pa.parquet.read_table(path)
+    return table_read.column_names, [column.to_pylist() for column in table_read.columns]
 
 
 @given(hostile_tables())
 @settings(max_examples=3, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-def test_a_report_of_any_table_is_made_or_refused(tmp_path: Path, one: str) -> None:
+def test_a_report_of_any_table_is_written_or_refused(tmp_path: Path, first: str) -> None:
     table, page = tmp_path / "a.csv", tmp_path / "report.html"
-    table.write_text(one.replace("nan", ""), encoding="utf-8")
+    table.write_text(first.replace("nan", ""), encoding="utf-8")
     page.unlink(missing_ok=True)
     code = main(["report", str(table), "-o", str(page)])
     assert code in {0, 2, 4}
@@ -266,7 +268,7 @@ NUMBERS = [column for column in trial_columns() if column.type is not str]
 
 @given(st.sampled_from(NUMBERS).flatmap(lambda column: st.tuples(st.just(column), likely(column))))
 @settings(max_examples=60)
-def test_every_column_takes_what_it_can_hold_and_nothing_else(drawn: tuple[Column, str]) -> None:
+def test_every_column_accepts_exactly_its_possible_values(drawn: tuple[Column, str]) -> None:
     column, text = drawn
     line = dict.fromkeys(COLUMNS, "") | {"status": "valid", column.name: text}
     content = _text([line]).encode()
@@ -274,8 +276,8 @@ def test_every_column_takes_what_it_can_hold_and_nothing_else(drawn: tuple[Colum
     if column.name == "schema_version" and not problem and float(text or "nan") > SCHEMA_VERSION:
         problem = "newer"
     if problem is None:
-        found = read([Path("a.csv")], trial_columns(), content=lambda _: content)
-        assert not np.isinf(found.numbers[column.name]).any()
+        table_read = read([Path("a.csv")], trial_columns(), content=lambda _: content)
+        assert not np.isinf(table_read.numbers[column.name]).any()
     else:
         with pytest.raises((EvidenceError, ConfigurationError), match=re.escape(problem)):
             read([Path("a.csv")], trial_columns(), content=lambda _: content)

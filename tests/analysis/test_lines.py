@@ -1,4 +1,4 @@
-"""Lines of tables: what an operator sees, of which pings a round-trip time is, and how many repeats have a figure."""
+"""Lines of tables: lines for an operator, payload sizes of round-trip times, and numbers of repeats."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,19 +37,19 @@ def shown(cells: Sequence[Cell], chosen: Sequence[lines.TableLine]) -> dict[str,
     return {line.label: [line.amount(cell, line.scale(cells)) for cell in cells] for line in chosen}
 
 
-def test_a_round_trip_time_says_of_which_pings_it_is() -> None:
-    said = shown(cells := cells_of([TCP, PINGED]), lines.lines(cells))
-    assert said["RTT, 502-byte ping, median"] == ["10.00 ms", ""]
-    assert said["RTT, 8192-byte ping, median"] == ["", "10.00 ms"]
+def test_a_round_trip_time_has_the_payload_size() -> None:
+    figures = shown(cells := cells_of([TCP, PINGED]), lines.lines(cells))
+    assert figures["RTT, 502-byte ping, median"] == ["10.00 ms", ""]
+    assert figures["RTT, 8192-byte ping, median"] == ["", "10.00 ms"]
 
 
-def test_pings_of_several_sizes_under_one_condition_are_named_so() -> None:
-    said = shown(cells := cells_of([PINGED, replace(PINGED, repeat=2, rtt_payload_bytes=56)]), lines.lines(cells))
-    assert [label for label in said if "RTT" in label] == ["RTT, 56- to 8192-byte ping, median"]
+def test_the_label_has_the_range_of_payload_sizes() -> None:
+    figures = shown(cells := cells_of([PINGED, replace(PINGED, repeat=2, rtt_payload_bytes=56)]), lines.lines(cells))
+    assert [label for label in figures if "RTT" in label] == ["RTT, 56- to 8192-byte ping, median"]
 
 
 @pytest.mark.parametrize("form", ["markdown", "latex"])
-def test_tables_for_papers_name_the_payload_and_how_many_repeats_have_a_figure(form: str) -> None:
+def test_tables_for_papers_have_payload_size_and_number_of_repeats(form: str) -> None:
     made = {"markdown": tables.to_markdown, "latex": tables.to_latex}[form]
     table = [
         PINGED,
@@ -62,31 +62,29 @@ def test_tables_for_papers_name_the_payload_and_how_many_repeats_have_a_figure(f
     assert "none, 0 of 2" in text
 
 
-def test_a_condition_without_any_reply_is_there_and_says_so(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_condition_without_any_reply_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     far = replace(
         PINGED, trial="far", distance="60ft", distance_m=18.288, rtt_loss=1.0, rtt_received=0, rtt_median_s=None
     )
     assert main(["aggregate", str(write(tmp_path, [PINGED, far])), "--quantity", "rtt_median_s"]) == 0
-    said = capsys.readouterr().out
-    assert "RTT, 8192-byte ping (ms)" in said
-    assert [line.split() for line in said.splitlines() if line.startswith(" 60ft")][-1] == ["60ft", "0", "of", "1"]
+    figures = capsys.readouterr().out
+    assert "RTT, 8192-byte ping (ms)" in figures
+    assert [line.split() for line in figures.splitlines() if line.startswith(" 60ft")][-1] == ["60ft", "0", "of", "1"]
 
 
-def test_what_the_radio_lost_of_tcp_and_of_udp_is_one_line_unless_a_condition_has_both() -> None:
+def test_radio_losses_of_tcp_and_udp_are_one_line_unless_a_condition_has_both() -> None:
     cells = cells_of([TCP, PINGED])
-    said = shown(cells, lines.with_radio_loss(lines.of_operator(cells), cells))
-    assert said["radio loss"] == ["1.00 %", "4.63 %"]
+    figures = shown(cells, lines.with_radio_loss(lines.of_operator(cells), cells))
+    assert figures["radio loss"] == ["1.00 %", "4.63 %"]
     together = cells_of([replace(PINGED, tcp_byte_loss=0.01)])
     labels = shown(together, lines.with_radio_loss(lines.of_operator(together), together))
     assert {"IP packet loss", "TCP byte loss before retransmission"} <= labels.keys()
     assert "radio loss" not in labels
 
 
-def test_an_operator_sees_what_is_expected_and_what_a_lab_measures_but_not_all() -> None:
-    own = Column("probe.level", "dBm", "Level.", figure=Figure("probe: level", Kind.MEDIAN))
-    columns = (*trial_columns(), own)
+def test_lines_for_an_operator_include_expected_and_additional_quantities() -> None:
+    additional = Column("probe.level", "dBm", "Level.", figure=Figure("probe: level", Kind.MEDIAN))
+    columns = (*trial_columns(), additional)
     row = replace(PINGED, transfer_stall_s=0.4, transfer_stalls=1)
     row["probe.level"] = -60.0
     content = rows.to_csv([row], columns).encode()
@@ -105,19 +103,19 @@ def test_an_operator_sees_what_is_expected_and_what_a_lab_measures_but_not_all()
 
 
 def test_figures_of_equal_rank_are_in_the_order_of_columns() -> None:
-    own = [Column(f"m{n}", "V", "Voltage.", figure=Figure(f"m{n}", Kind.MEDIAN)) for n in range(12)]
-    columns = (*trial_columns(), *own)
-    row = replace(PINGED) | {column.name: 7.4 for column in own}
+    additional = [Column(f"m{n}", "V", "Voltage.", figure=Figure(f"m{n}", Kind.MEDIAN)) for n in range(12)]
+    columns = (*trial_columns(), *additional)
+    row = replace(PINGED) | {column.name: 7.4 for column in additional}
     cells = aggregate(repeats.parse(rows.to_csv([row], columns).encode(), columns))
     labels = [line.label for line in lines.of_operator(cells)]
     assert [label for label in labels if label.startswith("m")] == [f"m{n}, median" for n in range(12)]
 
 
-def test_a_table_of_nothing_for_an_operator_shows_everything() -> None:
+def test_all_lines_are_shown_if_none_is_for_an_operator() -> None:
     bare = replace(ROW, file_loss=None, ip_loss=None, rtt_median_s=None, ip_packets_sent=None)
     assert [line.label for line in lines.of_operator(cells_of([bare]))] == ["transfer time, median"]
 
 
-def test_packets_that_were_sent_are_counted_over_all_valid_repeats() -> None:
+def test_sent_packets_are_summed_over_all_valid_repeats() -> None:
     cells = cells_of([TCP, PINGED, replace(PINGED, repeat=2), replace(PINGED, repeat=3, status="void")])
     assert lines.sent(cells) == {"packets sent": ["40", "432"]}

@@ -1,4 +1,4 @@
-"""One-sided bounds against scipy's, and what the bound of bursty losses promises."""
+"""One-sided bounds compared with scipy, and coverage of the bound of bursty losses."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.analysis.test_coverage import lost_in_bursts
 
 
 @given(st.integers(0, 200), st.integers(1, 200))
-def test_shares_of_repeats_are_clopper_and_pearsons(met: int, n: int) -> None:
+def test_shares_of_repeats_equal_clopper_and_pearson(met: int, n: int) -> None:
     assume(met <= n)
     low = 0.0 if met == 0 else stats.beta.ppf(0.05, met, n - met + 1)
     high = 1.0 if met == n else stats.beta.ppf(0.95, met + 1, n - met)
@@ -20,19 +20,19 @@ def test_shares_of_repeats_are_clopper_and_pearsons(met: int, n: int) -> None:
 
 
 @given(st.floats(0.001, 0.9999))
-def test_so_many_repeats_without_an_exception_show_a_share_and_one_fewer_does_not(share: float) -> None:
+def test_the_number_of_repeats_for_a_share_is_minimal(share: float) -> None:
     n = bounds.repeats_for(share)
     assert bounds.share_low(n, n) >= share * (1 - 1e-9)
     assert n == 1 or bounds.share_low(n - 1, n - 1) < share
 
 
-def test_ninety_per_cent_of_the_repeats_take_29() -> None:
+def test_29_repeats_are_needed_for_90_percent() -> None:
     """Wilks 1941, Ann. Math. Stat. 12:91: 29 for 90 %, 59 for 95 %, 299 for 99 %."""
     assert [bounds.repeats_for(share) for share in (0.9, 0.95, 0.99)] == [29, 59, 299]
 
 
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=20))
-def test_the_loss_is_garwoods_bound_of_bursts_as_long_as_the_worst_repeat_has_losses(lost: list[int]) -> None:
+def test_the_loss_is_garwoods_bound_with_the_worst_repeat_as_burst_length(lost: list[int]) -> None:
     burst, total = max([*lost, bounds.SHORTEST_BURST]), 1000 * len(lost)
     expected = burst * stats.gamma.ppf(0.95, sum(lost) / burst + 1) / total
     assert bounds.loss_high(lost, [1000] * len(lost)) == pytest.approx(min(expected, 1), rel=1e-9)
@@ -46,28 +46,28 @@ def test_fewer_losses_never_make_the_bound_larger(pairs: list[tuple[int, int]], 
     assert bounds.loss_high([0] * len(pairs), each) <= bounds.loss_high(fewer, each)
 
 
-def test_copies_that_arrived_are_no_negative_losses() -> None:
+def test_duplicates_are_no_negative_losses() -> None:
     assert bounds.loss_high([-50, 0], [1000, 1000]) == bounds.loss_high([0, 0], [1000, 1000])
     assert bounds.loss_high([0], [0]) == 1
 
 
 @pytest.mark.parametrize("bound", [0.001, 0.02, 0.3])
-def test_so_many_packets_without_a_loss_are_enough(bound: float) -> None:
+def test_the_number_of_packets_without_a_loss_is_minimal(bound: float) -> None:
     n = bounds.packets_for(bound)
     assert bounds.loss_high([0], [n]) < bound <= bounds.loss_high([0], [n - 1])
 
 
 @pytest.mark.parametrize("burst", [0, 1, 5])
 @pytest.mark.parametrize("rate", [0.0005, 0.005, 0.02])
-def test_the_bound_holds_the_true_loss_in_95_per_cent_of_runs(burst: int, rate: float) -> None:
+def test_the_bound_is_above_the_true_loss_in_95_percent_of_runs(burst: int, rate: float) -> None:
     """6 repeats of 1,250 datagrams on a Gilbert-Elliott link, as an iperf3 test of 3 s."""
     lost = lost_in_bursts(np.random.default_rng(21), rate, burst, (400, 6), 1250)
     held = np.mean([bounds.loss_high(run, [1250] * 6) >= rate for run in lost])
-    assert held >= 0.94  # 95 % less a standard error
+    assert held >= 0.94  # 95 % minus a standard error
 
 
 @pytest.mark.parametrize("bursts_per_run", [0.5, 3, 20])
-def test_bursts_of_the_assumed_length_are_covered_as_promised(bursts_per_run: float) -> None:
+def test_bursts_of_the_assumed_length_have_the_stated_coverage(bursts_per_run: float) -> None:
     random = np.random.default_rng(22)
     lost = bounds.SHORTEST_BURST * random.poisson(bursts_per_run / 6, (1000, 6))
     rate = bounds.SHORTEST_BURST * bursts_per_run / (6 * 1250)

@@ -69,7 +69,7 @@ def test_repeats_are_what_export_writes(named: Path, tmp_path: Path) -> None:
 
 def test_cells_of_named_steps_are_what_aggregate_prints(named: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["aggregate", str(named), "--by", "trial,protocol", "--format", "csv"]) == 0
-    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+    with pytest.warns(UserWarning, match="echo requests of different sizes"):
         cells = fieldkit.load(named).cells(by=["trial", "protocol"])
     assert as_csv(cells) == capsys.readouterr().out
     units = {row["quantity"]: row["unit"] for row in cells.to_pylist()}
@@ -83,7 +83,7 @@ def test_cells_are_of_the_quantities_that_are_asked_for() -> None:
 
 
 def test_cells_can_be_told_apart_by_source() -> None:
-    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+    with pytest.warns(UserWarning, match="echo requests of different sizes"):
         sources = {row["source"] for row in fieldkit.load(TRIALS).cells("source").to_pylist()}
     assert sources == {str(path) for path in STORED}
 
@@ -146,7 +146,7 @@ def test_packets_of_a_step_are_told_by_its_name(recorded_trial: Path) -> None:
 
 
 def test_what_tells_cells_apart_is_null_where_it_is_missing() -> None:
-    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+    with pytest.warns(UserWarning, match="echo requests of different sizes"):
         cells = fieldkit.load(TRIALS).cells("reason", "rtt_loss")
     assert None in cells["reason"].to_pylist()
 
@@ -225,7 +225,7 @@ def test_what_is_no_trial_is_refused_as_commands_refuse_it(tmp_path: Path) -> No
         fieldkit.load(tmp_path)
     other = tmp_path / "other.csv"
     other.write_text("a,b\n1,2\n", encoding="utf-8")
-    with pytest.warns(UserWarning, match="kept as text"), pytest.raises(ConfigurationError, match="no table of re"):
+    with pytest.warns(UserWarning, match="kept as text"), pytest.raises(ConfigurationError, match="not a table of"):
         fieldkit.load(other)
 
 
@@ -236,7 +236,7 @@ def test_a_damaged_table_is_refused_with_its_line(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match=r"damaged\.csv:3"):
         fieldkit.load(damaged)
     damaged.write_text("".join(lines)[:-1])
-    with pytest.raises(EvidenceError, match="the last line has no end"):
+    with pytest.raises(EvidenceError, match="the last line has no line feed"):
         fieldkit.load(damaged)
 
 
@@ -290,7 +290,7 @@ def test_a_cell_has_its_figures_by_name(named: Path) -> None:
         "udp",
     )
     assert found in list(cell)
-    with pytest.warns(UserWarning, match="Echo requests of several sizes"):
+    with pytest.warns(UserWarning, match="echo requests of different sizes"):
         up = fieldkit.load(named).cell(trial="named-0", protocol="udp")["up.file_loss"]
     assert (up.n, up.unit) == (8, "share")
 

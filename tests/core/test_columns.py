@@ -1,4 +1,4 @@
-"""Columns and what is measured of them: one value for each, or a reason why there is none."""
+"""Columns and measured values: each column has one value, or a reason why it is missing."""
 
 import pytest
 from hypothesis import given
@@ -15,49 +15,54 @@ measured = st.builds(
 
 
 def test_two_values_for_one_column_are_refused_even_if_they_are_equal() -> None:
-    one = Measured({"a": 1, "b": 2.0, "c": "x"})
+    first = Measured({"a": 1, "b": 2.0, "c": "x"})
     with pytest.raises(ValueError, match=r"^measured twice: a, c$"):
-        one | Measured({"c": "x", "a": 1})
+        first | Measured({"c": "x", "a": 1})
 
 
-def test_a_value_overrides_that_it_is_missing_on_either_side() -> None:
+def test_a_value_replaces_a_missing_reason_on_either_side() -> None:
     value, missing = Measured({"a": 0}), Measured(missing={"a": "not captured", "b": "no ping"})
     for both in (value | missing, missing | value):
         assert both == Measured({"a": 0}, {"b": "no ping"})
 
 
-def test_the_first_reason_for_which_a_column_is_missing_stands() -> None:
+def test_the_first_missing_reason_is_kept() -> None:
     assert (Measured(missing={"a": "first"}) | Measured(missing={"a": "second"})).missing == {"a": "first"}
 
 
 @given(measured, measured)
-def test_nothing_is_lost_and_nothing_is_both(one: Measured, other: Measured) -> None:
-    if one.values.keys() & other.values.keys():
+def test_a_union_keeps_all_columns_and_each_is_either_measured_or_missing(first: Measured, second: Measured) -> None:
+    if first.values.keys() & second.values.keys():
         with pytest.raises(ValueError, match="measured twice"):
-            one | other
+            first | second
         return
-    both = one | other
-    assert both.values == {**one.values, **other.values}
-    assert both.values.keys() | both.missing.keys() == {*one.values, *one.missing, *other.values, *other.missing}
+    both = first | second
+    assert both.values == {**first.values, **second.values}
+    assert both.values.keys() | both.missing.keys() == {
+        *first.values,
+        *first.missing,
+        *second.values,
+        *second.missing,
+    }
     assert not both.values.keys() & both.missing.keys()
-    assert one | Measured() == one == Measured() | one
+    assert first | Measured() == first == Measured() | first
 
 
-def test_none_is_missing_and_zero_and_false_are_values() -> None:
-    found = Measured.of({"a": 0, "b": None, "c": False, "d": ""}, "not at hand")
-    assert found == Measured({"a": 0, "c": False, "d": ""}, {"b": "not at hand"})
+def test_none_means_missing_but_zero_and_false_are_values() -> None:
+    measured = Measured.of({"a": 0, "b": None, "c": False, "d": ""}, "not available")
+    assert measured == Measured({"a": 0, "c": False, "d": ""}, {"b": "not available"})
 
 
 def test_all_declared_columns_can_be_missing_for_one_reason() -> None:
     assert Measured.nothing(DECLARED, "no capture") == Measured(missing=dict.fromkeys("abc", "no capture"))
 
 
-def test_the_unit_tells_the_type_of_values() -> None:
+def test_the_unit_determines_the_type_of_values() -> None:
     assert [column.type for column in DECLARED] == [int, float, str]
     assert {column.rank for column in DECLARED} == {10}
 
 
-def test_a_value_at_a_bound_of_more_digits_than_a_cell_has_is_read_again() -> None:
+def test_a_rounded_value_at_a_bound_is_still_possible() -> None:
     ends = 1.0000000004, 2.0000000006
     column = Column("level", "dBm", "x", bounds=ends)
     assert [cell(end) for end in ends] == ["1", "2"]

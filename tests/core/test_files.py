@@ -6,9 +6,7 @@ import pytest
 from fieldkit.core import files
 
 
-def test_write_leaves_the_old_file_or_the_new_one_and_its_mode(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_write_keeps_the_old_file_and_its_mode_on_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "trial.csv"
     files.write(path, b"older")
     path.chmod(0o640)
@@ -18,15 +16,15 @@ def test_write_leaves_the_old_file_or_the_new_one_and_its_mode(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("fieldkit.core.files.os.fsync", full)
-    with pytest.raises(OSError, match="No space") as told:
+    with pytest.raises(OSError, match="No space") as caught:
         files.write(path, b"new")
-    assert told.value.filename == str(path)
+    assert caught.value.filename == str(path)
     assert path.read_bytes() == b"old"
     assert path.stat().st_mode & 0o7777 == 0o640
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_pipe_is_not_replaced_and_neither_is_a_device(tmp_path: Path) -> None:
+def test_a_pipe_is_not_replaced(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     os.mkfifo(path)
     with pytest.raises(OSError, match="it is a pipe"):
@@ -35,7 +33,7 @@ def test_a_pipe_is_not_replaced_and_neither_is_a_device(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_room_for_a_folder_is_that_of_the_disk_it_will_be_on(
+def test_free_bytes_of_a_missing_folder_are_those_of_its_parent_s_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -7,9 +7,9 @@ RIVAL = Role("rival")
 
 
 @pytest.mark.parametrize(
-    ("topology", "near", "leg", "place_m"),
+    ("topology", "near", "leg", "position_m"),
     [
-        # East is from the sender to the receiver, north to the left of who looks that way.
+        # East is the direction from the sender to the receiver, north is to the left of it.
         (Topology.MASTERLESS, Role.RECEIVER, Leg(away_m=2.0), (12.0, 0.0, 0.0)),
         (Topology.MASTERLESS, Role.RECEIVER, Leg(left_m=3.0), (10.0, 3.0, 0.0)),
         (Topology.MASTERLESS, Role.SENDER, Leg(away_m=2.0), (-2.0, 0.0, 0.0)),
@@ -19,8 +19,8 @@ RIVAL = Role("rival")
         (Topology.MASTER, Role.RELAY, Leg(left_m=3.0), (0.0, 3.0, 0.0)),
     ],
 )
-def test_a_post_is_told_from_the_robot_that_it_is_near_to(
-    topology: Topology, near: Role, leg: Leg, place_m: Vector
+def test_a_post_is_relative_to_its_reference_robot(
+    topology: Topology, near: Role, leg: Leg, position_m: Vector
 ) -> None:
     placement = Placement(Scenario.LOS, topology, Distance(10.0, "10m"), (Post(RIVAL, near, leg),))
-    assert geometry.positions_m(placement)[RIVAL] == place_m
+    assert geometry.positions_m(placement)[RIVAL] == position_m

@@ -18,7 +18,7 @@ def test_entry_points_are_sorted_by_name(tmp_path: Path, monkeypatch: pytest.Mon
     assert [point.name for point in plugins.points("bench")] == ["early", "last", "middle"]
 
 
-def test_of_two_versions_of_a_package_the_first_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_of_two_versions_of_a_package_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for version in ("1.0", "2.0"):
         write_package(tmp_path / version, "bench-tools", f"[bench]\nbench = bench.v{version[0]}:run\n", version)
         monkeypatch.syspath_prepend(tmp_path / version)

@@ -1,4 +1,4 @@
-"""What an answer means, and who gives it."""
+"""Parsing of answers, and answers from a script."""
 
 from collections.abc import Iterator
 
@@ -24,31 +24,31 @@ from fieldkit.core.prompts import DONE, Answer, Script, parse
         ("yes", None),
     ],
 )
-def test_a_line_means_one_thing_or_nothing(line: str, meaning: Answer | None) -> None:
+def test_a_line_is_one_answer_or_none(line: str, meaning: Answer | None) -> None:
     assert parse(line, may_skip=True) == meaning
 
 
-def test_what_cannot_wait_cannot_be_skipped() -> None:
+def test_skip_is_no_answer_if_it_is_not_allowed() -> None:
     assert parse("s", may_skip=False) is None
 
 
 @given(st.text(max_size=20), st.booleans())
-def test_an_answer_never_skips_and_notes_at_once(line: str, may_skip: bool) -> None:
+def test_an_answer_has_no_note_if_it_skips(line: str, may_skip: bool) -> None:
     answer = parse(line, may_skip=may_skip)
     assert answer is None or not (answer.skip and (answer.note or not may_skip))
 
 
-def test_a_script_reads_a_line_only_after_its_request_was_told() -> None:
-    told: list[Event] = []
+def test_a_script_reads_a_line_only_after_its_request_was_reported() -> None:
+    events: list[Event] = []
 
     def lines() -> Iterator[str]:
-        yield {"move a": "n windy\n"}[_text(told[-1])]
-        yield {"move b": "s\n"}[_text(told[-1])]
+        yield {"move a": "n windy\n"}[_text(events[-1])]
+        yield {"move b": "s\n"}[_text(events[-1])]
 
-    script = Script(lines(), "pipe", told.append)
+    script = Script(lines(), "pipe", events.append)
     assert script.ask("move a", may_skip=True) == Answer(note="windy")
     assert script.ask("move b", may_skip=True) == Answer(skip=True)
-    assert told == [
+    assert events == [
         Request("move a", may_skip=True),
         Answered(skip=False, note="windy"),
         Request("move b", may_skip=True),
@@ -56,11 +56,13 @@ def test_a_script_reads_a_line_only_after_its_request_was_told() -> None:
     ]
 
 
-@pytest.mark.parametrize(("line", "said"), [("", "no answer left to: move a"), ("what", "'what' is no answer")])
-def test_a_script_that_does_not_answer_is_named_with_its_line(line: str, said: str) -> None:
+@pytest.mark.parametrize(
+    ("line", "message"), [("", "no answer left to: move a"), ("what", "'what' is not an answer")]
+)
+def test_an_error_of_a_script_names_its_line(line: str, message: str) -> None:
     script = Script(iter(["", line] if line else [""]), "answers.txt", lambda event: None)
     script.ask("move z")
-    with pytest.raises(ConfigurationError, match=said) as caught:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         script.ask("move a")
     assert caught.value.where == "answers.txt:2"
     assert caught.value.remedy

@@ -9,7 +9,7 @@ from fieldkit.core.model import FIXED_ROLES, Role, in_order
 
 
 @given(st.from_regex(Role.PATTERN, fullmatch=True))
-def test_a_role_is_one_object_however_it_is_made(name: str) -> None:
+def test_equal_names_give_the_same_role_object(name: str) -> None:
     role = Role(name)
     assert role == name
     assert Role(str(role)) is role
@@ -18,11 +18,11 @@ def test_a_role_is_one_object_however_it_is_made(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "Rival", "1st", "a-b", "a.b", "a/b", "x" * 32, "a\n"])
-def test_what_cannot_be_part_of_a_file_s_name_is_no_role(name: str) -> None:
-    with pytest.raises(ValueError, match="a role is named by"):
+def test_an_invalid_name_of_a_role_is_an_error(name: str) -> None:
+    with pytest.raises(ValueError, match="the name of a role"):
         Role(name)
 
 
-def test_a_lab_s_own_come_behind_the_fixed_ones() -> None:
-    own = [Role("a"), Role("z")]
-    assert in_order([own[1], *reversed(FIXED_ROLES), own[0]]) == [*FIXED_ROLES, *own]
+def test_additional_roles_are_listed_after_the_fixed_ones() -> None:
+    additional = [Role("a"), Role("z")]
+    assert in_order([additional[1], *reversed(FIXED_ROLES), additional[0]]) == [*FIXED_ROLES, *additional]

@@ -1,4 +1,4 @@
-"""Names that one process holds: whatever another user, a crash or a crowd does, one holds it and nothing is left."""
+"""Named locks: exactly one process holds a lock, and no file is left, despite other users, crashes and contention."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ NAME = "trial-0123abcd"
 
 @pytest.fixture(autouse=True)
 def base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A base folder of this test's own; its path is short, as `base_folder` wants it."""
+    """A temporary base folder with a short path, as `base_folder` requires."""
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="rt") as folder:
         monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
         yield Path(folder)
@@ -30,7 +30,7 @@ def private(base: Path) -> Path:
     return base / f"fieldkit-{os.geteuid()}"
 
 
-def test_a_name_is_held_once_and_nothing_is_left(base: Path) -> None:
+def test_a_lock_is_exclusive_and_leaves_no_file(base: Path) -> None:
     with runtime.held(NAME):
         assert private(base).stat().st_mode & 0o777 == 0o700
         with runtime.held("another"):
@@ -42,7 +42,7 @@ def test_a_name_is_held_once_and_nothing_is_left(base: Path) -> None:
         pass
 
 
-def test_what_kill_9_leaves_holds_nothing_and_is_removed(base: Path) -> None:
+def test_a_file_left_by_kill_9_is_not_locked_and_is_removed(base: Path) -> None:
     reader, writer = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -62,7 +62,7 @@ def test_what_kill_9_leaves_holds_nothing_and_is_removed(base: Path) -> None:
     assert list(base.iterdir()) == []
 
 
-def test_of_many_processes_one_holds_the_name(base: Path) -> None:
+def test_one_of_many_processes_gets_the_lock(base: Path) -> None:
     go, stay = os.pipe(), os.pipe()
     children = []
     for _ in range(12):
@@ -100,7 +100,7 @@ def test_of_many_processes_one_holds_the_name(base: Path) -> None:
     assert list(base.iterdir()) == []
 
 
-def test_names_come_and_go_while_others_remove_what_is_stale(base: Path) -> None:
+def test_concurrent_processes_can_lock_while_others_remove_stale_files(base: Path) -> None:
     children = []
     for number in range(4):
         pid = os.fork()
@@ -119,7 +119,7 @@ def test_names_come_and_go_while_others_remove_what_is_stale(base: Path) -> None
 
 
 @pytest.mark.parametrize("kind", ["open to others", "of another user", "link", "file", "link to nothing"])
-def test_what_another_user_laid_there_is_refused_and_left_alone(base: Path, tmp_path: Path, kind: str) -> None:
+def test_a_path_that_another_user_controls_is_refused_and_unchanged(base: Path, tmp_path: Path, kind: str) -> None:
     path, victim = private(base), tmp_path / "victim"
     victim.mkdir(mode=0o700)
     match kind:
@@ -159,17 +159,17 @@ def test_a_runtime_folder_that_is_not_private_is_not_used(
     base: Path, monkeypatch: pytest.MonkeyPatch, spoil: str
 ) -> None:
     assert runtime.base_folder() == base
-    named = {"is not there": base / "none", "is relative": Path(), "is too long": base / ("x" * 60)}.get(spoil, base)
+    folder = {"is not there": base / "none", "is relative": Path(), "is too long": base / ("x" * 60)}.get(spoil, base)
     if spoil == "is too long":
-        named.mkdir(mode=0o700)
+        folder.mkdir(mode=0o700)
     if spoil == "others write there":
         base.chmod(0o777)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(named))
-    assert runtime.base_folder() != named
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    assert runtime.base_folder() != folder
 
 
-def test_no_name_of_the_product_can_be_occupied_by_another_user() -> None:
-    """An abstract socket belongs to whoever binds it first (unix(7))."""
+def test_no_abstract_sockets_are_used() -> None:
+    """Any user can bind the name of an abstract socket first (unix(7))."""
     sources = [path for package in ("fieldkit", "sim_backends") for path in (ROOT / package).rglob("*.py")]
     assert len(sources) > 300
     assert [path for path in sources if 'bind(f"\\0' in path.read_text(encoding="utf-8")] == []

@@ -1,4 +1,4 @@
-"""Text of unknown origin in every form in which it is shown."""
+"""Sanitizing of text of unknown origin in all output formats."""
 
 import json
 
@@ -19,7 +19,7 @@ from fieldkit.core.text import guarded, harmless, json_text, one_line, unguarded
         ("\a\r", "??"),
     ],
 )
-def test_nothing_is_left_that_a_terminal_obeys(text: str, shown: str) -> None:
+def test_terminal_control_characters_are_replaced(text: str, shown: str) -> None:
     assert harmless(text) == shown
 
 
@@ -37,7 +37,7 @@ def test_any_text_is_printable_in_every_form(text: str) -> None:
 
 
 @given(st.text().filter(str.isprintable))
-def test_a_printable_text_stays_as_it_is(text: str) -> None:
+def test_a_printable_text_is_unchanged(text: str) -> None:
     assert harmless(text) == one_line(text) == text
 
 
@@ -49,11 +49,11 @@ JSON = st.recursive(
 
 
 @given(JSON, st.sampled_from([None, 1]))
-def test_json_says_the_same_with_escapes(value: object, indent: int | None) -> None:
+def test_escaped_json_has_the_same_value(value: object, indent: int | None) -> None:
     assert json.loads(json_text(value, indent=indent)) == value
 
 
-def test_json_escapes_beyond_sixteen_bits_and_what_json_itself_leaves() -> None:
+def test_json_escapes_all_unprintable_characters() -> None:
     assert json_text("\x7f\x9b\u202e\U000e0001\xa0é") == '"\\u007f\\u009b\\u202e\\udb40\\udc01\xa0é"'
 
 
@@ -61,7 +61,7 @@ CELLS = st.text() | st.from_regex(r"'{0,2}[=+@-][0-9a-z|!'\"]{0,5}", fullmatch=T
 
 
 @given(CELLS)
-def test_a_cell_is_no_formula_and_is_read_back(text: str) -> None:
+def test_a_guarded_cell_is_no_formula_and_can_be_restored(text: str) -> None:
     cell = guarded(text)
     assert unguarded(cell) == text
     if cell[:1] in {"=", "+", "-", "@"} and len(cell) > 1:
@@ -81,5 +81,5 @@ def test_a_cell_is_no_formula_and_is_read_back(text: str) -> None:
         ("it's", "it's"),
     ],
 )
-def test_what_a_spreadsheet_takes_for_a_formula_is_marked_as_text(text: str, cell: str) -> None:
+def test_a_possible_formula_is_marked_as_text(text: str, cell: str) -> None:
     assert guarded(text) == cell

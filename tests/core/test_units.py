@@ -26,7 +26,7 @@ def test_distances_are_metres_and_keep_their_label(text: str, metres: float, lab
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("30", "no unit"),
         ("30feet", "unknown unit 'feet'"),
@@ -38,11 +38,11 @@ def test_distances_are_metres_and_keep_their_label(text: str, metres: float, lab
         ("3m\n", ""),
     ],
 )
-def test_a_wrong_distance_says_what_to_write(text: str, said: str) -> None:
-    if not said:
+def test_an_error_of_a_distance_has_a_remedy(text: str, message: str) -> None:
+    if not message:
         assert parse_distance(text).label == "3m"
         return
-    with pytest.raises(ConfigurationError, match=said) as caught:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         parse_distance(text)
     assert caught.value.exit_code == 2
     assert caught.value.remedy
@@ -55,7 +55,7 @@ def test_durations_scale_with_their_unit(value: float) -> None:
 
 
 @given(st.text(max_size=12))
-def test_no_text_makes_the_parser_fail_in_another_way(text: str) -> None:
+def test_the_parser_raises_no_other_error(text: str) -> None:
     try:
         distance = parse_distance(text)
     except ConfigurationError:
@@ -67,7 +67,7 @@ def test_no_text_makes_the_parser_fail_in_another_way(text: str) -> None:
     ("seconds", "text"),
     [(0.42, "0.4 s"), (9.96, "10 s"), (59.6, "1 min 00 s"), (185, "3 min 05 s"), (3725, "1 h 02 min")],
 )
-def test_durations_read_well(seconds: float, text: str) -> None:
+def test_durations_are_formatted_for_people(seconds: float, text: str) -> None:
     assert format_duration(seconds) == text
 
 
@@ -75,14 +75,14 @@ def test_durations_read_well(seconds: float, text: str) -> None:
     ("label", "text"),
     [("40ft", "40 ft (12.19 m)"), ("9.1m", "9.1 m"), (".5 km", ".5 km (500.00 m)"), ("80cm", "80 cm (0.80 m)")],
 )
-def test_a_distance_reads_in_the_operators_own_unit(label: str, text: str) -> None:
+def test_a_distance_is_formatted_in_the_operator_s_unit(label: str, text: str) -> None:
     assert format_distance(parse_distance(label)) == text
 
 
 @pytest.mark.parametrize(
     ("size_bytes", "text"), [(200, "0.2 kB"), (35e6, "35 MB"), (1.24e9, "1.2 GB"), (5e12, "5000 GB")]
 )
-def test_sizes_read_well(size_bytes: float, text: str) -> None:
+def test_sizes_are_formatted_for_people(size_bytes: float, text: str) -> None:
     assert format_bytes(size_bytes) == text
 
 

@@ -129,9 +129,9 @@ REASONS = {
     "client-killed": "box-1: iperf3-client ended with exit code 137",
     "server-killed": "iperf3",
     "limit": "box-1",
-    "load-killed": "box-1: its job soak ended before fieldkit ended it, with exit code 137",
+    "load-killed": "box-1: its job soak exited before fieldkit stopped it, with exit code 137",
     "code": "box-2: sh ended with exit code 3",
-    "missing-value": "run.txt: no x: there is none",
+    "missing-value": "run.txt: no x: the value is missing",
 }
 
 

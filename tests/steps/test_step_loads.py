@@ -147,7 +147,7 @@ def test_values_are_from_reports_of_sending_and_receiving_end(tmp_path: Path) ->
         (lambda path: path.unlink(), "receiver-iperf3.json: cannot be read"),
         (
             lambda path: path.write_text(path.read_text()[:-60]),
-            "receiver-iperf3.json: is no JSON of iperf3, or was cut",
+            "receiver-iperf3.json: is not JSON of iperf3, or was truncated",
         ),
         (
             lambda path: shutil.copy(DATA / "iperf3" / "3.7" / "refused-client.json", path),

@@ -265,7 +265,7 @@ def _compare(
             _compare_transfer(placed, protocol, sent_file, values, missing)
             refused = prefixed(placed.step.prefix, "receiver_udp_buffer_errors")
             others = truth.udp_to.count(sent_file.target) - (protocol is Protocol.UDP)
-            assert "counts all of it together" in missing[refused] if others else values[refused] == REFUSED
+            assert "only one counter for all of it" in missing[refused] if others else values[refused] == REFUSED
             SEEN["valid, UDP of several to one"] += bool(others)
 
 

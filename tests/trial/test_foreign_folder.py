@@ -81,7 +81,7 @@ def test_a_link_to_a_file_of_ours_is_refused_in_one_sentence(
     out = [str(trial.parent / "out.mcap") if word == "out.mcap" else word for word in command[1:]]
     assert main([command[0], str(trial), *out]) == EvidenceError.exit_code
     said = capsys.readouterr().err
-    assert f"{place}: it is a symbolic link, no file of its own" in " ".join(said.split())
+    assert f"{place}: it is a symbolic link, not a regular file" in " ".join(said.split())
     assert "remedy: ask whoever made the trial" in " ".join(said.split())
     assert ours.read_text(encoding="utf-8") == OURS
 
@@ -91,7 +91,7 @@ def test_a_link_to_a_file_of_ours_is_refused_in_one_sentence(
 def test_what_could_keep_a_reader_waiting_is_refused(trial: Path, place: str, make: Callable[[Path], None]) -> None:
     (trial / place).unlink()
     make(trial / place)
-    with pytest.raises(EvidenceError, match="no file of its own") as caught:
+    with pytest.raises(EvidenceError, match="not a regular file") as caught:
         rebuild(trial)
     assert caught.value.where == str(trial / place)
     assert any(line.startswith(f"{place}: it is a ") for line in manifest.verify(trial))
@@ -103,7 +103,7 @@ def test_a_pipe_as_a_table_keeps_nobody_waiting(
     (trial / "trial.csv").unlink()
     pipe(trial / "trial.csv")
     assert main(["aggregate", str(trial.parent)]) != 0
-    assert "it is a pipe, no file of its own" in " ".join(capsys.readouterr().err.split())
+    assert "it is a pipe, not a regular file" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("name", ["repeats", "repeats/udp-01"])
@@ -125,7 +125,7 @@ def test_a_journal_with_a_second_name_is_not_written(trial: Path, ours: Path) ->
     (trial / "journal.jsonl").unlink()
     (trial / "journal.jsonl").hardlink_to(ours)
     with (
-        pytest.raises(ConfigurationError, match="a hard link, and writing it would change that file too"),
+        pytest.raises(ConfigurationError, match="hard link, and writing would change that file too"),
         journal.claimed(trial),
     ):
         raise AssertionError("claimed")

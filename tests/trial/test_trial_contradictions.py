@@ -330,7 +330,7 @@ def test_a_clock_that_was_set(attempt: Attempt, role: str) -> None:
     true, told = (note(first_ns + 50 * 10**9 + step_ns, AFTER_S) for step_ns in (0, 200_000_000))
     attempt.text(name, true, told)
     assert attempt.problems() == (
-        f"{robot}: its clock was set ahead by 0.200 s (known to 0.010 s) during the repeat",
+        f"{robot}: its clock was set ahead by 0.200 s (uncertainty 0.010 s) during the repeat",
     )
 
 
@@ -347,14 +347,14 @@ def test_a_robot_that_rebooted(attempt: Attempt) -> None:
             "receiver",
             "capture asked",
             "capture itself",
-            "turtlebot-2: its job capture ended before fieldkit ended it",
+            "turtlebot-2: its job capture exited before fieldkit stopped it",
         ),
-        ("sender", "capture asked 0", "capture limit 0", "turtlebot-1: its job capture did not end by itself"),
-        ("receiver", "listen itself 0", "listen itself 143", "its job listen was ended by SIGTERM, not by fieldkit"),
-        ("sender", "send itself 0", "send itself 137", "its job send was ended by SIGKILL, not by fieldkit"),
+        ("sender", "capture asked 0", "capture limit 0", "turtlebot-1: its job capture did not exit"),
+        ("receiver", "listen itself 0", "listen itself 143", "its job listen was killed by SIGTERM, not by fieldkit"),
+        ("sender", "send itself 0", "send itself 137", "its job send was killed by SIGKILL, not by fieldkit"),
         ("sender", "send itself 0 100000 1060.00", "send itself - 100000 -", "its job send was killed"),
-        ("sender", "record itself 0 100000 1001.50", "record itself 0 100000 1000.40", "ended after 0.4 s of 1 s"),
-        ("sender", "ping itself 0", "ping asked 0", "its job ping was ended by fieldkit before it was done"),
+        ("sender", "record itself 0 100000 1001.50", "record itself 0 100000 1000.40", "exited after 0.4 s of 1 s"),
+        ("sender", "ping itself 0", "ping asked 0", "its job ping was stopped by fieldkit before it had finished"),
     ],
 )
 def test_a_job_that_somebody_else_ended(attempt: Attempt, name: str, old: str, new: str, reason: str) -> None:

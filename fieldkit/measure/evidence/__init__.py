@@ -1,1 +1,1 @@
-"""Parsers of the files of every other tool, and of those that testbeds and robots write."""
+"""Parsers of the output files of external tools, testbeds and robots."""

@@ -1,4 +1,4 @@
-"""Contents of a ROS bag; read in a process of its own, as a bag is what a library of others makes of it."""
+"""Contents of a ROS bag, which the rosbags library reads in a sandboxed process."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,19 +10,20 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError, Json
 
 METADATA: Final = "metadata.yaml"
-"""What a ROS 2 recorder writes beside its file when it closes the bag."""
+"""File that a ROS 2 recorder writes next to its data file when it closes the bag."""
 
 ROS2: Final = {".db3", ".mcap"}
-"""How the files of ROS 2 end."""
+"""Suffixes of the data files of ROS 2 bags."""
 
-# A fresh three-cell battery has 12.6 V of nominal 11.1 V.
-_MOST_SHARE: Final = 1.5
+# The ratio of a full three-cell battery's voltage to its nominal voltage is 12.6 V / 11.1 V, below this bound.
+_MAX_FRACTION: Final = 1.5
 
 _READER: Final = Confined("fieldkit.measure.evidence.bag_reader")
 
-_BLOCK_BYTES: Final = 512  # st_blocks counts these, whatever a file system's own are
-_COUNTED_LATE_BYTES: Final = 64 << 20
-"""File systems may count the blocks of a file some seconds after it was written; so much is believed at once."""
+_BLOCK_BYTES: Final = 512  # unit of st_blocks on every file system
+_MIN_ALLOCATED_BYTES: Final = 64 << 20
+"""Some file systems update the block count of a file only seconds after a write, so up to this size the file size
+counts."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,13 @@ class Bag:
 
 
 def read(path: Path) -> Bag:
-    """Return what the bag at `path` holds: a ROS 1 bag, or the file of a ROS 2 bag (`.db3`, `.mcap`) in its folder.
+    """Return the contents of a bag.
+
+    Args:
+        path: A ROS 1 bag, or the data file of a ROS 2 bag (`.db3`, `.mcap`) in its folder.
 
     Raises:
-        EvidenceError: It is missing, empty, unindexed, cut short, holds no message, or is no bag.
+        EvidenceError: The file is missing, empty, unindexed, truncated, without messages, or not a bag.
     """
     where = str(path)
     if not path.is_file():
@@ -58,41 +62,41 @@ def read(path: Path) -> Bag:
         raise EvidenceError(
             f"the bag has no {METADATA}: its recorder was killed before it could close the bag",
             where=where,
-            remedy="end the recorder with SIGINT and wait for it, or mend the bag with `fieldkit bag repair`",
+            remedy="stop the recorder with SIGINT and wait for it, or repair the bag with `fieldkit bag repair`",
         )
     try:
-        found = _asked(path)
+        contents = _query(path)
     except ConfinedAnswerError as error:
         raise EvidenceError(
-            f"the bag cannot be read, it is unindexed, cut short or none: {error}",
+            f"the bag cannot be read, it is unindexed, truncated or not a bag: {error}",
             where=where,
-            remedy="end the recorder with SIGINT and wait for it, or mend the bag with `fieldkit bag repair`",
+            remedy="stop the recorder with SIGINT and wait for it, or repair the bag with `fieldkit bag repair`",
         ) from error
-    messages, closed = found["messages"], found.get("closed", found["messages"])
-    if messages != closed:
+    messages, metadata_messages = contents["messages"], contents.get("closed", contents["messages"])
+    if messages != metadata_messages:
         raise EvidenceError(
-            f"the file holds {messages} messages, {METADATA} counts {closed}",
+            f"the file contains {messages} messages, {METADATA} states {metadata_messages}",
             where=where,
-            remedy="is the bag split into several files? leave --max-bag-size and --max-bag-duration out of record",
+            remedy="is the bag split into several files? omit --max-bag-size and --max-bag-duration in `record`",
         )
     if messages == 0:
         tool = "ros2 topic hz" if is_ros2 else "rostopic hz"
         raise EvidenceError(
-            "the bag holds no message", where=where, remedy=f"does the topic publish? try `{tool} TOPIC`"
+            "the bag contains no message", where=where, remedy=f"does the topic publish? try `{tool} TOPIC`"
         )
-    by_topic = MappingProxyType(found["messages_by_topic"])
-    return Bag(messages, found["started_utc_ns"], found["duration_s"], by_topic)
+    by_topic = MappingProxyType(contents["messages_by_topic"])
+    return Bag(messages, contents["started_utc_ns"], contents["duration_s"], by_topic)
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What came of one topic.
+class TopicStats:
+    """Number and times of the recorded messages of one topic.
 
     Attributes:
         messages: Number of messages.
         first_utc_ns: Time of the first, nanoseconds since 1970 UTC by the recorder's clock.
         last_utc_ns: Time of the last.
-        gap_ns: Longest time from one message to the next; 0 where there are no two.
+        gap_ns: Longest time between consecutive messages; 0 if there is only one.
     """
 
     messages: int
@@ -101,57 +105,57 @@ class Heard:
     gap_ns: int
 
 
-def heard(path: Path) -> Mapping[str, Heard]:
-    """Return what came of each topic in the bag at `path`; of a topic without a message nothing.
+def heard(path: Path) -> Mapping[str, TopicStats]:
+    """Return number and times of the messages by topic; topics without a message are omitted.
 
     Raises:
-        EvidenceError: It is missing or cannot be read.
+        EvidenceError: The bag is missing or cannot be read.
     """
     if not path.is_file():
         raise EvidenceError("there is no bag", where=str(path), remedy="read the recorder's log: did it start?")
     try:
-        found = _asked(path, heard="true")["topics"]
+        topics = _query(path, heard="true")["topics"]
     except ConfinedAnswerError as error:
         raise EvidenceError(f"the bag cannot be read: {error}", where=str(path)) from error
-    return {topic: Heard(**one) for topic, one in found.items()}
+    return {topic: TopicStats(**fields) for topic, fields in topics.items()}
 
 
 def battery_share(path: Path, topic: str) -> float | None:
-    """Return the charge in the last `sensor_msgs/BatteryState` of `topic`, between 0 and 1; None if it tells none.
+    """Return the charge in the last `sensor_msgs/BatteryState` of `topic`, between 0 and 1; None if unknown.
 
-    The message says 0 to 1 and NaN for unknown. Some drivers give per cent, and the TurtleBot3 the voltage over the
-    nominal one, a little above 1.
+    According to its definition the field is 0 to 1, or NaN if unknown. Some drivers write per cent, and the
+    TurtleBot3 writes the ratio of voltage to nominal voltage, slightly above 1.
 
     Raises:
-        EvidenceError: The bag, which `read` can read, has a message that cannot be read.
+        EvidenceError: A message of the bag cannot be read.
     """
     try:
-        share: float | None = _asked(path, topic=topic)["share"]
+        share: float | None = _query(path, topic=topic)["share"]
     except ConfinedAnswerError as error:
         raise EvidenceError(f"a message of {topic} cannot be read: {error}", where=str(path)) from error
     if share is None or share < 0:
         return None
-    return min(1.0, share if share <= _MOST_SHARE else share / 100)
+    return min(1.0, share if share <= _MAX_FRACTION else share / 100)
 
 
 def positions(path: Path, topic: str, child: str) -> Json:
-    """Return what a topic of a bag says of where its robot was; see `bag_reader.positions`.
+    """Return the robot positions in the messages of a topic; see `bag_reader.positions`.
 
     Raises:
-        EvidenceError: It cannot be read, or its messages say no position.
+        EvidenceError: The bag cannot be read, or the type of its messages contains no position.
     """
     try:
-        return _asked(path, positions=topic, child=child)
+        return _query(path, positions=topic, child=child)
     except ConfinedAnswerError as error:
         raise EvidenceError(f"the positions of {topic} cannot be read: {error}", where=str(path)) from error
 
 
-def _asked(path: Path, **what: str) -> Json:
-    # The reader stays in the folder that it was started in.
-    return _READER.ask({"path": str(path.absolute()), **what}, given_bytes(path))
+def _query(path: Path, **parameters: str) -> Json:
+    # The path must be absolute, because the reader keeps the working directory in which it was started.
+    return _READER.ask({"path": str(path.absolute()), **parameters}, given_bytes(path))
 
 
 def given_bytes(path: Path) -> int:
-    """Return the size by which bounds grow: nobody gave the holes of a file that says it has terabytes."""
+    """Return the size of a file for the reader's limits, without the holes of a sparse file."""
     status = path.stat()
-    return min(status.st_size, max(_BLOCK_BYTES * status.st_blocks, _COUNTED_LATE_BYTES))
+    return min(status.st_size, max(_BLOCK_BYTES * status.st_blocks, _MIN_ALLOCATED_BYTES))

@@ -1,7 +1,8 @@
-"""Let rosbags open SQLite databases at any path.
+"""Workaround that lets rosbags open SQLite databases at any path.
 
-It puts the path into a URI as it is, where `?`, `#` and `%` have a meaning (sqlite.org/uri.html), and where bytes
-that are not UTF-8 are impossible. `allow_any` makes its storage plugins encode the path first.
+rosbags puts the path into a URI without encoding it, although `?`, `#` and `%` are special in a URI
+(sqlite.org/uri.html) and bytes that are not UTF-8 are not allowed. `allow_any` makes its storage plugins encode the
+path first.
 """
 
 import os
@@ -14,7 +15,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader, Sqlite3Writer
 
 
 class _UriPath(PosixPath):
-    """A path whose text is the path of a URI."""
+    """A path whose text is percent-encoded for a URI."""
 
     def __str__(self) -> str:
         return quote(os.fsencode(super().__str__()))
@@ -22,7 +23,7 @@ class _UriPath(PosixPath):
 
 class _AnyPathReader(Sqlite3Reader):
     def __init__(self, path: Path) -> None:
-        super().__init__(_UriPath(path))  # it opens the URI alone
+        super().__init__(_UriPath(path))  # the path is only used for the URI
 
 
 class _AnyPathWriter(Sqlite3Writer):
@@ -32,7 +33,7 @@ class _AnyPathWriter(Sqlite3Writer):
 
 
 def allow_any() -> None:
-    """Open databases at any path in this process from now on."""
+    """Patch rosbags so that this process can open databases at any path."""
     rosbag2.Reader.STORAGE_PLUGINS = {**rosbag2.Reader.STORAGE_PLUGINS, ".db3": _AnyPathReader}
     DirectoryReader.STORAGE_PLUGINS = {**DirectoryReader.STORAGE_PLUGINS, "sqlite3": _AnyPathReader}
     rosbag2.Writer.STORAGE_PLUGINS = {**rosbag2.Writer.STORAGE_PLUGINS, rosbag2.StoragePlugin.SQLITE3: _AnyPathWriter}

@@ -1,11 +1,12 @@
-"""A robot's clock before and after an attempt, beside its seconds since boot: has it been set meanwhile?
+"""Detection of steps of a robot's clock between two readings, by comparison with its time since boot.
 
-Linux slews its clock and the time since boot together: what NTP corrects by frequency, by tick or bit by bit, at up
-to 500 ppm or chrony's 8.3 %, moves both alike (clock_gettime(2)). Their difference changes only where the clock is
-set: settimeofday(2), ADJ_SETOFFSET of adjtimex(2), a leap second. So a step is what has changed in it.
+Linux slews its clock and the time since boot together, so gradual corrections by NTP (up to 500 ppm, or 8.3 % by
+chrony) change both equally (clock_gettime(2)). Their difference changes only if the clock is set: by settimeofday(2),
+ADJ_SETOFFSET of adjtimex(2), or a leap second. A change of the difference is therefore a clock step.
 
-A state file has lines `BEFORE TIME AFTER`: the clock between two readings of /proc/uptime, which cuts off to 10 ms.
-Each line bounds the difference from both sides, however long the robot took to read; together they bound it closer.
+A state file has lines `BEFORE TIME AFTER`: the clock between two readings of /proc/uptime, which is truncated to
+10 ms. Each line gives a lower and an upper bound of the difference, however long the reading took; several lines give
+closer bounds.
 """
 
 import re
@@ -21,13 +22,13 @@ _SECOND_NS: Final = 1_000_000_000
 
 @dataclass(frozen=True)
 class Clock:
-    """A robot's clock at one moment, by one or more readings; nanoseconds since 1970 UTC.
+    """Bounds of a robot's clock from one or more readings; nanoseconds since 1970 UTC.
 
     Attributes:
-        first_ns: The earliest that the clock can have shown at these readings.
-        last_ns: The latest.
-        lowest_ns: The least that it can be ahead of the time since boot.
-        highest_ns: The most; below `lowest_ns` where it was set between two readings.
+        first_ns: Earliest possible time of the clock at these readings.
+        last_ns: Latest possible time.
+        lowest_ns: Lower bound of the clock minus the time since boot.
+        highest_ns: Upper bound; it is below `lowest_ns` if the clock was set between two readings.
     """
 
     first_ns: int
@@ -38,11 +39,11 @@ class Clock:
 
 @dataclass(frozen=True)
 class ClockStep:
-    """How far a clock was set between two moments of one boot.
+    """Step of a clock between two times of one boot.
 
     Attributes:
-        step_s: The best estimate, in seconds; negative where it was set back.
-        error_s: The most that the estimate can be wrong.
+        step_s: Estimated step in seconds; negative if the clock was set back.
+        error_s: Largest possible error of the estimate, in seconds.
     """
 
     step_s: float
@@ -50,7 +51,7 @@ class ClockStep:
 
 
 def parse(lines: Iterable[str]) -> Clock | None:
-    """Return what readings say of a clock, None where there is no reading; other lines are passed over."""
+    """Return the bounds of a clock from lines of readings; None if there is no reading. Other lines are ignored."""
     readings = [_bounds(match) for line in lines if (match := _READING.fullmatch(line))]
     if not readings:
         return None
@@ -59,26 +60,27 @@ def parse(lines: Iterable[str]) -> Clock | None:
 
 
 def _bounds(match: re.Match[str]) -> tuple[int, int, int, int]:
-    """Return the least and the most that the clock showed, and that it was ahead of the time since boot."""
-    before_ns, after_ns = (int(match[at]) * _SECOND_NS + int(match[at + 1]) * _TICK_NS for at in (1, 5))
+    """Return `first_ns`, `last_ns`, `lowest_ns` and `highest_ns` of one reading (see `Clock`)."""
+    before_ns, after_ns = (int(match[group]) * _SECOND_NS + int(match[group + 1]) * _TICK_NS for group in (1, 5))
     first_ns = int(match[3]) * _SECOND_NS + int(match[4] or 0)
-    # A clock that tells whole seconds may have been up to one further.
+    # A clock reading in whole seconds is truncated by up to one second.
     last_ns = first_ns if match[4] else first_ns + _SECOND_NS
     return first_ns, last_ns, first_ns - after_ns - _TICK_NS, last_ns - before_ns
 
 
 def moved(before: Clock, after: Clock) -> ClockStep:
-    """Return how far a clock was set between two moments of one boot."""
+    """Return the step of a clock between two times of one boot."""
     least_ns, most_ns = after.lowest_ns - before.highest_ns, after.highest_ns - before.lowest_ns
     return ClockStep((least_ns + most_ns) / 2e9, (most_ns - least_ns) / 2e9)
 
 
 def problem(before: Clock, after: Clock) -> str | None:
-    """Return how a clock was set between two moments of one boot; None where it was not, as far as they can tell."""
-    if any(moment.lowest_ns > moment.highest_ns for moment in (before, after)):
+    """Return a description of a clock step between two times of one boot; None if no step can be detected."""
+    if any(reading.lowest_ns > reading.highest_ns for reading in (before, after)):
         return "its clock was set while it was read"
     step = moved(before, after)
     if abs(step.step_s) <= step.error_s:
         return None
-    where = "back" if step.step_s < 0 else "ahead"
-    return f"its clock was set {where} by {abs(step.step_s):.3f} s (known to {step.error_s:.3f} s) during the repeat"
+    direction = "back" if step.step_s < 0 else "ahead"
+    uncertainty = f"(uncertainty {step.error_s:.3f} s)"
+    return f"its clock was set {direction} by {abs(step.step_s):.3f} s {uncertainty} during the repeat"

@@ -1,9 +1,9 @@
-"""Reading what may be made to harm in a process of its own, whose memory, time and disk are bounded.
+"""Sandboxed reading of untrusted files, in a process with limits of memory, CPU time and disk.
 
-A library that takes a file at its word decompresses what it is given as a whole, asks a database whatever its schema
-makes of a question, and follows every reference. No look at a file beforehand foresees all of it, and a thread cannot
-be ended; a process can, by the kernel. It is started with the first question and asked the next ones too, as to start
-one takes 0.1 s. It ends when nobody asks, and when it has run out of memory.
+A library that trusts a file decompresses it as a whole, runs queries that the file's database schema can change, and
+follows every reference. A check of the file in advance cannot detect all of this, and a thread cannot be killed, but
+a process can. The process starts with the first query, which takes 0.1 s, and also answers the following ones. It
+exits after an idle time, and after it ran out of memory.
 """
 
 import json
@@ -26,103 +26,105 @@ from typing import Any, Final
 MEMORY_BYTES: Final = 256 << 20
 DISK_BYTES: Final = 16 << 20
 CPU_S: Final = 10
-"""What reading a file may take, whatever its size."""
+"""Base limits for reading a file of any size."""
 MEMORY_PER_BYTE: Final = 16
 DISK_PER_BYTE: Final = 1
 ANSWER_BYTES: Final = 16 << 20
 ANSWER_PER_BYTE: Final = 4
 BYTES_PER_CPU_S: Final = 1 << 20
-"""What it may take beside that by its size; an index entry of 12 bytes in a bag becomes an object of 170."""
+"""Additional limits per byte of the file; an index entry of 12 bytes in a bag becomes an object of 170 bytes."""
 MEMORY_SHARE: Final = 0.5
-MOST_CPU_S: Final = 3600
-"""What no file may take more of, whatever its size: of this machine's memory, and of time."""
+MAX_CPU_S: Final = 3600
+"""Upper limits for any file: share of this machine's memory, and CPU time."""
 
-# Others compute too on a busy machine; what waits, as for a named pipe, does not compute.
+# The wall-clock limit is needed for a reader that waits without using CPU time, as for a named pipe; it allows for
+# other processes on a busy machine.
 _WALL_PER_CPU_S: Final = 6
 _IDLE_MS: Final = 60_000
-"""Longer than a repeat, so that one process does for a trial; it ends with who asks, too, for its input ends then."""
-_END_S: Final = 5.0
-_UNANSWERED: Final = "unanswered"
-_TOO_LONG: Final = -signal.SIGXCPU
-# Nobody asked for a while, or somebody ended it: the kernel where memory is short, a person, a service manager.
-_NOT_BY_THE_FILE: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
+"""Idle time before the process exits: longer than a repeat, so that one process serves a whole trial. It also exits
+with its parent process, because its input is closed then."""
+_EXIT_WAIT_S: Final = 5.0
+_ERROR_KEY: Final = "unanswered"
+_TIMED_OUT: Final = -signal.SIGXCPU
+# Exits that the file did not cause: idle time, out-of-memory killer of the kernel, a person, a service manager.
+_EXTERNAL_EXIT_CODES: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
 
 Json = dict[str, Any]
-"""A question or an answer, whose keys only those two know who put and read it."""
+"""A query or an answer; the keys depend on the module that answers."""
 
 
 class ConfinedAnswerError(Exception):
-    """No answer came; says why."""
+    """The reader gave no answer; the message is the reason."""
 
 
 class Confined:
-    """Someone to ask in a process of their own.
+    """A sandboxed process that answers queries about files.
 
     Args:
-        module: A module that calls `serve` when it is run.
+        module: Name of a module that calls `serve` when it is run.
     """
 
     def __init__(self, module: str) -> None:
         self._module = module
         self._process: subprocess.Popen[bytes] | None = None
-        self._asker = 0
-        self._one_at_a_time = Lock()
+        self._owner_pid = 0
+        self._query_lock = Lock()
 
     def ask(self, question: Json, size_bytes: int) -> Json:
-        """Return the answer to a question about a file.
+        """Return the answer to a query about a file.
 
         Args:
-            question: What `serve` hands on.
-            size_bytes: Size of the file, by which the bounds grow.
+            question: Argument of the function that the module passed to `serve`.
+            size_bytes: Size of the file; the limits grow with it.
 
         Raises:
-            ConfinedAnswerError: It takes more memory, disk or time than a file of this size may, or cannot be told.
+            ConfinedAnswerError: The reader failed, or exceeded the limits of memory, disk or time.
         """
-        with self._one_at_a_time:
+        with self._query_lock:
             for _ in range(2):
-                with _place() as place:
-                    answer, code = self._asked([question, _bounds(size_bytes), place], size_bytes)
-                if answer or code not in _NOT_BY_THE_FILE:
+                with _temporary_folder() as folder:
+                    answer, code = self._exchange([question, _limits(size_bytes), folder], size_bytes)
+                if answer or code not in _EXTERNAL_EXIT_CODES:
                     break
         if not answer:
-            raise ConfinedAnswerError(_why(code, size_bytes))
-        if _UNANSWERED in answer:
-            raise ConfinedAnswerError(answer[_UNANSWERED])
+            raise ConfinedAnswerError(_exit_reason(code, size_bytes))
+        if _ERROR_KEY in answer:
+            raise ConfinedAnswerError(answer[_ERROR_KEY])
         return answer
 
     def end(self) -> None:
-        """End the process, which otherwise does so when nobody has asked for a while."""
-        with self._one_at_a_time:
-            if self._process is not None and self._asker == os.getpid():
+        """Stop the process, which otherwise exits after an idle time."""
+        with self._query_lock:
+            if self._process is not None and self._owner_pid == os.getpid():
                 self._end(self._process)
 
-    def _asked(self, question: Sequence[object], size_bytes: int) -> tuple[Json, int]:
-        """Return the answer; an empty one and the exit code where the process ended without, or had to be ended."""
-        if self._asker != os.getpid():  # a process that was forked has one of its own: two would mix up its answers
-            self._process, self._asker = None, os.getpid()
-        process = self._process = self._process or _started(self._module)
+    def _exchange(self, question: Sequence[object], size_bytes: int) -> tuple[Json, int]:
+        """Return the answer and 0, or an empty answer and the exit code if the process exited or was killed."""
+        if self._owner_pid != os.getpid():  # after fork, two processes would mix up the answers of one reader
+            self._process, self._owner_pid = None, os.getpid()
+        process = self._process = self._process or _start(self._module)
         assert process.stdin is not None
         assert process.stdout is not None
         try:
             with suppress(BrokenPipeError):
                 process.stdin.write(json.dumps(question).encode() + b"\n")
-            most_bytes = ANSWER_BYTES + ANSWER_PER_BYTE * size_bytes
-            line = _line(process.stdout.fileno(), most_bytes, _WALL_PER_CPU_S * _cpu_s(size_bytes))
+            max_bytes = ANSWER_BYTES + ANSWER_PER_BYTE * size_bytes
+            line = _read_line(process.stdout.fileno(), max_bytes, _WALL_PER_CPU_S * _cpu_s(size_bytes))
         except TimeoutError:
             self._end(process)
-            return {}, _TOO_LONG
-        except BaseException:  # a person interrupts: the answer would be taken for that to the next question
+            return {}, _TIMED_OUT
+        except BaseException:  # after Ctrl-C, this answer would be read as the answer to the next query
             self._end(process)
             raise
-        if len(line) > most_bytes:
+        if len(line) > max_bytes:
             self._end(process)
-            return {_UNANSWERED: "it says more than a file of its size may"}, 0
+            return {_ERROR_KEY: "its contents exceed the limit for a file of its size"}, 0
         if line.endswith(b"\n"):
             return json.loads(line), 0
-        return {}, self._end(process, _END_S)
+        return {}, self._end(process, _EXIT_WAIT_S)
 
     def _end(self, process: subprocess.Popen[bytes], patience_s: float = 0.0) -> int:
-        """End the process unless it does so itself, and return its exit code."""
+        """Kill the process unless it exits within `patience_s`, and return its exit code."""
         self._process = None
         with suppress(subprocess.TimeoutExpired):
             process.wait(patience_s)
@@ -132,113 +134,114 @@ class Confined:
 
 
 def serve(answer: Callable[[Json], Json]) -> None:
-    """Answer questions from standard input until nobody asks, or the memory did not suffice for one."""
+    """Answer queries from standard input until the idle time has passed, input ends, or memory was exhausted."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    with suppress(OSError):  # where memory is short the kernel is to end this process, and not the one that asks
+    with suppress(OSError):  # if memory is short, the kernel should kill this process instead of its parent
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     questions = select.poll()
     questions.register(sys.stdin.fileno(), select.POLLIN)
-    sane = True
-    while sane and questions.poll(_IDLE_MS) and (line := sys.stdin.readline()):
-        question, bounds, tempfile.tempdir = json.loads(line)
-        _confine(*bounds)
+    has_memory = True
+    while has_memory and questions.poll(_IDLE_MS) and (line := sys.stdin.readline()):
+        question, limits, tempfile.tempdir = json.loads(line)
+        _apply_limits(*limits)
         try:
-            said = answer(question)
-        except Exception as error:  # noqa: BLE001 (whatever it is, the file made it)
-            sane = not isinstance(error, MemoryError)
-            said = {_UNANSWERED: _told(error)}
-        _remove(tempfile.tempdir)  # who asked may have been killed
-        sys.stdout.write(json.dumps(said) + "\n")
+            reply = answer(question)
+        except Exception as error:  # noqa: BLE001 (the file caused it, whatever it is)
+            has_memory = not isinstance(error, MemoryError)
+            reply = {_ERROR_KEY: _error_text(error)}
+        _remove(tempfile.tempdir)  # the parent process may have been killed
+        sys.stdout.write(json.dumps(reply) + "\n")
         sys.stdout.flush()
 
 
 @contextmanager
-def _place() -> Iterator[str | None]:
-    """Make a folder for what has to be unpacked, and remove it also where who unpacks is ended in the midst of it.
+def _temporary_folder() -> Iterator[str | None]:
+    """Create a folder for unpacked files, and remove it even if the reader is killed.
 
-    None where no disk has room for one: few files need it.
+    The folder is None if no disk has space for it, because few files need it.
     """
-    place = None
+    folder = None
     with suppress(OSError):
-        place = tempfile.mkdtemp(prefix="fieldkit-")
+        folder = tempfile.mkdtemp(prefix="fieldkit-")
     try:
-        yield place
+        yield folder
     finally:
-        _remove(place)
+        _remove(folder)
 
 
-def _remove(place: str | None) -> None:
-    if place is not None:
-        shutil.rmtree(place, ignore_errors=True)
+def _remove(folder: str | None) -> None:
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
-def _bounds(size_bytes: int) -> tuple[int, int, int]:
-    """Return how much memory and disk, in bytes, and how many seconds of computing a file of this size may take."""
+def _limits(size_bytes: int) -> tuple[int, int, int]:
+    """Return the limits of memory and disk in bytes, and of CPU time in seconds, for a file of this size."""
     machine_bytes = os.sysconf("SC_PHYS_PAGES") * resource.getpagesize()
-    most_bytes = max(MEMORY_BYTES, int(MEMORY_SHARE * machine_bytes))
-    memory_bytes = min(MEMORY_BYTES + MEMORY_PER_BYTE * size_bytes, most_bytes)
+    max_bytes = max(MEMORY_BYTES, int(MEMORY_SHARE * machine_bytes))
+    memory_bytes = min(MEMORY_BYTES + MEMORY_PER_BYTE * size_bytes, max_bytes)
     return memory_bytes, DISK_BYTES + DISK_PER_BYTE * size_bytes, _cpu_s(size_bytes)
 
 
-def _confine(memory_bytes: int, disk_bytes: int, cpu_s: int) -> None:
-    """Bound what this process may take from now on, beside what it has taken."""
-    held_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+def _apply_limits(memory_bytes: int, disk_bytes: int, cpu_s: int) -> None:
+    """Limit the resources that this process may use in addition to those that it already uses."""
+    used_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
     used = resource.getrusage(resource.RUSAGE_SELF)
-    bounds = {
-        resource.RLIMIT_AS: held_bytes + memory_bytes,
+    limits = {
+        resource.RLIMIT_AS: used_bytes + memory_bytes,
         resource.RLIMIT_FSIZE: disk_bytes,
         resource.RLIMIT_CPU: math.ceil(used.ru_utime + used.ru_stime) + cpu_s,
     }
-    for which, bound in bounds.items():
-        _, most = resource.getrlimit(which)
-        resource.setrlimit(which, (bound if most == resource.RLIM_INFINITY else min(bound, most), most))
+    for kind, limit in limits.items():
+        _, hard_limit = resource.getrlimit(kind)
+        soft_limit = limit if hard_limit == resource.RLIM_INFINITY else min(limit, hard_limit)
+        resource.setrlimit(kind, (soft_limit, hard_limit))
 
 
-def _told(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     if isinstance(error, MemoryError):
-        return "it takes more memory than a file of its size may"
+        return "reading it needs more memory than the limit for a file of its size"
     return f"{type(error).__name__}: {' '.join(str(error)[:1000].split())}"[:300]
 
 
-def _why(code: int, size_bytes: int) -> str:
-    if code == _TOO_LONG:
-        return f"it takes longer than the {_cpu_s(size_bytes)} s that a file of its size may"
-    if code in _NOT_BY_THE_FILE:
-        return "its reader was ended twice by something else; is the memory of this machine full?"
-    return f"its reader ended with exit code {code}"
+def _exit_reason(code: int, size_bytes: int) -> str:
+    if code == _TIMED_OUT:
+        return f"reading it takes longer than {_cpu_s(size_bytes)} s, the limit for a file of its size"
+    if code in _EXTERNAL_EXIT_CODES:
+        return "another process or the kernel stopped its reader twice; is the memory of this machine full?"
+    return f"its reader exited with code {code}"
 
 
 def _cpu_s(size_bytes: int) -> int:
-    return min(CPU_S + size_bytes // BYTES_PER_CPU_S, MOST_CPU_S)
+    return min(CPU_S + size_bytes // BYTES_PER_CPU_S, MAX_CPU_S)
 
 
-def _started(module: str) -> subprocess.Popen[bytes]:
+def _start(module: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         (sys.executable, "-P", "-m", module),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         bufsize=0,
-        start_new_session=True,  # the first Ctrl-C lets a repeat finish
+        start_new_session=True,  # the first Ctrl-C must not reach it, because the repeat still finishes
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # numpy reserves memory for a thread per core
     )
 
 
-def _line(descriptor: int, most_bytes: int, within_s: float) -> bytes:
-    """Return what can be read until the end of a line or of the file, or until it is more than so many bytes.
+def _read_line(descriptor: int, max_bytes: int, within_s: float) -> bytes:
+    """Return the bytes up to the end of a line or of the file, or until they are more than `max_bytes`.
 
     Raises:
-        TimeoutError: Neither came in time.
+        TimeoutError: Neither end was reached in time.
     """
     until_s = time.monotonic() + within_s
-    found = bytearray()
+    line = bytearray()
     pipe = select.poll()
     pipe.register(descriptor, select.POLLIN)
-    while not found.endswith(b"\n") and len(found) <= most_bytes:
+    while not line.endswith(b"\n") and len(line) <= max_bytes:
         if not pipe.poll(max(0.0, 1e3 * (until_s - time.monotonic()))):
             raise TimeoutError
         piece = os.read(descriptor, 1 << 16)
         if not piece:
             break
-        found += piece
-    return bytes(found)
+        line += piece
+    return bytes(line)

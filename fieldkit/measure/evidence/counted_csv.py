@@ -1,6 +1,6 @@
-"""CSV of a testbed, behind a line that counts its lines, so that one that was cut does not look whole.
+"""CSV files of a testbed whose first line is the number of lines, so that truncation can be detected.
 
-That line is a comment, `# lines 12`; what earlier versions wrote has none.
+That line is a comment, `# lines 12`; files of earlier versions do not have it.
 """
 
 import re
@@ -15,29 +15,29 @@ _COUNT: Final = re.compile(r"# lines ([0-9]{1,9})\n", re.ASCII)
 
 
 def text(header: str, lines: Iterable[str]) -> str:
-    """Return a header and lines as `read` reads them."""
+    """Return the text of a file with this header and these lines."""
     listed = list(lines)
     return "".join(f"{line}\n" for line in (f"# lines {len(listed)}", header, *listed))
 
 
-def read(path: Path, header: str, form: re.Pattern[str], what: str) -> list[re.Match[str]]:
-    """Return the lines of a file.
+def read(path: Path, header: str, pattern: re.Pattern[str], error: str) -> list[re.Match[str]]:
+    """Return the matches of a pattern with the lines of a file.
 
     Args:
         path: The file.
-        header: Its first line.
-        form: What every other line matches.
-        what: What it does not say where it is none: `does not say where robots were`.
+        header: Its header line.
+        pattern: Pattern that all other lines must match.
+        error: Message if they do not: `is not a track of robots`.
 
     Raises:
-        EvidenceError: It is missing or not whole.
+        EvidenceError: The file is missing, truncated, or has other contents.
     """
-    said = reading.text(path)
-    count = _COUNT.match(said)
-    first, *lines = said[count.end() if count else 0 :].split("\n")
-    found = [match for line in lines[:-1] if (match := form.fullmatch(line)) is not None]
-    if first != header or lines[-1:] != [""] or len(found) < len(lines) - 1:
-        raise EvidenceError(what, where=str(path))
-    if count and int(count[1]) != len(found):
-        raise EvidenceError(f"has {len(found)} lines of {count[1]}: it was cut", where=str(path))
-    return found
+    content = reading.text(path)
+    count = _COUNT.match(content)
+    first, *lines = content[count.end() if count else 0 :].split("\n")
+    matches = [match for line in lines[:-1] if (match := pattern.fullmatch(line)) is not None]
+    if first != header or lines[-1:] != [""] or len(matches) < len(lines) - 1:
+        raise EvidenceError(error, where=str(path))
+    if count and int(count[1]) != len(matches):
+        raise EvidenceError(f"has {len(matches)} lines of {count[1]}: truncated", where=str(path))
+    return matches

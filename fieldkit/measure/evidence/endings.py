@@ -1,4 +1,4 @@
-"""Ends of an attempt's jobs on a robot, as it noted them: by themselves, at their limit, or by fieldkit."""
+"""Terminations of an attempt's jobs as recorded on the robot: cause, exit code and duration."""
 
 import re
 import signal
@@ -14,41 +14,41 @@ _ENDING: Final = re.compile(
 )
 
 _TICKS_PER_S: Final = 100
-"""Of field 22 of /proc/PID/stat, on every processor but Alpha and Itanium (USER_HZ)."""
+"""Unit of field 22 of /proc/PID/stat (USER_HZ), on every processor except Alpha and Itanium."""
 
 _KILLED: Final = 128
-"""A shell adds it to the number of the signal that ended a command."""
+"""A shell's exit code for a command that was killed by a signal is this plus the signal number."""
 
-_SLACK_S: Final = 0.1
-"""What the two clocks of a job's start and end, in 10 ms both, and its own start can take off."""
+_TOLERANCE_S: Final = 0.1
+"""Tolerance of a job's duration, for the resolution of both times (10 ms) and the start of its program."""
 
 
 class Cause(StrEnum):
-    """Cause of a job's end."""
+    """Cause of a job's termination: it exited, fieldkit stopped it, or its time limit was reached."""
 
     ITSELF = "itself"
     ASKED = "asked"
     LIMIT = "limit"
     RUNNING = "running"
-    """Nobody yet, when its robot was asked."""
+    """The job was still running when its state was recorded."""
 
 
 _NOT_ALLOWED: Final = {
-    Cause.ITSELF: "ended before fieldkit ended it, with exit code {}",
-    Cause.ASKED: "was ended by fieldkit before it was done",
-    Cause.LIMIT: "did not end by itself, and was ended at its limit",
+    Cause.ITSELF: "exited before fieldkit stopped it, with exit code {}",
+    Cause.ASKED: "was stopped by fieldkit before it had finished",
+    Cause.LIMIT: "did not exit, and was stopped at its time limit",
 }
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a job ended.
+    """Termination of a job.
 
     Attributes:
-        cause: Who ended it; whoever sends a signal on the robot, past fieldkit, makes it end by itself.
-        code: Its exit code; None where it was killed together with what watched over it.
-        lasted_s: How long it ran, in seconds; None where nobody saw its end.
-        ended_s: When it ended, in seconds since boot; None if that is unknown.
+        cause: Cause of the termination; `ITSELF` includes a signal that was not sent by fieldkit.
+        code: Exit code; None if the job was killed together with its supervisor, or is still running.
+        lasted_s: Duration in seconds; None if the end is unknown.
+        ended_s: End, in seconds since boot; None if unknown.
     """
 
     cause: Cause
@@ -58,16 +58,16 @@ class Ending:
 
 
 def parse(lines: Iterable[str]) -> Mapping[str, Ending]:
-    """Return the endings by name of the job; lines that tell none are passed over."""
+    """Return the terminations by name of the job; other lines are ignored."""
     return {match["name"]: _ending(match) for line in lines if (match := _ENDING.fullmatch(line))}
 
 
 def times_s(lines: Iterable[str]) -> Mapping[str, tuple[float, float | None]]:
-    """Return when each job started and ended, in seconds since boot; the end is None if that is unknown."""
+    """Return start and end of each job in seconds since boot, by its name; the end is None if unknown."""
     matches = [match for line in lines if (match := _ENDING.fullmatch(line))]
     started_s = {match["name"]: int(match["started"]) / _TICKS_PER_S for match in matches}
     ended_s = {match["name"]: None if match["ended"] == "-" else float(match["ended"]) for match in matches}
-    return {name: (at_s, ended_s[name]) for name, at_s in started_s.items()}
+    return {name: (start_s, ended_s[name]) for name, start_s in started_s.items()}
 
 
 def _ending(match: re.Match[str]) -> Ending:
@@ -77,21 +77,21 @@ def _ending(match: re.Match[str]) -> Ending:
 
 
 def problem(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) -> str | None:
-    """Return why a job did not end as it is to, without its name; None where it did.
+    """Return why the termination of a job is not acceptable, without its name; None if it is.
 
     Args:
-        ending: How it ended.
-        allowed: Who may end it.
-        least_s: How long it runs at least where nothing cuts it short, in seconds.
+        ending: The termination.
+        allowed: Acceptable causes.
+        least_s: Minimum duration of a job that exits without being stopped, in seconds.
     """
     if ending.code is None:
-        return "still ran when the evidence was collected" if ending.cause is Cause.RUNNING else "was killed"
+        return "was still running when the evidence was collected" if ending.cause is Cause.RUNNING else "was killed"
     if ending.cause not in allowed:
         return _NOT_ALLOWED[ending.cause].format(ending.code)
     if ending.cause is Cause.ITSELF and ending.code > _KILLED:
-        return f"was ended by {_signal(ending.code - _KILLED)}, not by fieldkit"
-    if ending.cause is Cause.ITSELF and ending.lasted_s is not None and ending.lasted_s + _SLACK_S < least_s:
-        return f"ended after {ending.lasted_s:.1f} s of {least_s:g} s"
+        return f"was killed by {_signal(ending.code - _KILLED)}, not by fieldkit"
+    if ending.cause is Cause.ITSELF and ending.lasted_s is not None and ending.lasted_s + _TOLERANCE_S < least_s:
+        return f"exited after {ending.lasted_s:.1f} s of {least_s:g} s"
     return None
 
 

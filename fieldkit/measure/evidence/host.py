@@ -1,4 +1,4 @@
-"""The state of a host before and after an attempt: boot, clock, how jobs ended, counters of the network stack."""
+"""The state of a host before and after an attempt: boot, clock, job terminations, counters of the network stack."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -17,12 +17,12 @@ COLUMNS: Final = columns(
     (
         "receiver_udp_buffer_errors",
         "count",
-        "Datagrams that the receiver's socket buffer refused during the repeat (RcvbufErrors).",
+        "Datagrams dropped during the repeat because the receiver's socket buffer was full (RcvbufErrors).",
     ),
     (
         "receiver_reassembly_failures",
         "count",
-        "Reassemblies that the receiver's kernel gave up during the repeat (ReasmFails).",
+        "IP reassemblies that failed in the receiver's kernel during the repeat (ReasmFails).",
     ),
 )
 
@@ -38,7 +38,7 @@ SYSTEM: Final = columns(
     ),
 )
 
-_SHARED: Final = "other steps send UDP to the receiver, too, and its kernel counts all of it together"
+_SHARED_REASON: Final = "other steps send UDP to the receiver too, and its kernel has only one counter for all of it"
 _SECTION: Final = re.compile(r"^==> (?P<file>.+) <==$", re.MULTILINE)
 _BOOT: Final = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 BOOT: Final = "boot"
@@ -46,22 +46,23 @@ CLOCK: Final = "clock"
 JOBS: Final = "jobs"
 _SNMP: Final = "/proc/net/snmp"
 _CONGESTION: Final = "/proc/sys/net/ipv4/tcp_congestion_control"
-_LONGEST_NAME: Final = 16
-"""Bytes of a congestion control's name in Linux (TCP_CA_NAME_MAX)."""
+_MAX_NAME_BYTES: Final = 16
+"""Maximum length of the name of a congestion control in Linux (TCP_CA_NAME_MAX)."""
 _DEV: Final = "/proc/net/dev"
-_KEPT: Final = (BOOT, CLOCK, "date", _SNMP, _DEV, "iw station dump", "end")
-"""Sections whose values count: the same job script writes all that the host can provide, before and after."""
+_REQUIRED_SECTIONS: Final = (BOOT, CLOCK, "date", _SNMP, _DEV, "iw station dump", "end")
+"""Sections that must be in both files or in neither: the same script writes those that the host supports, before and
+after."""
 
 
 @dataclass(frozen=True)
 class Counters:
-    """Counters of /proc/net/snmp (RFC 1213 names; Linux adds RcvbufErrors); None where the file lacks one.
+    """Counters of /proc/net/snmp (RFC 1213 names; Linux adds RcvbufErrors); None if the file does not contain one.
 
     Attributes:
-        udp_buffer_errors: Datagrams that a full socket buffer refused, `Udp: RcvbufErrors`.
-        reassembly_failures: Reassemblies given up, `Ip: ReasmFails`.
-        udp_in_errors: Datagrams that did not reach their socket for any reason, `Udp: InErrors`.
-        udp_send_errors: Datagrams that a full queue refused to send, `Udp: SndbufErrors`.
+        udp_buffer_errors: Datagrams dropped because of a full receive buffer, `Udp: RcvbufErrors`.
+        reassembly_failures: Failed IP reassemblies, `Ip: ReasmFails`.
+        udp_in_errors: Datagrams that could not be delivered to their socket for any reason, `Udp: InErrors`.
+        udp_send_errors: Datagrams that were not sent because of a full queue, `Udp: SndbufErrors`.
         udp_no_ports: Datagrams to a port without a listener, `Udp: NoPorts`.
     """
 
@@ -73,20 +74,20 @@ class Counters:
 
     @property
     def udp_undelivered(self) -> int | None:
-        """Datagrams that arrived whole and did not reach their socket; None if the kernel counts none."""
-        known = [count for count in (self.udp_buffer_errors, self.udp_in_errors) if count is not None]
-        return max(known, default=None)
+        """Datagrams that arrived but were not delivered to their socket; None if the kernel has no such counter."""
+        counts = [count for count in (self.udp_buffer_errors, self.udp_in_errors) if count is not None]
+        return max(counts, default=None)
 
 
 @dataclass(frozen=True)
 class HostState:
-    """A host at one moment, beside its counters; None where the file does not tell.
+    """State of a host at one time, without its counters; attributes are None if the file does not contain them.
 
     Attributes:
-        boot: Which boot it was, by the kernel's identification of it.
-        clock: Its clock.
-        endings: How each job of the attempt had ended, by name; told after an attempt alone.
-        sections: Names of its sections.
+        boot: Boot ID of the kernel.
+        clock: Bounds of the clock.
+        endings: Terminations of the attempt's jobs, by name; only in the state after an attempt.
+        sections: Names of the file's sections.
     """
 
     boot: str | None
@@ -96,17 +97,20 @@ class HostState:
 
 
 def before(role: Role) -> str:
-    """Return the file of a robot's state before an attempt: sections, each a line `==> FILE <==` and its text."""
+    """Return the name of the file with a robot's state before an attempt.
+
+    The file has sections, each with a line `==> FILE <==` and its text.
+    """
     return f"{role}-before.txt"
 
 
 def after(role: Role) -> str:
-    """Return the file of its state after it."""
+    """Return the name of the file with a robot's state after an attempt."""
     return f"{role}-after.txt"
 
 
 def state(path: Path) -> HostState:
-    """Return what a host-state file says beside counters.
+    """Return the state in a host-state file, without counters.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
@@ -119,33 +123,33 @@ def state(path: Path) -> HostState:
 
 
 def lacking(before: HostState, after: HostState) -> Iterator[str]:
-    """Yield the sections that a host wrote at one moment of an attempt and not at the other.
+    """Yield the names of sections that are in only one of the two states of an attempt.
 
-    A section that it cannot write is in neither. Files of versions that noted no boot have no jobs.
+    A section that the host does not support is in neither. Files of versions without the boot ID have no jobs.
     """
-    for name in _KEPT:
+    for name in _REQUIRED_SECTIONS:
         if name in before.sections ^ after.sections:
             yield name
     if BOOT in before.sections and JOBS not in after.sections:
         yield JOBS
-    for name, one, other in ((BOOT, before.boot, after.boot), (CLOCK, before.clock, after.clock)):
-        if name in before.sections & after.sections and (one is None) != (other is None):
+    for name, first, second in ((BOOT, before.boot, after.boot), (CLOCK, before.clock, after.clock)):
+        if name in before.sections & after.sections and (first is None) != (second is None):
             yield name
 
 
 def job_times_ns(path: Path) -> Mapping[str, tuple[int, int]]:
-    """Return when each job on a host started and ended, in nanoseconds since 1970 UTC by its clock, to about 10 ms.
+    """Return start and end of each job on a host, in nanoseconds since 1970 UTC by its clock, accurate to 10 ms.
 
-    Jobs whose end is unknown are left out, and all of them if the file does not say what the clock was.
+    Jobs whose end is unknown are omitted; the result is empty if the file does not contain the clock.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
     """
     sections = _sections(reading.text(path))
-    found = clock.parse(sections.get("clock", "").split("\n"))
-    if found is None:
+    bounds = clock.parse(sections.get("clock", "").split("\n"))
+    if bounds is None:
         return {}
-    boot_ns = (found.lowest_ns + found.highest_ns) // 2
+    boot_ns = (bounds.lowest_ns + bounds.highest_ns) // 2
     times_s = endings.times_s(sections.get("jobs", "").split("\n"))
     return {
         name: (boot_ns + round(started_s * 1e9), boot_ns + round(ended_s * 1e9))
@@ -155,7 +159,7 @@ def job_times_ns(path: Path) -> Mapping[str, tuple[int, int]]:
 
 
 def stations(path: Path) -> str:
-    """Return what `iw station dump` printed, nothing where there was none; raises `EvidenceError` as `state`."""
+    """Return the output of `iw station dump`, empty if it is missing; raises `EvidenceError` as `state`."""
     return _sections(reading.text(path)).get("iw station dump", "")
 
 
@@ -166,7 +170,7 @@ def congestion_control(path: Path) -> str | None:
         EvidenceError: The file is missing or cannot be read.
     """
     name = _sections(reading.text(path)).get(_CONGESTION, "").strip()
-    return name if len(name) <= _LONGEST_NAME and re.fullmatch(r"[a-z][a-z0-9_-]*", name) else None
+    return name if len(name) <= _MAX_NAME_BYTES and re.fullmatch(r"[a-z][a-z0-9_-]*", name) else None
 
 
 def read(path: Path) -> Counters:
@@ -179,8 +183,8 @@ def read(path: Path) -> Counters:
 
 
 def parse(text: str) -> Counters:
-    """Return the counters in the text of a host state; text without them gives None."""
-    table = _table(_sections(text).get(_SNMP, ""))
+    """Return the counters in the text of a host-state file; missing counters are None."""
+    table = _parse_snmp(_sections(text).get(_SNMP, ""))
     return Counters(
         udp_buffer_errors=table.get(("Udp", "RcvbufErrors")),
         reassembly_failures=table.get(("Ip", "ReasmFails")),
@@ -191,7 +195,7 @@ def parse(text: str) -> Counters:
 
 
 def received_bytes(path: Path, interface: str) -> int | None:
-    """Return how many bytes a host's interface has received since it exists (/proc/net/dev); None if it is not there.
+    """Return the number of bytes that an interface has received (/proc/net/dev); None if it does not exist.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
@@ -202,17 +206,17 @@ def received_bytes(path: Path, interface: str) -> int | None:
 
 
 def difference(before: Counters, after: Counters) -> Counters:
-    """Return how the counters moved; None where one is missing or went back (the host restarted)."""
+    """Return the increments of the counters; None if a counter is missing or has decreased (the host restarted)."""
     return Counters(
-        udp_buffer_errors=_moved(before.udp_buffer_errors, after.udp_buffer_errors),
-        reassembly_failures=_moved(before.reassembly_failures, after.reassembly_failures),
-        udp_in_errors=_moved(before.udp_in_errors, after.udp_in_errors),
-        udp_send_errors=_moved(before.udp_send_errors, after.udp_send_errors),
-        udp_no_ports=_moved(before.udp_no_ports, after.udp_no_ports),
+        udp_buffer_errors=_increment(before.udp_buffer_errors, after.udp_buffer_errors),
+        reassembly_failures=_increment(before.reassembly_failures, after.reassembly_failures),
+        udp_in_errors=_increment(before.udp_in_errors, after.udp_in_errors),
+        udp_send_errors=_increment(before.udp_send_errors, after.udp_send_errors),
+        udp_no_ports=_increment(before.udp_no_ports, after.udp_no_ports),
     )
 
 
-def _moved(before: int | None, after: int | None) -> int | None:
+def _increment(before: int | None, after: int | None) -> int | None:
     if before is None or after is None or after < before:
         return None
     return after - before
@@ -223,8 +227,8 @@ def _sections(text: str) -> dict[str, str]:
     return dict(zip(parts[1::2], parts[2::2], strict=True))
 
 
-def _table(snmp: str) -> dict[tuple[str, str], int]:
-    """Return the counters by group and name; each group is a line of names and one of values."""
+def _parse_snmp(snmp: str) -> dict[tuple[str, str], int]:
+    """Return the counters by group and name; each group has a line of names and a line of values."""
     names: dict[str, list[str]] = {}
     counters: dict[tuple[str, str], int] = {}
     for line in snmp.splitlines():
@@ -239,28 +243,31 @@ def _table(snmp: str) -> dict[tuple[str, str], int]:
     return counters
 
 
-def shared(found: Measured) -> Measured:
-    """Return the columns of `measure` where others send to the receiver, too: of nothing each has nothing."""
+def shared(measured: Measured) -> Measured:
+    """Return the columns of `measure` for a repeat in which other steps send UDP to the receiver too.
+
+    A counter above 0 becomes missing, because it is unknown whose datagrams it counts; 0 holds for all steps.
+    """
     names = (column.name for column in COLUMNS)
-    return found.without({name: _SHARED for name in names if found.values.get(name)})
+    return measured.without({name: _SHARED_REASON for name in names if measured.values.get(name)})
 
 
 def measure_system(congestion: str | None) -> Measured:
     """Return the columns of `SYSTEM`.
 
     Args:
-        congestion: The sender's congestion control; None if it is unknown.
+        congestion: The sender's congestion control; None if unknown.
     """
     return Measured.of({"tcp_congestion_control": congestion}, "the sender's state does not report it")
 
 
 def measure(before: Counters | None, after: Counters | None) -> Measured:
-    """Return the columns; None where a state is not at hand."""
+    """Return the columns; `before` and `after` are None if the state is not available."""
     if before is None or after is None:
-        return Measured.nothing(COLUMNS, "the receiver's state is not at hand")
-    moved = difference(before, after)
+        return Measured.nothing(COLUMNS, "the receiver's state is not available")
+    increments = difference(before, after)
     values = {
-        "receiver_udp_buffer_errors": moved.udp_buffer_errors,
-        "receiver_reassembly_failures": moved.reassembly_failures,
+        "receiver_udp_buffer_errors": increments.udp_buffer_errors,
+        "receiver_reassembly_failures": increments.reassembly_failures,
     }
     return Measured.of(values, "the receiver restarted, or does not count them")

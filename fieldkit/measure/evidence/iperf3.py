@@ -1,8 +1,9 @@
-"""Output of iperf3 (`--json`), of either end of a test, from version 3.1 on.
+"""Output of `iperf3 --json` from either end of a test, for version 3.1 and later.
 
-Versions differ in what they sum up at the end, and where: of a UDP test a server says 0 bytes, 3.1 has one sum for
-both ends. What they count in each interval is the same in all, tried with 3.1.3, 3.7, 3.12 and 3.17, so figures are
-sums over those. A test whose end did not say good-bye lacks its last interval, and its JSON says `error`.
+Versions differ in their totals at the end: the server of a UDP test reports 0 bytes, and 3.1 has one total for both
+ends. The counters of each interval are the same in all versions (checked with 3.1.3, 3.7, 3.12 and 3.17), so the
+columns are sums over the intervals. If the connection of a test broke, the last interval is missing and the JSON has
+the key `error`.
 """
 
 import json
@@ -26,20 +27,20 @@ COLUMNS: Final = columns(
     (
         "iperf3_throughput_bit_s",
         "bit/s",
-        "Payload per second, by iperf3's receiver: of its whole seconds but the first, if there are three.",
+        "Payload rate at iperf3's receiver, over its full seconds without the first one if there are at least three.",
         Figure("iperf3 throughput", Kind.MEDIAN, rank=60),
     ),
     (
         "iperf3_interval_min_bit_s",
         "bit/s",
-        "The same in the slowest of these seconds.",
+        "Payload rate in the slowest of these seconds.",
         Figure("iperf3 slowest second", Kind.MEDIAN, rank=61),
     ),
-    ("iperf3_interval_median_bit_s", "bit/s", "The same in the median of these seconds."),
-    ("iperf3_sent_bytes", "B", "Payload that iperf3 sent, by its sender."),
-    ("iperf3_received_bytes", "B", "Payload that it received, by its receiver."),
-    ("iperf3_datagrams_sent", "count", "UDP datagrams that its receiver expected. Empty for TCP."),
-    ("iperf3_datagrams_received", "count", "Of these, the ones that it got. Empty for TCP."),
+    ("iperf3_interval_median_bit_s", "bit/s", "Median of the payload rates of these seconds."),
+    ("iperf3_sent_bytes", "B", "Payload sent, as reported by iperf3's sender."),
+    ("iperf3_received_bytes", "B", "Payload received, as reported by iperf3's receiver."),
+    ("iperf3_datagrams_sent", "count", "UDP datagrams that iperf3's receiver expected. Empty for TCP."),
+    ("iperf3_datagrams_received", "count", "Of these, the datagrams that it received. Empty for TCP."),
     (
         "iperf3_loss",
         "share",
@@ -50,50 +51,50 @@ COLUMNS: Final = columns(
         "iperf3_jitter_s",
         "s",
         (
-            "Interarrival jitter (RFC 3550, section 6.4.1) by iperf3 itself, after the last datagram: the last 16 or "
-            "so decide it. Of the whole test: iperf3_captured_jitter_mean_s. Empty for TCP."
+            "Interarrival jitter (RFC 3550, section 6.4.1) as reported by iperf3 after the last datagram; about the "
+            "last 16 datagrams determine it. For the whole test see iperf3_captured_jitter_mean_s. Empty for TCP."
         ),
         Figure("iperf3's last jitter value (RFC 3550)", Kind.MEDIAN, rank=63),
     ),
     (
         "iperf3_retransmits",
         "count",
-        "Segments that the sender's kernel sent again. Empty for UDP, and where it cannot tell.",
+        "Segments that the sender's kernel retransmitted. Empty for UDP, and if its system does not report them.",
         Figure("iperf3 retransmissions", Kind.MEAN, rank=64),
     ),
 )
 
-_OF_UDP: Final = ("iperf3_datagrams_sent", "iperf3_datagrams_received", "iperf3_loss", "iperf3_jitter_s")
-_OF_TCP: Final = ("iperf3_retransmits",)
-_MOST_BYTES: Final = 16 << 20
-"""An hour of intervals of 1 s, of 8 streams, is 8 MB."""
-# cJSON before 1.5.9 printed what is no number as C does, which no JSON has.
-_NO_NUMBER: Final = re.compile(r"(?<=[:,\[])(\s*)[-+]?(?:nan|inf(?:inity)?)\b(?=\s*[,\]}])", re.IGNORECASE)
-_ENOUGH: Final = 3
-_WHOLE: Final = 0.5
-"""An interval shorter than this share of the longest is what was left at the end, while the receiver waited to be
-told of it: on a link with losses for some tenths of a second in which nothing came."""
+_UDP_COLUMNS: Final = ("iperf3_datagrams_sent", "iperf3_datagrams_received", "iperf3_loss", "iperf3_jitter_s")
+_TCP_COLUMNS: Final = ("iperf3_retransmits",)
+_MAX_BYTES: Final = 16 << 20
+"""One hour of 1 s intervals with 8 streams is 8 MB."""
+# cJSON before 1.5.9 printed nan and inf, which are not valid JSON.
+_INVALID_NUMBER: Final = re.compile(r"(?<=[:,\[])(\s*)[-+]?(?:nan|inf(?:inity)?)\b(?=\s*[,\]}])", re.IGNORECASE)
+_MIN_INTERVALS: Final = 3
+_MIN_LENGTH_SHARE: Final = 0.5
+"""An interval shorter than this share of the longest is a remainder at the end. On a link with losses, it contains
+some tenths of a second without data, until the receiver is notified of the end."""
 
 
 def json_file(role: Role) -> str:
-    """Return the file of what the iperf3 on a robot said."""
+    """Return the name of the file with the output of iperf3 on a robot."""
     return f"{role}-iperf3.json"
 
 
 @dataclass(frozen=True)
 class IperfInterval:
-    """One interval of a test at one end, all of its streams together; None where that end does not count it.
+    """One interval of a test at one end, with the sum of all streams; None if that end does not count it.
 
     Attributes:
-        lasted_s: Its length in seconds.
-        payload_bytes: Payload sent, or received.
-        datagrams: UDP datagrams, at the receiver those that it expected.
-        lost: Of these, the ones that the receiver missed.
-        retransmits: Segments sent again.
-        start_s: Its start in seconds; None if the JSON does not say.
-        end_s: Its end, likewise.
-        stream_bytes: Payload of each stream in it, added up; None without streams.
-        rate_bit_s: Payload bits per second, as iperf3 wrote them.
+        lasted_s: Length in seconds.
+        payload_bytes: Payload sent or received.
+        datagrams: UDP datagrams; at the receiver, those that it expected.
+        lost: Of these, the datagrams that the receiver did not receive.
+        retransmits: Retransmitted segments.
+        start_s: Start in seconds; None if the JSON does not contain it.
+        end_s: End in seconds; None if the JSON does not contain it.
+        stream_bytes: Sum of the payloads of the streams; None without streams.
+        rate_bit_s: Payload bits per second as written by iperf3.
     """
 
     lasted_s: float
@@ -114,15 +115,15 @@ class IperfInterval:
 
 @dataclass(frozen=True)
 class IperfTest:
-    """A test as one end tells it.
+    """Result of a test as reported by one end.
 
     Attributes:
-        error: What went wrong; empty where nothing did.
-        ports: Ports of this end's data connections, and of the other's.
-        intervals: Intervals in order, those that iperf3 was told to omit left out.
-        jitter_s: Jitter at the end, in seconds; None where it tells none.
+        error: Error message of iperf3; empty if there was none.
+        ports: Local and remote port of each data connection.
+        intervals: Intervals in order, without omitted ones (`--omit`).
+        jitter_s: Jitter at the end of the test, in seconds; None if not reported.
         start: Parameters of the test.
-        totals: Totals at its end.
+        totals: Totals at the end of the test.
     """
 
     error: str
@@ -133,34 +134,36 @@ class IperfTest:
     totals: IperfTotals = field(default_factory=IperfTotals)
 
     @property
-    def _whole(self) -> tuple[IperfInterval, ...]:
+    def _full_intervals(self) -> tuple[IperfInterval, ...]:
         longest_s = max((interval.lasted_s for interval in self.intervals), default=0.0)
-        return tuple(interval for interval in self.intervals if interval.lasted_s >= _WHOLE * longest_s)
+        return tuple(interval for interval in self.intervals if interval.lasted_s >= _MIN_LENGTH_SHARE * longest_s)
 
     @property
     def steady(self) -> tuple[IperfInterval, ...]:
-        """The whole intervals but the first, if there are three.
+        """The full intervals, without the first one if there are at least three.
 
-        In the first one TCP finds its rate, and the receiver waits for the first packet.
+        In the first one, TCP increases its rate from slow start, and the receiver waits for the first packet.
         """
-        whole = self._whole
-        return whole[1:] if len(whole) >= _ENOUGH else whole
+        full = self._full_intervals
+        return full[1:] if len(full) >= _MIN_INTERVALS else full
 
     @property
     def window_s(self) -> tuple[float, float]:
-        """From when on, and until when, these are, in seconds from the first packet on."""
-        start_s = sum(interval.lasted_s for interval in self._whole[: len(self._whole) - len(self.steady)])
+        """Start and end of the steady intervals, in seconds after the first packet."""
+        start_s = sum(
+            interval.lasted_s for interval in self._full_intervals[: len(self._full_intervals) - len(self.steady)]
+        )
         return start_s, start_s + sum(interval.lasted_s for interval in self.steady)
 
 
 def read(path: Path) -> IperfTest:
-    """Return what one end said.
+    """Return the result that one end reported.
 
     Raises:
-        EvidenceError: The file is missing, or no JSON of iperf3: that was cut, as where it was killed.
+        EvidenceError: The file is missing, or is not complete JSON of iperf3, for example because iperf3 was killed.
     """
-    if reading.size(path) > _MOST_BYTES:
-        raise EvidenceError(f"is longer than {_MOST_BYTES >> 20} MiB", where=str(path))
+    if reading.size(path) > _MAX_BYTES:
+        raise EvidenceError(f"is longer than {_MAX_BYTES >> 20} MiB", where=str(path))
     try:
         return parse(reading.text(path))
     except EvidenceError as error:
@@ -168,44 +171,44 @@ def read(path: Path) -> IperfTest:
 
 
 def parse(text: str) -> IperfTest:
-    """Return what a text says, which may begin with lines that are no JSON.
+    """Return the result in a text, which may start with lines that are not JSON.
 
     Raises:
-        EvidenceError: It is no JSON of iperf3.
+        EvidenceError: It is not JSON of iperf3.
     """
     try:
-        found, _ = json.JSONDecoder().raw_decode(_NO_NUMBER.sub(r"\1null", text), max(text.find("{"), 0))
+        document, _ = json.JSONDecoder().raw_decode(_INVALID_NUMBER.sub(r"\1null", text), max(text.find("{"), 0))
     except (ValueError, RecursionError) as error:
-        raise EvidenceError("is no JSON of iperf3, or was cut: did iperf3 end by itself?") from error
-    if not isinstance(found, dict) or not {"start", "intervals"} & found.keys():
-        raise EvidenceError("is JSON, but none of iperf3")
-    start, end = mapping(found, "start"), mapping(found, "end")
+        raise EvidenceError("is not JSON of iperf3, or was truncated: was iperf3 killed?") from error
+    if not isinstance(document, dict) or not {"start", "intervals"} & document.keys():
+        raise EvidenceError("is JSON, but not of iperf3")
+    start, end = mapping(document, "start"), mapping(document, "end")
     jitters_ms = [number(mapping(end, name), "jitter_ms") for name in ("sum_received", "sum")]
-    jitter_ms = next((one for one in jitters_ms if one is not None), None)
+    jitter_ms = next((value for value in jitters_ms if value is not None), None)
     return IperfTest(
-        error=brief(str(found.get("error", ""))),
+        error=brief(str(document.get("error", ""))),
         ports=tuple(_ports(start)),
-        intervals=tuple(_intervals(found)),
+        intervals=tuple(_intervals(document)),
         jitter_s=None if jitter_ms is None else jitter_ms / 1e3,
-        start=parse_start(found),
-        totals=parse_totals(found),
+        start=parse_start(document),
+        totals=parse_totals(document),
     )
 
 
-def _intervals(found: Mapping[str, Any]) -> Iterator[IperfInterval]:
-    for interval in items(found, "intervals"):
+def _intervals(document: Mapping[str, Any]) -> Iterator[IperfInterval]:
+    for interval in items(document, "intervals"):
         total = mapping(interval, "sum")
         lasted_s, payload_bytes = number(total, "seconds"), count(total, "bytes")
         if total.get("omitted") is True or not lasted_s or payload_bytes is None:
             continue
-        datagrams, lost, again = (count(total, name) for name in ("packets", "lost_packets", "retransmits"))
+        datagrams, lost, retransmits = (count(total, name) for name in ("packets", "lost_packets", "retransmits"))
         streams = [count(stream, "bytes") for stream in items(interval, "streams")]
         yield IperfInterval(
             lasted_s,
             payload_bytes,
             datagrams,
             lost,
-            again,
+            retransmits,
             start_s=number(total, "start"),
             end_s=number(total, "end"),
             stream_bytes=_sum(streams),
@@ -215,20 +218,20 @@ def _intervals(found: Mapping[str, Any]) -> Iterator[IperfInterval]:
 
 def _ports(start: Mapping[str, Any]) -> Iterator[tuple[int, int]]:
     for connection in items(start, "connected"):
-        own, other = count(connection, "local_port"), count(connection, "remote_port")
-        if own is not None and other is not None:
-            yield own, other
+        local, remote = count(connection, "local_port"), count(connection, "remote_port")
+        if local is not None and remote is not None:
+            yield local, remote
 
 
 def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | None) -> Measured:
-    """Return the columns of a test by what both ends say; None for an end whose word is not at hand."""
+    """Return the columns of a test from the results of both ends; None for an end whose result is not available."""
     sent, received = (test.intervals if test else () for test in (sender, receiver))
     received_bytes = sum(interval.payload_bytes for interval in received) if received else None
     steady = receiver.steady if receiver else ()
     rates = [interval.bit_s for interval in steady]
     lasted_s = sum(interval.lasted_s for interval in steady)
     datagrams, lost = (_sum([getattr(interval, name) for interval in received]) for name in ("datagrams", "lost"))
-    got = None if datagrams is None or lost is None else max(datagrams - lost, 0)
+    arrived = None if datagrams is None or lost is None else max(datagrams - lost, 0)
     values = {
         "iperf3_throughput_bit_s": 8 * sum(interval.payload_bytes for interval in steady) / lasted_s
         if steady
@@ -238,17 +241,18 @@ def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | 
         "iperf3_sent_bytes": sum(interval.payload_bytes for interval in sent) if sent else None,
         "iperf3_received_bytes": received_bytes,
         "iperf3_datagrams_sent": datagrams,
-        "iperf3_datagrams_received": got,
-        "iperf3_loss": 1 - got / datagrams if got is not None and datagrams else None,
+        "iperf3_datagrams_received": arrived,
+        "iperf3_loss": 1 - arrived / datagrams if arrived is not None and datagrams else None,
         "iperf3_jitter_s": receiver.jitter_s if receiver else None,
         "iperf3_retransmits": _sum([interval.retransmits for interval in sent]),
     }
-    foreign = _OF_TCP if protocol is Protocol.UDP else _OF_UDP
-    own = {name: value for name, value in values.items() if name not in foreign}
-    others = [column for column in COLUMNS if column.name in foreign]
-    return Measured.of(own, "iperf3 does not say it") | Measured.nothing(others, f"{protocol} has none")
+    inapplicable = _TCP_COLUMNS if protocol is Protocol.UDP else _UDP_COLUMNS
+    applicable = {name: value for name, value in values.items() if name not in inapplicable}
+    others = [column for column in COLUMNS if column.name in inapplicable]
+    return Measured.of(applicable, "iperf3 does not report it") | Measured.nothing(others, f"not for {protocol}")
 
 
 def _sum(counts: list[int | None]) -> int | None:
-    known = [count for count in counts if count is not None]
-    return sum(known) if known and len(known) == len(counts) else None
+    """Return the sum of the counts, or None if there are none or any of them is None."""
+    present = [count for count in counts if count is not None]
+    return sum(present) if present and len(present) == len(counts) else None

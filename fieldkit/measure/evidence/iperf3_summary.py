@@ -1,7 +1,7 @@
-"""What iperf3's JSON says beside its intervals: parameters of the test (`start`) and totals (`end`).
+"""Parameters (`start`) and totals (`end`) of a test in iperf3's JSON.
 
-Versions 3.1 to 3.17 differ: only the client's `end` describes both ends, a server has 0 for the other end, versions
-before 3.8 have one `sum` for both ends of a UDP test. 0 in `end` therefore means unknown.
+Only the client's `end` describes both ends; the server's has 0 for the other end. Versions before 3.8 have one `sum`
+for both ends of a UDP test. 0 in `end` therefore means unknown (checked with 3.1 to 3.17).
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,14 +13,14 @@ from fieldkit.measure.evidence.json_fields import count, items, mapping, number
 
 @dataclass(frozen=True)
 class IperfStart:
-    """Parameters of a test; None, or an empty text, if the JSON does not say.
+    """Parameters of a test; None, or an empty text, if the JSON does not contain them.
 
     Attributes:
-        cookie: Random text that both ends of one test have.
+        cookie: Random text that is the same at both ends of a test.
         began_utc_s: Start, in seconds since 1970 UTC.
         protocol: `tcp` or `udp`.
         streams: Number of parallel streams.
-        block_bytes: Bytes per write; of UDP, the payload of a datagram.
+        block_bytes: Bytes per write; for UDP, the payload of a datagram.
         reverse: Whether the server sends.
     """
 
@@ -40,11 +40,11 @@ class IperfTotals:
         sent_bytes: Payload sent.
         received_bytes: Payload received.
         datagrams: UDP datagrams that the receiver expected.
-        lost: Of these, the ones that it missed.
+        lost: Of these, the datagrams that it did not receive.
         jitter_s: Jitter at the receiver, in seconds.
-        retransmits: Segments sent again.
-        out_of_order: Datagrams out of order, duplicates included, of all streams.
-        ends_s: Every end of a summary, in seconds from the start.
+        retransmits: Retransmitted segments.
+        out_of_order: Datagrams of all streams that arrived out of order, duplicates included.
+        ends_s: End times of all summaries, in seconds from the start.
     """
 
     sent_bytes: int | None = None
@@ -76,12 +76,12 @@ def parse_totals(document: Mapping[str, Any]) -> IperfTotals:
     """Return the totals of a test."""
     end = mapping(document, "end")
     both, sent, received = (mapping(end, name) for name in ("sum", "sum_sent", "sum_received"))
-    of_udp = received if count(received, "packets") else both
+    udp_part = received if count(received, "packets") else both
     return IperfTotals(
         sent_bytes=count(sent or both, "bytes") or None,
         received_bytes=count(received, "bytes") or None,
-        datagrams=count(of_udp, "packets") or None,
-        lost=count(of_udp, "lost_packets") if count(of_udp, "packets") else None,
+        datagrams=count(udp_part, "packets") or None,
+        lost=count(udp_part, "lost_packets") if count(udp_part, "packets") else None,
         jitter_s=next((ms / 1e3 for part in (received, both) if (ms := number(part, "jitter_ms"))), None),
         retransmits=count(sent, "retransmits"),
         out_of_order=sum(count(mapping(stream, "udp"), "out_of_order") or 0 for stream in items(end, "streams")),

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final
 
-_MOST_COUNT: Final = 2**53
+_MAX_COUNT: Final = 2**53
 
 
 def mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
@@ -20,13 +20,13 @@ def items(document: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
 
 
 def number(document: Mapping[str, Any], key: str) -> float | None:
-    """Return the finite number under a key, None if there is none, or if it is negative or above 2**53."""
+    """Return the number under a key; None if it is missing, not finite, negative, or not below 2**53."""
     value = document.get(key)
-    fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _MOST_COUNT
+    fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _MAX_COUNT
     return float(value) if fits and value is not None and math.isfinite(value) else None
 
 
 def count(document: Mapping[str, Any], key: str) -> int | None:
-    """Return the number under a key as an integer; None as `number`."""
+    """Return the number under a key as an integer; None under the conditions of `number`."""
     value = number(document, key)
     return None if value is None else int(value)

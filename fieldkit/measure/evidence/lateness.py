@@ -1,8 +1,9 @@
-"""Lateness of packets during a repeat, noted by a testbed whose air is a model (`Oracle.lateness`).
+"""Lateness of an emulator's packet deliveries during a repeat, compared with its radio model (`Oracle.lateness`).
 
-The first line is the bound and how many lines follow, so that a file that was cut does not look whole: `bound
-100000000 lines 12`, by earlier versions the bound alone. Then `late 896000 17` for each lateness: 17 packets were
-late by at most 896,000 ns. All in integer nanoseconds, the lateness rounded up by an eighth at most.
+The first line of the file has the bound and the number of the following lines, so that truncation can be detected:
+`bound 100000000 lines 12`; earlier versions wrote only the bound. Each following line, as `late 896000 17`, means
+that 17 packets were late by at most 896,000 ns. All times are integer nanoseconds; a lateness is rounded up by at
+most an eighth.
 """
 
 import re
@@ -24,80 +25,80 @@ COLUMNS: Final = columns(
         "emulator_late_p99_s",
         "s",
         (
-            "99th percentile of how late packets were handed to their robots, against the emulator's own model, "
-            "over the whole repeat; rounded up by an eighth at most. This and the next two are empty where the "
-            "air is real."
+            "99th percentile of the lateness with which packets were delivered to the robots, compared with the "
+            "emulator's radio model, over the whole repeat; rounded up by at most an eighth. This and the next two "
+            "columns are empty for real radios."
         ),
     ),
-    ("emulator_late_max_s", "s", "The latest of these packets."),
+    ("emulator_late_max_s", "s", "Largest lateness of these packets."),
     (
         "emulator_too_late",
         "count",
-        "How many of them were later than the site file's emulated.late_bound; the repeat is void above 0.",
+        "Packets that were later than the site file's emulated.late_bound; above 0 the repeat is void.",
     ),
 )
 
 # 18 digits of nanoseconds are 31 years.
-_MOST_PACKETS: Final = 10**18
+_MAX_PACKETS: Final = 10**18
 _FILE: Final = re.compile(r"bound ([0-9]{1,18})(?: lines ([0-9]{1,9}))?\n((?:late [0-9]{1,18} [0-9]{1,18}\n)*)\Z")
 
 
 def text(before: Lateness, after: Lateness) -> str:
-    """Return what came to `before` until `after`, as `read` reads it."""
-    came = {late_ns: count - before.packets.get(late_ns, 0) for late_ns, count in sorted(after.packets.items())}
-    lines = [f"late {late_ns} {count}\n" for late_ns, count in came.items() if count]
+    """Return the file text for the packets that were counted between `before` and `after`."""
+    added = {late_ns: count - before.packets.get(late_ns, 0) for late_ns, count in sorted(after.packets.items())}
+    lines = [f"late {late_ns} {count}\n" for late_ns, count in added.items() if count]
     return "".join((f"bound {after.bound_ns} lines {len(lines)}\n", *lines))
 
 
 def read(path: Path) -> Lateness:
-    """Return what stands in the file.
+    """Return the lateness in a file.
 
     Raises:
-        EvidenceError: It is missing or not whole.
+        EvidenceError: The file is missing, truncated, or has other contents.
     """
     match = _FILE.match(reading.text(path))
     if match is None:
-        raise EvidenceError("does not say how late packets were handed over", where=str(path))
-    bound, announced, said = match.groups()
-    lines = said.splitlines()
-    if announced is not None and int(announced) != len(lines):
-        raise EvidenceError(f"has {len(lines)} lines of {announced}: it was cut", where=str(path))
+        raise EvidenceError("is not a lateness of packets", where=str(path))
+    bound, line_count, body = match.groups()
+    lines = body.splitlines()
+    if line_count is not None and int(line_count) != len(lines):
+        raise EvidenceError(f"has {len(lines)} lines of {line_count}: truncated", where=str(path))
     packets = {int(late_ns): int(count) for _, late_ns, count in map(str.split, lines)}
-    if sum(packets.values()) >= _MOST_PACKETS:
-        raise EvidenceError("counts more packets than there can be", where=str(path))
+    if sum(packets.values()) >= _MAX_PACKETS:
+        raise EvidenceError("contains an impossible number of packets", where=str(path))
     return Lateness(bound_ns=int(bound), packets=packets)
 
 
 def quantile_ns(lateness: Lateness, share: float) -> int | None:
-    """Return by how much at most `share` of the packets were late, None where there were no packets."""
+    """Return the quantile of the lateness at `share` (0 to 1) in ns; None if there are no packets."""
     counts = sorted((late_ns, count) for late_ns, count in lateness.packets.items() if count)
-    reached = accumulate(count for _, count in counts)
+    cumulative = accumulate(count for _, count in counts)
     wanted = share * sum(count for _, count in counts)
-    return next((late_ns for (late_ns, _), so_far in zip(counts, reached, strict=True) if so_far >= wanted), None)
+    return next((late_ns for (late_ns, _), total in zip(counts, cumulative, strict=True) if total >= wanted), None)
 
 
 def too_late(lateness: Lateness) -> int:
-    """Return how many packets were later than the bound."""
+    """Return the number of packets that were later than the bound."""
     return sum(count for late_ns, count in lateness.packets.items() if late_ns > lateness.bound_ns)
 
 
 def measure(lateness: Lateness | None) -> Measured:
-    """Return the columns; None where the air is real, or nobody can say."""
+    """Return the columns; `lateness` is None for real radios, or if the testbed cannot measure it."""
     if lateness is None:
-        return Measured.nothing(COLUMNS, "the air is real")
+        return Measured.nothing(COLUMNS, "the radios are real")
     late_ns = {share: quantile_ns(lateness, share) for share in (0.99, 1.0)}
     values = {
         "emulator_late_p99_s": None if late_ns[0.99] is None else late_ns[0.99] / 1e9,
         "emulator_late_max_s": None if late_ns[1.0] is None else late_ns[1.0] / 1e9,
         "emulator_too_late": too_late(lateness),
     }
-    return Measured.of(values, "no packet was handed over")
+    return Measured.of(values, "no packet was delivered")
 
 
 def problem(lateness: Lateness) -> str | None:
-    """Return why the model was not kept, None if it was."""
+    """Return why the emulation did not follow its model, or None if it did."""
     late_ns = quantile_ns(lateness, 1.0)
     if late_ns is None or late_ns <= lateness.bound_ns:
         return None
-    late = f"{too_late(lateness)} packets were handed over late, by up to {late_ns / 1e6:.3g} ms"
+    late = f"{too_late(lateness)} packets were delivered too late, by up to {late_ns / 1e6:.3g} ms"
     return f"{late}; the bound is {lateness.bound_ns / 1e6:g} ms"

@@ -1,8 +1,9 @@
-"""Samples of the radios' links during an attempt: what a robot's own sampler wrote, or its testbed (`Oracle.links`).
+"""Samples of the radios' links during an attempt, written by a robot's sampler or by its testbed (`Oracle.links`).
 
-A robot's `ROLE-link.txt`, which most robots compress, has sections, each a line `==> SECONDS NAME <==` and what was
-printed then: `link`, `survey` and `station` by iw, `wireless` by the kernel. The seconds are those since boot; when
-that was, its state before tells. A testbed's `link.csv` has a line for each station that a radio knows at a moment.
+A robot's `ROLE-link.txt`, which is usually compressed, has sections, each with a line `==> SECONDS NAME <==` and the
+output of that time: `link`, `survey` and `station` of iw, `wireless` of the kernel. The seconds are counted from
+boot; the host state before the attempt gives the time of boot. A testbed's `link.csv` has a line per time and peer
+station.
 """
 
 import gzip
@@ -39,12 +40,12 @@ _TICK_NS: Final = 10_000_000
 
 
 def file(role: Role) -> str:
-    """Return the file that a robot's own sampler writes, without the ending of a compressed one."""
+    """Return the name of the file that a robot's sampler writes, without the suffix `.gz` of a compressed one."""
     return f"{role}-link.txt"
 
 
 def text(samples: Mapping[Role, Sequence[LinkSample]]) -> str:
-    """Return samples of a testbed as `read` reads them."""
+    """Return the file text for samples of a testbed."""
     return counted_csv.text(_HEADER, (line for role in samples for line in _rows(role, samples)))
 
 
@@ -63,114 +64,116 @@ def _dbm(power: float | None) -> str | None:
 
 
 def read(path: Path) -> Mapping[Role, Sequence[LinkSample]]:
-    """Return what a testbed noted, by robot, in the order of time.
+    """Return the samples in a testbed's file by role, in the order of time.
 
     Raises:
-        EvidenceError: The file is missing or not whole.
+        EvidenceError: The file is missing, truncated, or has other contents.
     """
-    rows = map(_parsed, counted_csv.read(path, _HEADER, _ROW, "does not say how links were"))
+    rows = map(_parse_row, counted_csv.read(path, _HEADER, _ROW, "is not a file of link samples"))
     samples: dict[Role, list[LinkSample]] = {}
-    for (role, _), same in groupby(rows, key=lambda row: (row[0], row[1].utc_ns)):
-        samples.setdefault(role, []).append(_joined(one for _, one in same))
-    return {role: sorted(one, key=lambda sample: sample.utc_ns) for role, one in samples.items()}
+    for (role, _), group in groupby(rows, key=lambda row: (row[0], row[1].utc_ns)):
+        samples.setdefault(role, []).append(_merge(sample for _, sample in group))
+    return {role: sorted(of_role, key=lambda sample: sample.utc_ns) for role, of_role in samples.items()}
 
 
-def _parsed(match: re.Match[str]) -> tuple[Role, LinkSample]:
+def _parse_row(match: re.Match[str]) -> tuple[Role, LinkSample]:
     utc_ns, role, noise, active, busy, station, signal, *counts = match.groups()
     numbers = [None if count is None else int(count) for count in counts]
-    known = StationSample(station, _power(signal), *numbers) if station else None
+    peer = StationSample(station, _parse_dbm(signal), *numbers) if station else None
     radio = LinkSample(
         int(utc_ns),
-        noise_dbm=_power(noise),
+        noise_dbm=_parse_dbm(noise),
         active_ns=None if active is None else int(active),
         busy_ns=None if busy is None else int(busy),
-        stations=(known,) if known else (),
+        stations=(peer,) if peer else (),
     )
     return Role(role), radio
 
 
-def _power(said: str | None) -> float | None:
-    return None if said is None else float(said)
+def _parse_dbm(text: str | None) -> float | None:
+    return None if text is None else float(text)
 
 
 def read_own(folder: Path, role: Role) -> Sequence[LinkSample]:
-    """Return what a robot's own sampler wrote, and before and after it the state of the host, in the order of time.
+    """Return the samples of a robot's sampler and of the host states before and after, in the order of time.
 
     Raises:
-        EvidenceError: It left nothing, or does not say what its clock showed.
+        EvidenceError: The files are missing, or do not contain the robot's clock.
     """
-    edges = [folder / name(role) for name in (host.before, host.after) if (folder / name(role)).is_file()]
-    told = [(state.clock, host.stations(path)) for path in edges if (state := host.state(path)).clock]
-    if not told or told[0][0] is None:
-        raise EvidenceError("does not say what its clock showed", where=str(folder / host.before(role)))
-    clock = told[0][0]
-    ahead_ns = (clock.lowest_ns + clock.highest_ns) // 2
-    own = [LinkSample(exchange.first_ns, iw.stations(said)) for exchange, said in told if exchange is not None]
-    own += [replace(sample, utc_ns=sample.utc_ns + ahead_ns) for sample in parse(_written(folder / file(role)))]
-    return tuple(sorted((sample for sample in own if _tells(sample)), key=lambda one: one.utc_ns))
+    paths = [folder / name(role) for name in (host.before, host.after) if (folder / name(role)).is_file()]
+    dumps = [(state.clock, host.stations(path)) for path in paths if (state := host.state(path)).clock]
+    if not dumps or dumps[0][0] is None:
+        raise EvidenceError("does not contain the clock", where=str(folder / host.before(role)))
+    clock = dumps[0][0]
+    boot_ns = (clock.lowest_ns + clock.highest_ns) // 2
+    samples = [LinkSample(bounds.first_ns, iw.stations(dump)) for bounds, dump in dumps if bounds is not None]
+    samples += [
+        replace(sample, utc_ns=sample.utc_ns + boot_ns) for sample in parse(_sampler_text(folder / file(role)))
+    ]
+    return tuple(sorted((sample for sample in samples if _has_values(sample)), key=lambda sample: sample.utc_ns))
 
 
-def _written(path: Path) -> str:
-    """Return the text of a robot's sampler, nothing where there is none."""
+def _sampler_text(path: Path) -> str:
+    """Return the text of a robot's sampler, empty if there is no file."""
     if path.is_file():
         return reading.text(path)
     packed = path.with_name(f"{path.name}.gz")
     if not packed.is_file():
         return ""
-    reading.size(packed)  # a file, and readable
+    reading.size(packed)  # checks that it is a readable file
     try:
         with gzip.open(packed, "rb") as file_:
-            found = file_.read(reading.MOST_TEXT_BYTES)
+            content = file_.read(reading.MAX_TEXT_BYTES)
     except (OSError, EOFError, zlib.error) as error:
         raise EvidenceError(f"cannot be read: {error}", where=str(packed)) from error
-    return found.decode(errors="replace")
+    return content.decode(errors="replace")
 
 
 def parse(text: str) -> Sequence[LinkSample]:
-    """Return what the text of a robot's sampler says; times are nanoseconds since boot.
+    """Return the samples in the text of a robot's sampler; their times are nanoseconds since boot.
 
-    A line that was cut when the sampler was ended is left out.
+    An incomplete last line, written when the sampler was stopped, is omitted.
     """
     parts = _SECTION.split(text[: text.rfind("\n") + 1])[1:]
     sections = [
-        _section(int(seconds) * 10**9 + int(hundredths) * _TICK_NS, name, said)
-        for seconds, hundredths, name, said in zip(*(parts[at::4] for at in range(4)), strict=True)
+        _parse_section(int(seconds) * 10**9 + int(hundredths) * _TICK_NS, name, body)
+        for seconds, hundredths, name, body in zip(*(parts[offset::4] for offset in range(4)), strict=True)
     ]
-    return [_joined(same) for _, same in groupby(sections, key=lambda one: one.utc_ns)]
+    return [_merge(group) for _, group in groupby(sections, key=lambda sample: sample.utc_ns)]
 
 
-def _section(at_ns: int, name: str, said: str) -> LinkSample:
+def _parse_section(at_ns: int, name: str, body: str) -> LinkSample:
     match name:
         case "station":
-            return LinkSample(at_ns, iw.stations(said))
+            return LinkSample(at_ns, iw.stations(body))
         case "link":
-            cell = iw.cell(said)
+            cell = iw.cell(body)
             return LinkSample(at_ns, (cell,) if cell else (), cell=cell.station if cell else None)
         case "survey":
-            noise_dbm, active_ns, busy_ns = iw.channel(said)
+            noise_dbm, active_ns, busy_ns = iw.channel(body)
             return LinkSample(at_ns, noise_dbm=noise_dbm, active_ns=active_ns, busy_ns=busy_ns)
         case _:
-            signal_dbm, noise_dbm = iw.wireless(said)
+            signal_dbm, noise_dbm = iw.wireless(body)
             stations = () if signal_dbm is None else (StationSample("", signal_dbm),)
             return LinkSample(at_ns, stations, noise_dbm=noise_dbm)
 
 
-def _joined(samples: Iterable[LinkSample]) -> LinkSample:
-    """Return what was told at one moment as one; of a station told twice, what was told last with most."""
-    return reduce(_both, samples)
+def _merge(samples: Iterable[LinkSample]) -> LinkSample:
+    """Merge samples of the same time; later values replace earlier ones."""
+    return reduce(_merge_two, samples)
 
 
-def _both(one: LinkSample, other: LinkSample) -> LinkSample:
-    stations = {station.station: station for station in (*one.stations, *other.stations)}
+def _merge_two(first: LinkSample, second: LinkSample) -> LinkSample:
+    stations = {station.station: station for station in (*first.stations, *second.stations)}
     return LinkSample(
-        one.utc_ns,
+        first.utc_ns,
         tuple(stations.values()),
-        other.cell or one.cell,
-        one.noise_dbm if other.noise_dbm is None else other.noise_dbm,
-        one.active_ns if other.active_ns is None else other.active_ns,
-        one.busy_ns if other.busy_ns is None else other.busy_ns,
+        second.cell or first.cell,
+        first.noise_dbm if second.noise_dbm is None else second.noise_dbm,
+        first.active_ns if second.active_ns is None else second.active_ns,
+        first.busy_ns if second.busy_ns is None else second.busy_ns,
     )
 
 
-def _tells(one: LinkSample) -> bool:
-    return one != LinkSample(one.utc_ns)
+def _has_values(sample: LinkSample) -> bool:
+    return sample != LinkSample(sample.utc_ns)

@@ -1,6 +1,6 @@
-"""Delays of packets on the air, noted by a transfer where its testbed knows them (`Oracle.delays`).
+"""Air delay of a transfer's packets in four components, if its testbed can measure it (`Oracle.delays`).
 
-One line per number: `packets 215`, then the four parts summed over them, in integer nanoseconds.
+One line per number: `packets 215`, then the four components summed over all packets, in integer nanoseconds.
 """
 
 import re
@@ -22,16 +22,16 @@ COLUMNS: Final = columns(
         "delay_s",
         "s",
         (
-            "Mean delay of the transfer's packets from sender to receiver, the sum of the paper's four parts (its "
-            "eq. 2). Empty where nobody knows them, as in the field."
+            "Mean one-way delay of the transfer's packets, the sum of the four components of the paper's eq. 2. "
+            "Empty if the testbed cannot measure it, as in the field."
         ),
         Figure("air delay", Kind.MEDIAN, rank=34),
     ),
-    ("delay_processing_s", "s", "Of delay_s, what the stations took."),
-    ("delay_transmission_s", "s", "Of delay_s, what the packet's bits took at the rate of the link."),
-    ("delay_propagation_s", "s", "Of delay_s, what the way took once they had left."),
-    ("delay_queuing_s", "s", "Of delay_s, what the packet waited for others before it."),
-    ("delay_packets", "count", "How many packets delay_s is the mean of: those that were delivered."),
+    ("delay_processing_s", "s", "Part of delay_s: processing in the stations."),
+    ("delay_transmission_s", "s", "Part of delay_s: transmission of the packet's bits at the rate of the link."),
+    ("delay_propagation_s", "s", "Part of delay_s: propagation on the medium."),
+    ("delay_queuing_s", "s", "Part of delay_s: waiting for earlier packets."),
+    ("delay_packets", "count", "Number of packets of which delay_s is the mean: those that were delivered."),
 )
 
 _NAMES: Final = tuple(item.name for item in fields(DelayParts))
@@ -40,34 +40,34 @@ _FILE: Final = re.compile("".join(rf"{name} ([0-9]{{1,18}})\n" for name in _NAME
 
 
 def read(path: Path) -> DelayParts:
-    """Return what stands in the file.
+    """Return the delays in a file.
 
     Raises:
-        EvidenceError: It is missing or not whole, or packets took time of which there are none.
+        EvidenceError: The file is missing, incomplete, or contains delays of 0 packets.
     """
     match = _FILE.match(reading.text(path))
     if match is None:
-        raise EvidenceError("does not say what packets were delayed by", where=str(path))
+        raise EvidenceError("is not a file of packet delays", where=str(path))
     parts = DelayParts(**dict(zip(_NAMES, map(int, match.groups()), strict=True)))
     if not parts.packets and total_ns(parts):
-        raise EvidenceError("says that no packets took time", where=str(path))
+        raise EvidenceError("contains delays, but of 0 packets", where=str(path))
     return parts
 
 
 def total_ns(parts: DelayParts) -> int:
-    """Return the sum of the four parts, in ns: the paper's eq. 2 over all packets."""
+    """Return the sum of the four components in ns: the paper's eq. 2, summed over all packets."""
     return parts.processing_ns + parts.transmission_ns + parts.propagation_ns + parts.queuing_ns
 
 
 def text(before: DelayParts, after: DelayParts) -> str:
-    """Return what came to `before` until `after`, as `read` reads it."""
+    """Return the file text for the packets that were delivered between `before` and `after`."""
     return "".join(f"{name} {getattr(after, name) - getattr(before, name)}\n" for name in _NAMES)
 
 
 def measure(parts: DelayParts | None) -> Measured:
-    """Return the columns: means over the packets; None where nobody sees into the air."""
+    """Return the columns, means over the packets; `parts` is None if the testbed cannot measure the delay."""
     if parts is None:
-        return Measured.nothing(COLUMNS, "nobody sees into the air")
+        return Measured.nothing(COLUMNS, "the testbed cannot measure the delay on the air")
     scale = 1e9 * parts.packets
     values = {
         "delay_s": total_ns(parts) / scale if scale else None,

@@ -1,4 +1,4 @@
-"""Check that a log of numbered JSON lines is whole and unchanged (`fieldkit.agent.numbered_lines`)."""
+"""Check that a log of numbered JSON lines is complete and unchanged (`fieldkit.agent.numbered_lines`)."""
 
 import json
 import re
@@ -13,7 +13,7 @@ _END: Final = re.compile(r'(.*), "crc32": ([0-9]{1,10})\}', re.ASCII)
 
 
 def problem(path: Path) -> str | None:
-    """Return why a log is not whole; None if it is, or if its lines have no numbers, as in older versions.
+    """Return why a log is not complete; None if it is, or if its lines have no numbers, as in older versions.
 
     Raises:
         EvidenceError: As `reading.text`.
@@ -27,7 +27,7 @@ def problem(path: Path) -> str | None:
         return "its lines are not numbered without a gap: some are missing or were changed"
     end = _END.fullmatch(lines[-1].rstrip("\n"))
     if end is None or not lines[-1].endswith("\n"):
-        return "it has no end: its writer was ended"
+        return "its last line is missing: its writer was killed"
     head = "".join(lines[:-1]) + end[1] + "}"
     return (
         None if zlib.crc32(head.encode("utf-8", "replace")) == int(end[2]) else "was changed: its checksum is wrong"
@@ -36,8 +36,8 @@ def problem(path: Path) -> str | None:
 
 def _number(line: str) -> int | None:
     try:
-        said: Any = json.loads(line)
+        value: Any = json.loads(line)
     except JSON_ERRORS:
         return None
-    number = said.get("n") if isinstance(said, dict) else None
+    number = value.get("n") if isinstance(value, dict) else None
     return number if type(number) is int else None

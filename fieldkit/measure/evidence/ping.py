@@ -1,7 +1,7 @@
-"""The standard output of iputils' ping (`LC_ALL=C ping -n -D`), old and new, and of busybox's, line by line.
+"""Parser for the standard output of ping (`LC_ALL=C ping -n -D`) of iputils, old and new, and of busybox.
 
-The old iputils, s20101006, says `icmp_req` for `icmp_seq`; busybox counts from 0, iputils from 1. Lines that none of
-them prints are kept, and never fatal.
+The old iputils s20101006 prints `icmp_req` instead of `icmp_seq`; busybox counts from 0, iputils from 1. Unknown
+lines are kept and are never an error.
 """
 
 import re
@@ -18,12 +18,12 @@ from fieldkit.measure.evidence import reading
 from fieldkit.measure.evidence.survivors import quantile_of_sent
 
 FILE: Final = "ping.txt"
-"""What it said on its standard output."""
+"""Standard output of ping."""
 
 COLUMNS: Final = columns(
     20,
     ("rtt_sent", "count", "Echo requests sent."),
-    ("rtt_received", "count", "Echo requests answered, duplicates not counted."),
+    ("rtt_received", "count", "Echo requests that were answered; duplicates are not counted."),
     (
         "rtt_loss",
         "share",
@@ -41,7 +41,7 @@ COLUMNS: Final = columns(
     ("rtt_mean_s", "s", "Mean round-trip time."),
     ("rtt_p95_s", "s", "95th percentile of the round-trip time."),
     ("rtt_max_s", "s", "Largest round-trip time."),
-    ("rtt_jitter_s", "s", "Mean absolute difference between one round-trip time and the next."),
+    ("rtt_jitter_s", "s", "Mean absolute difference between consecutive round-trip times."),
 )
 SENT_COLUMNS: Final = columns(
     110,
@@ -49,8 +49,8 @@ SENT_COLUMNS: Final = columns(
         "rtt_median_sent_s",
         "s",
         (
-            "Median round-trip time over all echo requests, an unanswered one as later than every answer; empty when "
-            "half of them or more stayed unanswered."
+            "Median round-trip time over all echo requests, in which an unanswered request is later than every "
+            "answer; empty if half of the requests or more were unanswered."
         ),
     ),
 )
@@ -60,15 +60,15 @@ GAP_COLUMNS: Final = columns(
         "rtt_gap_s",
         "s",
         (
-            "Longest time from one answer to the next; empty when the ping began or ended in a longer one, or in one "
-            "of 1 s or more, and when ping has no time stamps."
+            "Longest time between consecutive answers; empty if ping printed no time stamps, or if it started or "
+            "ended without answers for a longer time, or for 1 s or more."
         ),
         Figure("longest gap between answers", Kind.MEDIAN, at_least="rtt_gap_at_least_s"),
     ),
     (
         "rtt_gap_lost",
         "count",
-        "Echo requests without an answer in that time; empty as rtt_gap_s.",
+        "Echo requests without an answer in that time; empty if rtt_gap_s is.",
         Figure("lost in the gap", Kind.MEDIAN, at_least="rtt_gap_lost_at_least"),
     ),
 )
@@ -78,34 +78,34 @@ OPEN_GAP_COLUMNS: Final = columns(
         "rtt_gap_at_least_s",
         "s",
         (
-            "Lower bound of rtt_gap_s where the ping began or ended in the gap: the longest time without an answer "
-            "that was observed. Empty otherwise."
+            "Lower bound of rtt_gap_s if ping started or ended in the gap: the longest observed time without an "
+            "answer. Empty otherwise."
         ),
     ),
-    ("rtt_gap_lost_at_least", "count", "Lower bound of rtt_gap_lost, likewise."),
+    ("rtt_gap_lost_at_least", "count", "Lower bound of rtt_gap_lost in the same case."),
 )
-_SEQUENCES: Final = 1 << 16
-"""Sequence numbers of ICMP."""
-_LATE: Final = 1 << 10
-"""An answer that is behind the one before it by fewer numbers is late; else the numbers began again."""
+_SEQUENCE_NUMBERS: Final = 1 << 16
+"""Number of ICMP sequence numbers."""
+_MAX_LATE_NUMBERS: Final = 1 << 10
+"""An answer whose number is below the previous one by less than this is late; otherwise the numbers have wrapped."""
 
 UNREMARKABLE_S: Final = 1.0
-"""A shorter gap at either end of a ping, and shorter than the longest that ended, is taken for a lost echo."""
+"""A gap at the start or end of a ping is ignored if it is shorter than this and than the longest gap in between."""
 WAY_COLUMNS: Final = columns(
     40,
     (
         "rtt_distance_start_m",
         "m",
-        "Distance between sender and receiver at the first reply to ping that has a time stamp.",
+        "Distance between sender and receiver at the first ping reply that has a time stamp.",
     ),
-    ("rtt_distance_min_m", "m", "Smallest distance from that reply to the last."),
+    ("rtt_distance_min_m", "m", "Smallest distance between that reply and the last one."),
     ("rtt_distance_mean_m", "m", "Mean distance over that time."),
     ("rtt_distance_max_m", "m", "Largest distance in that time."),
     ("rtt_sender_speed_m_s", "m/s", "Mean speed of the sender over that time."),
     (
         "rtt_relative_speed_m_s",
         "m/s",
-        "Mean magnitude of the sender's velocity less the receiver's over that time.",
+        "Mean magnitude of the relative velocity of sender and receiver over that time.",
     ),
 )
 
@@ -127,7 +127,7 @@ _MS: Final = r"[0-9]{1,9}\.[0-9]{1,9}"
 _TIMES: Final = re.compile(
     rf"(?:rtt min/avg/max/mdev|round-trip min/avg/max) = (?P<min>{_MS})/(?P<avg>{_MS})/(?P<max>{_MS})(?:/{_MS})? ms"
 )
-_SILENT: Final = re.compile(
+_IGNORED_LINE: Final = re.compile(
     r"|--- .+ ping statistics ---|rtt min/avg/max/mdev = .+ ms(?:, .+)?|round-trip min/avg/max = .+ ms"
     r"|(?:, )?pipe [0-9]+|(?:\[[0-9.]+\] )?no answer yet for icmp_seq=[0-9]+"
 )
@@ -139,8 +139,8 @@ class Reply:
 
     Attributes:
         seq: Sequence number, 16 bits.
-        rtt_s: Round-trip time in seconds; None with a payload too short for a time stamp.
-        at_utc_ns: When it was printed, nanoseconds since 1970 UTC; None without `-D`.
+        rtt_s: Round-trip time in seconds; None if the payload is too short for a time stamp.
+        at_utc_ns: Time of printing, nanoseconds since 1970 UTC; None without `-D`.
         duplicate: Whether the request had been answered before.
         damaged: Whether its checksum was wrong; ping does not count it as received.
     """
@@ -154,13 +154,13 @@ class Reply:
 
 @dataclass(frozen=True)
 class Problem:
-    """An ICMP error in place of a reply.
+    """An ICMP error instead of a reply.
 
     Attributes:
         seq: Sequence number of the request.
-        source: Address of the host that says so.
-        text: What it says, for example `Destination Host Unreachable`.
-        at_utc_ns: When it was printed, nanoseconds since 1970 UTC; None without `-D`.
+        source: Address of the host that sent the error.
+        text: The error, for example `Destination Host Unreachable`.
+        at_utc_ns: Time of printing, nanoseconds since 1970 UTC; None without `-D`.
     """
 
     seq: int
@@ -175,13 +175,13 @@ class Ping:
 
     Attributes:
         payload_bytes: ICMP payload of a request; None without the header line.
-        replies: Every reply in the order of arrival, duplicates too.
-        problems: Every ICMP error.
-        transmitted: Requests sent, by the summary; None when ping was ended before it.
-        received: Requests answered, by the summary.
-        unknown: Lines that are no ping's, as they stand.
-        first_seq: Sequence number of the first request: 1, or busybox's 0.
-        summary_s: Shortest, mean and longest round-trip time, by the summary; None if it has none.
+        replies: All replies in the order of arrival, including duplicates.
+        problems: All ICMP errors.
+        transmitted: Number of sent requests according to the summary; None if ping was killed before it.
+        received: Number of answered requests according to the summary.
+        unknown: Unknown lines, unchanged.
+        first_seq: Sequence number of the first request: 1, or 0 for busybox.
+        summary_s: Shortest, mean and longest round-trip time according to the summary; None if it has none.
     """
 
     payload_bytes: int | None
@@ -205,16 +205,16 @@ class Ping:
 
     @property
     def gaps(self) -> tuple[int, ...]:
-        """Sequence numbers without an answer, from the first to the last one known to have been sent."""
+        """Sequence numbers without an answer, from the first request to the last known one."""
         answered = {reply.seq for reply in self.answers}
         seen = answered | {problem.seq for problem in self.problems}
         end = max(seen, default=-1) + 1 if self.transmitted is None else self.first_seq + self.transmitted
-        # The number has 16 bits; a longer run starts again at 0.
+        # The number has 16 bits and wraps to 0 in a longer run.
         return tuple(seq for seq in range(self.first_seq, min(end, 0x10000)) if seq not in answered)
 
 
 def read(path: Path) -> Ping:
-    """Return what a run of ping printed.
+    """Return the parsed output of a run of ping.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
@@ -223,7 +223,7 @@ def read(path: Path) -> Ping:
 
 
 def parse(text: str) -> Ping:
-    """Return what `text` says; never raises, whatever it is."""
+    """Return the parsed output of a run of ping; raises no error for any text."""
     payload_bytes = transmitted = received = None
     first_seq = 1
     summary_s = None
@@ -243,20 +243,20 @@ def parse(text: str) -> Ping:
             transmitted, received = int(match["sent"]), int(match["received"])
         elif match := _TIMES.match(line):
             summary_s = (float(match["min"]) / 1e3, float(match["avg"]) / 1e3, float(match["max"]) / 1e3)
-        elif not _SILENT.fullmatch(line):
+        elif not _IGNORED_LINE.fullmatch(line):
             unknown.append(line)
-    said = tuple(replies), tuple(problems), transmitted, received, tuple(unknown)
-    return Ping(payload_bytes, *said, first_seq, summary_s)
+    parsed = tuple(replies), tuple(problems), transmitted, received, tuple(unknown)
+    return Ping(payload_bytes, *parsed, first_seq, summary_s)
 
 
 @dataclass(frozen=True)
 class AnswerGap:
-    """The longest time without an answer in a ping.
+    """The longest time without an answer in a run of ping.
 
     Attributes:
-        lasted_s: From the answer before it to the one after it, in seconds; as far as observed if it is open.
-        lost: Requests without an answer in it.
-        is_open: Whether the ping began or ended in it, so that both numbers are lower bounds.
+        lasted_s: Time in seconds between the answers before and after the gap; the observed time if it is open.
+        lost: Number of requests without an answer in it.
+        is_open: Whether ping started or ended in the gap, so that both numbers are lower bounds.
     """
 
     lasted_s: float
@@ -264,61 +264,63 @@ class AnswerGap:
     is_open: bool
 
 
-def longest_gap(found: Ping, interval_s: float) -> AnswerGap | None:
-    """Return the longest time without an answer, by the order of requests; None if answers have no time stamps.
+def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
+    """Return the longest time without an answer, in the order of requests; None if answers have no time stamps.
 
-    A gap that the ping began or ended in is open. It counts where it is as long as the longest that has both ends, or
-    lasts `UNREMARKABLE_S`.
+    A gap in which ping started or ended is open. It is returned if it is at least as long as the longest gap between
+    two answers, or at least `UNREMARKABLE_S` long.
 
     Args:
-        found: The ping.
-        interval_s: Time between two requests. Open gaps are counted in requests that were sent and not answered.
+        output: Output of ping.
+        interval_s: Time between two requests. The length of an open gap is its unanswered requests times this.
     """
-    stamped = sorted(_numbered(found))
-    if not stamped and (found.answers or not found.transmitted):
+    stamped = sorted(_stamped_answers(output))
+    if not stamped and (output.answers or not output.transmitted):
         return None
-    ended = [(later_ns - ns, later - seq - 1) for (seq, ns), (later, later_ns) in pairwise(stamped)]
-    gap_ns, lost = max(ended, default=(0, 0))
-    unanswered = _open_ends(found, [seq for seq, _ in stamped])
+    closed = [(later_ns - ns, later - seq - 1) for (seq, ns), (later, later_ns) in pairwise(stamped)]
+    gap_ns, lost = max(closed, default=(0, 0))
+    unanswered = _open_ends(output, [seq for seq, _ in stamped])
     open_s = unanswered * interval_s
     if unanswered and (unanswered >= lost or open_s >= UNREMARKABLE_S):
         return AnswerGap(max(open_s, gap_ns / 1e9), max(unanswered, lost), is_open=True)
-    return AnswerGap(gap_ns / 1e9, lost, is_open=False) if ended else None
+    return AnswerGap(gap_ns / 1e9, lost, is_open=False) if closed else None
 
 
-def _numbered(found: Ping) -> Iterator[tuple[int, int]]:
-    """Yield the number of the request and the time stamp of each answer that has one; 16 bits are unwrapped."""
+def _stamped_answers(output: Ping) -> Iterator[tuple[int, int]]:
+    """Yield the unwrapped sequence number and the time stamp of each answer that has a time stamp."""
     last: int | None = None
-    for answer in found.answers:
+    for answer in output.answers:
         if answer.at_utc_ns is not None:
-            ahead = 0 if last is None else (answer.seq - last + _LATE) % _SEQUENCES - _LATE
+            ahead = (
+                0 if last is None else (answer.seq - last + _MAX_LATE_NUMBERS) % _SEQUENCE_NUMBERS - _MAX_LATE_NUMBERS
+            )
             last = answer.seq if last is None else last + ahead
             yield last, answer.at_utc_ns
 
 
-def _open_ends(found: Ping, answered: Sequence[int]) -> int:
-    """Return how many requests stayed unanswered before the first answer, or after the last, whichever is more."""
-    sent = found.transmitted or 0
+def _open_ends(output: Ping, answered: Sequence[int]) -> int:
+    """Return the number of unanswered requests before the first answer or after the last one, whichever is larger."""
+    sent = output.transmitted or 0
     if not answered:
         return sent
-    return max(answered[0] - found.first_seq, found.first_seq + sent - 1 - answered[-1], 0)
+    return max(answered[0] - output.first_seq, output.first_seq + sent - 1 - answered[-1], 0)
 
 
-def measure_gap(found: Ping | None, interval_s: float) -> Measured:
+def measure_gap(output: Ping | None, interval_s: float) -> Measured:
     """Return the columns of the longest gap between answers.
 
     Args:
-        found: The ping; None if its output is not at hand.
-        interval_s: As `longest_gap`.
+        output: Output of ping; None if it is not available.
+        interval_s: Time between two requests.
     """
-    gap = None if found is None else longest_gap(found, interval_s)
+    gap = None if output is None else longest_gap(output, interval_s)
     if gap is None:
         return Measured.nothing((*GAP_COLUMNS, *OPEN_GAP_COLUMNS), "no two answers have a time stamp")
-    ended, bounds = (tuple(column.name for column in columns) for columns in (GAP_COLUMNS, OPEN_GAP_COLUMNS))
-    known, others = (bounds, ended) if gap.is_open else (ended, bounds)
-    reason = "the ping began or ended in the gap" if gap.is_open else "the gap ended within the ping"
-    values = dict(zip(known, (gap.lasted_s, gap.lost), strict=True))
-    return Measured(values, dict.fromkeys(others, reason))
+    closed, bounds = (tuple(column.name for column in columns) for columns in (GAP_COLUMNS, OPEN_GAP_COLUMNS))
+    filled, empty = (bounds, closed) if gap.is_open else (closed, bounds)
+    reason = "ping started or ended in the gap" if gap.is_open else "ping neither started nor ended in the gap"
+    values = dict(zip(filled, (gap.lasted_s, gap.lost), strict=True))
+    return Measured(values, dict.fromkeys(empty, reason))
 
 
 def _reply(match: re.Match[str]) -> Reply:
@@ -338,8 +340,8 @@ def _at_utc_ns(match: re.Match[str]) -> int | None:
 
 
 def measure(pings: Ping | None) -> Measured:
-    """Return the columns of what ping said; None where its output is not at hand."""
-    # Without its first line ping never ran: no answer is then no measurement.
+    """Return the columns of a run of ping; `pings` is None if its output is not available."""
+    # Without the header line ping did not run, so the absence of answers is not a measured loss.
     if pings is None or pings.payload_bytes is None:
         return Measured.nothing((*COLUMNS, *SENT_COLUMNS), "ping did not run")
     rtt_s = pings.rtt_s
@@ -359,7 +361,7 @@ def measure(pings: Ping | None) -> Measured:
     }
     of_sent = {"rtt_median_sent_s": quantile_of_sent(rtt_s, pings.transmitted or 0, 0.5)}
     return (
-        Measured.of(counts, "ping was cut short")
+        Measured.of(counts, "ping was killed before its summary")
         | Measured.of(times, "too few replies have a time")
-        | Measured.of(of_sent, "half of the requests or more stayed unanswered")
+        | Measured.of(of_sent, "half of the requests or more were unanswered")
     )

@@ -1,8 +1,8 @@
-"""Values in what any program printed: at a path into its JSON, or by a regular expression.
+"""Extraction of a value from a program's output: by a path into JSON, or by a regular expression.
 
-What a robot says is not trusted, and expressions may be careless. Paths are JMESPath (jmespath.org/specification),
-which has no loop but those over the data. Expressions are RE2 (github.com/google/re2/wiki/Syntax), which takes a time
-that grows with the text alone: Python's own takes years for `(a+)+$` and forty letters.
+Output of a robot is not trusted, and expressions can be inefficient. Paths are JMESPath (jmespath.org/specification),
+whose only loops are over the data. Expressions are RE2 (github.com/google/re2/wiki/Syntax), whose time is linear in
+the length of the text; Python's `re` needs years for `(a+)+$` and forty letters.
 """
 
 import json
@@ -16,33 +16,33 @@ from fieldkit.core.text import brief
 from fieldkit.measure.evidence import reading
 
 MOST_BYTES: Final = 1 << 20
-"""What is kept of a program's output; one that prints more is cut."""
+"""Maximum size of a program's output; the rest is discarded on the robot."""
 
 _TOO_DEEP: Final = "it is nested too deeply"
 
 
 def problem_of_path(text: str) -> str | None:
-    """Return why a text is no path into JSON, None where it is one."""
+    """Return why a text is not a path into JSON, or None if it is."""
     try:
-        _path(text)
+        _compile_path(text)
     except ValueError as error:
         return " ".join(str(error).split())
     return None
 
 
 def problem_of_expression(text: str) -> str | None:
-    """Return why a text is no regular expression with one group, None where it is one."""
+    """Return why a text is not a regular expression with one group, or None if it is."""
     try:
-        groups = _expression(text).groups
+        groups = _compile_expression(text).groups
     except ValueError as error:
         return str(error)
-    return None if groups == 1 else f"it has {groups} groups, and the value is what the only one matches"
+    return None if groups == 1 else f"it has {groups} groups, but must have exactly one, which matches the value"
 
 
 @cache
-def _path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types)
-    """Return a path; what is none is a ValueError, as jmespath's own are."""
-    import jmespath  # noqa: PLC0415 (most commands see no path, and it takes 20 ms)
+def _compile_path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types)
+    """Return a compiled path; raises ValueError, like jmespath, for any other text."""
+    import jmespath  # noqa: PLC0415 (takes 20 ms, and most commands need no path)
 
     try:
         return jmespath.compile(text)
@@ -51,8 +51,8 @@ def _path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types)
 
 
 @cache
-def _expression(text: str) -> Any:  # noqa: ANN401 (re2 declares no types)
-    """Return an expression; what is none is a ValueError."""
+def _compile_expression(text: str) -> Any:  # noqa: ANN401 (re2 declares no types)
+    """Return a compiled expression; raises ValueError for any other text."""
     import re2  # noqa: PLC0415 (as jmespath)
 
     options = re2.Options()
@@ -60,15 +60,15 @@ def _expression(text: str) -> Any:  # noqa: ANN401 (re2 declares no types)
     try:
         return re2.compile(f"(?m){text}", options)
     except re2.error as error:
-        said = error.args[0] if error.args else error
-        raise ValueError(said.decode(errors="replace") if isinstance(said, bytes) else str(said)) from error
+        message = error.args[0] if error.args else error
+        raise ValueError(message.decode(errors="replace") if isinstance(message, bytes) else str(message)) from error
 
 
 def text(path: Path) -> str:
-    """Return what a program printed, bytes that are no UTF-8 replaced.
+    """Return the output of a program; bytes that are not UTF-8 are replaced.
 
     Raises:
-        EvidenceError: The file is missing, cannot be read, or holds all that is kept: there was more.
+        EvidenceError: The file is missing, cannot be read, or has the maximum size, so that output was discarded.
     """
     if reading.size(path) >= MOST_BYTES:
         raise EvidenceError(f"the program printed more than {MOST_BYTES >> 20} MiB", where=str(path))
@@ -76,64 +76,64 @@ def text(path: Path) -> str:
 
 
 def document(path: Path) -> object:
-    """Return the JSON that a program printed.
+    """Return the value of the JSON that a program printed.
 
     Raises:
-        EvidenceError: As `text`, or it is none.
+        EvidenceError: As `text`, or the output is not JSON.
     """
     try:
-        found: object = json.loads(text(path).removeprefix("\ufeff"))
+        parsed: object = json.loads(text(path).removeprefix("\ufeff"))
     except (ValueError, RecursionError) as error:
-        why = _TOO_DEEP if isinstance(error, RecursionError) else str(error)
-        raise EvidenceError(f"is no JSON: {why}", where=str(path)) from error
-    return found
+        reason = _TOO_DEEP if isinstance(error, RecursionError) else str(error)
+        raise EvidenceError(f"is not JSON: {reason}", where=str(path)) from error
+    return parsed
 
 
 def at_path(path: Path, where: str) -> object:
-    """Return what stands at `where` in the JSON that a program printed; None where nothing does.
+    """Return the value at the path `where` in the JSON that a program printed; None if there is none.
 
     Raises:
-        EvidenceError: As `document`, or what stands there does not suit the functions that the path calls.
+        EvidenceError: As `document`, or a function in the path was applied to a value of the wrong type.
     """
     printed = document(path)
     try:
-        found: object = _path(where).search(printed)
+        result: object = _compile_path(where).search(printed)
     except (ValueError, RecursionError) as error:
-        why = _TOO_DEEP if isinstance(error, RecursionError) else " ".join(str(error).split())
-        raise EvidenceError(why, where=str(path)) from error
-    return found
+        reason = _TOO_DEEP if isinstance(error, RecursionError) else " ".join(str(error).split())
+        raise EvidenceError(reason, where=str(path)) from error
+    return result
 
 
 def by_expression(path: Path, expression: str) -> object:
-    """Return what the expression's group matches, where it matches first; None where it does not.
+    """Return the text of the expression's group in its first match; None if it does not match.
 
     Raises:
         EvidenceError: As `text`.
     """
-    match = _expression(expression).search(text(path))
+    match = _compile_expression(expression).search(text(path))
     return None if match is None else match[1]
 
 
-def value(column: Column, found: object) -> Value:
-    """Return what a program printed as a value of a column.
+def value(column: Column, extracted: object) -> Value:
+    """Convert an extracted value to a value of a column.
 
     Raises:
-        EvidenceError: It is none: nothing at all, a list, words instead of a number.
+        EvidenceError: It is not a value of the column: missing, a list, or a text instead of a number.
     """
-    if found is None:
-        raise EvidenceError("there is none")
-    if isinstance(found, list | dict):
+    if extracted is None:
+        raise EvidenceError("the value is missing")
+    if isinstance(extracted, list | dict):
         raise EvidenceError("it is not one value, but several")
-    said = json.dumps(found) if isinstance(found, bool | int | float) else str(found).strip()
-    shown = brief(said)
-    if said in MISSING:
-        raise EvidenceError("there is none")
+    text = json.dumps(extracted) if isinstance(extracted, bool | int | float) else str(extracted).strip()
+    shown = brief(text)
+    if text in MISSING:
+        raise EvidenceError("the value is missing")
     if column.type is str:
         return shown
-    if isinstance(found, bool) != (column.type is bool) and not isinstance(found, str):
-        raise EvidenceError(f"it is {shown}, of another type")
-    if why := column.problem(said):
-        raise EvidenceError(f"it is {shown!r}, {why}")
+    if isinstance(extracted, bool) != (column.type is bool) and not isinstance(extracted, str):
+        raise EvidenceError(f"it is {shown}, which has another type than the column")
+    if reason := column.problem(text):
+        raise EvidenceError(f"it is {shown!r}, {reason}")
     if column.type is bool:
-        return said.lower() in {"true", "1"}
-    return float(said) if column.type is float else int(said) if said.lstrip("+-").isdigit() else int(float(said))
+        return text.lower() in {"true", "1"}
+    return float(text) if column.type is float else int(text) if text.lstrip("+-").isdigit() else int(float(text))

@@ -1,4 +1,4 @@
-"""Bytes and text of evidence files, with errors that say what to do."""
+"""Reading of evidence files, with errors that contain a remedy."""
 
 import json
 import os
@@ -14,95 +14,97 @@ from fieldkit.core.text import JSON_ERRORS
 
 T = TypeVar("T")
 
-MOST_TEXT_BYTES: Final = 64 << 20
-"""No tool says more during a repeat: a ping of an hour at 10 a second is 3 MB."""
+MAX_TEXT_BYTES: Final = 64 << 20
+"""Maximum size of a tool's output; ping with 10 requests per second for an hour prints 3 MB."""
 
-_PIECE_BYTES: Final = 1 << 20
-_MOST_READ_BYTES: Final = 1 << 24
-"""Most captures are smaller, and to hold them costs little."""
+_CHUNK_BYTES: Final = 1 << 20
+_MAX_READ_BYTES: Final = 1 << 24
+"""Size up to which a file is read into memory instead of mapped; most captures are smaller."""
 
 
 def size(path: Path) -> int:
-    """Return how many bytes a piece of evidence has.
+    """Return the size of an evidence file in bytes.
 
     Raises:
-        EvidenceError: It is missing or cannot be read.
+        EvidenceError: The file is missing or cannot be read.
     """
-    with _opened(path) as file:
+    with _open_regular(path) as file:
         return file.seek(0, 2)
 
 
-def same(folder: Path, one: str, other: str) -> bool:
-    """Return whether two pieces of evidence are equal, byte for byte; raises `EvidenceError` as `size` does."""
-    whole = size(folder / one)
-    return whole == size(folder / other) and alike_bytes(folder, one, other) == whole
+def same(folder: Path, first: str, second: str) -> bool:
+    """Return True if two evidence files have the same bytes; raises `EvidenceError` as `size`."""
+    size_bytes = size(folder / first)
+    return size_bytes == size(folder / second) and alike_bytes(folder, first, second) == size_bytes
 
 
 def mapped(path: Path) -> bytes | mmap:
-    """Return the bytes of one piece of evidence; raises `EvidenceError` as `size` does.
+    """Return the bytes of an evidence file; raises `EvidenceError` as `size`.
 
-    A large one is mapped into memory, and must not shrink while it is read, nor its disk fail: the kernel ends who
-    looks at what is not there any more.
+    A large file is mapped into memory. If it is truncated while it is used, or its disk fails, the kernel kills this
+    process (SIGBUS).
     """
-    with _opened(path) as file:
-        if file.seek(0, 2) > _MOST_READ_BYTES:
+    with _open_regular(path) as file:
+        if file.seek(0, 2) > _MAX_READ_BYTES:
             return mmap(file.fileno(), 0, access=ACCESS_READ)
         file.seek(0)
-        return file.read(_MOST_READ_BYTES)
+        return file.read(_MAX_READ_BYTES)
 
 
-def alike_bytes(folder: Path, one: str, other: str) -> int:
-    """Return how many bytes two files in a folder have in common from the beginning on; raises as `size` does."""
-    with _opened(folder / one) as left, _opened(folder / other) as right:
-        alike = 0
-        while (mine := left.read(_PIECE_BYTES)) == (theirs := right.read(_PIECE_BYTES)) and mine:
-            alike += len(mine)
-        shorter = min(len(mine), len(theirs))
-        differ = (at for at in range(shorter) if mine[at] != theirs[at])
-        return alike + next(differ, shorter)
+def alike_bytes(folder: Path, first: str, second: str) -> int:
+    """Return the length of the common prefix of two files in a folder, in bytes; raises as `size`."""
+    with _open_regular(folder / first) as left, _open_regular(folder / second) as right:
+        common_bytes = 0
+        while (left_chunk := left.read(_CHUNK_BYTES)) == (right_chunk := right.read(_CHUNK_BYTES)) and left_chunk:
+            common_bytes += len(left_chunk)
+        shorter = min(len(left_chunk), len(right_chunk))
+        differences = (index for index in range(shorter) if left_chunk[index] != right_chunk[index])
+        return common_bytes + next(differences, shorter)
 
 
 def text(path: Path) -> str:
-    """Return a tool's output, bytes that are no UTF-8 replaced.
+    """Return the text of a tool's output; bytes that are not UTF-8 are replaced.
 
     Raises:
-        EvidenceError: It is missing, cannot be read, or is longer than what any tool says.
+        EvidenceError: The file is missing, cannot be read, or is longer than `MAX_TEXT_BYTES`.
     """
-    with _opened(path) as file:
-        found = file.read(MOST_TEXT_BYTES + 1)
-    if len(found) > MOST_TEXT_BYTES:
-        raise EvidenceError(f"is longer than {MOST_TEXT_BYTES >> 20} MiB, as no tool's output is", where=str(path))
-    return found.decode(errors="replace")
+    with _open_regular(path) as file:
+        content = file.read(MAX_TEXT_BYTES + 1)
+    if len(content) > MAX_TEXT_BYTES:
+        raise EvidenceError(
+            f"is longer than {MAX_TEXT_BYTES >> 20} MiB, the limit of a tool's output", where=str(path)
+        )
+    return content.decode(errors="replace")
 
 
 def json_lines(path: Path, parse: Callable[[Any], T], wrong: str) -> list[T]:
-    """Return what stands in the lines of a log, a JSON value each; a last one that is not whole is left out.
+    """Return the parsed JSON lines of a log; an incomplete last line is omitted.
 
     Args:
         path: The log.
-        parse: Makes of a line's value what it says; raises one of `JSON_ERRORS` where it is none.
-        wrong: What a wrong line does not: `does not say where the robot drove`.
+        parse: Converts the value of a line; raises one of `JSON_ERRORS` if it is invalid.
+        wrong: Predicate of the message about an invalid line: `is not a sample of a drive`.
 
     Raises:
-        EvidenceError: As `text`; or a line is wrong.
+        EvidenceError: As `text`, or a line is invalid.
     """
-    found = []
+    parsed = []
     for number, line in enumerate(text(path).split("\n")[:-1], 1):
         try:
-            found.append(parse(json.loads(line)))
+            parsed.append(parse(json.loads(line)))
         except JSON_ERRORS:
             raise EvidenceError(f"line {number} {wrong}", where=str(path)) from None
-    return found
+    return parsed
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a piece of evidence; a pipe that nobody writes into, or a device without end, is none."""
+def _open_regular(path: Path) -> Iterator[BinaryIO]:
+    """Open a regular file; other types, such as a pipe without a writer or an endless device, are refused."""
     try:
-        # Looked at when it is open: what is at the path may have become another thing since anybody looked before.
-        with open(path, "rb", opener=_without_waiting) as file:
+        # The type is checked after opening, because the path can be replaced between a check and the opening.
+        with open(path, "rb", opener=_open_nonblocking) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise EvidenceError("is no file", where=str(path), remedy="repeat the measurement")
+                raise EvidenceError("is not a regular file", where=str(path), remedy="repeat the measurement")
             yield file
     except OSError as error:
         raise EvidenceError(
@@ -110,5 +112,5 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         ) from error
 
 
-def _without_waiting(path: str, flags: int) -> int:
+def _open_nonblocking(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK)

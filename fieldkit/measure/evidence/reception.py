@@ -1,8 +1,9 @@
-"""Reception of a recorder's topics: how soon, and how steadily; by its log and its bag, both by the robot's clock.
+"""Discovery time and gaps of recorded topics, from the recorder's log and its bag; both use the robot's clock.
 
-ROS 1's rosbag says `[ INFO] [1795208123.219164628]: Subscribing to /scan` before it asks the master who publishes
-it, and ROS 2's `[INFO] [1795208123.219164628] [rosbag2_recorder]: Listening for topics...` before it looks for any.
-When a message came, a bag says by the same clock (recorder.cpp of ros_comm 1.15 and of rosbag2).
+rosbag of ROS 1 logs `[ INFO] [1795208123.219164628]: Subscribing to /scan` before it queries the master for the
+publishers, and that of ROS 2 `[INFO] [1795208123.219164628] [rosbag2_recorder]: Listening for topics...` before it
+starts discovery. The bag has the time of each message by the same clock (recorder.cpp of ros_comm 1.15 and of
+rosbag2).
 """
 
 import re
@@ -20,31 +21,31 @@ COLUMNS: Final = columns(
     (
         "bag_discovered",
         "bool",
-        "Whether each topic of the recording brought a message; empty when the recorder left no log or no whole bag.",
+        "Whether a message of each recorded topic was received; empty without the recorder's log or a complete bag.",
         Figure("topics discovered", Kind.FLAG),
     ),
     (
         "bag_discovery_s",
         "s",
         (
-            "From the recorder's subscribing to the first message, of the topic that took longest: what registering "
-            "and connecting took, and the wait for the message. Empty when a topic brought none, or the log does not "
-            "say when that was."
+            "Time from the recorder's subscription to the first message, for the slowest topic; it includes "
+            "registration, connection and the wait for the message. Empty if no message of a topic was received, or "
+            "if the log does not contain the time of the subscription."
         ),
         Figure("discovery", Kind.MEDIAN),
     ),
     (
         "bag_messages",
         "count",
-        "Messages of the recording's topics in the bag; empty when there is no whole bag.",
+        "Messages of the recorded topics in the bag; empty without a complete bag.",
         Figure("messages recorded", Kind.MEDIAN),
     ),
     (
         "bag_gap_s",
         "s",
         (
-            "Longest time without a message of a topic, from its first one to the end of the recording's duration. "
-            "Empty as bag_discovery_s."
+            "Longest time without a message of a topic, between its first message and the end of the recording's "
+            "duration. Empty if bag_discovery_s is."
         ),
         Figure("longest gap between messages", Kind.MEDIAN),
     ),
@@ -58,14 +59,14 @@ _NS: Final = 10**9
 
 @dataclass(frozen=True)
 class RecordingReception:
-    """How a recording heard its topics.
+    """Reception of the topics of a recording.
 
     Attributes:
-        discovered: Whether each topic brought a message; None when nobody knows.
-        messages: Messages of its topics; None when there is no whole bag.
-        discovery_s: From subscribing to the first message, of the topic that took longest; None when one brought
-            none, or nobody knows when it was subscribed to.
-        gap_s: Longest time without a message of a topic, in seconds; None as `discovery_s`.
+        discovered: Whether a message of each topic was received; None if unknown.
+        messages: Number of messages of its topics; None without a complete bag.
+        discovery_s: Time from the subscription to the first message, for the slowest topic; None if no message of a
+            topic was received, or if the time of the subscription is unknown.
+        gap_s: Longest time without a message of a topic, in seconds; None if `discovery_s` is None.
     """
 
     discovered: bool | None
@@ -75,54 +76,54 @@ class RecordingReception:
 
 
 def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: float) -> RecordingReception:
-    """Return how a recording heard its topics.
+    """Return the reception of the topics of a recording.
 
     Args:
         folder: The attempt's folder.
-        log: The recorder's log in it.
-        file: The bag in it.
-        topics: What was to be recorded.
-        duration_s: For how long, from subscribing on, in seconds.
+        log: Name of the recorder's log.
+        file: Name of the bag.
+        topics: The recorded topics.
+        duration_s: Duration of the recording from the subscription, in seconds.
 
     Raises:
-        EvidenceError: There is no log.
+        EvidenceError: The log is missing.
     """
-    begun_ns = subscribed_ns(reading.text(folder / log), topics)
-    all_begun = begun_ns.keys() >= set(topics)
+    start_ns = subscribed_ns(reading.text(folder / log), topics)
+    all_subscribed = start_ns.keys() >= set(topics)
     try:
-        found = bag.heard(folder / file)
+        by_topic = bag.heard(folder / file)
     except EvidenceError:
-        # One that cannot reach its master never subscribes, and leaves no bag.
-        return RecordingReception(None if all_begun else False, None, None, None)
-    discovered = found.keys() >= set(topics)
-    messages = sum(found[topic].messages for topic in topics if topic in found)
-    if not (discovered and all_begun):
+        # A recorder that cannot reach its master never subscribes and writes no bag.
+        return RecordingReception(None if all_subscribed else False, None, None, None)
+    discovered = by_topic.keys() >= set(topics)
+    messages = sum(by_topic[topic].messages for topic in topics if topic in by_topic)
+    if not (discovered and all_subscribed):
         return RecordingReception(discovered, messages, None, None)
-    first_ns = (found[topic].first_utc_ns - begun_ns[topic] for topic in topics)
-    ends_ns = {topic: begun_ns[topic] + round(duration_s * _NS) for topic in topics}
-    gap_ns = (max(found[topic].gap_ns, ends_ns[topic] - found[topic].last_utc_ns) for topic in topics)
+    first_ns = (by_topic[topic].first_utc_ns - start_ns[topic] for topic in topics)
+    ends_ns = {topic: start_ns[topic] + round(duration_s * _NS) for topic in topics}
+    gap_ns = (max(by_topic[topic].gap_ns, ends_ns[topic] - by_topic[topic].last_utc_ns) for topic in topics)
     return RecordingReception(discovered, messages, max(0, *first_ns) / _NS, max(gap_ns) / _NS)
 
 
 def subscribed_ns(log: str, topics: Sequence[str]) -> dict[str, int]:
-    """Return when a recorder began to look for each topic that its log tells of, nanoseconds since 1970 UTC."""
-    at_ns = {match["topic"]: _stamp_ns(match) for match in _ROS1.finditer(log)}
-    everything = _ROS2.search(log)
-    if everything is not None:
-        return dict.fromkeys(topics, _stamp_ns(everything))
-    return {topic: at_ns[topic] for topic in topics if topic in at_ns}
+    """Return the time of subscription or start of discovery by topic, from the log; nanoseconds since 1970 UTC."""
+    by_topic = {match["topic"]: _stamp_ns(match) for match in _ROS1.finditer(log)}
+    all_topics = _ROS2.search(log)
+    if all_topics is not None:
+        return dict.fromkeys(topics, _stamp_ns(all_topics))
+    return {topic: by_topic[topic] for topic in topics if topic in by_topic}
 
 
 def _stamp_ns(match: re.Match[str]) -> int:
     return int(match["s"]) * _NS + int(match["ns"])
 
 
-def measure(found: RecordingReception | None) -> Measured:
-    """Return the columns; None where the evidence does not tell."""
-    if found is None:
-        return Measured.nothing(COLUMNS, "the recorder left no log")
-    counts = {"bag_discovered": found.discovered, "bag_messages": found.messages}
-    times = {"bag_discovery_s": found.discovery_s, "bag_gap_s": found.gap_s}
-    return Measured.of(counts, "there is no whole bag") | Measured.of(
-        times, "a topic brought no message, or the log says no time"
+def measure(reception: RecordingReception | None) -> Measured:
+    """Return the columns; `reception` is None without the recorder's log."""
+    if reception is None:
+        return Measured.nothing(COLUMNS, "the recorder's log is missing")
+    counts = {"bag_discovered": reception.discovered, "bag_messages": reception.messages}
+    times = {"bag_discovery_s": reception.discovery_s, "bag_gap_s": reception.gap_s}
+    return Measured.of(counts, "there is no complete bag") | Measured.of(
+        times, "no message of a topic was received, or the log contains no time"
     )

@@ -1,4 +1,4 @@
-"""Messages that were lost, by the gaps in numbers that come again after 256 of them, as MAVLink's do."""
+"""Loss of messages from gaps in sequence numbers that wrap after 256, as those of MAVLink."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,19 +7,20 @@ from typing import Final
 
 NUMBERS: Final = 256
 SILENCE_US: Final = 1_000_000
-"""After so long a time without a message its number alone does not tell how many were lost."""
+"""After this time without a message, sequence numbers can have wrapped, so that they do not give the number of lost
+messages."""
 
 
 @dataclass(frozen=True)
-class Counted:
-    """What numbers tell.
+class MessageCounts:
+    """Message counts derived from sequence numbers.
 
     Attributes:
-        messages: Messages that came, each once.
-        lost: Those that did not.
-        repeated: Those that came once more.
-        silence_s: Longest time without one.
-        rate_hz: Messages a second that were sent, while they came.
+        messages: Received messages without duplicates.
+        lost: Lost messages.
+        repeated: Duplicates.
+        silence_s: Longest time without a message.
+        rate_hz: Rate at which messages were sent, without silences.
     """
 
     messages: int
@@ -29,44 +30,45 @@ class Counted:
     rate_hz: float
 
 
-def counted(came: Sequence[tuple[int, int]], ended_us: int) -> Counted:
-    """Return how many messages came, and how many did not.
+def count_messages(arrivals: Sequence[tuple[int, int]], ended_us: int) -> MessageCounts:
+    """Count received and lost messages.
 
-    Between two that come one after the other `(number - number before - 1) % 256` are missing. One that comes late
-    is not. In a silence of more than 1 s whole rounds of 256 may have been lost, too: as many as bring the sum
-    nearest to the rate at which they were sent otherwise; and after the last one, as many as that rate makes.
+    Between two consecutive messages, `(number - previous number - 1) % 256` are missing; a message that arrives late
+    is not lost. In a silence of more than 1 s, multiples of 256 can be lost in addition: the multiple is used that
+    best agrees with the rate in the rest of the time. After the last message, the loss is computed from this rate.
 
     Args:
-        came: Of each message when it came, in us, and its number, in the order in which they came.
-        ended_us: When nobody listened any more; 0 where nobody knows.
+        arrivals: Time of arrival in us and sequence number of each message, in the order of arrival.
+        ended_us: End of the reception in us; 0 if unknown.
     """
-    if not came:
-        return Counted(0, 0, 0, 0.0, 0.0)
-    rate_hz = _rate_hz(came)
+    if not arrivals:
+        return MessageCounts(0, 0, 0, 0.0, 0.0)
+    rate_hz = _rate_hz(arrivals)
     messages, lost, repeated, silence_us = 1, 0, 0, 0
-    newest = came[0][1]
-    for (before_us, _), (at_us, number) in pairwise(came):
-        lasted_us, step = at_us - before_us, (number - newest) % NUMBERS
-        silence_us = max(silence_us, lasted_us)
-        silent = lasted_us > SILENCE_US
-        if step == 0 and not silent:
+    newest = arrivals[0][1]
+    for (before_us, _), (at_us, number) in pairwise(arrivals):
+        interval_us, step = at_us - before_us, (number - newest) % NUMBERS
+        silence_us = max(silence_us, interval_us)
+        is_silence = interval_us > SILENCE_US
+        if step == 0 and not is_silence:
             repeated += 1
-        elif step > NUMBERS // 2 and not silent:
-            messages, lost = messages + 1, max(lost - 1, 0)  # it was missed, and is late
+        elif step > NUMBERS // 2 and not is_silence:
+            messages, lost = messages + 1, max(lost - 1, 0)  # it was counted as lost, but was only late
         else:
             step = step or NUMBERS
-            rounds = max(round((rate_hz * lasted_us / 1e6 - step) / NUMBERS), 0) if silent else 0
-            messages, lost, newest = messages + 1, lost + step - 1 + NUMBERS * rounds, number
-    tail_us = max(ended_us - came[-1][0], 0)
+            wraps = max(round((rate_hz * interval_us / 1e6 - step) / NUMBERS), 0) if is_silence else 0
+            messages, lost, newest = messages + 1, lost + step - 1 + NUMBERS * wraps, number
+    tail_us = max(ended_us - arrivals[-1][0], 0)
     if tail_us > SILENCE_US:
         lost += max(round(rate_hz * tail_us / 1e6) - 1, 0)
-    return Counted(messages, lost, repeated, max(silence_us, tail_us) / 1e6, rate_hz)
+    return MessageCounts(messages, lost, repeated, max(silence_us, tail_us) / 1e6, rate_hz)
 
 
-def _rate_hz(came: Sequence[tuple[int, int]]) -> float:
-    """Return how many messages were sent a second, by those that came without a silence between them."""
+def _rate_hz(arrivals: Sequence[tuple[int, int]]) -> float:
+    """Return the rate of sent messages in Hz, from arrivals without a silence between them."""
     steps = [
-        (at_us - before_us, (number - before) % NUMBERS) for (before_us, before), (at_us, number) in pairwise(came)
+        (at_us - before_us, (number - before) % NUMBERS)
+        for (before_us, before), (at_us, number) in pairwise(arrivals)
     ]
     steady = [(us, step) for us, step in steps if 0 <= us <= SILENCE_US and step <= NUMBERS // 2]
     seconds = sum(us for us, _ in steady) / 1e6

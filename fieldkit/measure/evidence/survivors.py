@@ -1,4 +1,4 @@
-"""Statistics of delays that also count what was lost, which a statistic over what arrived leaves out."""
+"""Quantiles of delays in which lost packets count as infinitely late, instead of being omitted."""
 
 import math
 from collections.abc import Sequence
@@ -8,22 +8,23 @@ from numpy.typing import NDArray
 
 
 def quantile_of_sent(arrived_s: Sequence[float] | NDArray[np.float64], sent: int, share: float) -> float | None:
-    """Return a quantile of the delays of all that was sent, where what was lost is later than all that arrived.
+    """Return a quantile of the delays of all sent packets, in which a lost packet is later than every received one.
 
-    Interpolated linearly, as `numpy.quantile`, so that it is the quantile of what arrived if nothing was lost.
+    It is interpolated linearly, as by `numpy.quantile`, so it equals the quantile of the received packets if no
+    packet was lost.
 
     Args:
-        arrived_s: Delays of what arrived, in seconds, in any order.
-        sent: How many were sent; taken as the number of delays if it is smaller.
-        share: Which quantile, 0 to 1.
+        arrived_s: Delays of the received packets in seconds, in any order.
+        sent: Number of sent packets; at least the number of delays is used.
+        share: The quantile, 0 to 1.
 
     Returns:
-        None if it is infinite, since too many were lost, or where nothing was sent.
+        The quantile in seconds; None if it is infinite because too many packets were lost, or if none was sent.
     """
     total = max(sent, len(arrived_s))
-    place = share * (total - 1)
-    if not len(arrived_s) or math.ceil(place) >= len(arrived_s):
+    position = share * (total - 1)
+    if not len(arrived_s) or math.ceil(position) >= len(arrived_s):
         return None
     ordered = np.sort(np.asarray(arrived_s, dtype=np.float64))
-    low, high = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
-    return low + (high - low) * (place - math.floor(place))
+    low, high = float(ordered[math.floor(position)]), float(ordered[math.ceil(position)])
+    return low + (high - low) * (position - math.floor(position))

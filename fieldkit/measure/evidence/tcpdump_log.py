@@ -1,4 +1,4 @@
-"""tcpdump's own account of a capture, from standard error."""
+"""Counters of a capture in tcpdump's standard error."""
 
 import re
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Final
 from fieldkit.core.model import Role
 from fieldkit.measure.evidence import reading
 
-# tcpdump writes its progress and `^C` into the same line, and the singular for one packet.
+# The line can start with progress output and `^C`; tcpdump uses the singular for one packet.
 _COUNT: Final = re.compile(
     r"(?P<count>[0-9]{1,18}) packets? (?P<what>captured|received by filter|dropped by kernel|dropped by interface)$",
     re.MULTILINE,
@@ -17,32 +17,32 @@ _LISTENING: Final = re.compile(r"^tcpdump: listening on ", re.MULTILINE)
 
 
 def capture_file(role: Role) -> str:
-    """Return the file of a robot's capture."""
+    """Return the name of the file with a robot's capture."""
     return f"{role}.pcap"
 
 
 def log_file(role: Role) -> str:
-    """Return the file of what its tcpdump said on standard error."""
+    """Return the name of the file with the standard error of a robot's tcpdump."""
     return f"{role}-capture.log"
 
 
 def log_of(capture: str) -> str:
-    """Return the log of a capture by its file, whatever name of a step both begin with."""
+    """Return the name of the log that belongs to a capture's file name, with or without the name of a step."""
     return f"{capture.removesuffix('.pcap')}-capture.log"
 
 
 @dataclass(frozen=True)
 class CaptureLog:
-    """tcpdump's account of a capture; counters are None when it was ended before it could give them.
+    """Counters that tcpdump printed for a capture; they are None if it was killed before.
 
     Attributes:
-        listening: Whether it said that it was listening: before, packets pass unseen.
-        captured: Packets written.
-        received_by_filter: Packets that the kernel handed over, on a loopback each twice. It is more than were
-            written where strangers came after the socket was opened and before its filter was set: libpcap filters
-            those itself (pcap-linux.c, `blocks_to_filter_in_userland`), and tcpdump was not listening yet. Among
-            5,000 strange packets a second one did so in 2 of 10 captures.
-        dropped_by_kernel: Packets that matched and found the capture buffer full.
+        listening: Whether it printed that it is listening; earlier packets are not captured.
+        captured: Packets that were written.
+        received_by_filter: Packets that the kernel passed to libpcap; each one twice on a loopback interface. The
+            count is larger than `captured` if other packets arrived between the opening of the socket and the
+            installation of the filter. libpcap discards those itself (pcap-linux.c, `blocks_to_filter_in_userland`).
+            At 5,000 other packets per second, this happened to one packet in 2 of 10 captures.
+        dropped_by_kernel: Packets that matched the filter while the capture buffer was full.
         dropped_by_interface: Packets that the interface or its driver dropped.
     """
 
@@ -54,7 +54,7 @@ class CaptureLog:
 
 
 def read(path: Path) -> CaptureLog:
-    """Return what a capture's log says.
+    """Return the counters in a capture's log.
 
     Raises:
         EvidenceError: The log is missing or cannot be read.
@@ -63,7 +63,7 @@ def read(path: Path) -> CaptureLog:
 
 
 def parse(text: str) -> CaptureLog:
-    """Return what the text of a log says; text that is none says nothing."""
+    """Return the counters in the text of a log; all are None if there are none."""
     counts = {match["what"]: int(match["count"]) for match in _COUNT.finditer(text)}
     captured = counts.get("captured")
     return CaptureLog(
@@ -71,6 +71,6 @@ def parse(text: str) -> CaptureLog:
         captured=captured,
         received_by_filter=counts.get("received by filter"),
         dropped_by_kernel=counts.get("dropped by kernel"),
-        # tcpdump leaves out this line, and only this one, when it is 0.
+        # tcpdump omits this line, and only this one, if the count is 0.
         dropped_by_interface=counts.get("dropped by interface", None if captured is None else 0),
     )

@@ -1,1 +1,1 @@
-"""Evidence of robots that move by themselves: logs of drives and flights, telemetry, and their checks."""
+"""Evidence of self-moving robots: logs of drives and flights, telemetry, and their checks."""

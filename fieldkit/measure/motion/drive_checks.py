@@ -1,4 +1,4 @@
-"""Contradictions in the log of a drive: with itself, with the way and speed that were asked for, with the attempt."""
+"""Contradictions between the log of a drive, the commanded path and speed, and the attempt."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -10,33 +10,34 @@ from fieldkit.core.model import Leg
 from fieldkit.measure.motion.drive_log import HOME, DriveMoment, speeds_m_s
 from fieldkit.measure.motion.motion_log import time_contradictions
 
-OFF_WAY_M: Final = 1.0
-"""A driver steers on its own odometry, within centimetres on even ground; one that is this far off is lost."""
+MAX_DEVIATION_M: Final = 1.0
+"""Largest acceptable deviation from the path. The control loop uses the same odometry, so on even ground the
+deviation is some centimetres."""
 
 _START_M: Final = 0.3
-"""How far from its origin a robot may start: `START_M` of `fieldkit.agent.drive_plan`, which a test compares."""
+"""Largest distance of the start from the origin: `START_M` of `fieldkit.agent.drive_plan`, which a test compares."""
 _ROUNDING_M: Final = 2e-3
-"""Places are written to 0.1 mm, the way that was driven to 1 mm."""
-_NOISE_M: Final = 0.05
-_NOISE_SHARE: Final = 0.25
-"""Between two lines odometry that jitters counts a longer way than the straight one."""
+"""Positions are rounded to 0.1 mm, the driven distance to 1 mm."""
+_JITTER_M: Final = 0.05
+_JITTER_SHARE: Final = 0.25
+"""Between two lines, jitter of the odometry makes the driven distance longer than the straight line."""
 _SPEED_SHARE: Final = 1.5
 _SPEED_M_S: Final = 0.1
-"""A speed over half a second may be too large by a message of odometry, and by how a robot overshoots."""
+"""Tolerance of a speed over half a second, for one additional odometry message and for overshoot of the control."""
 _COMMAND_M_S: Final = 1e-3
 _COAST_M: Final = 1.0
 _COAST_SHARE: Final = 0.1
-"""A robot that is commanded to stop rolls on, and its place shifts while it turns."""
+"""After a command to stop, a robot coasts, and its position shifts while it turns."""
 
 
 @dataclass(frozen=True)
 class DrivePlan:
-    """What a robot was asked to drive.
+    """Commanded drive of a robot.
 
     Attributes:
-        legs: The way from its place.
-        speed_m_s: How fast.
-        window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if it is not known.
+        legs: The path from the robot's position.
+        speed_m_s: The speed.
+        window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
     """
 
     legs: tuple[Leg, ...]
@@ -45,35 +46,35 @@ class DrivePlan:
 
 
 def contradictions(log: Sequence[DriveMoment], plan: DrivePlan) -> Iterator[str]:
-    """Yield what cannot be true of a drive that ended well, a sentence each."""
+    """Yield the contradictions in the log of a successful drive, one sentence each."""
     if log[-1].ended != HOME or any(moment.ended for moment in log[:-1]):
-        yield f"does not end with the robot at its place, but {log[-1].ended or 'on its way'}"
+        yield f"does not end with the robot at its starting position, but {log[-1].ended or 'on its path'}"
     yield from time_contradictions(log, plan.window)
-    if not log[0].off_m - _START_M <= log[0].driven_m <= (1 + _NOISE_SHARE) * (log[0].off_m + _START_M) + _NOISE_M:
-        yield f"begins {log[0].off_m:.2f} m from its place, after {log[0].driven_m:.2f} m"
+    if not log[0].off_m - _START_M <= log[0].driven_m <= (1 + _JITTER_SHARE) * (log[0].off_m + _START_M) + _JITTER_M:
+        yield f"starts {log[0].off_m:.2f} m from its origin, after {log[0].driven_m:.2f} m driven"
     if any(_jumps(*pair) for pair in pairwise(log)):
-        yield "a pose is not as far from the one before it as the wheels went"
-    off_m = max(_off_way_m(moment, plan.legs) for moment in log)
-    if off_m > OFF_WAY_M:
-        yield f"its odometry was {off_m:.1f} m off the way that was asked for"
+        yield "the distance between two consecutive poses differs from the driven distance"
+    off_m = max(_deviation_m(moment, plan.legs) for moment in log)
+    if off_m > MAX_DEVIATION_M:
+        yield f"its odometry deviates by {off_m:.1f} m from the commanded path"
     fastest_m_s = max(speeds_m_s(log), default=0.0)
     if fastest_m_s > _SPEED_SHARE * plan.speed_m_s + _SPEED_M_S:
-        yield f"it drove at {fastest_m_s:.2f} m/s, and was to drive at {plan.speed_m_s:g} m/s"
+        yield f"it drove at {fastest_m_s:.2f} m/s instead of {plan.speed_m_s:g} m/s"
     if not all(0 <= moment.forward_m_s <= plan.speed_m_s + _COMMAND_M_S for moment in log):
-        yield f"it was commanded to drive at another speed than 0 to {plan.speed_m_s:g} m/s"
-    if _coasted_m(log) > _COAST_M + _COAST_SHARE * log[-1].driven_m:
-        yield f"it drove {_coasted_m(log):.1f} m while it was commanded to stand"
+        yield f"a commanded speed is not between 0 and {plan.speed_m_s:g} m/s"
+    if _coasting_distance_m(log) > _COAST_M + _COAST_SHARE * log[-1].driven_m:
+        yield f"it drove {_coasting_distance_m(log):.1f} m while the commanded speed was 0"
 
 
 def _jumps(before: DriveMoment, after: DriveMoment) -> bool:
-    """Return whether two lines have places that the way between them does not explain."""
+    """Return True if the positions of two lines do not agree with the driven distance between them."""
     straight_m = math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
     driven_m = after.driven_m - before.driven_m
-    return not straight_m - _ROUNDING_M <= driven_m <= (1 + _NOISE_SHARE) * straight_m + _NOISE_M
+    return not straight_m - _ROUNDING_M <= driven_m <= (1 + _JITTER_SHARE) * straight_m + _JITTER_M
 
 
-def _coasted_m(log: Sequence[DriveMoment]) -> float:
-    """Return how far a robot went between lines that both say that it was commanded to stand."""
+def _coasting_distance_m(log: Sequence[DriveMoment]) -> float:
+    """Return the distance driven between consecutive lines that both have a commanded speed of 0."""
     return sum(
         math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
         for before, after in pairwise(log)
@@ -81,15 +82,19 @@ def _coasted_m(log: Sequence[DriveMoment]) -> float:
     )
 
 
-def _off_way_m(moment: DriveMoment, legs: Sequence[Leg]) -> float:
-    """Return how far a robot is from the nearest piece of its way."""
-    corners = list(accumulate(legs, lambda at, leg: (at[0] + leg.away_m, at[1] + leg.left_m), initial=(0.0, 0.0)))
+def _deviation_m(moment: DriveMoment, legs: Sequence[Leg]) -> float:
+    """Return the distance of a robot from the nearest segment of its path."""
+    corners = list(
+        accumulate(legs, lambda corner, leg: (corner[0] + leg.away_m, corner[1] + leg.left_m), initial=(0.0, 0.0))
+    )
     return min(_distance_m((moment.x_m, moment.y_m), begin, end) for begin, end in pairwise(corners))
 
 
-def _distance_m(place: tuple[float, float], begin: tuple[float, float], end: tuple[float, float]) -> float:
-    along = end[0] - begin[0], end[1] - begin[1]
-    off = place[0] - begin[0], place[1] - begin[1]
-    square = along[0] ** 2 + along[1] ** 2
-    share = min(max((off[0] * along[0] + off[1] * along[1]) / square, 0.0), 1.0) if square else 0.0
-    return math.hypot(off[0] - share * along[0], off[1] - share * along[1])
+def _distance_m(point: tuple[float, float], begin: tuple[float, float], end: tuple[float, float]) -> float:
+    """Return the distance of a point from a line segment."""
+    segment = end[0] - begin[0], end[1] - begin[1]
+    offset = point[0] - begin[0], point[1] - begin[1]
+    squared_length = segment[0] ** 2 + segment[1] ** 2
+    dot = offset[0] * segment[0] + offset[1] * segment[1]
+    share = min(max(dot / squared_length, 0.0), 1.0) if squared_length else 0.0
+    return math.hypot(offset[0] - share * segment[0], offset[1] - share * segment[1])

@@ -1,8 +1,8 @@
-"""Log of a ground robot on a way that it drove by itself, and the columns of it.
+"""Log of an autonomous drive of a ground robot, and its columns.
 
-The robot's agent writes a JSON object a line, ten times a second (`fieldkit.agent.drive`): when, where it is by its
-own odometry, seen from where it began and as it faced there, and how far its wheels took it. The last line says how
-it ended. All of it is the robot's word.
+The robot's agent writes a JSON object per line, ten times a second (`fieldkit.agent.drive`): time, pose by its
+odometry in the frame of the start, and driven distance. The last line has the reason of the end. All values are
+measured by the robot itself.
 """
 
 import math
@@ -24,44 +24,48 @@ from fieldkit.measure.motion.motion_log import LAST_NS, LONGEST_M, LONGEST_S
 FILE: Final = "drive.jsonl"
 
 HOME: Final = "home"
-"""How a drive ends that nothing stopped."""
+"""End of a drive that returned to its start without being stopped."""
 
 COLUMNS: Final = columns(
     100,
     (
         "drive_out_m",
         "m",
-        "How far it drove by its odometry, as all that follows, until it turned back.",
+        "Distance driven until it turned back, by its odometry; so are all following columns.",
         Figure("distance driven", Kind.MEDIAN),
     ),
-    ("drive_farthest_m", "m", "How far from its place its odometry had it at most."),
+    ("drive_farthest_m", "m", "Largest distance from its starting position."),
     (
         "drive_speed_median_m_s",
         "m/s",
-        "Median of its speed while it drove on the way out, over half a second at a time; empty of a shorter way.",
+        "Median of its speeds on the outward path, each over half a second; empty for a shorter path.",
         Figure("drive speed", Kind.MEDIAN),
     ),
-    ("drive_speed_max_m_s", "m/s", "Largest of these speeds, there and back."),
+    ("drive_speed_max_m_s", "m/s", "Largest of these speeds, outward and return path."),
     (
         "drive_back_off_m",
         "m",
-        "How far from its place its odometry had it after it came back; empty where it did not.",
+        "Distance from its starting position after its return; empty if it did not return.",
         Figure("position error", Kind.MEDIAN),
     ),
     (
         "drive_back_turned_rad",
         "rad",
-        "How far to the left it was turned then from how it faced in the beginning.",
+        "Heading after its return relative to the start, positive to the left.",
         (-math.pi, math.pi),
     ),
-    ("drive_ended", "text", "What ended it: home, or what stopped it on its way. Empty where it was cut short."),
+    (
+        "drive_ended",
+        "text",
+        "End of the drive: home, or the reason for a stop on its path. Empty if the log is incomplete.",
+    ),
 )
-"""In trials whose robots drive by themselves."""
+"""Columns of trials with self-driving robots."""
 
 _OUT: Final = frozenset({"out", "there"})
 _PHASES: Final = frozenset({"waits", "back", HOME}) | _OUT
-_SPAN_S: Final = 0.5
-"""Speeds are over so long: a message of odometry more or less is 3 % of it at 50 a second, and 7 % at 30."""
+_SPEED_INTERVAL_S: Final = 0.5
+"""Interval of speeds: one odometry message more or less changes a speed by 3 % at 50 Hz and by 7 % at 30 Hz."""
 _ROUNDING: Final = 1e-4
 
 
@@ -70,15 +74,15 @@ class DriveMoment:
     """A line of the log.
 
     Attributes:
-        at_s: When, since it was started.
-        phase: What it was about: `waits`, `out`, `there`, `back` or `home`.
-        x_m: How far ahead of where it began it was.
-        y_m: And to the left of that.
-        yaw_rad: How far to the left it was turned since.
-        driven_m: How far its wheels took it, there and back.
-        forward_m_s: How fast it was told to drive; 0 where it stands or turns.
-        ended: How it ended; empty while it had not.
-        utc_ns: When by the robot's clock, nanoseconds since 1970 UTC; 0 if the line does not say.
+        at_s: Time since the start of the program.
+        phase: Phase of the drive: `waits`, `out`, `there`, `back` or `home`.
+        x_m: Position ahead of the start.
+        y_m: Position to the left of the start.
+        yaw_rad: Heading relative to the start, positive to the left.
+        driven_m: Driven distance since the start.
+        forward_m_s: Commanded speed; 0 while the robot stands or turns.
+        ended: Reason of the end; empty before the end.
+        utc_ns: Time by the robot's clock, nanoseconds since 1970 UTC; 0 if the line does not have it.
     """
 
     at_s: float
@@ -93,27 +97,27 @@ class DriveMoment:
 
     @property
     def off_m(self) -> float:
-        """How far it was from where it began."""
+        """Distance from the start."""
         return math.hypot(self.x_m, self.y_m)
 
 
 def read(path: Path) -> tuple[DriveMoment, ...]:
-    """Return the lines of a log in the order of time; a last one that is not whole is left out.
+    """Return the lines of a log in the order of time; an incomplete last line is omitted.
 
     Raises:
-        EvidenceError: It is missing, has no line, or one that no driver writes.
+        EvidenceError: The log is missing, empty, or has an invalid line.
     """
-    log = motion_log.read(path, _moment, "the robot drove")
+    log = motion_log.read(path, _parse_moment, "drive")
     if any(after.driven_m < before.driven_m for before, after in pairwise(log)):
         raise EvidenceError("its lines are not in the order of time", where=str(path))
     return log
 
 
-def _moment(said: Mapping[str, Any]) -> DriveMoment:
-    """Return what a line says; raises what `motion_log.read` catches."""
-    at_s, driven_m, forward_m_s = (float(said[name]) for name in ("at_s", "driven_m", "forward_m_s"))
-    x_m, y_m, yaw_rad = (float(said[name]) for name in ("x_m", "y_m", "yaw_rad"))
-    phase, ended, utc_ns = said["phase"], said["ended"], int(said.get("utc_ns", 0))
+def _parse_moment(fields: Mapping[str, Any]) -> DriveMoment:
+    """Convert the JSON object of a line; raises one of `JSON_ERRORS` if it is invalid."""
+    at_s, driven_m, forward_m_s = (float(fields[name]) for name in ("at_s", "driven_m", "forward_m_s"))
+    x_m, y_m, yaw_rad = (float(fields[name]) for name in ("x_m", "y_m", "yaw_rad"))
+    phase, ended, utc_ns = fields["phase"], fields["ended"], int(fields.get("utc_ns", 0))
     is_possible = (
         0 <= at_s <= LONGEST_S
         and 0 <= driven_m <= LONGEST_M
@@ -125,15 +129,15 @@ def _moment(said: Mapping[str, Any]) -> DriveMoment:
         and 0 <= utc_ns < LAST_NS
     )
     if not is_possible:
-        raise ValueError(said)
+        raise ValueError(fields)
     yaw_rad = max(-math.pi, min(yaw_rad, math.pi))
     return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, brief(ended), utc_ns)
 
 
 def measure(log: Sequence[DriveMoment] | None) -> Measured:
-    """Return the columns; all are missing where there is no log."""
+    """Return the columns; all are missing if there is no log."""
     if not log:
-        return Measured.nothing(COLUMNS, "the robot did not write down how it drove")
+        return Measured.nothing(COLUMNS, "the robot wrote no log of its drive")
     out = [record for record in log if record.phase in _OUT]
     home = log[-1] if log[-1].ended == HOME else None
     out_m_s = speeds_m_s([record for record in out if record.phase == "out"])
@@ -147,13 +151,13 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
         "drive_back_turned_rad": None if home is None else home.yaw_rad,
         "drive_ended": log[-1].ended or None,
     }
-    return Measured.of(values, "its log does not go so far")
+    return Measured.of(values, "the log ends before that")
 
 
 def speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:
-    """Return the speed in m/s from each moment until half a second later, where it was commanded to drive at both."""
+    """Return the speeds over half a second in m/s, one per line if the robot was commanded to move at both ends."""
     times_s = [record.at_s for record in log]
-    pairs = ((record, bisect_left(times_s, record.at_s + _SPAN_S)) for record in log if record.forward_m_s)
+    pairs = ((record, bisect_left(times_s, record.at_s + _SPEED_INTERVAL_S)) for record in log if record.forward_m_s)
     return [
         (log[later].driven_m - record.driven_m) / (log[later].at_s - record.at_s)
         for record, later in pairs

@@ -1,4 +1,4 @@
-"""Sources of what is known of moving robots, and the checks between them: drives, flights, telemetry, positions."""
+"""Cross-checks between the sources of data on moving robots: drives, flights, telemetry, positions."""
 
 from typing import Final
 
@@ -8,40 +8,40 @@ _WINDOW: Final = "the robot's clock around the attempt"
 
 OF_DRIVE: Final = (
     CrossCheck(
-        "way of a drive",
+        "path of a drive",
         ("drive_*",),
-        "`drive.jsonl`: places, way and speed of each line",
+        "`drive.jsonl`: position, driven distance and speed of each line",
         (
-            "its own line numbers and checksum",
-            "the way that the wheels went, against the places",
-            "the way and speed of the procedure",
+            "its line numbers and checksum",
+            "the driven distance, compared with the positions",
+            "the path and speed of the procedure",
             _WINDOW,
         ),
-        "1 m off the way; half more than the speed, and 0.1 m/s; 25 % and 5 cm a line for odometry that jitters",
+        "1 m from the path; 50 % of the speed plus 0.1 m/s; 25 % plus 5 cm per line for jitter of the odometry",
     ),
     CrossCheck(
         "distance of a drive",
         ("drive_out_m", "drive_farthest_m", "drive_speed_*", "drive_back_*"),
-        "`drive.jsonl`: places",
+        "`drive.jsonl`: positions",
         ("`track.csv`", "positions that a step or a person recorded"),
-        "a tenth for drift of odometry, and 0.5 m, or 10 m if satellites give the other",
+        "10 % for drift of the odometry plus 0.5 m, or plus 10 m if the other source uses satellites",
         CheckOutcome.WITHHELD,
     ),
 )
 
 OF_FLIGHT: Final = (
     CrossCheck(
-        "way of a flight",
+        "path of a flight",
         ("fly_*",),
-        "`fly.jsonl`: place and speed of each line",
+        "`fly.jsonl`: position and speed of each line",
         (
-            "its own line numbers and checksum",
-            "the speeds, against the places",
-            "the way, height and limits of the procedure and the profile",
+            "its line numbers and checksum",
+            "the speeds, compared with the positions",
+            "the path, height and limits of the procedure and the profile",
             "`mavlink.tlog` of the same drone: LOCAL_POSITION_NED",
             _WINDOW,
         ),
-        "5 m, which an autopilot's estimate may be off by; half more than the speed, and 2 m/s",
+        "5 m for errors of an autopilot's position estimate; 50 % of the speed plus 2 m/s",
     ),
 )
 
@@ -51,15 +51,15 @@ OF_TELEMETRY: Final = (
         ("mavlink_*",),
         "`mavlink.tlog`: frames and their times",
         ("`mavlink.json`: frames, checksum, time of the end", "the checksum of each frame", _WINDOW),
-        "1 ms between two times, for a clock that is slewed",
+        "1 ms between two times, because the clock may be slewed",
     ),
 )
 
 OF_POSITIONS: Final = (
     CrossCheck(
-        "planned places in the record",
+        "planned positions in the record",
         ("positions_from",),
-        "`positions.json`: places and starts",
+        "`positions.json`: positions and their start times",
         ("the placement in `trial.yaml`",),
         "1 mm of rounding: the laptop wrote both",
     ),
@@ -68,15 +68,15 @@ OF_POSITIONS: Final = (
         ("*_distance_*", "*_relative_speed_m_s", "*_sender_speed_m_s"),
         "positions that a step or a person recorded",
         ("the placement in `trial.yaml`",),
-        "a tenth of the distance, and 2 m, or 15 m by satellites: places are paced off, and receivers err",
+        "10 % of the distance plus 2 m, or plus 15 m by satellites: distances are paced off, receivers have errors",
         CheckOutcome.WITHHELD,
     ),
     CrossCheck(
         "error of the robots' clocks",
         ("positions_clock_error_s",),
-        "`positions.json`: clocks, asked before and after",
+        "`positions.json`: clocks, read before and after",
         (),
-        "the laptop is the only one that asks",
+        "only the laptop reads them",
         CheckOutcome.UNCHECKED,
     ),
 )

@@ -1,7 +1,7 @@
-"""Decode telemetry logs of MAVLink with pymavlink; run by `tlog` in a process of its own.
+"""Decoder of MAVLink telemetry logs with pymavlink, which `tlog` runs in a sandboxed process.
 
-A log is frames, each behind the time in microseconds since 1970 UTC in 8 bytes, big-endian, as MAVProxy and
-QGroundControl write it. Messages and fields are named as in https://mavlink.io/en/messages/common.html.
+A log is a sequence of frames, each after its time in microseconds since 1970 UTC (8 bytes, big-endian), as MAVProxy
+and QGroundControl write it. Messages and fields are named as in https://mavlink.io/en/messages/common.html.
 """
 
 import math
@@ -21,20 +21,20 @@ from fieldkit.measure.motion import periodic, tlog
 from fieldkit.measure.motion.periodic import StreamMessage
 
 _TIME: Final = struct.Struct(">Q")
-_MOST_US: Final = 2**52
-"""In the year 2112."""
-_FARTHEST_M: Final = 1e9
+_MAX_TIME_US: Final = 2**52
+"""Upper bound of times, in the year 2112."""
+_MAX_DISTANCE_M: Final = 1e9
 _MAGIC_1: Final = 0xFE
 _MAGIC_2: Final = 0xFD
-_SIGNED: Final = 1
+_SIGNED_FLAG: Final = 1
 _SIGNATURE_BYTES: Final = 13
 _UNKNOWN_16: Final = 0xFFFF
 _UNKNOWN_8: Final = 0xFF
 _RADIO: Final = "RADIO_STATUS"
-"""What a telemetry radio tells of its link, in a system of its own."""
+"""Status of a telemetry radio's link; the radio has a separate system ID."""
 
 Source = tuple[int, int]
-"""Ids of a system and its component."""
+"""IDs of a system and its component."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class LoggedFrame:
     """A frame of a log.
 
     Attributes:
-        at_us: When it came, microseconds since 1970 UTC by the recorder's clock.
-        data: The frame.
+        at_us: Time of arrival, microseconds since 1970 UTC by the recorder's clock.
+        data: Bytes of the frame.
     """
 
     at_us: int
@@ -51,18 +51,18 @@ class LoggedFrame:
 
     @property
     def source(self) -> Source:
-        """Who sent it."""
+        """The sender."""
         system = 3 if self.data[0] == _MAGIC_1 else 5
         return self.data[system], self.data[system + 1]
 
     @property
     def number(self) -> int:
-        """Its number among those of its sender, from 0 to 255."""
+        """Sequence number of its sender, from 0 to 255."""
         return self.data[2 if self.data[0] == _MAGIC_1 else 4]
 
     @property
     def kind(self) -> int:
-        """Id of its message."""
+        """ID of its message."""
         return self.data[5] if self.data[0] == _MAGIC_1 else int.from_bytes(self.data[7:10], "little")
 
 
@@ -70,31 +70,31 @@ def frames(data: bytes) -> Iterator[LoggedFrame]:
     """Yield the frames of a log.
 
     Raises:
-        ValueError: It is cut off in a frame, or has something else than a frame where one is to begin.
+        ValueError: The log is truncated within a frame, or a frame has an invalid start or time.
     """
-    at = 0
-    while at < len(data):
-        head = data[at + _TIME.size : at + _TIME.size + 3]
+    offset = 0
+    while offset < len(data):
+        head = data[offset + _TIME.size : offset + _TIME.size + 3]
         if len(head) < 3:
-            raise ValueError(f"it is cut off after {at} bytes")
-        size = 8 + head[1] if head[0] == _MAGIC_1 else 12 + head[1] + _SIGNATURE_BYTES * (head[2] & _SIGNED)
+            raise ValueError(f"it is truncated after {offset} bytes")
+        size = 8 + head[1] if head[0] == _MAGIC_1 else 12 + head[1] + _SIGNATURE_BYTES * (head[2] & _SIGNED_FLAG)
         if head[0] not in {_MAGIC_1, _MAGIC_2}:
-            raise ValueError(f"no frame begins {at + _TIME.size} bytes from its start")
-        frame = data[at + _TIME.size : at + _TIME.size + size]
+            raise ValueError(f"no frame starts at offset {offset + _TIME.size}")
+        frame = data[offset + _TIME.size : offset + _TIME.size + size]
         if len(frame) < size:
-            raise ValueError(f"it is cut off after {at} bytes")
-        (at_us,) = _TIME.unpack_from(data, at)
-        if at_us >= _MOST_US:
-            raise ValueError(f"a time is after 2112, {at} bytes from its start")
+            raise ValueError(f"it is truncated after {offset} bytes")
+        (at_us,) = _TIME.unpack_from(data, offset)
+        if at_us >= _MAX_TIME_US:
+            raise ValueError(f"the time at offset {offset} is after the year 2112")
         yield LoggedFrame(at_us, frame)
-        at += _TIME.size + size
+        offset += _TIME.size + size
 
 
 class TlogDecoder:
-    """Decodes frames of the common dialect.
+    """Decoder of frames of the common dialect.
 
     Attributes:
-        damaged: Frames whose checksum was wrong.
+        damaged: Number of frames with a wrong checksum.
     """
 
     def __init__(self) -> None:
@@ -102,23 +102,23 @@ class TlogDecoder:
         self._link = dialect.MAVLink(None)
 
     def message(self, frame: LoggedFrame) -> Any | None:  # noqa: ANN401 (of a class that the dialect generates)
-        """Return the message in a frame; None where it is damaged, or of another dialect."""
+        """Return the message in a frame; None if the frame is damaged, or of another dialect."""
         try:
-            found = self._link.decode(bytearray(frame.data))
+            decoded = self._link.decode(bytearray(frame.data))
         except dialect.MAVError:
             self.damaged += 1
             return None
-        return None if found.get_type().startswith("UNKNOWN") else found
+        return None if decoded.get_type().startswith("UNKNOWN") else decoded
 
 
 def answer(question: Json) -> Json:
-    """Answer a question about the log at `path`.
+    """Return the answer to a query about the log at `path`.
 
-    With `positions` the places that messages of this name tell, else a summary of the log; both of the autopilot in
-    `system`, 0 for the only one.
+    A query with `positions` returns the positions in messages of this name, and any other query a summary of the log.
+    Both are of the autopilot with the system ID `system`, 0 for the only one.
 
     Raises:
-        ValueError: It is no log, or there is not one autopilot.
+        ValueError: The file is not a log, or does not contain exactly one such autopilot.
     """
     data = Path(question["path"]).read_bytes()
     autopilot = _autopilot(data, question["system"])
@@ -128,43 +128,45 @@ def answer(question: Json) -> Json:
 
 
 def _autopilot(data: bytes, wanted: int) -> Source:
-    """Return whose heartbeats are those of an autopilot.
+    """Return the sender of an autopilot's heartbeats.
 
     Raises:
-        ValueError: Nobody's, or those of several systems.
+        ValueError: There are no such heartbeats, or several senders of them.
     """
-    decoder, found = TlogDecoder(), Counter[Source]()
+    decoder, heartbeats = TlogDecoder(), Counter[Source]()
     for frame in frames(data):
         if frame.kind == dialect.MAVLINK_MSG_ID_HEARTBEAT and wanted in {0, frame.source[0]}:
-            beat = decoder.message(frame)
-            found[frame.source] += beat is not None and beat.autopilot != dialect.MAV_AUTOPILOT_INVALID
-    found += Counter()  # without those of 0
-    if not found:
+            heartbeat = decoder.message(frame)
+            is_autopilot = heartbeat is not None and heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID
+            heartbeats[frame.source] += is_autopilot
+    heartbeats += Counter()  # removes senders with a count of 0
+    if not heartbeats:
         raise ValueError(f"no heartbeat of an autopilot{f' of system {wanted}' if wanted else ''}")
-    if len(found) > 1:
-        raise ValueError(f"autopilots of systems {', '.join(str(system) for system, _ in sorted(found))}: name one")
-    return next(iter(found))
+    if len(heartbeats) > 1:
+        systems = ", ".join(str(system) for system, _ in sorted(heartbeats))
+        raise ValueError(f"autopilots of systems {systems}: name one")
+    return next(iter(heartbeats))
 
 
 def _summary(data: bytes, autopilot: Source, ended_us: int, intervals_us: Mapping[str, int]) -> Json:
     decoder, series = TlogDecoder(), defaultdict[str, list[float]](list)
     kinds, numbers, count, back_us = Counter[str](), list[tuple[int, int]](), 0, 0
-    first_us, last_us, before_us = _MOST_US, 0, 0
+    first_us, last_us, before_us = _MAX_TIME_US, 0, 0
     streams = defaultdict[str, list[StreamMessage]](list)
     for frame in frames(data):
         count += 1
         first_us, last_us = min(first_us, frame.at_us), max(last_us, frame.at_us)
         back_us, before_us = max(back_us, before_us - frame.at_us), frame.at_us
-        is_its, damaged = frame.source == autopilot, decoder.damaged
+        is_autopilot, damaged = frame.source == autopilot, decoder.damaged
         message = decoder.message(frame)
-        if is_its and decoder.damaged == damaged:  # its number, too, if nothing else, whatever dialect it is of
+        if is_autopilot and decoder.damaged == damaged:  # messages of other dialects have a sequence number too
             numbers.append((frame.at_us, frame.number))
-        if message is not None and (is_its or message.get_type() == _RADIO):
+        if message is not None and (is_autopilot or message.get_type() == _RADIO):
             kinds[message.get_type()] += 1
-            if is_its and hasattr(message, "time_boot_ms"):
+            if is_autopilot and hasattr(message, "time_boot_ms"):
                 stream = streams[message.get_type()]
                 stream.append(StreamMessage(frame.at_us, message.time_boot_ms, len(numbers) - 1))
-            for name, value in _told(message):
+            for name, value in _message_values(message):
                 if math.isfinite(value):
                     series[name].append(value)
     return {
@@ -173,14 +175,14 @@ def _summary(data: bytes, autopilot: Source, ended_us: int, intervals_us: Mappin
         "damaged": decoder.damaged,
         "system": autopilot[0],
         "kinds": dict(kinds),
-        "numbers": vars(sequence.counted(numbers, ended_us)),
+        "numbers": vars(sequence.count_messages(numbers, ended_us)),
         "periodic": periodic.lost(numbers, streams, ended_us, intervals_us),
-        "values": dict(_reduced(series)),
+        "values": dict(_column_values(series)),
     }
 
 
-def _told(message: Any) -> Iterator[tuple[str, float]]:  # noqa: ANN401 (as `TlogDecoder.message`)
-    """Yield what a message tells, in SI units and degrees."""
+def _message_values(message: Any) -> Iterator[tuple[str, float]]:  # noqa: ANN401 (as `TlogDecoder.message`)
+    """Yield names and values of a message's fields, in SI units and degrees."""
     match message.get_type():
         case "HEARTBEAT":
             yield "armed", float(bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED))
@@ -202,31 +204,31 @@ def _told(message: Any) -> Iterator[tuple[str, float]]:  # noqa: ANN401 (as `Tlo
             if message.voltage_battery != _UNKNOWN_16:
                 yield "battery_v", message.voltage_battery / 1e3
         case "RADIO_STATUS":
-            yield from (("rssi", one) for one in (message.rssi, message.remrssi) if one != _UNKNOWN_8)
+            yield from (("rssi", rssi) for rssi in (message.rssi, message.remrssi) if rssi != _UNKNOWN_8)
 
 
-def _reduced(series: dict[str, list[float]]) -> Iterator[tuple[str, float]]:
-    """Yield what the values of a series come to, by the columns' names without their prefix."""
+def _column_values(series: dict[str, list[float]]) -> Iterator[tuple[str, float]]:
+    """Yield names of columns, without their prefix, and their values, computed from series of values."""
     for name in ("height_m", "speed_m_s", "climb_m_s"):
-        # Over a link that loses much, one may have come and not the other; both count from home.
+        # Either message can be missing if the link has many losses; both are relative to home.
         series[name] = series[f"{name}/local"] or series[f"{name}/global"]
     for name in ("battery", "battery_v", "north_m", "east_m", "lat_deg", "lon_deg"):
-        what, unit = name.split("_", 1) if "_" in name else (name, "")
+        quantity, unit = name.split("_", 1) if "_" in name else (name, "")
         if values := series[name]:
-            yield f"{what}_begin_{unit}".rstrip("_"), values[0]
-            yield f"{what}_end_{unit}".rstrip("_"), values[-1]
+            yield f"{quantity}_begin_{unit}".rstrip("_"), values[0]
+            yield f"{quantity}_end_{unit}".rstrip("_"), values[-1]
     reductions: dict[str, Callable[[list[float]], float]] = {"min": min, "mean": fmean, "max": max}
-    for name, wanted in _REDUCED.items():
-        what, _, unit = name.partition("_")
-        for one in wanted:
+    for name, wanted in _REDUCTIONS.items():
+        quantity, _, unit = name.partition("_")
+        for statistic in wanted:
             if values := series[name]:
-                yield f"{what}_{one}_{unit}".rstrip("_"), float(reductions[one](values))
-    for name, of in (("armed", series["armed"]), ("drop_rate", series["drop_rate"]), ("rssi_min", series["rssi"])):
-        if of:
-            yield name, (min if name == "rssi_min" else max)(of)
+                yield f"{quantity}_{statistic}_{unit}".rstrip("_"), float(reductions[statistic](values))
+    for name, source in (("armed", "armed"), ("drop_rate", "drop_rate"), ("rssi_min", "rssi")):
+        if values := series[source]:
+            yield name, (min if name == "rssi_min" else max)(values)
 
 
-_REDUCED: Final = {
+_REDUCTIONS: Final = {
     "height_m": ("min", "mean", "max"),
     "speed_m_s": ("mean", "max"),
     "climb_m_s": ("min", "max"),
@@ -236,10 +238,10 @@ _REDUCED: Final = {
 
 
 def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int, int, float, float, float, float]]:
-    """Yield of each message when it came, in us, the autopilot's own time, in ms, the place, and the heading.
+    """Yield time of arrival in us, the autopilot's time in ms, three coordinates and the heading of each message.
 
-    Of `LOCAL_POSITION_NED` metres east, north and up, of `GLOBAL_POSITION_INT` degrees north and east, and metres up.
-    The heading is that of the last ATTITUDE, in radians from east to north.
+    The coordinates of `LOCAL_POSITION_NED` are metres east, north and up; those of `GLOBAL_POSITION_INT` are latitude
+    and longitude in degrees, and metres up. The heading is that of the last ATTITUDE, in radians from east to north.
     """
     decoder, heading_rad, rows = TlogDecoder(), math.nan, []
     for frame in frames(data):
@@ -248,14 +250,14 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
         if message.get_type() == "ATTITUDE":
             heading_rad = math.pi / 2 - message.yaw
         elif message.get_type() == kind == tlog.GLOBAL:
-            place = message.lat / 1e7, message.lon / 1e7, message.alt / 1e3
-            rows.append((frame.at_us, message.time_boot_ms, *place, heading_rad))
+            position = message.lat / 1e7, message.lon / 1e7, message.alt / 1e3
+            rows.append((frame.at_us, message.time_boot_ms, *position, heading_rad))
         elif message.get_type() == kind == tlog.LOCAL:
-            place = message.y, message.x, -message.z
-            rows.append((frame.at_us, message.time_boot_ms, *place, heading_rad))
-    bounds = (90.0, 180.0, _FARTHEST_M) if kind == tlog.GLOBAL else (_FARTHEST_M,) * 3
+            position = message.y, message.x, -message.z
+            rows.append((frame.at_us, message.time_boot_ms, *position, heading_rad))
+    bounds = (90.0, 180.0, _MAX_DISTANCE_M) if kind == tlog.GLOBAL else (_MAX_DISTANCE_M,) * 3
     if not all(abs(value) <= bound for row in rows for value, bound in zip(row[2:5], bounds, strict=True)):  # nor NaN
-        raise ValueError(f"a {kind} tells no place")
+        raise ValueError(f"a {kind} contains no valid position")
     first_rad = next((row[5] for row in rows if math.isfinite(row[5])), 0.0)
     for row in rows:
         yield (*row[:5], row[5] if math.isfinite(row[5]) else first_rad)

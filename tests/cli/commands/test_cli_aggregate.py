@@ -71,7 +71,9 @@ def test_expectations_of_trials_under_one_condition_are_judged_together(
         [" rtt_median_s > 1 us", "tcp"], [" rtt_median_s > 1 us", "udp"], [" tcp rtt_loss < 2 %", "tcp"],
     ]  # fmt: skip
     assert shown.out.count("  holds\n") == 2
-    assert "1: what it expects is left out: there is no figure 'no_such'" in shown.err.replace(f"/{LOSSY.name}", "")
+    assert "1: what it expects is left out: the expected figure 'no_such' does not exist" in shown.err.replace(
+        f"/{LOSSY.name}", ""
+    )
     assert "expected" not in output_of(capsys, str(tmp_path), "--quantity", "datagram_loss")
     assert "expected" not in output_of(capsys, str(tmp_path), "--format", "csv")
 
@@ -98,7 +100,7 @@ def test_different_procedures_of_one_name_cause_a_note(tmp_path: Path, capsys: p
     for name, procedure in (("one", "bbbb"), ("two", "dddd")):  # as for --record 1s and --record 15s
         write(tmp_path / name, repeats(replace(ROW, trial=name, procedure_sha256=procedure, **alike), 3))
     assert main(["aggregate", str(tmp_path), "--quantity", "ip_loss"]) == 0
-    assert capsys.readouterr().err == "note: A procedure is not the same in all its trials\n"
+    assert capsys.readouterr().err == "note: A procedure differs between its trials\n"
     assert main(["aggregate", str(tmp_path / "one"), "--quantity", "ip_loss"]) == 0
     assert capsys.readouterr().err == ""
 
@@ -111,7 +113,7 @@ def test_different_ping_sizes_in_one_condition_cause_a_note(
         write(tmp_path, [*repeats(udp, 3), *tcp_repeats(replace(udp, protocol="tcp", rtt_payload_bytes=502), 3)])
     )
     assert main(["aggregate", table, "--quantity", "rtt_median_s", "--by", "distance"]) == 0
-    assert capsys.readouterr().err.startswith("note: Echo requests of several sizes are in one condition")
+    assert capsys.readouterr().err.startswith("note: A condition has echo requests of different sizes")
     assert main(["aggregate", table, "--quantity", "rtt_median_s"]) == 0
     assert capsys.readouterr().err == ""
 

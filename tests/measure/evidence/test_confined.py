@@ -1,4 +1,4 @@
-"""Bags made to harm: each is small, and fills memory or disk, or never ends, where a library believes it."""
+"""Malicious bags: small files that would fill memory or disk, or never end, if a library trusts them."""
 
 import bz2
 import os
@@ -29,20 +29,20 @@ MIB = 1 << 20
 
 @pytest.fixture
 def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What takes longer than a second is bounded as what takes longer than ten is."""
+    """Reduce the CPU limit from 10 s to 1 s."""
     monkeypatch.setattr(confined, "CPU_S", 1)
 
 
 @pytest.fixture
 def unpacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[confined.Confined]:
-    """Unpacks 1 kB and is ended by the signals of the question, one each time, before it answers."""
+    """Reader that unpacks 1 kB and is killed by the signals of the query, one per try, before it answers."""
     (tmp_path / "unpacks.py").write_text(_UNPACKS, encoding="utf-8")
     (tmp_path / "tmp").mkdir()
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    one = confined.Confined("unpacks")
-    yield one
-    one.end()
+    reader = confined.Confined("unpacks")
+    yield reader
+    reader.end()
 
 
 _UNPACKS = """
@@ -69,14 +69,14 @@ confined.serve(answer)
     ("signals", "why"),
     [
         ([], None),
-        ([signal.SIGKILL], None),  # as the kernel where memory is short
+        ([signal.SIGKILL], None),  # as the kernel if memory is short
         ([signal.SIGTERM], None),
-        ([signal.SIGKILL, signal.SIGKILL], "ended twice by something else"),
-        ([signal.SIGXCPU], "takes longer than the 10 s"),
-        ([signal.SIGSEGV], "ended with exit code -11"),
+        ([signal.SIGKILL, signal.SIGKILL], "another process or the kernel stopped its reader twice"),
+        ([signal.SIGXCPU], "takes longer than 10 s"),
+        ([signal.SIGSEGV], "exited with code -11"),
     ],
 )
-def test_a_reader_that_something_else_ends_is_asked_again_and_leaves_nothing(
+def test_a_reader_that_is_killed_externally_is_restarted_and_leaves_no_files(
     unpacks: confined.Confined, tmp_path: Path, signals: list[signal.Signals], why: str | None
 ) -> None:
     question = {"signals": signals, "ended": str(tmp_path / "ended")}
@@ -88,28 +88,28 @@ def test_a_reader_that_something_else_ends_is_asked_again_and_leaves_nothing(
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
-def test_an_answer_may_be_as_long_as_its_file_is_large(unpacks: confined.Confined) -> None:
+def test_the_limit_of_an_answer_grows_with_the_file(unpacks: confined.Confined) -> None:
     large = confined.ANSWER_BYTES + 1000
     assert len(unpacks.ask({"says": large}, 4096)["said"]) == large
-    with pytest.raises(confined.ConfinedAnswerError, match="it says more than a file of its size may"):
+    with pytest.raises(confined.ConfinedAnswerError, match="its contents exceed the limit for a file of its size"):
         unpacks.ask({"says": large}, 10)
-    assert len(unpacks.ask({"says": 10}, 10)["said"]) == 10, "the next question is answered"
+    assert len(unpacks.ask({"says": 10}, 10)["said"]) == 10, "the next query is answered"
 
 
-def test_a_reader_needs_no_room_for_what_it_does_not_unpack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_needs_no_disk_space_if_it_unpacks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_bag(tmp_path / "scan.bag", {"/scan": 3})
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "full"))
     assert bag.read(path).messages == 3
 
 
-def test_neither_holes_nor_size_lift_the_bounds_above_what_the_machine_has(tmp_path: Path) -> None:
+def test_sparse_and_large_files_have_limits_of_the_machine(tmp_path: Path) -> None:
     path = tmp_path / "scan.bag"
     path.touch()
     os.truncate(path, 1 << 42)
     assert bag.given_bytes(path) < 128 * MIB
-    memory_bytes, _, cpu_s = confined._bounds(1 << 42)
+    memory_bytes, _, cpu_s = confined._limits(1 << 42)
     assert memory_bytes < os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    assert cpu_s == confined.MOST_CPU_S
+    assert cpu_s == confined.MAX_CPU_S
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_neither_holes_nor_size_lift_the_bounds_above_what_the_machine_has(tmp_p
         ("compression_mode: ", "compression_mode: 2026-13-45 #"),
     ],
 )
-def test_no_metadata_raises_anything_but_that_the_bag_cannot_be_read(
+def test_invalid_metadata_only_raises_that_the_bag_cannot_be_read(
     tmp_path: Path, one_second: None, old: str, new: str
 ) -> None:
     path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
@@ -138,7 +138,7 @@ def test_no_metadata_raises_anything_but_that_the_bag_cannot_be_read(
         bag.read(path)
 
 
-def test_metadata_whose_references_multiply_are_refused(tmp_path: Path, one_second: None) -> None:
+def test_metadata_with_exponential_references_are_refused(tmp_path: Path, one_second: None) -> None:
     path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
     merged = "".join(f"k{n}: &k{n} {{<<: [{', '.join([f'*k{n - 1}'] * 9)}]}}\n" for n in range(1, 30))
     (path.parent / bag.METADATA).write_text(f"k0: &k0 {{a: 1}}\n{merged}", encoding="utf-8")
@@ -146,7 +146,7 @@ def test_metadata_whose_references_multiply_are_refused(tmp_path: Path, one_seco
         bag.read(path)
 
 
-def test_a_bag_that_unpacks_to_more_than_the_disk_it_may_take_is_refused(tmp_path: Path) -> None:
+def test_a_bag_that_exceeds_the_disk_limit_is_refused(tmp_path: Path) -> None:
     path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
     (path.parent / "zeros.zstd").write_bytes(zstd.compress(bytes(64 * MIB)))
     metadata = path.parent / bag.METADATA
@@ -158,7 +158,7 @@ def test_a_bag_that_unpacks_to_more_than_the_disk_it_may_take_is_refused(tmp_pat
         bag.read(path)
 
 
-def test_a_chunk_that_unpacks_to_more_memory_than_it_may_take_is_refused(tmp_path: Path) -> None:
+def test_a_chunk_that_exceeds_the_memory_limit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "scan.bag"
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = Writer(path)
@@ -169,7 +169,7 @@ def test_a_chunk_that_unpacks_to_more_memory_than_it_may_take_is_refused(tmp_pat
         connection = writer.add_connection(TOPIC, TYPE, typestore=store)
         writer.write(connection, 1, store.serialize_ros1(message(Stores.ROS1_NOETIC, 0.5), TYPE))
     assert bag.read(path).messages == 1
-    with pytest.raises(EvidenceError, match="more memory than a file of its size may"):
+    with pytest.raises(EvidenceError, match="more memory than the limit for a file of its size"):
         bag.battery_share(path, TOPIC)
     assert bag.battery_share(ros1(Path(tempfile.mkdtemp(dir=tmp_path)), [0.5]), TOPIC) == 0.5
 
@@ -182,7 +182,7 @@ def test_a_database_whose_schema_never_ends_is_refused(tmp_path: Path, one_secon
             " WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
             " SELECT i AS schema_version FROM n WHERE i < 0;"
         )
-    with pytest.raises(EvidenceError, match="takes longer than the 1 s"):
+    with pytest.raises(EvidenceError, match="takes longer than 1 s"):
         bag.read(path)
     assert bag.read(write_ros2_bag(tmp_path / "other", "db3", {"/scan": 5})).messages == 5
 

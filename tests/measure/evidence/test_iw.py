@@ -1,4 +1,4 @@
-"""What iw and the kernel print, read from real outputs of versions 3 to 6 and of eleven drivers."""
+"""Parsing of real outputs of iw versions 3 to 6 with eleven drivers, and of the kernel."""
 
 from dataclasses import replace
 
@@ -25,47 +25,47 @@ STATIONS = {
 }
 
 
-def said(name: str) -> str:
+def output(name: str) -> str:
     return (DATA / "iw" / f"{name}.txt").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", STATIONS)
-def test_a_station_is_read_from_what_each_driver_tells(name: str) -> None:
-    assert iw.stations(said(name)) == (STATIONS[name],)
+def test_a_station_is_parsed_from_the_output_of_each_driver(name: str) -> None:
+    assert iw.stations(output(name)) == (STATIONS[name],)
 
 
-def test_several_stations_follow_each_other() -> None:
-    both = iw.stations(said("station-iwlwifi-6") + said("station-mt7603-6"))
+def test_several_stations_are_parsed() -> None:
+    both = iw.stations(output("station-iwlwifi-6") + output("station-mt7603-6"))
     assert both == (STATIONS["station-iwlwifi-6"], STATIONS["station-mt7603-6"])
-    assert [one.signal_dbm for one in iw.stations(said("stations-ap"))] == [-57.0]
-    other, one = iw.stations(said("stations-hwsim-ap-6"))
-    assert (other.tx_packets, other.tx_failures, one.tx_packets, one.tx_failures) == (13, 7, 6, 0)
+    assert [peer.signal_dbm for peer in iw.stations(output("stations-ap"))] == [-57.0]
+    other, peer = iw.stations(output("stations-hwsim-ap-6"))
+    assert (other.tx_packets, other.tx_failures, peer.tx_packets, peer.tx_failures) == (13, 7, 6, 0)
 
 
-def test_the_access_point_that_a_station_is_joined_to() -> None:
-    assert iw.cell(said("link-rtl8812au")) == StationSample("xx:xx", -45.0, 216.7e6)
-    pi = iw.cell(said("link-station"))
+def test_the_associated_access_point() -> None:
+    assert iw.cell(output("link-rtl8812au")) == StationSample("xx:xx", -45.0, 216.7e6)
+    pi = iw.cell(output("link-station"))
     assert pi == StationSample("f0:99:bf:0e:86:98", -65.0, 65e6, None, 1263, 25943), "a Raspberry Pi's brcmfmac"
-    assert iw.cell(said("link-none")) is iw.cell(said("link-ibss")) is iw.cell(said("no-wifi")) is None
-    assert iw.cell(said("link-hwsim-ibss-6")) is None
+    assert iw.cell(output("link-none")) is iw.cell(output("link-ibss")) is iw.cell(output("no-wifi")) is None
+    assert iw.cell(output("link-hwsim-ibss-6")) is None
     ours = StationSample("02:00:00:00:00:00", -30.0)
-    assert iw.cell(said("link-hwsim-3")) == replace(ours, tx_rate_bit_s=1e6, tx_packets=21, rx_packets=3530)
+    assert iw.cell(output("link-hwsim-3")) == replace(ours, tx_rate_bit_s=1e6, tx_packets=21, rx_packets=3530)
     rates = replace(ours, tx_rate_bit_s=65e6, rx_rate_bit_s=1e6)
-    assert iw.cell(said("link-hwsim-5")) == replace(rates, tx_packets=19, rx_packets=3320)
+    assert iw.cell(output("link-hwsim-5")) == replace(rates, tx_packets=19, rx_packets=3320)
     rates = replace(ours, tx_rate_bit_s=1e6, rx_rate_bit_s=1e6)
-    assert iw.cell(said("link-hwsim-6")) == replace(rates, tx_packets=21, rx_packets=3950)
+    assert iw.cell(output("link-hwsim-6")) == replace(rates, tx_packets=21, rx_packets=3950)
 
 
-def test_the_channel_in_use_is_the_one_that_counts() -> None:
-    assert iw.channel(said("survey-ath9k-4")) == (-95.0, 1704490481 * 10**6, 945335227 * 10**6)
-    assert iw.channel(said("survey-mt7996-6")) == (-84.0, 497753 * 10**6, 104676 * 10**6)
-    assert iw.channel(said("survey-hwsim-6")) == (None, None, None), "it does not say which one is in use"
-    assert iw.channel(said("survey-ath10k-4")) == iw.channel("") == (None, None, None)
+def test_only_the_channel_in_use_is_parsed() -> None:
+    assert iw.channel(output("survey-ath9k-4")) == (-95.0, 1704490481 * 10**6, 945335227 * 10**6)
+    assert iw.channel(output("survey-mt7996-6")) == (-84.0, 497753 * 10**6, 104676 * 10**6)
+    assert iw.channel(output("survey-hwsim-6")) == (None, None, None), "no channel is marked as in use"
+    assert iw.channel(output("survey-ath10k-4")) == iw.channel("") == (None, None, None)
 
 
-def test_the_kernels_own_line_tells_powers_where_they_are_powers() -> None:
+def test_a_line_of_proc_net_wireless_has_powers_if_they_are_valid() -> None:
     def behind(name: str) -> str:
-        return said(name).splitlines()[-1].partition(":")[2].lstrip()
+        return output(name).splitlines()[-1].partition(":")[2].lstrip()
 
     assert iw.wireless(behind("wireless-iwlwifi")) == (-42.0, None)
     assert iw.wireless(behind("wireless-hwsim")) == (-30.0, None)
@@ -74,12 +74,12 @@ def test_the_kernels_own_line_tells_powers_where_they_are_powers() -> None:
 
 
 @given(st.sampled_from([*STATIONS, "link-station", "survey-mt7996-6"]), st.integers(0), st.binary(max_size=20))
-def test_a_changed_output_says_less_or_other_and_raises_nothing(name: str, at: int, with_: bytes) -> None:
-    whole = said(name).encode()
-    at %= len(whole)
-    text = (whole[:at] + with_ + whole[at + len(with_) :]).decode(errors="replace")
-    for one in iw.stations(text):
-        assert one.signal_dbm is None or -1000 < one.signal_dbm < 0
+def test_a_changed_output_raises_no_error(name: str, at: int, with_: bytes) -> None:
+    complete = output(name).encode()
+    at %= len(complete)
+    text = (complete[:at] + with_ + complete[at + len(with_) :]).decode(errors="replace")
+    for peer in iw.stations(text):
+        assert peer.signal_dbm is None or -1000 < peer.signal_dbm < 0
     iw.cell(text)
     iw.channel(text)
     iw.wireless(text)

@@ -1,4 +1,4 @@
-"""Columns of a link: closed forms of a few samples."""
+"""Columns of a link, computed by hand from a few samples."""
 
 from dataclasses import replace
 
@@ -20,17 +20,17 @@ def samples(*stations: StationSample, cell: str | None = None) -> list[LinkSampl
     ]
 
 
-def measured(found: list[LinkSample]) -> dict[str, object]:
-    return {name.removeprefix("sender_"): value for name, value in link.measure(Role.SENDER, found).values.items()}
+def measured(recorded: list[LinkSample]) -> dict[str, object]:
+    return {name.removeprefix("sender_"): value for name, value in link.measure(Role.SENDER, recorded).values.items()}
 
 
-def test_each_column_is_what_it_says() -> None:
-    found = samples(
+def test_each_column_has_the_expected_value() -> None:
+    recorded = samples(
         ONE,
         replace(ONE, signal_dbm=-70.0, tx_rate_bit_s=6.5e6, tx_packets=15, tx_retries=4),
         replace(ONE, signal_dbm=-55.0, tx_packets=30, rx_packets=130, tx_retries=9, tx_failures=2, beacon_losses=1),
     )
-    assert measured(found) == {
+    assert measured(recorded) == {
         "signal_median_dbm": -55.0,
         "signal_min_dbm": -70.0,
         "signal_last_dbm": -55.0,
@@ -47,13 +47,13 @@ def test_each_column_is_what_it_says() -> None:
     }
 
 
-def test_nothing_is_missing_without_a_reason() -> None:
+def test_each_column_has_a_value_or_a_reason() -> None:
     names = {column.name for column in link.COLUMNS}
-    for found in ([], samples(ONE), [LinkSample(0)]):
-        told = [link.measure(role, found) for role in link.ROLES]
-        assert names == {name for one in told for name in (*one.values, *one.missing)}
+    for recorded in ([], samples(ONE), [LinkSample(0)]):
+        measured_link = [link.measure(role, recorded) for role in link.ROLES]
+        assert names == {name for item in measured_link for name in (*item.values, *item.missing)}
     assert "no Wi-Fi, or no iw" in link.measure(Role.SENDER, []).missing["sender_signal_min_dbm"]
-    assert "tx_retries" not in measured(samples(ONE)), "one sample of a counter says nothing of the repeat"
+    assert "tx_retries" not in measured(samples(ONE)), "an increment needs two samples"
 
 
 COUNTS = st.none() | st.integers(0, 10**18)
@@ -66,7 +66,7 @@ POWERS = st.none() | st.floats(-1e6, 1e6)
             LinkSample,
             st.integers(0, 10**9),
             st.builds(StationSample, st.sampled_from("ab"), POWERS, POWERS, POWERS, COUNTS, COUNTS).map(
-                lambda one: (one,)
+                lambda item: (item,)
             ),
             st.none() | st.sampled_from("ab"),
             POWERS,
@@ -76,77 +76,79 @@ POWERS = st.none() | st.floats(-1e6, 1e6)
         max_size=5,
     )
 )
-def test_whatever_a_driver_tells_the_table_can_be_read_again(found: list[LinkSample]) -> None:
-    told = link.measure(Role.SENDER, found)
+def test_any_values_of_a_driver_give_a_table_that_can_be_read(recorded: list[LinkSample]) -> None:
+    measured_link = link.measure(Role.SENDER, recorded)
     for column in link.COLUMNS[: len(link.COLUMNS) // 2]:
-        assert (column.name in told.values) is not (column.name in told.missing)
-        assert not column.problem(cell(told.values.get(column.name)))
+        assert (column.name in measured_link.values) is not (column.name in measured_link.missing)
+        assert not column.problem(cell(measured_link.values.get(column.name)))
 
 
-def test_an_access_points_link_is_that_with_the_most_packets() -> None:
+def test_an_access_points_link_has_the_station_with_the_most_packets() -> None:
     other = replace(ONE, station="bb", signal_dbm=-80.0, tx_packets=0, rx_packets=10**6)
-    found = [
+    recorded = [
         LinkSample(0, (other, ONE)),
         LinkSample(S, (other, replace(ONE, tx_packets=60, signal_dbm=-52.0))),
         LinkSample(2 * S, (replace(other, tx_packets=40), StationSample("", -51.0))),
     ]
-    assert measured(found)["radio_tx_packets"] == 50
-    assert measured(found)["signal_min_dbm"] == -52.0
-    assert measured(found)["signal_last_dbm"] == -51.0, "the kernel's own line, where iw was not called"
-    assert "roams" not in measured(found)
+    assert measured(recorded)["radio_tx_packets"] == 50
+    assert measured(recorded)["signal_min_dbm"] == -52.0
+    assert measured(recorded)["signal_last_dbm"] == -51.0, (
+        "the sample of /proc/net/wireless, because iw was not called"
+    )
+    assert "roams" not in measured(recorded)
 
 
-def test_a_station_that_roams_goes_on_counting() -> None:
+def test_counters_continue_when_a_station_roams() -> None:
     far = replace(ONE, station="bb", tx_packets=4, tx_retries=0)
-    found = [
+    recorded = [
         *samples(ONE, replace(ONE, tx_packets=15), cell="aa"),
         LinkSample(2 * S, (far,), "bb"),
         LinkSample(3 * S, (replace(far, tx_packets=9),)),
         LinkSample(4 * S, (), "aa"),
     ]
-    assert measured(found)["roams"] == 2
-    assert measured(found)["radio_tx_packets"] == 5 + 4 + 5
+    assert measured(recorded)["roams"] == 2
+    assert measured(recorded)["radio_tx_packets"] == 5 + 4 + 5
 
 
-def test_a_link_that_is_made_anew_counts_from_zero_whatever_the_one_before_had() -> None:
-    # As mac80211 told it of a robot that roamed: the next access point had counted more than the one before.
+def test_counters_of_a_new_link_start_from_zero() -> None:
+    # From mac80211 of a robot that roamed: the counter of the next access point is above that of the previous one.
     near = StationSample("02:00:00:00:00:00", -30.0, 1e6, 1e6, 11, 1522, 0, 0, 1)
     far = StationSample("02:00:00:00:03:00", -30.0, 1e6, 1e6, 139, 1775, 0, 0, 0)
-    found = [
+    recorded = [
         LinkSample(0, (near,)),
         LinkSample(S, (replace(near, tx_packets=21, rx_packets=1530),), near.station),
         LinkSample(2 * S, (far,)),
     ]
-    assert measured(found)["roams"] == 1, "seen by its station alone"
-    assert measured(found)["radio_tx_packets"] == 10 + 139
-    assert measured(found)["radio_rx_packets"] == 8 + 1775
-    assert measured(found)["beacon_losses"] == 0
+    assert measured(recorded)["roams"] == 1, "only the station dump shows the new access point"
+    assert measured(recorded)["radio_tx_packets"] == 10 + 139
+    assert measured(recorded)["radio_rx_packets"] == 8 + 1775
+    assert measured(recorded)["beacon_losses"] == 0
 
 
-def test_what_a_link_counted_unseen_before_it_was_made_anew_makes_a_sum_unknown() -> None:
-    # A robot that was deauthenticated 50 s after the last look, as mac80211 told it.
+def test_unsampled_counts_before_a_new_link_make_the_sum_unknown() -> None:
+    # From mac80211 of a robot that was deauthenticated 50 s after the last sample.
     before = StationSample("02:00:00:00:00:00", -30.0, 1e6, 1e6, 33, 10211, 0, 0, 1)
     after = replace(before, tx_packets=158, rx_packets=781, beacon_losses=0)
-    found = [LinkSample(0, (before,), before.station), LinkSample(50 * S, (after,))]
-    told = link.measure(Role.SENDER, found)
-    assert told.values["sender_roams"] == 0
+    recorded = [LinkSample(0, (before,), before.station), LinkSample(50 * S, (after,))]
+    measured_link = link.measure(Role.SENDER, recorded)
+    assert measured_link.values["sender_roams"] == 0
     for name in ("radio_tx_packets", "radio_rx_packets", "tx_retries", "tx_failures", "beacon_losses"):
-        assert "made anew" in told.missing[f"sender_{name}"]
+        assert "established again" in measured_link.missing[f"sender_{name}"]
 
 
-def test_a_station_that_knows_others_besides_is_joined_to_its_access_point() -> None:
+def test_the_link_of_a_station_with_several_peers_is_its_access_point() -> None:
     peer = replace(ONE, station="peer", tx_packets=5000)
-    found = [
+    recorded = [
         LinkSample(0, (ONE, peer)),
         LinkSample(S, (replace(ONE, tx_packets=12),), "aa"),
         LinkSample(2 * S, (replace(ONE, tx_packets=17), peer)),
     ]
-    assert measured(found)["radio_tx_packets"] == 7
-    assert measured(found)["roams"] == 0
+    assert measured(recorded)["radio_tx_packets"] == 7
+    assert measured(recorded)["roams"] == 0
 
 
 @pytest.mark.parametrize("busy", [[0, 500, 100], [900, 1400, 1500]])
-def test_a_channels_counters_may_begin_anew(busy: list[int]) -> None:
+def test_counters_of_a_channel_may_restart(busy: list[int]) -> None:
     active = [1000, 2000, 200] if busy[-1] < busy[1] else [1000, 2000, 2200]
-    found = [LinkSample(at, active_ns=a, busy_ns=b) for at, (a, b) in enumerate(zip(active, busy, strict=True))]
-    assert link.busy_share(found) == pytest.approx(600 / 1200)
+    recorded = [LinkSample(at, active_ns=a, busy_ns=b) for at, (a, b) in enumerate(zip(active, busy, strict=True))]
+    assert link.busy_share(recorded) == pytest.approx(600 / 1200)

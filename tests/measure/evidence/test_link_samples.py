@@ -1,4 +1,4 @@
-"""Samples of links: a robot's own file, whole, cut and compressed, and a testbed's."""
+"""Samples of links: files of robots, complete, truncated and compressed, and files of testbeds."""
 
 import gzip
 from pathlib import Path
@@ -17,15 +17,15 @@ BOOTED_S = 1_700_000_000
 STATE = f"==> clock <==\n100.00 {BOOTED_S + 100}.000000000 100.00\n==> iw station dump <==\n"
 
 
-def said(name: str) -> str:
+def output(name: str) -> str:
     return (DATA / "iw" / f"{name}.txt").read_text(encoding="utf-8")
 
 
 OWN = (
-    f"==> 101.00 link <==\n{said('link-station')}\n==> 101.00 survey <==\n{said('survey-mt7996-6')}"
-    f"==> 101.00 station <==\n{said('station-iwlwifi-6')}"
+    f"==> 101.00 link <==\n{output('link-station')}\n==> 101.00 survey <==\n{output('survey-mt7996-6')}"
+    f"==> 101.00 station <==\n{output('station-iwlwifi-6')}"
     "==> 101.20 wireless <==\n0000   54.  -56.  -256        0      0      0      0      0        0\n"
-    f"==> 101.40 station <==\n{said('station-iwlwifi-6').replace('3441', '3451')}"
+    f"==> 101.40 station <==\n{output('station-iwlwifi-6').replace('3441', '3451')}"
 )
 
 COUNTS = st.none() | st.integers(0, 10**18 - 1)
@@ -46,19 +46,19 @@ SAMPLES = st.lists(
     st.builds(
         LinkSample,
         st.integers(0, 2**62),
-        st.lists(STATIONS, max_size=2, unique_by=lambda one: one.station).map(tuple),
+        st.lists(STATIONS, max_size=2, unique_by=lambda item: item.station).map(tuple),
         st.none(),
         POWERS,
         COUNTS,
         COUNTS,
     ),
     max_size=5,
-    unique_by=lambda one: one.utc_ns,
-).map(lambda found: sorted(found, key=lambda one: one.utc_ns))
+    unique_by=lambda item: item.utc_ns,
+).map(lambda samples_read: sorted(samples_read, key=lambda item: item.utc_ns))
 
 
 @given(samples=st.dictionaries(st.sampled_from(FIXED_ROLES), SAMPLES.filter(bool)))
-def test_what_a_testbed_noted_is_read_as_it_was_written(
+def test_samples_of_a_testbed_are_read_as_written(
     samples: dict[Role, list[LinkSample]], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("links") / link_samples.FILE
@@ -67,60 +67,64 @@ def test_what_a_testbed_noted_is_read_as_it_was_written(
 
 
 @pytest.mark.parametrize("damage", [lambda text: text[:-5], lambda text: text.replace("-5", "x5"), lambda _: ""])
-def test_a_testbeds_file_that_is_not_whole_says_so(tmp_path: Path, damage: "type[str]") -> None:
+def test_an_incomplete_file_of_a_testbed_is_an_error(tmp_path: Path, damage: "type[str]") -> None:
     sample = LinkSample(5, (StationSample("turtlebot-1", -50.0, 6e6, None, 1, 2, 3, 4),), noise_dbm=-95.0)
     path = tmp_path / link_samples.FILE
     path.write_text(damage(link_samples.text({Role.SENDER: [sample]})), encoding="ascii")
-    with pytest.raises(EvidenceError, match="does not say how links were"):
+    with pytest.raises(EvidenceError, match="is not a file of link samples"):
         link_samples.read(path)
 
 
-def test_a_testbeds_file_that_was_cut_says_so_and_an_earlier_one_is_read(tmp_path: Path) -> None:
+def test_a_truncated_file_of_a_testbed_is_an_error_and_an_earlier_format_is_read(tmp_path: Path) -> None:
     samples = {Role.SENDER: [LinkSample(at_ns, noise_dbm=-95.0) for at_ns in range(3)]}
     path, whole = tmp_path / link_samples.FILE, link_samples.text(samples)
     count, *lines = whole.splitlines(keepends=True)
     path.write_text("".join([count, *lines[:-1]]), encoding="ascii")
-    with pytest.raises(EvidenceError, match="has 2 lines of 3: it was cut"):
+    with pytest.raises(EvidenceError, match="has 2 lines of 3: truncated"):
         link_samples.read(path)
     path.write_text("".join(lines), encoding="ascii")
     assert link_samples.read(path) == samples
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_a_robots_own_file_is_read_with_its_clock_and_the_states_around_it(tmp_path: Path, packed: bool) -> None:
-    (tmp_path / "sender-before.txt").write_text(STATE + said("station-iwlwifi-6").replace("3441", "3431"))
+def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, packed: bool) -> None:
+    (tmp_path / "sender-before.txt").write_text(STATE + output("station-iwlwifi-6").replace("3441", "3431"))
     (tmp_path / "sender-after.txt").write_text(
         STATE.replace("100.00 ", "102.00 ").replace(f"{BOOTED_S + 100}", f"{BOOTED_S + 102}")
-        + said("station-iwlwifi-6").replace("3441", "3461")
+        + output("station-iwlwifi-6").replace("3441", "3461")
     )
     if packed:
         (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode()))
     else:
         (tmp_path / "sender-link.txt").write_text(OWN, encoding="utf-8")
-    found = link_samples.read_own(tmp_path, Role.SENDER)
-    at_s = [one.utc_ns / S - BOOTED_S for one in found]
+    samples_read = link_samples.read_own(tmp_path, Role.SENDER)
+    at_s = [item.utc_ns / S - BOOTED_S for item in samples_read]
     assert at_s == pytest.approx([100.0, 101.0, 101.2, 101.4, 102.0], abs=0.02)
-    packets = [[station.tx_packets for station in one.stations if station.station] for one in found]
+    packets = [[station.tx_packets for station in item.stations if station.station] for item in samples_read]
     assert packets == [[3431], [1263, 3441], [], [3451], [3461]]
-    assert found[1].cell == "f0:99:bf:0e:86:98"
-    assert (found[1].noise_dbm, found[1].active_ns, found[1].busy_ns) == (-84.0, 497753 * 10**6, 104676 * 10**6)
-    assert found[2].stations == (StationSample("", -56.0),)
+    assert samples_read[1].cell == "f0:99:bf:0e:86:98"
+    assert (samples_read[1].noise_dbm, samples_read[1].active_ns, samples_read[1].busy_ns) == (
+        -84.0,
+        497753 * 10**6,
+        104676 * 10**6,
+    )
+    assert samples_read[2].stations == (StationSample("", -56.0),)
 
 
 @given(st.integers(0, len(OWN)))
-def test_a_sampler_that_was_cut_leaves_what_it_had_told(at: int) -> None:
+def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
     whole, cut = link_samples.parse(OWN), link_samples.parse(OWN[:at])
-    assert [one.utc_ns for one in cut] == [one.utc_ns for one in whole][: len(cut)]
-    for one, other in zip(cut, whole, strict=False):
-        for station in one.stations:
+    assert [item.utc_ns for item in cut] == [item.utc_ns for item in whole][: len(cut)]
+    for item, other in zip(cut, whole, strict=False):
+        for station in item.stations:
             (same,) = (known for known in other.stations if known.station == station.station)
-            told = {name: value for name, value in vars(station).items() if value is not None}
-            later = {"tx_packets", "rx_packets", "signal_dbm", "tx_rate_bit_s"}  # which link tells first
-            assert all(value == getattr(same, name) for name, value in told.items() if name not in later)
+            present = {name: value for name, value in vars(station).items() if value is not None}
+            later = {"tx_packets", "rx_packets", "signal_dbm", "tx_rate_bit_s"}  # `link` reports these first
+            assert all(value == getattr(same, name) for name, value in present.items() if name not in later)
 
 
-def test_without_a_clock_or_a_file_there_are_none(tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="what its clock showed"):
+def test_without_a_clock_or_a_file_there_are_no_samples(tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match="does not contain the clock"):
         link_samples.read_own(tmp_path, Role.SENDER)
     (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")
     assert link_samples.read_own(tmp_path, Role.SENDER) == ()

@@ -15,7 +15,7 @@ from fieldkit.measure.evidence import bag
 
 
 def write_bag(path: Path, topics: dict[str, int], period_s: float = 0.2) -> Path:
-    """A real bag with that many messages per topic."""
+    """Write a real bag with this number of messages per topic."""
     store = get_typestore(Stores.ROS1_NOETIC)
     message_type = "std_msgs/msg/String"
     message = store.types[message_type](data="x" * 100)
@@ -29,13 +29,13 @@ def write_bag(path: Path, topics: dict[str, int], period_s: float = 0.2) -> Path
 
 
 def test_contents_of_a_bag(tmp_path: Path) -> None:
-    found = bag.read(write_bag(tmp_path / "scan.bag", {"/scan": 74, "/odom": 3}))
-    assert found.messages == 77
-    assert dict(found.messages_by_topic) == {"/scan": 74, "/odom": 3}
-    assert found.duration_s == 14.6
+    contents = bag.read(write_bag(tmp_path / "scan.bag", {"/scan": 74, "/odom": 3}))
+    assert contents.messages == 77
+    assert dict(contents.messages_by_topic) == {"/scan": 74, "/odom": 3}
+    assert contents.duration_s == 14.6
 
 
-def test_a_ros_1_bag_is_read_without_what_those_of_ros_2_take(tmp_path: Path) -> None:
+def test_a_ros_1_bag_is_read_without_the_imports_for_ros_2(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "scan.bag", {"/scan": 2})
     script = f"""
 import sys
@@ -46,7 +46,7 @@ print(bag_reader.answer({{"path": {str(path)!r}}})["messages"], {{"ruamel", "sql
     assert done.stdout == "2 set()\n"
 
 
-def test_a_bag_cut_at_any_byte_is_refused_with_a_remedy(tmp_path: Path) -> None:
+def test_a_bag_truncated_at_any_byte_is_refused_with_a_remedy(tmp_path: Path) -> None:
     whole = write_bag(tmp_path / "scan.bag", {"/scan": 5}).read_bytes()
     cut = tmp_path / "cut.bag"
     for size in range(0, len(whole), 37):
@@ -58,7 +58,7 @@ def test_a_bag_cut_at_any_byte_is_refused_with_a_remedy(tmp_path: Path) -> None:
 
 
 def test_an_unindexed_bag_is_refused(tmp_path: Path) -> None:
-    """What a killed recorder leaves behind: the header still has index position 0."""
+    """A killed recorder leaves a header with index position 0."""
     path = write_bag(tmp_path / "scan.bag", {"/scan": 5})
     data = bytearray(path.read_bytes())
     at = data.index(b"index_pos=") + len(b"index_pos=")
@@ -70,11 +70,11 @@ def test_an_unindexed_bag_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_bag_without_messages_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="holds no message"):
+    with pytest.raises(EvidenceError, match="contains no message"):
         bag.read(write_bag(tmp_path / "scan.bag", {"/scan": 0}))
 
 
-def test_a_name_is_of_the_folder_that_one_is_in_now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_relative_path_uses_the_current_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for count, name in enumerate(("here", "there"), start=1):
         (tmp_path / name).mkdir()
         monkeypatch.chdir(tmp_path / name)
@@ -90,7 +90,7 @@ def test_flipped_bytes_are_refused_or_read_but_raise_nothing_else(tmp_path: Path
     whole = write_bag(tmp_path / "scan.bag", {"/scan": 2}).read_bytes()
     path = tmp_path / "flipped.bag"
     random = np.random.default_rng(5)
-    # The index, where the reader looks, is at the end; the padding of the header is left out.
+    # The index, which is read, is at the end; the padding of the header is omitted.
     ends = [*range(120), *range(4100, len(whole))]
     for at in random.choice(ends, 400, replace=False):
         data = bytearray(whole)
@@ -104,7 +104,7 @@ SUFFIXES = {"db3": rosbag2.StoragePlugin.SQLITE3, "mcap": rosbag2.StoragePlugin.
 
 
 def write_ros2_bag(folder: Path, suffix: str, topics: dict[str, int], period_s: float = 0.2) -> Path:
-    """A real ROS 2 bag with that many messages per topic; its file, named as ROS 2 names it."""
+    """Write a real ROS 2 bag with this number of messages per topic; return its data file, named as by ROS 2."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     message_type = "std_msgs/msg/String"
     message = bytes(store.serialize_cdr(store.types[message_type](data="x" * 100), message_type))
@@ -121,14 +121,14 @@ def write_ros2_bag(folder: Path, suffix: str, topics: dict[str, int], period_s: 
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_ros2_bag_says_the_same_as_a_ros1_bag(suffix: str, tmp_path: Path) -> None:
+def test_a_ros2_bag_has_the_same_contents_as_a_ros1_bag(suffix: str, tmp_path: Path) -> None:
     topics = {"/scan": 74, "/odom": 3}
     ros1 = bag.read(write_bag(tmp_path / "scan.bag", topics))
     assert bag.read(write_ros2_bag(tmp_path / "scan", suffix, topics)) == ros1
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_ros2_bag_whose_recorder_was_killed_says_so(suffix: str, tmp_path: Path) -> None:
+def test_a_ros2_bag_of_a_killed_recorder_is_an_error(suffix: str, tmp_path: Path) -> None:
     path = write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 5})
     (path.parent / "metadata.yaml").unlink()
     with pytest.raises(EvidenceError, match=r"no metadata.yaml: its recorder was killed") as caught:
@@ -138,17 +138,17 @@ def test_a_ros2_bag_whose_recorder_was_killed_says_so(suffix: str, tmp_path: Pat
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_a_ros2_bag_without_messages_is_refused(suffix: str, tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="holds no message") as caught:
+    with pytest.raises(EvidenceError, match="contains no message") as caught:
         bag.read(write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 0}))
     assert "ros2 topic hz" in caught.value.remedy
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_file_with_other_messages_than_its_metadata_counts_is_refused(suffix: str, tmp_path: Path) -> None:
+def test_a_file_that_contradicts_its_metadata_is_refused(suffix: str, tmp_path: Path) -> None:
     path = write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 5})
     other = write_ros2_bag(tmp_path / "other" / "scan", suffix, {"/scan": 4})
     shutil.copy(other, path)
-    with pytest.raises(EvidenceError, match=r"holds 4 messages, metadata.yaml counts 5"):
+    with pytest.raises(EvidenceError, match=r"contains 4 messages, metadata.yaml states 5"):
         bag.read(path)
 
 

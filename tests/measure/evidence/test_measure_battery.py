@@ -1,4 +1,4 @@
-"""The charge that a bag tells, in bags of both generations with one battery message after another."""
+"""Battery charge in ROS 1 and ROS 2 bags with several battery messages."""
 
 import math
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ def ros2(folder: Path, percentages: Sequence[float], storage: StoragePlugin) -> 
         connection = writer.add_connection(TOPIC, TYPE, typestore=store)
         for at, percentage in enumerate(percentages):
             writer.write(connection, at, store.serialize_cdr(message(Stores.ROS2_FOXY, percentage), TYPE))
-    (path,) = (one for one in (folder / "scan").iterdir() if one.suffix in {".db3", ".mcap"})
+    (path,) = (file for file in (folder / "scan").iterdir() if file.suffix in {".db3", ".mcap"})
     return path
 
 
@@ -65,20 +65,20 @@ def ros2(folder: Path, percentages: Sequence[float], storage: StoragePlugin) -> 
     ("percentages", "share"),
     [([0.9, 0.8], 0.8), ([1.09], 1.0), ([55.0], 0.55), ([0.0], 0.0), ([math.nan], None), ([-1.0], None), ([], None)],
 )
-def test_the_last_message_tells_the_charge(tmp_path: Path, percentages: list[float], share: float | None) -> None:
+def test_the_last_message_has_the_charge(tmp_path: Path, percentages: list[float], share: float | None) -> None:
     assert battery_share(ros1(tmp_path, percentages), TOPIC) == pytest.approx(share)
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)
-def test_a_ros_2_bag_tells_it_too(tmp_path: Path, storage: StoragePlugin) -> None:
+def test_the_charge_in_a_ros_2_bag(tmp_path: Path, storage: StoragePlugin) -> None:
     assert battery_share(ros2(tmp_path, [0.9, 0.25], storage), TOPIC) == pytest.approx(0.25)
 
 
-def test_another_topic_tells_nothing(tmp_path: Path) -> None:
+def test_another_topic_has_no_charge(tmp_path: Path) -> None:
     assert battery_share(ros1(tmp_path, [0.5]), "/odom") is None
 
 
-def test_a_bag_that_is_cut_short_is_an_error(tmp_path: Path) -> None:
+def test_a_truncated_bag_is_an_error(tmp_path: Path) -> None:
     path = ros1(tmp_path, [0.5])
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(EvidenceError, match="cannot be read"):

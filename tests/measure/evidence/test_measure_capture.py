@@ -24,16 +24,16 @@ SILENT = CaptureLog(False, None, None, None, None)
         ("../4.9/limited", CaptureLog(True, 100, 114, 0, 0)),
     ],
 )
-def test_what_real_logs_say(name: str, says: CaptureLog) -> None:
+def test_real_logs_are_parsed(name: str, says: CaptureLog) -> None:
     assert tcpdump_log.read(TCPDUMP / f"{name}.log") == says
 
 
-def test_drops_of_the_interface_are_read_where_tcpdump_gives_them() -> None:
+def test_drops_of_the_interface_are_parsed_if_present() -> None:
     log = (TCPDUMP / "normal.log").read_text(encoding="utf-8") + "1 packet dropped by interface\n"
     assert tcpdump_log.parse(log).dropped_by_interface == 1
 
 
-def test_counters_stand_behind_progress_and_an_echoed_interrupt() -> None:
+def test_counters_are_parsed_after_progress_and_an_echoed_interrupt() -> None:
     assert tcpdump_log.parse("^C5 packets captured\n").captured == 5
     assert tcpdump_log.parse("Got 4\r5 packets captured\n").captured == 5
 

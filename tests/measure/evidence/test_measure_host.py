@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from fieldkit.measure.evidence import host
 from fieldkit.measure.evidence.host import Counters
 
-# Verbatim from a Linux 6.1 host, other groups left out.
+# Verbatim from a Linux 6.1 host, without other groups.
 STATE = """\
 ==> /proc/net/dev <==
 Udp: RcvbufErrors
@@ -26,18 +26,18 @@ UdpLite: 0 0 0 0 77 0 0 0 0
 """
 
 
-def test_counters_come_from_their_own_section_and_group() -> None:
-    found = host.parse(STATE.format(reassembly=3, buffer=17))
-    assert (found.udp_buffer_errors, found.reassembly_failures) == (17, 3)
+def test_counters_are_read_from_their_section_and_group() -> None:
+    counters = host.parse(STATE.format(reassembly=3, buffer=17))
+    assert (counters.udp_buffer_errors, counters.reassembly_failures) == (17, 3)
 
 
-def test_the_difference_is_after_less_before() -> None:
+def test_the_difference_is_after_minus_before() -> None:
     before, after = (host.parse(STATE.format(reassembly=n, buffer=10 * n)) for n in (3, 5))
     moved = host.difference(before, after)
     assert (moved.udp_buffer_errors, moved.reassembly_failures) == (20, 2)
 
 
-def test_a_counter_that_is_missing_or_went_back_says_nothing() -> None:
+def test_a_counter_that_is_missing_or_decreased_has_no_difference() -> None:
     assert host.difference(Counters(None, 5), Counters(3, 4)) == Counters(None, None)
 
 
@@ -45,7 +45,7 @@ def test_a_counter_that_is_missing_or_went_back_says_nothing() -> None:
     "text",
     ["", "==> /proc/net/snmp <==\n", "Ip: ReasmFails\nIp: 1\n", "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: x\n"],
 )
-def test_a_state_without_the_counters_says_nothing(text: str) -> None:
+def test_a_state_without_counters_has_none(text: str) -> None:
     assert host.parse(text) == Counters(None, None)
 
 

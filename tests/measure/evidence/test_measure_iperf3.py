@@ -1,4 +1,4 @@
-"""What iperf3 says, by real outputs of four versions on emulated robots (5 % loss, 2 ms, 20 Mbit/s)."""
+"""Parsing of real outputs of four iperf3 versions on emulated robots (5 % loss, 2 ms, 20 Mbit/s)."""
 
 import json
 import math
@@ -18,21 +18,21 @@ VERSIONS = ("3.1.3", "3.7", "3.12", "3.17.1")
 PAYLOAD_BYTES = 1400
 
 
-def said(version: str, test: str, end: str) -> str:
+def output(version: str, test: str, end: str) -> str:
     return (DATA / "iperf3" / version / f"{test}-{end}.json").read_text(encoding="utf-8")
 
 
 def measured(version: str, test: str) -> dict[str, Any]:
     sends, receives = ("server", "client") if test.endswith("reverse") else ("client", "server")
-    sender, receiver = (iperf3.parse(said(version, test, end)) for end in (sends, receives))
-    found = iperf3.measure(Protocol(test[:3]), sender, receiver)
-    assert found.values.keys() | found.missing.keys() == {column.name for column in iperf3.COLUMNS}
-    return dict(found.values)
+    sender, receiver = (iperf3.parse(output(version, test, end)) for end in (sends, receives))
+    result = iperf3.measure(Protocol(test[:3]), sender, receiver)
+    assert result.values.keys() | result.missing.keys() == {column.name for column in iperf3.COLUMNS}
+    return dict(result.values)
 
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("test", ["udp", "udp-reverse"])
-def test_a_udp_test_adds_up_whatever_the_version(version: str, test: str) -> None:
+def test_the_counts_of_a_udp_test_agree_in_all_versions(version: str, test: str) -> None:
     values = measured(version, test)
     assert values["iperf3_received_bytes"] == PAYLOAD_BYTES * values["iperf3_datagrams_received"]
     assert values["iperf3_datagrams_sent"] == pytest.approx(values["iperf3_sent_bytes"] / PAYLOAD_BYTES, rel=0.02)
@@ -46,9 +46,9 @@ def test_a_udp_test_adds_up_whatever_the_version(version: str, test: str) -> Non
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("test", ["udp", "udp-reverse"])
-def test_its_figures_are_those_that_its_summary_of_the_receiver_gives(version: str, test: str) -> None:
-    """Of the client's words, in which alone each version sums up the receiver as it was."""
-    end = json.loads(said(version, test, "client"))["end"]
+def test_its_figures_equal_the_totals_of_the_receiver(version: str, test: str) -> None:
+    """The totals are in the output of the client, where all versions report the receiver correctly."""
+    end = json.loads(output(version, test, "client"))["end"]
     values = measured(version, test)
     lost = values["iperf3_datagrams_sent"] - values["iperf3_datagrams_received"]
     assert lost == end["sum"]["lost_packets"]
@@ -58,61 +58,61 @@ def test_its_figures_are_those_that_its_summary_of_the_receiver_gives(version: s
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_a_tcp_test_of_two_streams_adds_up(version: str) -> None:
+def test_the_counts_of_a_tcp_test_with_two_streams_agree(version: str) -> None:
     values = measured(version, "tcp")
-    end = json.loads(said(version, "tcp", "client"))["end"]
+    end = json.loads(output(version, "tcp", "client"))["end"]
     assert values["iperf3_sent_bytes"] == end["sum_sent"]["bytes"]
     assert values["iperf3_retransmits"] == end["sum_sent"]["retransmits"]
     assert values["iperf3_received_bytes"] == end["sum_received"]["bytes"]
     assert values["iperf3_throughput_bit_s"] == pytest.approx(end["sum_received"]["bits_per_second"], rel=0.15)
     assert not {"iperf3_loss", "iperf3_datagrams_sent", "iperf3_jitter_s"} & values.keys()
-    ports = [iperf3.parse(said(version, "tcp", who)).ports for who in ("client", "server")]
+    ports = [iperf3.parse(output(version, "tcp", end_name)).ports for end_name in ("client", "server")]
     assert len(ports[0]) == 2
     assert ports[0] == tuple((own, other) for other, own in ports[1])
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-def test_a_test_that_did_not_begin_says_why(version: str) -> None:
-    found = iperf3.parse(said(version, "refused", "client"))
-    assert "Connection refused" in found.error
-    assert found.intervals == ()
+def test_a_test_that_did_not_start_has_an_error(version: str) -> None:
+    result = iperf3.parse(output(version, "refused", "client"))
+    assert "Connection refused" in result.error
+    assert result.intervals == ()
 
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
-def test_json_that_was_cut_is_told(version: str, share: float) -> None:
-    text = said(version, "udp", "server")
-    with pytest.raises(EvidenceError, match="or was cut"):
+def test_truncated_json_is_an_error(version: str, share: float) -> None:
+    text = output(version, "udp", "server")
+    with pytest.raises(EvidenceError, match="or was truncated"):
         iperf3.parse(text[: int(share * len(text))])
 
 
-def test_words_before_the_json_and_numbers_that_are_none_are_survived() -> None:
-    text = said("3.1.3", "udp", "server").replace('"lost_percent":\t', '"lost_percent":\t-nan, "x":\t', 1)
+def test_text_before_the_json_and_invalid_numbers_are_accepted() -> None:
+    text = output("3.1.3", "udp", "server").replace('"lost_percent":\t', '"lost_percent":\t-nan, "x":\t', 1)
     assert "nan" in text
     with pytest.raises(ValueError, match="Expecting value"):
         json.loads(text)
-    assert iperf3.parse(text) == iperf3.parse(said("3.1.3", "udp", "server"))
+    assert iperf3.parse(text) == iperf3.parse(output("3.1.3", "udp", "server"))
     assert iperf3.parse(f"warning: old\n{text}").intervals
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", '"start"', "12", '{"a": 1}', 5000 * '{"start":', 5000 * "["])
-def test_other_json_is_none_of_iperf3(text: str) -> None:
+def test_other_json_is_an_error(text: str) -> None:
     with pytest.raises(EvidenceError):
         iperf3.parse(text)
 
 
-def test_what_is_omitted_counts_nowhere() -> None:
-    data = json.loads(said("3.12", "udp", "server"))
+def test_omitted_intervals_are_not_counted() -> None:
+    data = json.loads(output("3.12", "udp", "server"))
     whole = iperf3.parse(json.dumps(data)).intervals
     data["intervals"][0]["sum"]["omitted"] = True
     assert iperf3.parse(json.dumps(data)).intervals == whole[1:]
 
 
-def test_without_both_ends_only_what_is_at_hand_is_told() -> None:
-    sender = iperf3.parse(said("3.12", "udp", "client"))
-    found = iperf3.measure(Protocol.UDP, sender, None)
-    assert set(found.values) == {"iperf3_sent_bytes"}
-    assert found.missing["iperf3_throughput_bit_s"]
+def test_with_one_end_only_its_columns_have_values() -> None:
+    sender = iperf3.parse(output("3.12", "udp", "client"))
+    result = iperf3.measure(Protocol.UDP, sender, None)
+    assert set(result.values) == {"iperf3_sent_bytes"}
+    assert result.missing["iperf3_throughput_bit_s"]
 
 
 VALUES = st.recursive(
@@ -137,21 +137,21 @@ VALUES = st.recursive(
     connected=VALUES,
     protocol=st.sampled_from(Protocol),
 )
-def test_whatever_it_says_no_column_gets_an_impossible_value(
+def test_no_output_gives_an_impossible_value(
     intervals: object, end: object, connected: object, protocol: Protocol
 ) -> None:
     text = json.dumps({"start": {"connected": connected}, "intervals": intervals, "end": end})
     test = iperf3.parse(text)
-    found = iperf3.measure(protocol, test, test)
+    result = iperf3.measure(protocol, test, test)
     for column in iperf3.COLUMNS:
-        if column.name in found.values:
-            value = found.values[column.name]
+        if column.name in result.values:
+            value = result.values[column.name]
             assert isinstance(value, int | float)
             assert math.isfinite(value)
             assert column.problem(str(value)) is None or value > 1e15, (column.name, value)
 
 
-def test_a_file_that_no_test_leaves_is_not_read(tmp_path: Path) -> None:
+def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
     path = tmp_path / "sender-iperf3.json"
     with path.open("wb") as file:
         file.truncate((16 << 20) + 1)

@@ -1,4 +1,4 @@
-"""How late a lab says that packets were: written, read, damaged, and as columns."""
+"""Lateness files of a testbed: written, read, damaged, and as columns."""
 
 from collections import Counter
 from pathlib import Path
@@ -24,14 +24,14 @@ def file(folder: Path, content: bytes) -> Path:
     return path
 
 
-def test_columns_say_what_the_file_does(tmp_path: Path) -> None:
+def test_columns_of_a_file(tmp_path: Path) -> None:
     file(tmp_path, TEXT.encode())
     assert measure(tmp_path, None) == Measures(
         emulator_late_p99_s=6e-6, emulator_late_max_s=8e-6, emulator_too_late=2
     )
 
 
-def test_without_packets_none_was_late(tmp_path: Path) -> None:
+def test_without_packets_there_is_no_lateness(tmp_path: Path) -> None:
     file(tmp_path, b"bound 5000\n")
     assert measure(tmp_path, None) == Measures(emulator_too_late=0)
 
@@ -49,7 +49,7 @@ def test_without_packets_none_was_late(tmp_path: Path) -> None:
         TEXT.replace(" 98", " " + "9" * 19),
     ],
 )
-def test_anything_else_is_refused_and_gives_no_number(tmp_path: Path, other: str) -> None:
+def test_other_contents_are_refused(tmp_path: Path, other: str) -> None:
     path = file(tmp_path, other.encode())
     with pytest.raises(EvidenceError):
         lateness.read(path)
@@ -57,7 +57,7 @@ def test_anything_else_is_refused_and_gives_no_number(tmp_path: Path, other: str
 
 
 @given(before=COUNTS, came=COUNTS, bound_ns=st.integers(1, 10**12))
-def test_what_came_between_two_looks_is_written_and_read(
+def test_packets_between_two_readings_are_written_and_read(
     tmp_path_factory: pytest.TempPathFactory, before: dict[int, int], came: dict[int, int], bound_ns: int
 ) -> None:
     first = Lateness(bound_ns=bound_ns, packets=before)
@@ -67,7 +67,7 @@ def test_what_came_between_two_looks_is_written_and_read(
 
 
 @given(st.integers(0, 10**6))
-def test_a_file_that_was_cut_anywhere_does_not_look_whole(tmp_path_factory: pytest.TempPathFactory, at: int) -> None:
+def test_a_truncated_file_is_refused(tmp_path_factory: pytest.TempPathFactory, at: int) -> None:
     came = Lateness(bound_ns=5000, packets={1000: 98, 6000: 1, 8000: 1})
     whole = lateness.text(Lateness(bound_ns=5000, packets={}), came).encode()
     path = file(tmp_path_factory.getbasetemp(), whole[: at % len(whole)])
@@ -78,12 +78,12 @@ def test_a_file_that_was_cut_anywhere_does_not_look_whole(tmp_path_factory: pyte
 @given(st.lists(st.integers(0, 10**10), min_size=1, max_size=300), st.floats(0.01, 1.0))
 def test_quantiles_are_those_of_the_packets_rounded_up(late_ns: list[int], share: float) -> None:
     counted = Lateness(bound_ns=1, packets=Counter(map(rounded_up, late_ns)))
-    found = lateness.quantile_ns(counted, share)
+    quantile_ns = lateness.quantile_ns(counted, share)
     true_ns = int(np.quantile(late_ns, share, method="inverted_cdf"))
-    assert found is not None
-    assert true_ns < found <= true_ns * 9 / 8 + 1
+    assert quantile_ns is not None
+    assert true_ns < quantile_ns <= true_ns * 9 / 8 + 1
 
 
 @given(st.sets(st.integers(0, 2**40), min_size=1))
-def test_lateness_of_any_size_takes_few_values(late_ns: set[int]) -> None:
-    assert len({rounded_up(one) for one in late_ns}) <= 8 * 41
+def test_rounded_lateness_has_few_values(late_ns: set[int]) -> None:
+    assert len({rounded_up(value) for value in late_ns}) <= 8 * 41

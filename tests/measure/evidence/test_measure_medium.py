@@ -1,4 +1,4 @@
-"""What a lab says that packets were delayed by: read, damaged, and as columns."""
+"""Files of packet delays of a testbed: read, damaged, and as columns."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ PARTS = DelayParts(packets=4, processing_ns=8, transmission_ns=1200, propagation
 TEXT = "packets 4\nprocessing_ns 8\ntransmission_ns 1200\npropagation_ns 400\nqueuing_ns 20000000000\n"
 UDP = transfer(Protocol.UDP)
 NOBODY_KNOWS = Measures(paper_window_bytes=8192)
-"""What is said of a transfer that left no evidence."""
+"""Missing columns of a transfer without evidence."""
 NOTHING = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_ns=0, queuing_ns=0)
 
 
@@ -30,7 +30,7 @@ def file(folder: Path, content: bytes) -> Path:
     return path
 
 
-def test_what_a_transfer_notes_is_read(tmp_path: Path) -> None:
+def test_delays_of_a_transfer_are_read(tmp_path: Path) -> None:
     assert medium.read(file(tmp_path, TEXT.encode())) == PARTS
 
 
@@ -50,7 +50,7 @@ def test_what_a_transfer_notes_is_read(tmp_path: Path) -> None:
         "\n".join(reversed(TEXT.splitlines())) + "\n",
     ],
 )
-def test_anything_else_is_refused_and_gives_no_number(tmp_path: Path, other: str) -> None:
+def test_other_contents_are_refused(tmp_path: Path, other: str) -> None:
     path = file(tmp_path, other.encode())
     with pytest.raises(EvidenceError):
         medium.read(path)
@@ -80,12 +80,12 @@ def test_columns_are_means_per_packet_in_seconds(tmp_path: Path) -> None:
     )
 
 
-def test_where_nothing_arrived_there_is_no_delay(tmp_path: Path) -> None:
+def test_without_delivered_packets_there_is_no_delay(tmp_path: Path) -> None:
     file(tmp_path, text(NOTHING).encode())
     assert measure(tmp_path, UDP) == Measures(**NOBODY_KNOWS, delay_packets=0)
 
 
-def test_nobody_knows_where_there_is_no_file(tmp_path: Path) -> None:
+def test_without_a_file_the_columns_are_missing(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
         medium.read(tmp_path / "medium.txt")
     assert measure(tmp_path, UDP) == NOBODY_KNOWS

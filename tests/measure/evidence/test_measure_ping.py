@@ -17,14 +17,14 @@ from tests.helpers.paths import DATA
 OUTPUTS = DATA / "ping" / "20221126"
 
 
-def test_every_real_output_is_understood_to_the_last_line() -> None:
+def test_all_lines_of_real_outputs_are_parsed() -> None:
     outputs = sorted(set(OUTPUTS.iterdir()) - {OUTPUTS / "about.txt"})
     assert len(outputs) >= 10
     for path in outputs:
         assert ping.read(path).unknown == (), path.name
 
 
-def test_other_pings_are_understood_but_for_what_is_none_of_theirs() -> None:
+def test_outputs_of_other_pings_are_parsed_except_foreign_lines() -> None:
     unknown = {
         path.name: ping.read(path).unknown
         for path in (*(DATA / "busybox/1.35.0").glob("ping-[!a]*.txt"), *(DATA / "ping/20101006").iterdir())
@@ -37,18 +37,18 @@ def test_other_pings_are_understood_but_for_what_is_none_of_theirs() -> None:
 
 
 def test_busyboxs_duplicate_counts_once_and_its_times_are_milliseconds() -> None:
-    found = ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt")
-    assert [(reply.seq, reply.duplicate) for reply in found.replies] == [
+    result = ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt")
+    assert [(reply.seq, reply.duplicate) for reply in result.replies] == [
         (0, False),
         (0, True),
         (2, False),
         (3, False),
     ]
-    assert found.rtt_s == (0.170 / 1e3, 0.157 / 1e3, 0.149 / 1e3)
-    assert {reply.at_utc_ns for reply in found.replies} == {None}
+    assert result.rtt_s == (0.170 / 1e3, 0.157 / 1e3, 0.149 / 1e3)
+    assert {reply.at_utc_ns for reply in result.replies} == {None}
 
 
-def test_an_interrupted_busybox_run_has_gaps_from_0() -> None:
+def test_gaps_of_an_interrupted_busybox_run_start_from_0() -> None:
     lines = ["PING 10.9.9.9 (10.9.9.9): 56 data bytes", "64 bytes from 10.9.9.9: seq=2 ttl=64 time=0.157 ms"]
     assert ping.parse("\n".join(lines)).gaps == (0, 1)
 
@@ -96,44 +96,44 @@ def test_a_normal_run() -> None:
         ("unreachable", 56, 0, (4, 0), (1, 2, 3, 4)),
     ],
 )
-def test_what_real_runs_say(
+def test_real_outputs(
     name: str, payload_bytes: int, answers: int, summary: tuple[int | None, int | None], gaps: tuple[int, ...]
 ) -> None:
-    found = ping.read(OUTPUTS / f"{name}.txt")
-    assert found.payload_bytes == payload_bytes
-    assert len(found.answers) == answers
-    assert ((found.transmitted, found.received), found.gaps) == (summary, gaps)
+    result = ping.read(OUTPUTS / f"{name}.txt")
+    assert result.payload_bytes == payload_bytes
+    assert len(result.answers) == answers
+    assert ((result.transmitted, result.received), result.gaps) == (summary, gaps)
 
 
 def test_a_duplicate_is_kept_and_marked_but_does_not_count() -> None:
-    found = ping.read(OUTPUTS / "duplicates.txt")
-    assert [(reply.seq, reply.duplicate) for reply in found.replies] == [(1, False), (1, True), (3, False)]
-    assert found.rtt_s == (0.159 / 1e3, 0.052 / 1e3)
+    result = ping.read(OUTPUTS / "duplicates.txt")
+    assert [(reply.seq, reply.duplicate) for reply in result.replies] == [(1, False), (1, True), (3, False)]
+    assert result.rtt_s == (0.159 / 1e3, 0.052 / 1e3)
 
 
-def test_errors_keep_who_says_what_of_which_request() -> None:
+def test_errors_have_source_text_and_request() -> None:
     problems = ping.read(OUTPUTS / "unreachable.txt").problems
     assert problems[0] == Problem(1, "10.9.0.1", "Destination Host Unreachable", 1_795_206_651_395_678_000)
     assert [problem.seq for problem in problems] == [1, 2, 3, 4]
 
 
 def test_a_payload_too_short_for_a_time_stamp_gives_no_round_trip_times() -> None:
-    found = ping.read(OUTPUTS / "payload-8.txt")
-    assert len(found.answers) == 2
-    assert found.rtt_s == ()
+    result = ping.read(OUTPUTS / "payload-8.txt")
+    assert len(result.answers) == 2
+    assert result.rtt_s == ()
 
 
-def test_a_reply_with_a_wrong_checksum_is_none() -> None:
-    found = ping.parse("64 bytes from 10.9.0.2: icmp_seq=1 ttl=64 time=1.00 ms (BAD CHECKSUM!)\n")
-    assert (len(found.replies), len(found.answers), found.gaps) == (1, 0, ())
+def test_a_reply_with_a_wrong_checksum_does_not_count() -> None:
+    result = ping.parse("64 bytes from 10.9.0.2: icmp_seq=1 ttl=64 time=1.00 ms (BAD CHECKSUM!)\n")
+    assert (len(result.replies), len(result.answers), result.gaps) == (1, 0, ())
 
 
-def test_gaps_of_an_interrupted_run_end_at_the_last_number_seen() -> None:
+def test_gaps_of_an_interrupted_run_end_at_the_last_known_number() -> None:
     lines = [f"64 bytes from 10.9.0.2: icmp_seq={seq} ttl=64 time=1.00 ms" for seq in (2, 5)]
     assert ping.parse("\n".join(lines)).gaps == (1, 3, 4)
 
 
-def test_a_line_cut_short_is_kept_as_it_stands() -> None:
+def test_a_truncated_line_is_kept_unchanged() -> None:
     cut = "[1795206656.303416] 64 bytes from 127.0.0.1: icmp_seq=4 tt"
     assert ping.parse(cut).unknown == (cut,)
 
@@ -154,13 +154,13 @@ words = st.sampled_from([
 @given(st.one_of(st.text(), st.lists(words, max_size=30).map("".join)))
 @example("64 bytes from 1: icmp_seq=" + "9" * 5000)
 def test_garbage_never_raises(text: str) -> None:
-    found = ping.parse(text)
-    assert len(found.answers) <= len(found.replies) <= text.count("\n") + 1
-    assert len(found.gaps) <= 65536
+    result = ping.parse(text)
+    assert len(result.answers) <= len(result.replies) <= text.count("\n") + 1
+    assert len(result.gaps) <= 65536
 
 
 @given(st.binary())
-def test_bytes_that_are_no_text_never_raise(data: bytes) -> None:
+def test_bytes_that_are_not_text_never_raise(data: bytes) -> None:
     ping.parse(data.decode(errors="replace"))
 
 
@@ -170,12 +170,12 @@ def test_garbage_between_the_lines_of_a_real_run_changes_nothing(data: st.DataOb
     lines = real.split("\n")
     noise = st.text(st.characters(exclude_characters="\n"), min_size=1).filter(lambda line: "e" not in line)
     at = data.draw(st.integers(0, len(lines)))
-    found = ping.parse("\n".join([*lines[:at], data.draw(noise), *lines[at:]]))
-    assert (found.replies, found.transmitted) == (ping.parse(real).replies, 3)
+    result = ping.parse("\n".join([*lines[:at], data.draw(noise), *lines[at:]]))
+    assert (result.replies, result.transmitted) == (ping.parse(real).replies, 3)
 
 
 def answered(*seqs_ms: tuple[int, int], sent: int) -> Ping:
-    """A ping of `sent` requests, answered at so many ms."""
+    """A ping of `sent` requests with the times of its answers in ms."""
     replies = tuple(Reply(seq, 1e-3, at_ms * 1_000_000, duplicate=False, damaged=False) for seq, at_ms in seqs_ms)
     return Ping(56, replies, (), sent, len(replies), ())
 
@@ -189,7 +189,7 @@ def test_the_longest_gap_has_the_number_of_lost_requests() -> None:
     assert ping.longest_gap(answered((1, 100), (2, 200), (3, 350), sent=3), INTERVAL_S) == AnswerGap(
         0.15, 0, is_open=False
     )
-    # A late answer makes no gap of its own: the answer to 2 came after that to 3.
+    # A late answer creates no additional gap: the answer to 2 arrived after that to 3.
     assert ping.longest_gap(answered((1, 100), (3, 300), (2, 310), sent=3), INTERVAL_S) == AnswerGap(
         0.21, 0, is_open=False
     )
@@ -208,11 +208,9 @@ def test_the_longest_gap_has_the_number_of_lost_requests() -> None:
         pytest.param(answered((65535, 100), (0, 200), (1, 300), sent=65537), 6553.4, 65534, True, id="16 bits"),
     ],
 )
-def test_a_gap_that_the_ping_began_or_ended_in_is_a_lower_bound(
-    ping_: Ping, lasted_s: float, lost: int, is_open: bool
-) -> None:
-    found = ping.longest_gap(ping_, INTERVAL_S)
-    assert found == AnswerGap(pytest.approx(lasted_s), lost, is_open)  # type: ignore[arg-type]
+def test_a_gap_at_the_start_or_end_is_a_lower_bound(ping_: Ping, lasted_s: float, lost: int, is_open: bool) -> None:
+    result = ping.longest_gap(ping_, INTERVAL_S)
+    assert result == AnswerGap(pytest.approx(lasted_s), lost, is_open)  # type: ignore[arg-type]
     values = ping.measure_gap(ping_, INTERVAL_S).values
     suffix = ("_at_least_s", "_lost_at_least") if is_open else ("_s", "_lost")
     assert values == {
@@ -220,7 +218,7 @@ def test_a_gap_that_the_ping_began_or_ended_in_is_a_lower_bound(
     }
 
 
-def test_the_numbers_of_a_long_ping_begin_again() -> None:
+def test_the_numbers_of_a_long_ping_wrap() -> None:
     answers = [(seq & 0xFFFF, 100 * seq) for seq in range(1, 70_001) if not 66_000 < seq <= 66_010]
     assert ping.longest_gap(answered(*answers, sent=70_000), INTERVAL_S) == AnswerGap(1.1, 10, is_open=False)
 
@@ -234,8 +232,8 @@ def test_without_time_stamps_there_is_no_gap() -> None:
 
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
 def test_every_ping_has_either_a_gap_or_its_lower_bound(came: list[bool]) -> None:
-    found = answered(*((seq, 100 * seq) for seq, arrived in enumerate(came, 1) if arrived), sent=len(came))
-    measured = ping.measure_gap(found, INTERVAL_S)
+    result = answered(*((seq, 100 * seq) for seq, arrived in enumerate(came, 1) if arrived), sent=len(came))
+    measured = ping.measure_gap(result, INTERVAL_S)
     longest_run = max((len(list(run)) for arrived, run in groupby(came) if not arrived), default=0)
     if len(came) == 1 and came[0]:
         assert not measured.values

@@ -1,4 +1,4 @@
-"""A robot's clock before and after an attempt: a step is seen, slewing and a busy robot are none."""
+"""Clock steps between two readings are detected; slewing and slow readings are not steps."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from fieldkit.measure.evidence import clock
 from fieldkit.measure.evidence.clock import Clock
 
-# As dash with coreutils, and busybox with its adjtimex, wrote them on one machine.
+# Output of dash with coreutils, and of busybox with its adjtimex, on the same machine.
 COREUTILS = """\
 12610.46 1795320483.268162430 12610.47
 12610.47 1795320483.269366458 12610.47
@@ -27,49 +27,49 @@ BUSYBOX = """\
 """
 
 
-def known(text: str) -> Clock:
-    found = clock.parse(text.splitlines())
-    assert found is not None
-    return found
+def parsed(text: str) -> Clock:
+    bounds = clock.parse(text.splitlines())
+    assert bounds is not None
+    return bounds
 
 
-def test_two_moments_of_one_boot_agree_to_a_few_milliseconds() -> None:
-    before, after = known(COREUTILS), known(BUSYBOX)
+def test_two_readings_of_one_boot_agree_to_a_few_milliseconds() -> None:
+    before, after = parsed(COREUTILS), parsed(BUSYBOX)
     step = clock.moved(before, after)
     assert abs(step.step_s) <= step.error_s < 0.01
     assert clock.problem(before, after) is None
 
 
-def test_the_step_of_a_tampered_reading_is_told_with_its_sign_and_error() -> None:
+def test_the_step_of_a_changed_reading_has_sign_and_uncertainty() -> None:
     back = BUSYBOX.replace(" 1795320484.0", " 1795320483.9").replace(" 1795320484.1", " 1795320484.0")
-    problem = clock.problem(known(COREUTILS), known(back))
+    problem = clock.problem(parsed(COREUTILS), parsed(back))
     assert problem is not None
-    assert problem.startswith("its clock was set back by 0.099 s (known to 0.006 s)")
+    assert problem.startswith("its clock was set back by 0.099 s (uncertainty 0.006 s)")
     hour = BUSYBOX.replace(" 1795320484", " 1795324084")
-    assert (clock.problem(known(COREUTILS), known(hour)) or "").startswith("its clock was set ahead by 3600.0")
+    assert (clock.problem(parsed(COREUTILS), parsed(hour)) or "").startswith("its clock was set ahead by 3600.0")
 
 
-def test_whole_seconds_show_a_step_of_more_than_they_hide() -> None:
+def test_a_clock_in_whole_seconds_shows_larger_steps() -> None:
     seconds = "100.00 1000 100.01\n100.01 1000 100.02\n"
-    assert clock.problem(known(seconds), known("200.00 1100 200.01\n")) is None
-    assert "set ahead by 3.005 s (known to 1.015 s)" in (
-        clock.problem(known(seconds), known("200.00 1103 200.01\n")) or ""
+    assert clock.problem(parsed(seconds), parsed("200.00 1100 200.01\n")) is None
+    assert "set ahead by 3.005 s (uncertainty 1.015 s)" in (
+        clock.problem(parsed(seconds), parsed("200.00 1103 200.01\n")) or ""
     )
 
 
-def test_a_clock_set_while_it_was_read_is_told() -> None:
-    torn = known("1.00 50.000000000 1.00\n1.00 70.000000000 1.00\n")
-    assert clock.problem(torn, known(BUSYBOX)) == "its clock was set while it was read"
+def test_a_clock_set_during_the_reading_is_detected() -> None:
+    torn = parsed("1.00 50.000000000 1.00\n1.00 70.000000000 1.00\n")
+    assert clock.problem(torn, parsed(BUSYBOX)) == "its clock was set while it was read"
 
 
 @pytest.mark.parametrize("text", ["", "1.0 2 3.0", "nothing", "1.00 1795320484.07 1.00", "12611.27  12611.27"])
-def test_lines_that_tell_no_time_are_none(text: str) -> None:
+def test_lines_without_a_time_are_ignored(text: str) -> None:
     assert clock.parse(text.splitlines()) is None
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot whose clock and time since boot go at one rate, however it is slewed."""
+    """A robot whose clock and time since boot have the same rate, even if slewed."""
 
     ahead_ns: int
     rate: float
@@ -78,7 +78,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class Moment:
-    """When a robot is asked, and how long it takes over each reading."""
+    """Time of a reading, and durations of its parts."""
 
     true_ns: int
     pauses_ns: list[int]
@@ -90,9 +90,9 @@ class Moment:
             true_ns += pause_ns + 100_000
             up = [f"{now // 10**9}.{now % 10**9 // 10**7:02d}" for now in (at[0], at[2])]
             wall_ns = at[1] + robot.ahead_ns + step_ns
-            told = f"{wall_ns // 10**9}.{wall_ns % 10**9:09d}" if robot.nano else str(wall_ns // 10**9)
-            lines.append(f"{up[0]} {told} {up[1]}")
-        return known("\n".join(lines))
+            wall_text = f"{wall_ns // 10**9}.{wall_ns % 10**9:09d}" if robot.nano else str(wall_ns // 10**9)
+            lines.append(f"{up[0]} {wall_text} {up[1]}")
+        return parsed("\n".join(lines))
 
 
 ROBOTS = st.builds(Robot, st.integers(10**18, 2 * 10**18), st.floats(0.9, 1.1), st.booleans())
@@ -105,9 +105,9 @@ def test_neither_slewing_nor_a_busy_robot_is_a_step(robot: Robot, before: Moment
 
 
 @given(ROBOTS, MOMENTS, MOMENTS, st.integers(-(10**13), 10**13))
-def test_a_step_is_told_within_its_error(robot: Robot, before: Moment, after: Moment, step_ns: int) -> None:
-    one, other = before.of(robot), after.of(robot, step_ns)
-    step = clock.moved(one, other)
+def test_a_step_is_within_its_uncertainty(robot: Robot, before: Moment, after: Moment, step_ns: int) -> None:
+    first, second = before.of(robot), after.of(robot, step_ns)
+    step = clock.moved(first, second)
     assert abs(step.step_s - step_ns / 1e9) <= step.error_s + 1e-6
     if abs(step_ns) / 1e9 > 2 * step.error_s + 1e-6:
-        assert clock.problem(one, other) is not None
+        assert clock.problem(first, second) is not None

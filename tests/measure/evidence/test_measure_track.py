@@ -1,4 +1,4 @@
-"""Where robots were: written, read, damaged, and as columns."""
+"""Tracks of robots: written, read, damaged, and as columns."""
 
 from dataclasses import astuple
 from pathlib import Path
@@ -37,24 +37,24 @@ VECTORS = st.tuples(COORDINATES, COORDINATES, COORDINATES)
 TRACKS = st.lists(
     st.builds(Whereabouts, st.integers(0, 2**63), st.sampled_from(FIXED_ROLES), st.none() | VECTORS, VECTORS),
     max_size=20,
-).map(lambda track: sorted(track, key=lambda one: one.utc_ns))
+).map(lambda track: sorted(track, key=lambda entry: entry.utc_ns))
 
 
-def test_distance_and_speed_are_means_over_the_time_and_nowhere_is_no_distance() -> None:
-    found = track.apart(AWAY, *ENDS, 10 * S + S // 2, 14 * S)
-    # 0.5 s at 5 m, 2 s at 8 m, then 1 s nowhere.
-    assert found is not None
-    assert astuple(found) == pytest.approx((5.0, 5.0, 18.5 / 2.5, 8.0, 11.5 / 2.5, 11.5 / 2.5))
+def test_distance_and_speed_are_means_over_times_with_positions() -> None:
+    separation = track.apart(AWAY, *ENDS, 10 * S + S // 2, 14 * S)
+    # 0.5 s at 5 m, 2 s at 8 m, then 1 s without a position.
+    assert separation is not None
+    assert astuple(separation) == pytest.approx((5.0, 5.0, 18.5 / 2.5, 8.0, 11.5 / 2.5, 11.5 / 2.5))
 
 
-def test_a_moment_has_a_distance_and_the_time_before_all_has_none() -> None:
+def test_a_single_time_has_a_distance_and_times_before_the_track_have_none() -> None:
     assert track.apart(AWAY, *ENDS, 11 * S, 11 * S) == track.Apart(8.0, 8.0, 8.0, 8.0, 5.0, 5.0)
     assert track.apart(AWAY, *ENDS, 13 * S, 14 * S) is None
     assert track.apart(AWAY, *ENDS, 1 * S, 14 * S) is None
     assert track.apart((HERE,), *ENDS, 6 * S, 14 * S) is None
 
 
-def test_distances_change_with_either_and_not_with_the_relay() -> None:
+def test_distances_change_with_both_robots_but_not_with_the_relay() -> None:
     assert list(track.distances_m(AWAY, *ENDS)) == [
         (5 * S, 5.0),
         (10 * S, 5.0),
@@ -64,22 +64,22 @@ def test_distances_change_with_either_and_not_with_the_relay() -> None:
     ]
 
 
-def test_columns_say_how_far_apart_the_robots_were_while_ping_had_replies(tmp_path: Path) -> None:
+def test_columns_have_the_distance_between_first_and_last_reply(tmp_path: Path) -> None:
     (tmp_path / "ping.txt").write_text(PING, encoding="ascii")
     without = measure(tmp_path, None)
     assert without.rtt_distance_start_m is None
     (tmp_path / "track.csv").write_text(track.text(AWAY), encoding="ascii")
-    said = measure(tmp_path, None)
-    assert (said.rtt_distance_start_m, said.rtt_distance_min_m, said.rtt_distance_max_m) == (5.0, 5.0, 8.0)
-    assert said.rtt_distance_mean_m == pytest.approx((0.5 * 5 + 1.5 * 8) / 2)
-    assert said.rtt_sender_speed_m_s == pytest.approx((0.5 * 3 + 1.5 * 5) / 2)
-    assert said.transfer_distance_start_m is None
+    row = measure(tmp_path, None)
+    assert (row.rtt_distance_start_m, row.rtt_distance_min_m, row.rtt_distance_max_m) == (5.0, 5.0, 8.0)
+    assert row.rtt_distance_mean_m == pytest.approx((0.5 * 5 + 1.5 * 8) / 2)
+    assert row.rtt_sender_speed_m_s == pytest.approx((0.5 * 3 + 1.5 * 5) / 2)
+    assert row.transfer_distance_start_m is None
     (tmp_path / "track.csv").write_text(track.text(AWAY)[:-1], encoding="ascii")
     assert measure(tmp_path, None) == without
 
 
 @given(TRACKS)
-def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, whereabouts: list[Whereabouts]) -> None:
+def test_a_written_track_is_read(tmp_path_factory: pytest.TempPathFactory, whereabouts: list[Whereabouts]) -> None:
     path = tmp_path_factory.getbasetemp() / "track.csv"
     path.write_text(track.text(whereabouts), encoding="ascii")
     assert track.read(path) == tuple(whereabouts)
@@ -102,11 +102,11 @@ TEXT = track.text(AWAY)
         TEXT.replace(f"{15 * S}", f"{9 * S}"),
     ],
 )
-def test_anything_else_is_refused(tmp_path: Path, other: str) -> None:
+def test_other_contents_are_refused(tmp_path: Path, other: str) -> None:
     assert other != TEXT
     path = tmp_path / "track.csv"
     path.write_text(other, encoding="ascii")
-    with pytest.raises(EvidenceError, match="where robots were"):
+    with pytest.raises(EvidenceError, match="is not a track of robots"):
         track.read(path)
 
 

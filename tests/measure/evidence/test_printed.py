@@ -1,4 +1,4 @@
-"""Values in what any program printed."""
+"""Values in the output of programs."""
 
 import json
 import math
@@ -20,7 +20,7 @@ def column(unit: str) -> Column:
 
 
 @pytest.fixture
-def said(tmp_path: Path) -> Path:
+def output(tmp_path: Path) -> Path:
     path = tmp_path / "run.txt"
     path.write_text(STATUS, encoding="utf-8")
     return path
@@ -36,16 +36,16 @@ def said(tmp_path: Path) -> Path:
         ("mode", "text", "auto"),
     ],
 )
-def test_a_path_finds_a_value_of_its_column(said: Path, where: str, unit: str, value: object) -> None:
-    found = printed.value(column(unit), printed.at_path(said, where))
-    assert (found, type(found)) == (value, type(value))
+def test_a_path_finds_a_value_of_its_column(output: Path, where: str, unit: str, value: object) -> None:
+    extracted = printed.value(column(unit), printed.at_path(output, where))
+    assert (extracted, type(extracted)) == (value, type(value))
 
 
 @pytest.mark.parametrize(
-    ("found", "unit", "why"),
+    ("extracted", "unit", "reason"),
     [
-        (None, "V", "there is none"),
-        ("", "text", "there is none"),
+        (None, "V", "the value is missing"),
+        ("", "text", "the value is missing"),
         ({"a": 1}, "text", "not one value"),
         ([], "V", "not one value"),
         (True, "V", "another type"),
@@ -58,69 +58,69 @@ def test_a_path_finds_a_value_of_its_column(said: Path, where: str, unit: str, v
         (10**400, "count", "not from"),
     ],
 )
-def test_what_is_no_value_of_a_column_is_told(found: object, unit: str, why: str) -> None:
-    with pytest.raises(EvidenceError, match=why):
-        printed.value(column(unit), found)
+def test_an_invalid_value_is_an_error(extracted: object, unit: str, reason: str) -> None:
+    with pytest.raises(EvidenceError, match=reason):
+        printed.value(column(unit), extracted)
 
 
-def test_a_number_as_text_is_one_and_words_are_made_harmless() -> None:
+def test_a_number_as_text_is_accepted_and_words_are_sanitized() -> None:
     assert printed.value(column("V"), " 12.5\n") == 12.5
     assert printed.value(column("count"), "1e3") == 1000
     assert printed.value(column("text"), "a\x1b[31m\u202eb\r\nc" + 500 * "d").startswith("a?[31m?b c")  # type: ignore[union-attr]
     assert len(str(printed.value(column("text"), 500 * "d"))) == 200
 
 
-def test_an_expression_finds_what_its_group_matches_first(said: Path) -> None:
-    said.write_text("signal: -61 dBm\nnoise: -95 dBm\nsignal: -70 dBm\n", encoding="utf-8")
-    assert printed.by_expression(said, r"^signal: (-?[0-9]+)") == "-61"
-    assert printed.by_expression(said, r"(?s).*signal: (-?[0-9]+)") == "-70"
-    assert printed.by_expression(said, r"^rate: ([0-9]+)") is None
+def test_an_expression_finds_what_its_group_matches_first(output: Path) -> None:
+    output.write_text("signal: -61 dBm\nnoise: -95 dBm\nsignal: -70 dBm\n", encoding="utf-8")
+    assert printed.by_expression(output, r"^signal: (-?[0-9]+)") == "-61"
+    assert printed.by_expression(output, r"(?s).*signal: (-?[0-9]+)") == "-70"
+    assert printed.by_expression(output, r"^rate: ([0-9]+)") is None
 
 
-def test_an_expression_that_backtracks_elsewhere_takes_no_time(said: Path) -> None:
-    """Python's own `re` takes 2^100000 steps for this one; the run would never end."""
-    said.write_text(100_000 * "a" + "b", encoding="utf-8")
-    assert printed.by_expression(said, r"^(a+)+$") is None
+def test_an_expression_with_catastrophic_backtracking_is_fast(output: Path) -> None:
+    """Python's `re` needs 2^100000 steps for this expression."""
+    output.write_text(100_000 * "a" + "b", encoding="utf-8")
+    assert printed.by_expression(output, r"^(a+)+$") is None
 
 
 @pytest.mark.parametrize("text", ["(", "a", "(a)(b)", r"(a)\1", "(?=a)(b)"])
-def test_what_is_no_expression_with_one_group_is_refused(text: str) -> None:
+def test_an_expression_without_exactly_one_group_is_refused(text: str) -> None:
     assert printed.problem_of_expression(text)
 
 
 @pytest.mark.parametrize("text", ["", "a[", "a b", "f("])
-def test_what_is_no_path_is_refused(text: str) -> None:
+def test_an_invalid_path_is_refused(text: str) -> None:
     assert printed.problem_of_path(text)
 
 
-def test_what_suits_is_not_refused() -> None:
+def test_valid_paths_and_expressions_are_accepted() -> None:
     assert printed.problem_of_path("a.b[0].c") is None
     assert printed.problem_of_expression("(?:a|b)([0-9.]+)") is None
 
 
 @pytest.mark.parametrize("text", ["", "{", "{'a': 1}", 100_000 * "[", STATUS[:-9], "NaN x", "9" * 5000])
-def test_what_is_no_json_is_told(said: Path, text: str) -> None:
-    said.write_text(text, encoding="utf-8")
-    with pytest.raises(EvidenceError, match="is no JSON"):
-        printed.at_path(said, "a")
+def test_invalid_json_is_an_error(output: Path, text: str) -> None:
+    output.write_text(text, encoding="utf-8")
+    with pytest.raises(EvidenceError, match="is not JSON"):
+        printed.at_path(output, "a")
 
 
-def test_a_mark_of_byte_order_before_json_is_none_of_it_and_the_last_of_two_values_counts(said: Path) -> None:
-    said.write_text('\ufeff{"a": 3, "a": 4}', encoding="utf-8")
-    assert printed.at_path(said, "a") == 4
+def test_a_byte_order_mark_is_ignored_and_the_last_of_duplicate_keys_is_used(output: Path) -> None:
+    output.write_text('\ufeff{"a": 3, "a": 4}', encoding="utf-8")
+    assert printed.at_path(output, "a") == 4
 
 
-def test_a_path_that_does_not_suit_the_data_is_told(said: Path) -> None:
+def test_a_path_that_does_not_match_the_data_is_an_error(output: Path) -> None:
     with pytest.raises(EvidenceError, match="sum"):
-        printed.at_path(said, "sum(mode)")
+        printed.at_path(output, "sum(mode)")
 
 
-def test_output_that_was_cut_is_none(said: Path) -> None:
-    said.write_bytes(b" " * (printed.MOST_BYTES - 1))
-    assert len(printed.text(said)) == printed.MOST_BYTES - 1
-    said.write_bytes(b" " * printed.MOST_BYTES)
+def test_truncated_output_is_an_error(output: Path) -> None:
+    output.write_bytes(b" " * (printed.MOST_BYTES - 1))
+    assert len(printed.text(output)) == printed.MOST_BYTES - 1
+    output.write_bytes(b" " * printed.MOST_BYTES)
     with pytest.raises(EvidenceError, match="more than 1 MiB"):
-        printed.text(said)
+        printed.text(output)
 
 
 @given(
@@ -130,10 +130,10 @@ def test_output_that_was_cut_is_none(said: Path) -> None:
     ),
     st.sampled_from(["V", "count", "B", "ns", "s", "share", "bool", "text"]),
 )
-def test_whatever_is_found_becomes_a_cell_that_can_be_read_again_or_is_told(found: object, unit: str) -> None:
-    found = json.loads(json.dumps(found))
+def test_any_extracted_value_is_a_valid_cell_or_an_error(extracted: object, unit: str) -> None:
+    extracted = json.loads(json.dumps(extracted))
     try:
-        value = printed.value(column(unit), found)
+        value = printed.value(column(unit), extracted)
     except EvidenceError:
         return
     assert isinstance(value, column(unit).type)
@@ -144,9 +144,9 @@ def test_whatever_is_found_becomes_a_cell_that_can_be_read_again_or_is_told(foun
 
 
 @pytest.mark.parametrize("where", ["(" * 5000 + "a" + ")" * 5000, "a" + "|a" * 5000])
-def test_a_path_that_is_nested_too_deeply_is_told(said: Path, where: str) -> None:
-    if why := printed.problem_of_path(where):
-        assert why == "it is nested too deeply"
+def test_a_path_that_is_nested_too_deeply_is_an_error(output: Path, where: str) -> None:
+    if reason := printed.problem_of_path(where):
+        assert reason == "it is nested too deeply"
         return
     with pytest.raises(EvidenceError, match="nested too deeply"):
-        printed.at_path(said, where)
+        printed.at_path(output, where)

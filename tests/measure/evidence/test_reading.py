@@ -1,4 +1,4 @@
-"""Evidence files are told by size and content without being held in memory, and nothing else is waited for."""
+"""Comparison of evidence files by size and content, and refusal of special files."""
 
 import os
 from pathlib import Path
@@ -20,24 +20,24 @@ def test_files_are_compared_byte_for_byte(tmp_path: Path, at: int, change: bytes
     assert reading.same(tmp_path, "a", "b") is same
 
 
-def test_a_file_that_another_begins_with_is_not_the_same(tmp_path: Path) -> None:
+def test_a_prefix_of_a_file_is_not_equal_to_it(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"x" * 10)
     (tmp_path / "b").write_bytes(b"x" * 11)
     assert not reading.same(tmp_path, "a", "b")
 
 
 @pytest.mark.parametrize("read", [reading.size, reading.text, reading.mapped])
-def test_a_pipe_and_a_device_are_no_files(tmp_path: Path, read: object) -> None:
+def test_a_pipe_and_a_device_are_refused(tmp_path: Path, read: object) -> None:
     assert callable(read)
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "device").symlink_to("/dev/zero")
     for name in ("pipe", "device"):
-        with pytest.raises(EvidenceError, match="is no file"):
+        with pytest.raises(EvidenceError, match="is not a regular file"):
             read(tmp_path / name)
 
 
-def test_text_that_is_longer_than_any_tool_says_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "MOST_TEXT_BYTES", 1 << 20)
+def test_text_above_the_size_limit_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, "MAX_TEXT_BYTES", 1 << 20)
     (tmp_path / "ping.txt").write_bytes(b"\n" * (1 << 20))
     assert len(reading.text(tmp_path / "ping.txt")) == 1 << 20
     (tmp_path / "ping.txt").write_bytes(b"\n" * ((1 << 20) + 1))

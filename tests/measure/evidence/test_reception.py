@@ -1,4 +1,4 @@
-"""How soon and how steadily a recorder heard its topics: bags of known times beside logs of real recorders' words."""
+"""Discovery time and gaps of recorded topics, from bags with known times and logs of real recorders."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,11 +32,11 @@ def log(begun_ns: Mapping[str, int]) -> str:
     return "".join(lines) + RECORDING
 
 
-def write(folder: Path, said: str, came_ns: Mapping[str, Sequence[int]]) -> None:
+def write(folder: Path, text: str, came_ns: Mapping[str, Sequence[int]]) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
     kind = "std_msgs/msg/String"
     data = bytes(store.serialize_ros1(store.types[kind](data="x"), kind))
-    (folder / "log").write_text(said, encoding="utf-8")
+    (folder / "log").write_text(text, encoding="utf-8")
     (folder / "scan.bag").unlink(missing_ok=True)
     with Writer(folder / "scan.bag") as writer:
         for topic, stamps_ns in came_ns.items():
@@ -49,7 +49,7 @@ def read(folder: Path, *topics: str, duration_s: float = 5.0) -> RecordingRecept
     return reception.read(folder, "log", "scan.bag", topics, duration_s)
 
 
-def test_discovery_is_of_the_slowest_topic_and_a_gap_of_any(tmp_path: Path) -> None:
+def test_discovery_is_of_the_slowest_topic_and_the_gap_of_any_topic(tmp_path: Path) -> None:
     came = {"/scan": [BEGAN_NS + at for at in (S // 2, S, 5 * S)], "/imu": [BEGAN_NS + S + S // 4, BEGAN_NS + 4 * S]}
     write(tmp_path, log({"/imu": BEGAN_NS, "/scan": BEGAN_NS}), came)
     assert read(tmp_path, "/scan") == RecordingReception(discovered=True, messages=3, discovery_s=0.5, gap_s=4.0)
@@ -58,7 +58,7 @@ def test_discovery_is_of_the_slowest_topic_and_a_gap_of_any(tmp_path: Path) -> N
     )
 
 
-def test_each_topic_counts_from_its_own_subscribing(tmp_path: Path) -> None:
+def test_the_discovery_of_a_topic_starts_with_its_subscription(tmp_path: Path) -> None:
     write(tmp_path, log({"/a": BEGAN_NS, "/b": BEGAN_NS + S}), {"/a": [BEGAN_NS + S], "/b": [BEGAN_NS + S + 1000]})
     assert read(tmp_path, "/b", duration_s=1.0).discovery_s == pytest.approx(1e-6)
     assert read(tmp_path, "/a", "/b").discovery_s == 1.0
@@ -85,31 +85,31 @@ def test_a_topic_of_a_longer_name_is_another_one(tmp_path: Path) -> None:
     assert read(tmp_path, "/scan").discovery_s == 1.0
 
 
-def test_a_recorder_that_never_reached_its_master_discovered_nothing_and_left_no_bag(tmp_path: Path) -> None:
+def test_a_recorder_without_its_master_discovers_nothing(tmp_path: Path) -> None:
     (tmp_path / "log").write_text("", encoding="utf-8")
     measured = reception.measure(read(tmp_path, "/scan"))
     assert dict(measured.values) == {"bag_discovered": False}
     assert measured.missing.keys() == {"bag_discovery_s", "bag_messages", "bag_gap_s"}
 
 
-def test_of_a_recorder_that_lost_its_power_nobody_knows_what_it_heard(tmp_path: Path) -> None:
+def test_the_reception_without_a_complete_bag_is_unknown(tmp_path: Path) -> None:
     (tmp_path / "log").write_text(log({"/scan": BEGAN_NS}), encoding="utf-8")
     assert not reception.measure(read(tmp_path, "/scan")).values
 
 
-def test_a_recorder_of_other_words_tells_what_came_but_not_how_soon(tmp_path: Path) -> None:
+def test_an_unknown_log_gives_messages_but_no_discovery_time(tmp_path: Path) -> None:
     write(tmp_path, "recording\n", {"/scan": [BEGAN_NS]})
     assert read(tmp_path, "/scan") == RecordingReception(discovered=True, messages=1, discovery_s=None, gap_s=None)
 
 
-def test_without_a_log_nobody_knows(tmp_path: Path) -> None:
+def test_without_a_log_the_columns_are_missing(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
         read(tmp_path, "/scan")
     assert not reception.measure(None).values
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_ros2_recorder_looks_for_all_its_topics_at_once(suffix: str, tmp_path: Path) -> None:
+def test_a_ros2_recorder_starts_discovery_of_all_topics_together(suffix: str, tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = "std_msgs/msg/String"
     data = bytes(store.serialize_cdr(store.types[kind](data="x"), kind))
@@ -118,16 +118,16 @@ def test_a_ros2_recorder_looks_for_all_its_topics_at_once(suffix: str, tmp_path:
         for at_ns in (BEGAN_NS + 2 * S, BEGAN_NS + 3 * S):
             writer.write(connection, at_ns, data)
     (tmp_path / "log").write_text(ROS2.format(s=BEGAN_NS // S, ns=BEGAN_NS % S), encoding="utf-8")
-    found = reception.read(tmp_path, "log", f"scan/scan.{suffix}", ["/scan"], 4.0)
-    assert found == RecordingReception(discovered=True, messages=2, discovery_s=2.0, gap_s=1.0)
+    result = reception.read(tmp_path, "log", f"scan/scan.{suffix}", ["/scan"], 4.0)
+    assert result == RecordingReception(discovered=True, messages=2, discovery_s=2.0, gap_s=1.0)
 
 
 @given(st.integers(0, 9_999_999_999 * S), st.sampled_from([ROSBAG, ROS2]))
-def test_no_digit_of_a_stamp_is_lost(at_ns: int, said: str) -> None:
-    text = said.format(s=at_ns // S, ns=at_ns % S, topic="/scan")
+def test_no_digit_of_a_stamp_is_lost(at_ns: int, text: str) -> None:
+    text = text.format(s=at_ns // S, ns=at_ns % S, topic="/scan")
     assert reception.subscribed_ns(text, ["/scan", "/imu"])["/scan"] == at_ns
 
 
 @given(st.text())
-def test_whatever_a_recorder_says_is_read_or_passed_over(said: str) -> None:
-    assert reception.subscribed_ns(said, ["/scan"]).keys() <= {"/scan"}
+def test_any_log_is_parsed_or_ignored(text: str) -> None:
+    assert reception.subscribed_ns(text, ["/scan"]).keys() <= {"/scan"}

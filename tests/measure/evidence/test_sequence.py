@@ -1,4 +1,4 @@
-"""Losses counted by numbers that come again, against messages of which it is known which were lost."""
+"""Losses from wrapping sequence numbers, compared with known losses."""
 
 from itertools import pairwise
 
@@ -6,57 +6,57 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.measure.evidence.sequence import NUMBERS, counted
+from fieldkit.measure.evidence.sequence import NUMBERS, count_messages
 
 PERIOD_US = 20_000
 
 
 def sent(count: int, first: int = 0) -> list[tuple[int, int]]:
-    """Messages of 50 Hz, each with its time and its number."""
+    """Messages at 50 Hz, each with its time and its number."""
     return [(number * PERIOD_US, (first + number) % NUMBERS) for number in range(count)]
 
 
 @given(st.lists(st.booleans(), min_size=10, max_size=900), st.integers(0, 255))
-def test_what_is_missing_between_the_first_and_the_last_is_counted(lost: list[bool], first: int) -> None:
-    came = [one for one, gone in zip(sent(len(lost), first), lost, strict=True) if not gone]
+def test_losses_between_the_first_and_the_last_message_are_counted(lost: list[bool], first: int) -> None:
+    arrivals = [message for message, is_lost in zip(sent(len(lost), first), lost, strict=True) if not is_lost]
     # A second without a message, where the number alone does not tell it, has tests of its own.
-    if not came or max((after[0] - before[0] for before, after in pairwise(came)), default=0) > 1e6:
+    if not arrivals or max((after[0] - before[0] for before, after in pairwise(arrivals)), default=0) > 1e6:
         return
-    found = counted(came, 0)
-    missing = came[-1][0] // PERIOD_US - came[0][0] // PERIOD_US + 1 - len(came)
-    assert (found.messages, found.lost, found.repeated) == (len(came), missing, 0)
+    counts = count_messages(arrivals, 0)
+    missing = arrivals[-1][0] // PERIOD_US - arrivals[0][0] // PERIOD_US + 1 - len(arrivals)
+    assert (counts.messages, counts.lost, counts.repeated) == (len(arrivals), missing, 0)
 
 
 @given(st.permutations(range(4)), st.integers(0, 255))
-def test_who_comes_late_is_not_lost_and_who_comes_twice_counts_once(order: list[int], first: int) -> None:
-    came = sent(40, first)
-    came[10:14] = [came[10 + index] for index in order]
-    came.insert(20, came[19])
-    found = counted([(at * PERIOD_US, number) for at, (_, number) in enumerate(came)], 0)
-    assert (found.messages, found.lost, found.repeated) == (40, 0, 1)
+def test_late_messages_are_not_lost_and_duplicates_count_once(order: list[int], first: int) -> None:
+    arrivals = sent(40, first)
+    arrivals[10:14] = [arrivals[10 + index] for index in order]
+    arrivals.insert(20, arrivals[19])
+    counts = count_messages([(at * PERIOD_US, number) for at, (_, number) in enumerate(arrivals)], 0)
+    assert (counts.messages, counts.lost, counts.repeated) == (40, 0, 1)
 
 
-@pytest.mark.parametrize("gone", [40, 51, 200, 255, 256, 257, 700, 3000])
-def test_a_silence_of_more_than_256_messages_is_counted_by_the_rate(gone: int) -> None:
-    came = sent(5000)
-    found = counted(came[:500] + came[500 + gone :], 0)
-    assert (found.messages, found.lost) == (5000 - gone, gone)
-    assert found.silence_s == pytest.approx((gone + 1) / 50)
-    assert found.rate_hz == pytest.approx(50)
+@pytest.mark.parametrize("n_lost", [40, 51, 200, 255, 256, 257, 700, 3000])
+def test_losses_in_a_silence_of_more_than_256_messages_are_computed_from_the_rate(n_lost: int) -> None:
+    arrivals = sent(5000)
+    counts = count_messages(arrivals[:500] + arrivals[500 + n_lost :], 0)
+    assert (counts.messages, counts.lost) == (5000 - n_lost, n_lost)
+    assert counts.silence_s == pytest.approx((n_lost + 1) / 50)
+    assert counts.rate_hz == pytest.approx(50)
 
 
-def test_what_was_sent_after_the_last_that_came_is_counted_by_the_rate() -> None:
-    found = counted(sent(500), 500 * PERIOD_US + 10_000_000)
-    assert found.lost == pytest.approx(500, abs=1)
-    assert found.silence_s == pytest.approx(10, abs=0.03)
+def test_losses_after_the_last_message_are_computed_from_the_rate() -> None:
+    counts = count_messages(sent(500), 500 * PERIOD_US + 10_000_000)
+    assert counts.lost == pytest.approx(500, abs=1)
+    assert counts.silence_s == pytest.approx(10, abs=0.03)
 
 
-def test_nothing_came() -> None:
-    assert (counted([], 9).messages, counted([(1, 2)], 0).messages) == (0, 1)
+def test_no_messages() -> None:
+    assert (count_messages([], 9).messages, count_messages([(1, 2)], 0).messages) == (0, 1)
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**52), st.integers(0, 255)), max_size=40), st.integers(0, 2**62))
-def test_whatever_the_numbers_are_it_ends(came: list[tuple[int, int]], ended_us: int) -> None:
-    found = counted(came, ended_us)
-    assert 0 <= found.messages <= len(came)
-    assert found.lost >= 0
+def test_any_numbers_give_valid_counts(arrivals: list[tuple[int, int]], ended_us: int) -> None:
+    counts = count_messages(arrivals, ended_us)
+    assert 0 <= counts.messages <= len(arrivals)
+    assert counts.lost >= 0

@@ -1,4 +1,4 @@
-"""What a robot wrote down of its drive: its columns on a way that is known, and lines that no driver writes."""
+"""Columns of the log of a drive on a known path, and invalid lines."""
 
 import json
 import math
@@ -30,7 +30,7 @@ LINE = {
 
 
 def drive(out_s: float, speed_m_s: float, back_m_s: float) -> Iterator[dict[str, Any]]:
-    """Lines of a robot that waits for 2 s, goes straight, stands for 1 s, and comes back, 3 cm and 4 cm off."""
+    """Lines of a robot that waits for 2 s, drives straight, stands for 1 s, and returns, 3 cm and 4 cm off."""
     yield from ({**LINE, "at_s": tenth / 10} for tenth in range(20))
     for tenth in range(round(10 * out_s) + 1):
         at_s = tenth / 10
@@ -55,13 +55,13 @@ def written(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
     return path
 
 
-def test_the_columns_of_a_way_that_is_known(tmp_path: Path) -> None:
+def test_the_columns_of_a_known_path(tmp_path: Path) -> None:
     log = drive_log.read(written(tmp_path, list(drive(4.0, 0.5, 1.0))))
-    found = drive_log.measure(log)
-    assert not found.missing
-    assert found.values["drive_ended"] == "home"
-    del found.values["drive_ended"]  # type: ignore[attr-defined]
-    assert found.values == pytest.approx(
+    measured = drive_log.measure(log)
+    assert not measured.missing
+    assert measured.values["drive_ended"] == "home"
+    del measured.values["drive_ended"]  # type: ignore[attr-defined]
+    assert measured.values == pytest.approx(
         {
             "drive_out_m": 2.0,
             "drive_farthest_m": 2.0,
@@ -73,24 +73,24 @@ def test_the_columns_of_a_way_that_is_known(tmp_path: Path) -> None:
     )
 
 
-def test_what_is_not_known_is_missing_and_says_why(tmp_path: Path) -> None:
+def test_unknown_values_are_missing_with_a_reason(tmp_path: Path) -> None:
     assert drive_log.measure(None).missing.keys() == NAMES
-    # A robot that was cut short: the last line is torn, none says how it ended.
+    # An interrupted drive: the last line is incomplete, and no line has the end.
     lines = [line for line in drive(1.0, 0.5, 1.0) if line["phase"] == "out"]
-    found = drive_log.measure(drive_log.read(written(tmp_path, lines, end='{"utc_ns": 1')))
-    assert found.missing.keys() == {"drive_back_off_m", "drive_back_turned_rad", "drive_ended"}
-    assert found.values["drive_out_m"] == 0.5
+    measured = drive_log.measure(drive_log.read(written(tmp_path, lines, end='{"utc_ns": 1')))
+    assert measured.missing.keys() == {"drive_back_off_m", "drive_back_turned_rad", "drive_ended"}
+    assert measured.values["drive_out_m"] == 0.5
     short = drive_log.measure(drive_log.read(written(tmp_path, lines[:22])))
     assert "drive_speed_median_m_s" in short.missing
 
 
-def test_what_stopped_it_is_said_without_what_moves_a_cursor(tmp_path: Path) -> None:
+def test_control_characters_in_the_reason_of_the_end_are_replaced(tmp_path: Path) -> None:
     lines = [LINE, {**LINE, "at_s": 1.0, "ended": "odometry\x1b[2J was silent" + "!" * 999}]
-    found = drive_log.measure(drive_log.read(written(tmp_path, lines)))
-    said = str(found.values["drive_ended"])
-    assert said.startswith("odometry?[2J was silent!")
-    assert len(said) == 200
-    assert "drive_back_off_m" in found.missing
+    measured = drive_log.measure(drive_log.read(written(tmp_path, lines)))
+    text = str(measured.values["drive_ended"])
+    assert text.startswith("odometry?[2J was silent!")
+    assert len(text) == 200
+    assert "drive_back_off_m" in measured.missing
 
 
 @pytest.mark.parametrize(
@@ -110,13 +110,13 @@ def test_what_stopped_it_is_said_without_what_moves_a_cursor(tmp_path: Path) -> 
         {"ended": 3},
     ],
 )
-def test_a_line_that_no_driver_writes_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
-    with pytest.raises(EvidenceError, match="line 2 does not say where the robot drove"):
+def test_an_invalid_line_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    with pytest.raises(EvidenceError, match="line 2 is not a line of a drive log"):
         drive_log.read(written(tmp_path, [LINE, {**LINE, **wrong}]))
 
 
-def test_a_log_that_is_none_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="says nothing of where"):
+def test_a_missing_or_empty_log_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match="contains no position of a"):
         drive_log.read(written(tmp_path, []))
     with pytest.raises(EvidenceError, match="not in the order of time"):
         drive_log.read(written(tmp_path, [{**LINE, "at_s": 1.0}, LINE]))
@@ -138,18 +138,18 @@ lines = st.fixed_dictionaries(
 
 
 @given(st.lists(lines | st.just(LINE), max_size=4), st.binary(max_size=20))
-def test_whatever_a_robot_writes_its_columns_are_possible_or_it_is_refused(
-    tmp_path_factory: pytest.TempPathFactory, said: list[dict[str, Any]], end: bytes
+def test_any_log_is_refused_or_gives_possible_values(
+    tmp_path_factory: pytest.TempPathFactory, text: list[dict[str, Any]], end: bytes
 ) -> None:
     path = tmp_path_factory.getbasetemp() / drive_log.FILE
-    path.write_bytes("".join(f"{json.dumps(line)}\n" for line in said).encode() + end)
+    path.write_bytes("".join(f"{json.dumps(line)}\n" for line in text).encode() + end)
     try:
-        found = drive_log.measure(drive_log.read(path))
+        measured = drive_log.measure(drive_log.read(path))
     except EvidenceError:
         return
-    assert found.values.keys() | found.missing.keys() == NAMES
+    assert measured.values.keys() | measured.missing.keys() == NAMES
     for column in drive_log.COLUMNS:
-        if column.name in found.values:
-            value = found.values[column.name]
+        if column.name in measured.values:
+            value = measured.values[column.name]
             assert isinstance(value, column.type)
             assert column.problem(str(value)) is None

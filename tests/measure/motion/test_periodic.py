@@ -1,4 +1,4 @@
-"""Lost messages of periodic streams, counted from streams whose losses are known."""
+"""Lost messages of periodic streams, compared with known losses."""
 
 import random
 from collections import Counter
@@ -15,7 +15,7 @@ REQUESTED = {"ATTITUDE": 50_000, "LOCAL_POSITION_NED": 50_000}
 
 @pytest.mark.parametrize("steps_ms", [(50,), (40, 60), (40, 60, 40, 60, 50), (48, 52)], ids=str)
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.2, 0.4])
-def test_each_lost_message_is_counted_once_also_of_a_sender_with_turns_of_its_own(
+def test_each_lost_message_is_counted_once_even_if_the_sender_has_a_loop_period(
     steps_ms: tuple[int, ...], share: float
 ) -> None:
     """An autopilot whose loop takes 20 ms sends 20 messages a second at intervals of 40 and 60 ms."""
@@ -28,7 +28,7 @@ def test_each_lost_message_is_counted_once_also_of_a_sender_with_turns_of_its_ow
     assert periodic.lost(numbers, {"ATTITUDE": stream}, ended_us, REQUESTED) == (len(came), SENT - len(came))
 
 
-def test_a_number_that_a_router_withheld_is_no_loss() -> None:
+def test_a_number_that_a_router_filtered_is_no_loss() -> None:
     numbers = [(50_000 * at, 2 * at % 256) for at in range(100)]
     stream = [StreamMessage(50_000 * at, 50 * at, at) for at in range(100)]
     assert periodic.lost(numbers, {"ATTITUDE": stream}, 0, REQUESTED) == (100, 0)

@@ -57,7 +57,7 @@ def mean_m(folder: Path, begin_s: float = 1.0, end_s: float = 3.0) -> float | st
 
 
 def test_the_trials_sources_precede_the_attempts_and_those_the_testbeds(attempt: Path) -> None:
-    assert mean_m(attempt) == "nobody knows where robots are"
+    assert mean_m(attempt) == "the positions of the robots are unknown"
     (attempt / track.FILE).write_text(track.text(ORACLE), encoding="ascii")
     assert mean_m(attempt) == pytest.approx(100)
     written(attempt, AWAY)

@@ -66,7 +66,7 @@ def run_and_view(step: AskStep, here: Path, operator: ScriptedOperator | None = 
         (f"{WIND}, choices: [a, b]", "they have no unit"),
         ("column: a, question: b, least: 2, most: 1", "least is greater than most"),
         (f"{WIND}, usual: strong", "usual is 'strong'; permitted answers: a number in m/s from 0 to 40"),
-        (f"{GRASS}, usual: high", "usual is 'high'; permitted answers: 1 dry, 2 wet; - if nobody knows\n"),
+        (f"{GRASS}, usual: high", "usual is 'high'; permitted answers: 1 dry, 2 wet; - if unknown\n"),
         ("column: a, question: b, choices: [a]", "at least 2 items"),
         ("column: A, question: b", "'A' is not a name: small letters"),
         ("column: a, question: b, unit: 2m", "'2m' is not a unit"),
