@@ -129,7 +129,7 @@ def verify(folder: Path) -> list[str]:
         EvidenceError: There is no manifest, or it cannot be read.
     """
     listed = read(folder)
-    found = {str(path.relative_to(folder)): what for path, what in store.foreign(folder)}
+    found = {str(path.relative_to(folder)): what for path, what in store.unexpected_files(folder)}
     present = {_name(folder, path): path for path in _plain_files(folder)}
     present.pop(MANIFEST_FILE, None)
     return _told(_compared(listed.keys() - found.keys(), listed, present) | found)

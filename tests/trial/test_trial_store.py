@@ -21,7 +21,7 @@ def folder(tmp_path: Path) -> Path:
     (partial / "scan").mkdir()
     (partial / "scan" / "scan_0.db3").write_bytes(b"SQLite format 3\0" * 9)
     sums = manifest.Manifest(made)
-    sums.add(store.keep_attempt(partial, "udp-01"))
+    sums.add(store.commit_attempt(partial, "udp-01"))
     sums.write()
     return made
 
@@ -101,6 +101,6 @@ def test_what_was_half_fetched_is_kept_for_the_next_fetch_and_never_as_evidence(
         (partial / name).write_bytes(b"x")
     assert store.reopen_attempt(folder, repeat) == partial
     assert [path.name for path in partial.iterdir()] == [".sender.camera.bag.part"]
-    kept = store.keep_attempt(partial, "tcp-01.void1")
+    kept = store.commit_attempt(partial, "tcp-01.void1")
     assert list(kept.iterdir()) == []
     assert list(store.reopen_attempt(folder, repeat).iterdir()) == []

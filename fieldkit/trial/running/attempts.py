@@ -75,7 +75,7 @@ class Attempts:
             OSError: The disk is full or gone.
         """
         self._robots.demand_up()
-        store.demand_room(self._folder, size.attempt_bytes(self._plan))
+        store.demand_space(self._folder, size.attempt_bytes(self._plan))
         begun = self._ledger.begin(repeat)
         partial = store.open_attempt(self._folder, repeat)
         remote = begun.remote(self._plan.trial)
@@ -108,7 +108,7 @@ class Attempts:
         """Settle an attempt that fieldkit was killed in; errors as `make`."""
         self._sink(PhaseStarted("recover", str(cut.repeat)))
         remote, was_measured = cut.remote(self._plan.trial), cut.status is Status.MEASURED
-        found = store.kept_unentered(self._folder, cut.folders)
+        found = store.unjournalled_attempt(self._folder, cut.folders)
         evidence_folder = found or store.reopen_attempt(self._folder, cut.repeat)
         # Of an attempt that was cut in its midst what there is, is evidence as that of any void one.
         missing = [] if found else self._robots.fetch(remote, evidence_folder, clean=was_measured)

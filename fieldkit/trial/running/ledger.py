@@ -132,7 +132,7 @@ class Ledger:
             OSError: As `begin`.
         """
         with self._stop.whole():
-            final = store.keep_attempt(evidence, attempt.folder)
+            final = store.commit_attempt(evidence, attempt.folder)
             ended = replace(attempt, reason=encodable(attempt.reason))
             row = rows.build(self._plan, ended, measured)
             self._append(ended, time.time_ns())
