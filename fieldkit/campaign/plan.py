@@ -13,7 +13,7 @@ from fieldkit.config.schema import AfterValidator, Document, Duration, Field, In
 from fieldkit.core import laptop_files
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Topology
-from fieldkit.trial.procedure import Procedure, Repeats, expecting, load_procedure
+from fieldkit.trial.procedure import Procedure, Repeats, load_procedure, with_expectation
 
 CAMPAIGN_FILE: Final = laptop_files.CAMPAIGN
 
@@ -109,7 +109,7 @@ def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedu
             found.append(load_procedure(name))
     for index, text in enumerate(campaign.expect):
         with document.naming("expect", index):
-            found = expecting(found, text)
+            found = with_expectation(found, text)
     return tuple(found)
 
 

@@ -72,7 +72,7 @@ def of_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[Fi
         finished: Finished repeats of this and of other trials.
     """
     alike = [
-        each
+        repeat
         for repeat in finished
         if repeat.plan.procedure.name == plan.procedure.name and repeat.protocol is protocol
     ]

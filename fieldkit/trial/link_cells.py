@@ -30,7 +30,7 @@ _DELAY: Final = Quantity(
 
 @dataclass(frozen=True)
 class LinkCriterion:
-    """What a middleware must achieve on the link in each repeat.
+    """The requirements that a middleware must meet on the link in each repeat.
 
     Attributes:
         max_loss: Share of the samples that may be lost, 0 to 1; those that were never sent count as lost.
@@ -107,7 +107,7 @@ class LinkCell:
 
     @property
     def largest_delay_s(self) -> float:
-        """The largest value, over all repeats, of the delay of 95 % of the samples sent; infinity if one is missing."""
+        """Maximum over all repeats of the delay of 95 % of the samples sent; infinity if one is missing."""
         if self.delay is None or self.delay.sample is None or self.delay.missing:
             return math.inf
         return float(self.delay.sample.high.max())

@@ -50,17 +50,6 @@ class Plan(Strict):
         step_packages: The package of each kind of step that does not ship with fieldkit.
         columns: Columns of its steps that not every trial has; None if there are none, or if an earlier fieldkit
             planned the trial.
-        topology: Topology.
-        distance: As the operator wrote it.
-        distance_m: In metres.
-        protocols: Protocols under test.
-        repeats: Repeats per protocol.
-        cast: Who plays which role.
-        procedure: What is done.
-        lab_bytes: How many bytes the lab itself adds to an attempt at most.
-        step_packages: The package of each kind of step that does not ship with fieldkit.
-        columns: What its steps measure beside the columns of every trial; None where they measure nothing else, or
-            an earlier fieldkit planned it.
     """
 
     schema_version: Int

@@ -1,4 +1,4 @@
-"""A trial's folder: file names, plan, and the folders of attempts, which are synced to disk before they are renamed."""
+"""A trial's folder: file names, plan, and folders of attempts, which are synced before they are renamed."""
 
 import os
 import shutil
@@ -112,7 +112,7 @@ def demand_plain(folder: Path) -> None:
             raise EvidenceError(
                 problem,
                 where=str(path),
-                remedy="get a copy with plain files from the person who ran the trial; fieldkit reads only plain files",
+                remedy="get a copy with plain files from the person who ran the trial; no others are read",
             )
 
 
@@ -140,7 +140,7 @@ def _unexpected_below(folder: Path, depth: int) -> Iterator[tuple[Path, str]]:
 
 
 def attempt_folder(folder: Path, name: str) -> Path:
-    """Return the evidence folder of an attempt, given the trial's folder and the attempt's name, `Attempt.folder`."""
+    """Return the evidence folder of an attempt; `folder` is the trial's folder, `name` is `Attempt.folder`."""
     return folder / REPEATS / name
 
 
@@ -185,7 +185,7 @@ def commit_attempt(partial: Path, name: str) -> Path:
 
 
 def unjournalled_attempt(folder: Path, names: Iterable[str]) -> Path | None:
-    """Return the committed folder of an attempt whose journal entry is missing because fieldkit was killed, or None.
+    """Return the committed folder of an attempt whose journal entry is missing after a kill, or None.
 
     Args:
         folder: The trial's folder.

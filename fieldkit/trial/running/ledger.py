@@ -174,13 +174,13 @@ class Ledger:
     def _differing(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
         if ended and not (self._folder / store.MANIFEST_FILE).exists():
             yield store.MANIFEST_FILE, "missing, so nothing says whether evidence is as it was"
-        if self._manifest.whole_lines(store.TRIAL_CSV) is None:
+        if self._manifest.unchanged_lines(store.TRIAL_CSV) is None:
             yield store.TRIAL_CSV, "changed"
         yield from manifest.differences(self._folder).items()
 
     def _known_lines(self, ended: int) -> list[str]:
         """Return the lines of the table that are as they were summed, for so many attempts at most."""
-        whole = self._manifest.whole_lines(store.TRIAL_CSV)
+        whole = self._manifest.unchanged_lines(store.TRIAL_CSV)
         if not whole:
             return []
         text = files.read(self._folder / store.TRIAL_CSV).decode()
