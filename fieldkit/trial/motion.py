@@ -267,7 +267,7 @@ def held_error(held: Sequence[MotionHold], folder: Path) -> MotionHeldError:
     campaign = folder.parent / laptop_files.CAMPAIGN
     command = "fieldkit campaign, as before" if campaign.is_file() else typed("fieldkit", "resume", folder)
     return MotionHeldError(
-        f"a fault stopped a robot, and robots stay held until a person confirms: {robots}",
-        remedy=f"put the robot at its place, check that its path is free, then without --yes: {command}; or, if robots "
-        "may move from where they are, --allow-motion-after-fault",
+        f"a fault stopped a robot, and no robot moves before a person confirms: {robots}",
+        remedy=f"put the robot at its place, check that its path is free, then without --yes: {command}; or, if "
+        "robots may move from where they are, --allow-motion-after-fault",
     )

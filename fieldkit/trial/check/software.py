@@ -12,6 +12,7 @@ from fieldkit.core.model import Role
 from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
+from fieldkit.steps import variants
 from fieldkit.steps.scene import Need, Planned, Said
 from fieldkit.steps.variants import Tool, Variants
 from fieldkit.trial.check import radio, tools
