@@ -52,6 +52,6 @@ def judge_clock(clock_offset: Offset | None, by_hand: str, report: Report) -> No
         ahead = "ahead" if clock_offset.offset_s > 0 else "behind"
         detail = f"{magnitude_s / 3600:.1f} hours {ahead}: {detail}"
     command = "date -u -s @$(date +%s)"
-    has_sudo = report.means is None or report.means.root or "sudo" in report.means.programs
+    has_sudo = report.user_tools is None or report.user_tools.root or "sudo" in report.user_tools.programs
     on_robot = f"sudo {command}" if has_sudo else f"\"su -c '{command}'\""
     report.warn("clock", detail, f"ssh -t {by_hand} {on_robot}   # on the laptop")

@@ -32,8 +32,8 @@ def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator
         for role in _self_moving(later):
             if motion.place_of(role, earlier.placement) != motion.place_of(role, later.placement):
                 raise ConfigurationError(
-                    f"{later.cast[role].name} moves without a person and must be at another place for {later.distance}, "
-                    "and with --yes no person moves it there",
+                    f"{later.cast[role].name} moves without a person and must be at another place for "
+                    f"{later.distance}, and with --yes no person moves it there",
                     remedy="run it without --yes, or one distance per command",
                 )
 

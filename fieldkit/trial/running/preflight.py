@@ -139,7 +139,7 @@ def _check(
         radio.judge(robot, sections, report)
         stage = "jobs"
         jobs.install(shell, Deadline.after(JOBS_S))
-        # A trial has locked its robots already. Another user's jobs are not leftovers, and a recording would disturb them.
+        # A trial has locked its robots already. A recording would disturb jobs of another user.
         if whole and not _judge_lock(locks.holder(shell), report):
             return
         _judge_jobs(plan, jobs.left(shell, Deadline.after(JOBS_S)), report)

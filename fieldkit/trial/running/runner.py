@@ -73,7 +73,7 @@ def resume_trial(
     placement = place(resumable(folder), testbed, sink)
     if placement.answer.skip:
         return None
-    return continue_trial(folder, testbed, sink, stop or Stop(), failed=failed)
+    return go_on(folder, testbed, sink, stop or Stop(), failed=failed)
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
         return _run(plan, testbed, folder, sink, stop, report_resume=report_resume)
 
 
-def continue_trial(
+def go_on(
     folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, report_resume: bool = True, failed: bool = False
 ) -> Outcome:
     """Resume an interrupted trial: finished repeats are kept, each other repeat is attempted again.
