@@ -1,8 +1,9 @@
 """The order of a campaign: random, within a limit on the walking distance.
 
 Slow changes during a day (sun, batteries, other Wi-Fi networks) must not look like an effect of distance, so the
-order is random. Setting up robots for another topology takes longest, and carrying them takes long, so the order is random
-within blocks: all trials of a topology; in it all of a scenario; in it all at a distance. The total path is limited.
+order is random. Setting up robots for another topology takes longest, and carrying them takes long, so the order is
+random within blocks: all trials of a topology; in it all of a scenario; in it all at a distance. The total path is
+limited.
 """
 
 import random

@@ -1,6 +1,6 @@
 """Writer of JSON messages to an MCAP file; the only module of fieldkit that writes MCAP.
 
-File format: https://mcap.dev/spec; requirements of Foxglove on JSON: https://docs.foxglove.dev, custom schema encodings.
+File format: https://mcap.dev/spec. JSON for Foxglove: https://docs.foxglove.dev, custom schema encodings.
 """
 
 from collections.abc import Iterable, Mapping

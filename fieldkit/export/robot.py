@@ -84,7 +84,7 @@ def messages(record: AttemptRecord) -> Iterator[Message]:
         if file in record.captures:
             what, meaning = (
                 _named("packets", _step(file)),
-                "The packets of its capture: IP packets, frames of offload.",
+                "What its capture holds: IP packets, frames of offload.",
             )
             channel = _channel(record, role, what, schemas.PACKET, meaning)
             streams.append(packets.messages(channel, record.attempt.folder, marked[file]))
@@ -124,7 +124,7 @@ def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterato
     log = _channel(record, role, "log", schemas.LOG, "ICMP errors in place of a reply to ping.")
     for problem in pings.problems:
         if problem.at_utc_ns is not None:
-            text = f"icmp_seq={problem.seq}: {problem.source} reports {problem.text}"
+            text = f"icmp_seq={problem.seq}: {problem.source} says {problem.text}"
             yield Message(
                 log,
                 problem.at_utc_ns,
@@ -133,14 +133,14 @@ def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterato
 
 
 def _links(record: AttemptRecord, role: Role) -> Iterator[Message]:
-    channel = _channel(record, role, "link", schemas.LINK, "State of its radio's links, five times a second.")
+    channel = _channel(record, role, "link", schemas.LINK, "What its radio told of its links, five times a second.")
     for sample in record.links[role]:
         yield Message(channel, sample.utc_ns, schemas.link(record.attempt.folder, sample))
 
 
 def _phases(record: AttemptRecord, role: Role) -> Iterator[Message]:
     """Yield when a robot started and stopped recording, sending or receiving, and ping; named steps are separate."""
-    meaning = "The phase that started, by the first and last time stamps of its evidence."
+    meaning = "What it began to do, by the first and last stamp of its evidence."
     for step, phase, begin_ns, end_ns in _spans(record, role):
         channel = _channel(record, role, _named("phase", step), schemas.PHASE, meaning)
         for t_ns, what in ((begin_ns, phase), (end_ns, "idle")):

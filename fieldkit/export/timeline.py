@@ -32,9 +32,9 @@ _OPEN_ATTEMPTS: Final = 2
 _LAPTOP: Final = "laptop"
 _LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
 
-_LOG: Final = Channel("/trial/log", schemas.LOG, _LAPTOP, "The journal's entries on each attempt.")
+_LOG: Final = Channel("/trial/log", schemas.LOG, _LAPTOP, "What the journal says of each attempt.")
 _PLACES: Final = Channel(
-    "/tf", schemas.TRANSFORMS, _LAPTOP, "Measured or planned positions of robots: metres east, north, up."
+    "/tf", schemas.TRANSFORMS, _LAPTOP, "Where robots were, or by plan are to stand: metres east, north, up."
 )
 
 
@@ -114,7 +114,7 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
 
 
 def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, int]]) -> Iterator[Message]:
-    """Yield the positions of robots, attempt by attempt with its end, each from the best source according to `where`."""
+    """Yield the positions of robots by attempt, each from the best source according to `where`."""
     for attempt, ended_ns in attempts:
         samples_by_role = where.told_of(evidence(attempt))
         # A position from before the start of the attempt is reported at the start.
@@ -140,7 +140,7 @@ def _sampled(plan: Plan, role: Role, samples: Samples, started_ns: int, ended_ns
 def _place(plan: Plan, role: Role, t_ns: int, place: Vector, frame: str = "field") -> Message:
     name = plan.cast[role].name
     if frame == WGS84:
-        channel = Channel(f"/{role}/location", schemas.LOCATION, _LAPTOP, "Its geographic position.")
+        channel = Channel(f"/{role}/location", schemas.LOCATION, _LAPTOP, "Where on the earth it was.")
         return Message(channel, t_ns, schemas.location(t_ns, name, place))
     return Message(_PLACES, t_ns, schemas.transform(t_ns, name, place, frame))
 
