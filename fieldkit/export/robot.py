@@ -82,11 +82,11 @@ def messages(record: AttemptRecord) -> Iterator[Message]:
     marked = fates.packet_fates(record.captures, record.transfers)
     for file, role in record.plan.captures().items():
         if file in record.captures:
-            what, meaning = (
+            topic, meaning = (
                 _named("packets", _step(file)),
                 "What its capture holds: IP packets, frames of offload.",
             )
-            channel = _channel(record, role, what, schemas.PACKET, meaning)
+            channel = _channel(record, role, topic, schemas.PACKET, meaning)
             streams.append(packets.messages(channel, record.attempt.folder, marked[file]))
     for role in record.plan.cast:
         short = [*_phases(record, role), *_links(record, role), *_rtts(record, role)]
@@ -94,13 +94,13 @@ def messages(record: AttemptRecord) -> Iterator[Message]:
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
 
-def _channel(record: AttemptRecord, role: Role, what: str, schema: Json, meaning: str) -> Channel:
-    return Channel(f"/{role}/{what}", schema, f"{role} {record.plan.cast[role].name}", meaning)
+def _channel(record: AttemptRecord, role: Role, topic: str, schema: Json, meaning: str) -> Channel:
+    return Channel(f"/{role}/{topic}", schema, f"{role} {record.plan.cast[role].name}", meaning)
 
 
-def _named(what: str, step: str) -> str:
+def _named(topic: str, step: str) -> str:
     """Return the name of a topic below that of its robot: `rtt`, or `rtt/busy` for a step with a name."""
-    return f"{what}/{step}" if step else what
+    return f"{topic}/{step}" if step else topic
 
 
 def _step(file: str) -> str:
@@ -143,8 +143,8 @@ def _phases(record: AttemptRecord, role: Role) -> Iterator[Message]:
     meaning = "What it began to do, by the first and last stamp of its evidence."
     for step, phase, begin_ns, end_ns in _spans(record, role):
         channel = _channel(record, role, _named("phase", step), schemas.PHASE, meaning)
-        for t_ns, what in ((begin_ns, phase), (end_ns, "idle")):
-            yield Message(channel, t_ns, schemas.phase(t_ns, record.attempt.folder, what))
+        for t_ns, name in ((begin_ns, phase), (end_ns, "idle")):
+            yield Message(channel, t_ns, schemas.phase(t_ns, record.attempt.folder, name))
 
 
 def _spans(record: AttemptRecord, role: Role) -> Iterator[tuple[str, str, int, int]]:

@@ -158,7 +158,9 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[
         return _compared(summed[attempt].keys(), summed[attempt], present)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return top_level | {name: what for changes in pool.map(compare, selected) for name, what in changes.items()}
+        return top_level | {
+            name: change for changes in pool.map(compare, selected) for name, change in changes.items()
+        }
 
 
 def _top_level_differences(folder: Path, sums: Sums) -> dict[str, str]:

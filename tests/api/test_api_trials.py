@@ -207,7 +207,7 @@ def test_a_repeat_of_several_trials_is_to_be_named_with_its_trial() -> None:
 def test_packets_without_evidence_as_it_was_kept_are_refused(tmp_path: Path) -> None:
     shutil.copytree(LOSSY, trial := tmp_path / LOSSY.name)
     alone = shutil.copy(trial / store.TRIAL_CSV, tmp_path / "alone.csv")
-    with pytest.raises(EvidenceError, match="evidence of udp-02 is not at hand"):
+    with pytest.raises(EvidenceError, match="evidence of udp-02 is not available"):
         fieldkit.load(alone).packets("udp-02")
     with (trial / store.REPEATS / "udp-02" / "receiver.pcap").open("ab") as capture:
         capture.write(b"more")
@@ -303,8 +303,12 @@ def test_the_interval_of_a_single_repeat_shows_nothing(recorded_trial: Path) -> 
 @pytest.mark.parametrize(
     ("condition", "what", "remedy"),
     [
-        ({}, "4 cells have any condition, and not one", "they differ in procedure: 'driveaway', 'los', 'selfheal'; "),
-        ({"protocol": "sctp"}, "no cells have protocol='sctp', and not one", "protocol: 'tcp', 'udp'"),
+        (
+            {},
+            "4 cells have any condition; exactly one must",
+            "they differ in procedure: 'driveaway', 'los', 'selfheal'; ",
+        ),
+        ({"protocol": "sctp"}, "no cells have protocol='sctp'; exactly one must", "protocol: 'tcp', 'udp'"),
         ({"protocl": "udp"}, "cell: there is no column 'protocl'", "did you mean 'protocol'?"),
     ],
 )

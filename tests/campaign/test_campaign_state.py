@@ -81,7 +81,7 @@ def test_a_file_that_changed_is_refused_and_the_key_named(
     again, document = plan.make_plan(lawn, "emulated" if named == "backend" else "field")
     with pytest.raises(ConfigurationError) as caught:
         plan.begun(journal.folder, again, document)
-    assert caught.value.what == f"changed since the campaign was begun: {named}"
+    assert caught.value.what == f"changed since the campaign started: {named}"
     assert caught.value.where == f"{lawn}:{line}"
     assert "campaign.yaml" in caught.value.remedy
 

@@ -42,14 +42,14 @@ def test_another_try_of_a_test_has_a_folder_of_its_own(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_made_is_told_with_the_option(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigurationError, match="no folder for evidence") as caught:
+    with pytest.raises(ConfigurationError, match="cannot create the folder for evidence") as caught:
         EvidenceFolder(tmp_path / "file" / "run" / "test_a").add("heard")
     assert "--fieldkit-output" in caught.value.remedy
 
 
 def test_a_run_that_kept_nothing_leaves_no_folder(tmp_path: Path) -> None:
     keeper = EvidenceKeeper(tmp_path / "results" / "run", Keep.FAILED)
-    keeper.told(Note("robots are up"))
+    keeper.add_event(Note("robots are up"))
     assert list(tmp_path.rglob(LOG))
     keeper.end()
     assert not list(tmp_path.iterdir())
@@ -59,7 +59,7 @@ def test_what_others_left_in_the_folder_stays(tmp_path: Path) -> None:
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "notes.txt").touch()
     keeper = EvidenceKeeper(tmp_path / "results" / "run", Keep.FAILED)
-    keeper.told(Note("robots are up"))
+    keeper.add_event(Note("robots are up"))
     keeper.end()
     assert [path.name for path in tmp_path.rglob("*")] == ["results", "notes.txt"]
 
@@ -67,6 +67,6 @@ def test_what_others_left_in_the_folder_stays(tmp_path: Path) -> None:
 def test_events_are_told_in_words_and_progress_is_not(tmp_path: Path) -> None:
     keeper = EvidenceKeeper(tmp_path / "run", Keep.ALL)
     for event in (Note("up"), PhaseStarted("record", "udp-01"), TrialStarted("folder", 0, 1)):
-        keeper.told(event)
+        keeper.add_event(event)
     lines = (keeper.folder.path / LOG).read_text(encoding="utf-8").splitlines()
     assert [line.split(" ", 1)[1] for line in lines] == ["up", "udp-01 record"]

@@ -212,7 +212,7 @@ def test_tests_pass_fail_and_meet_errors_of_the_lab(ran: SuiteRun) -> None:
 def test_a_failure_is_told_by_the_line_of_the_test(ran: SuiteRun) -> None:
     said = part(ran.said, "test_fails_by_a_program")
     assert '>       robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])' in said
-    assert "rover: `sh -c 'echo broken >&2; exit 3'` ended with exit code 3: broken" in said
+    assert "rover: `sh -c 'echo broken >&2; exit 3'` exited with code 3: broken" in said
     assert "/fieldkit/" not in said, "nothing of fieldkit's own is shown"
     assert "rover: `sleep 60` did not end in time" in part(ran.said, "test_fails_by_time")
     assert "where inf = CellFigure(name='file_loss', unit='share', n=1" in part(ran.said, "test_fails_by_its_figure")
@@ -222,7 +222,7 @@ def test_a_failure_is_told_by_the_line_of_the_test(ran: SuiteRun) -> None:
 def test_an_error_of_the_lab_is_told_by_what_and_remedy(ran: SuiteRun) -> None:
     said = part(ran.said, "ERROR at setup of test_asks_for_who_is_not_there")
     assert "there is no robot 'sendr' in this lab\n  remedy: did you mean 'sender'?" in said
-    assert "asked for at test_robots.py:" in said
+    assert "requested at test_robots.py:" in said
     assert "the site file gives no roles for topology master" in part(
         ran.said, "ERROR at setup of test_asks_for_robots_that_the_site_has_not"
     )

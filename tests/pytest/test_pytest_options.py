@@ -67,7 +67,7 @@ from fieldkit.pytest.options import LabOptions
 
 def test_operator(pytestconfig):
     person = operator_of(pytestconfig, LabOptions(), print)
-    with pytest.raises(ConfigurationError, match="somebody must carry it, and there is no terminal") as caught:
+    with pytest.raises(ConfigurationError, match="a person must carry it, but there is no terminal") as caught:
         person.ask("carry it")
     assert "--fieldkit-yes" in caught.value.remedy
     assert operator_of(pytestconfig, LabOptions(yes=True), print) is NOBODY

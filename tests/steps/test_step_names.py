@@ -156,12 +156,12 @@ def test_gates_put_names_before_columns_and_reasons_and_rows_before_words(tmp_pa
     [
         ("ping: {name: up, ", "ping: {name: 2up, ", "'2up' is not a name: small letters, digits and _"),
         ("ping: {name: up, ", "ping: {name: up.2, ", "'up.2' is not a name"),
-        ("ping: {name: up, ", "ping: {", "a ping comes twice; tell them apart by name:"),
+        ("ping: {name: up, ", "ping: {", "a ping comes twice; give each a name:"),
         ("transfer: {name: bare", "transfer: {name: up", "a transfer named up comes twice; give one another name"),
-        ("name: imu}", "name: scan}", "a recording on sender comes twice; tell them apart by name:"),
+        ("name: imu}", "name: scan}", "a recording on sender comes twice; give each a name:"),
         ("file: imu", "file: odom", "sends odom, and nothing of that name is recorded on sender before it"),
         (", file: imu", "", "names no file, and 2 are recorded there before it: write file:"),
-        ("            name: inner\n", "", "a capture on sender comes twice; tell them apart by name:"),
+        ("            name: inner\n", "", "a capture on sender comes twice; give each a name:"),
         ("robots: [sender]", "robots: [sender, sender]", "a robot is named twice"),
     ],
 )

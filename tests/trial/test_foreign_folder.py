@@ -82,7 +82,7 @@ def test_a_link_to_a_file_of_ours_is_refused_in_one_sentence(
     assert main([command[0], str(trial), *out]) == EvidenceError.exit_code
     said = capsys.readouterr().err
     assert f"{place}: it is a symbolic link, no file of its own" in " ".join(said.split())
-    assert "remedy: ask whoever made the trial" in " ".join(said.split())
+    assert "remedy: get a copy with plain files from" in " ".join(said.split())
     assert ours.read_text(encoding="utf-8") == OURS
 
 
@@ -116,7 +116,7 @@ def test_a_folder_elsewhere_is_no_folder_of_the_trial(trial: Path, tmp_path: Pat
 
 def test_evidence_deeper_than_evidence_lies_is_refused(trial: Path) -> None:
     (trial / "repeats/udp-01/a/b").mkdir(parents=True)
-    with pytest.raises(EvidenceError, match="a folder, where evidence has none any more"):
+    with pytest.raises(EvidenceError, match="a folder, deeper than evidence can be"):
         store.read_plan(trial)
 
 
@@ -176,11 +176,11 @@ RUNNING, VALID, VOID, MEASURED = Status.RUNNING, Status.VALID, Status.VOID, Stat
 @pytest.mark.parametrize(
     ("entries", "why"),
     [
-        ([(1, 2, RUNNING)], "attempt 2 at udp-01 begins, though it or its repeat was over"),
-        ([(1, 3, RUNNING)], "attempt 3 at udp-01 begins, though it or its repeat was over"),
-        ([(1, 2, VALID)], "attempt 2 at udp-01 is valid, though it does not run"),
-        ([(1, 7, VOID)], "attempt 7 at udp-01 is void, though it does not run"),
-        ([(1, 7, MEASURED)], "attempt 7 at udp-01 is measured, though it does not run"),
+        ([(1, 2, RUNNING)], "attempt 2 at udp-01 starts, although it or its repeat has ended"),
+        ([(1, 3, RUNNING)], "attempt 3 at udp-01 starts, although it or its repeat has ended"),
+        ([(1, 2, VALID)], "attempt 2 at udp-01 is valid, although it is not running"),
+        ([(1, 7, VOID)], "attempt 7 at udp-01 is void, although it is not running"),
+        ([(1, 7, MEASURED)], "attempt 7 at udp-01 is measured, although it is not running"),
         ([(2, 1, RUNNING)], "the plan has no repeat udp-02"),
         ([(1_000_000_000, 1, RUNNING)], "the plan has no repeat udp-1000000000"),
     ],
@@ -190,7 +190,7 @@ def test_a_journal_that_contradicts_itself_or_the_plan_is_told_with_its_line(
 ) -> None:
     lie(trial, *(JournalEntry(1, Protocol.UDP, number, attempt, status) for number, attempt, status in entries))
     for read in (rebuild, lambda folder: Ledger(store.read_plan(folder), folder, Stop())):
-        with pytest.raises(EvidenceError, match=f"this cannot have happened: {why}") as caught:
+        with pytest.raises(EvidenceError, match=f"impossible entry: {why}") as caught:
             read(trial)
         assert caught.value.where == f"{trial / journal.JOURNAL_FILE}:6"
 

@@ -97,7 +97,7 @@ def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign_with_that_reason(
 
 def test_a_fieldkit_that_was_killed_in_a_motion_holds_robots(tmp_path: Path) -> None:
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.BEGUN, "rover-1")
-    with pytest.raises(MotionHeldError, match="fieldkit ended while it moved"):
+    with pytest.raises(MotionHeldError, match="fieldkit stopped while it moved"):
         kept(tmp_path).demand()
 
 

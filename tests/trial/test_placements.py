@@ -52,7 +52,7 @@ def test_a_place_in_metres_is_within_two_metres(apart_m: float, agrees: bool, tm
     why = placements.contradiction(SCENE, in_metres(tmp_path, apart_m))
     assert (why is None) is agrees
     if why:
-        assert why.startswith("the sender and the receiver were placed 18.3 m apart, and by the record")
+        assert why.startswith("the sender and the receiver were placed 18.3 m apart, but by their recorded")
 
 
 @given(off_m=st.floats(-18, 300))

@@ -48,7 +48,7 @@ def cell(
 
 
 def judge(*cells: LinkCell, criterion: LinkCriterion = ONE_PERCENT) -> Assessment:
-    return recommendation.judged(DDS, cells, {(own.place, own.size_bytes) for own in cells}, criterion)
+    return recommendation.assess_candidate(DDS, cells, {(own.place, own.size_bytes) for own in cells}, criterion)
 
 
 def test_a_repeat_at_the_bound_passes_and_one_above_fails() -> None:
@@ -155,8 +155,8 @@ def test_every_cell_must_pass_and_none_may_lack() -> None:
     good, bad = cell(5 * [0]), cell(5 * [9], size_bytes=1e6)
     assert judge(good, bad).failed == (f"{PLACE}, 1e+06 B: loss <= 0.01 in 0 of 5 repeats, up to 0.09",)
     wanted = {(PLACE, SIZE), (PLACE, 1e6)}
-    assessment = recommendation.judged(DDS, [good], wanted, ONE_PERCENT)
-    assert assessment.lacking == (f"{PLACE}, 1e+06 B: it was not measured; the others were",)
+    assessment = recommendation.assess_candidate(DDS, [good], wanted, ONE_PERCENT)
+    assert assessment.lacking == (f"{PLACE}, 1e+06 B: not measured, although other candidates were",)
 
 
 def test_the_rank_is_the_loss_of_the_worst_cell_and_then_the_delay() -> None:

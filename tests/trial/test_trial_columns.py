@@ -176,10 +176,10 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
 @pytest.mark.parametrize(
     ("steps", "what"),
     [
-        (("meter: {measures: [rtt_sent]}",), "'rtt_sent' is fieldkit's own already"),
-        (("meter: {measures: [status]}",), "'status' is fieldkit's own already"),
-        (("meter: {}", "meter: {}"), "'meter_level' comes twice"),
-        (("meter: {called: a, measures: [x, x]}",), "'a.x' comes twice"),
+        (("meter: {measures: [rtt_sent]}",), "'rtt_sent' is one of fieldkit's"),
+        (("meter: {measures: [status]}",), "'status' is one of fieldkit's"),
+        (("meter: {}", "meter: {}"), "'meter_level' is filled by two steps"),
+        (("meter: {called: a, measures: [x, x]}",), "'a.x' is filled by two steps"),
         (("meter: {measures: [Level]}",), "its name is not made of lower-case letters"),
     ],
 )

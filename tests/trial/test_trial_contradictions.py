@@ -195,13 +195,13 @@ def test_robots_that_provide_no_such_section_contradict_nothing(attempt: Attempt
 @pytest.mark.parametrize("role", ["sender", "receiver"])
 def test_a_section_that_is_there_at_one_moment_alone(attempt: Attempt, role: str, moment: str, section: str) -> None:
     attempt.text(f"{role}-{moment}.txt", f"==> {section} <==", "==> other <==")
-    demand(attempt, f"that after it do not both have the section {section}")
+    demand(attempt, f"the section {section} is missing in its state")
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
 def test_jobs_of_which_nothing_is_noted(attempt: Attempt, role: str) -> None:
     attempt.text(f"{role}-after.txt", "==> jobs <==", "==> other <==")
-    demand(attempt, "do not both have the section jobs")
+    demand(attempt, "the section jobs is missing in its state")
 
 
 @pytest.mark.parametrize("moment", ["before", "after"])
@@ -214,7 +214,7 @@ def test_a_state_that_is_missing(attempt: Attempt, role: str, moment: str) -> No
 @pytest.mark.parametrize("job", ["capture asked 0 100000 1090.00\n", "listen itself 0 100000 1060.00\n"])
 def test_a_job_that_ran_without_a_note_of_its_end(attempt: Attempt, job: str) -> None:
     attempt.text("receiver-after.txt", job, "")
-    demand(attempt, f"its job {job.partition(' ')[0]} ran, and nothing says how it ended")
+    demand(attempt, f"its job {job.partition(' ')[0]} ran, but its exit was not recorded")
 
 
 def test_a_robot_that_a_step_reboots_may_reboot(tcp: Attempt) -> None:

@@ -152,7 +152,9 @@ def test_a_step_that_cannot_measure_what_it_left_voids_the_attempt_and_raises_no
 
     monkeypatch.setattr(PingStep, "measure", measure)
     (said,) = problems(PLAN, Protocol.UDP, folder)
-    assert said == "what the step ping left cannot be measured: OverflowError: int too large to convert to float"
+    assert (
+        said == "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
+    )
     judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
     assert judged.measured.missing["rtt_loss"] == said
     assert judged.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size
@@ -185,7 +187,7 @@ def test_a_figure_that_is_neither_there_nor_missing_for_a_reason_voids(
         return Measured({name: value for name, value in found.values.items() if name != "rtt_loss"}, found.missing)
 
     monkeypatch.setattr(PingStep, "measure", forgetful)
-    assert problems(PLAN, Protocol.UDP, folder) == ("the step ping does not say why it has no rtt_loss",)
+    assert problems(PLAN, Protocol.UDP, folder) == ("the step ping gives neither a value nor a reason for rtt_loss",)
 
 
 def test_what_a_fault_disturbed_need_not_be_whole(tmp_path: Path) -> None:

@@ -77,9 +77,9 @@ def test_what_is_given_fills_the_columns_is_summed_and_can_be_forgotten(
 @pytest.mark.parametrize(
     ("words", "code", "complaint"),
     [
-        (["walk.csv"], 2, "'walk.csv' is no ROLE=FILE"),
-        (["Receiver=walk.csv"], 2, "is no ROLE=FILE"),
-        (["receiver="], 2, "is no ROLE=FILE"),
+        (["walk.csv"], 2, "'walk.csv' is not ROLE=FILE"),
+        (["Receiver=walk.csv"], 2, "is not ROLE=FILE"),
+        (["receiver="], 2, "is not ROLE=FILE"),
         (["reciever=walk.csv"], 2, "did you mean 'receiver'"),
         (["receiver=nowhere.csv"], 2, "there is no such file"),
         (["receiver=91,0"], 2, "there is no such file"),

@@ -14,7 +14,7 @@ LAPTOP: Final = "laptop"
 
 @dataclass(frozen=True)
 class UserTools:
-    """What a robot's user can run in order to fix problems.
+    """Permissions and programs with which a robot's user can fix problems.
 
     Attributes:
         root: Whether the user is root.
@@ -32,7 +32,7 @@ class Report:
         robot: Its name.
 
     Attributes:
-        user_tools: What the robot's user can run; None while unknown, and for the laptop.
+        user_tools: Tools of the robot's user; None while unknown, and for the laptop.
     """
 
     def __init__(self, robot: str) -> None:

@@ -22,7 +22,7 @@ _BATTERY: Final = re.compile(r"^(?P<name>\S{1,60}) (?P<percent>[0-9]{1,3})$", re
 
 
 def user_tools(sections: Sections) -> UserTools:
-    """Return what a robot's user can run in order to fix problems."""
+    """Return the permissions and programs of a robot's user."""
     programs = sections.get("means", NOTHING).text.split()
     return UserTools(sections.get("user", NOTHING).text.strip() == "0", frozenset(programs))
 

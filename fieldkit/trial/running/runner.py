@@ -217,7 +217,7 @@ def _show_judgements(judgements: Iterable[Judgement], sink: Sink) -> None:
 
 def _judged(judgement: Judgement) -> ExpectationJudged:
     _, protocol, measured, interval, _ = wording.judged(judgement)
-    found = judgement.found
+    estimate = judgement.found
     return ExpectationJudged(
         expectation=judgement.expectation.text,
         protocol=protocol.lower(),
@@ -225,9 +225,9 @@ def _judged(judgement: Judgement) -> ExpectationJudged:
         why=judgement.why,
         measured=measured,
         interval=interval,
-        n=found.n if found else 0,
+        n=estimate.n if estimate else 0,
         n_valid=judgement.cell.n_valid if judgement.cell else 0,
-        n_censored=found.n_censored if found else 0,
+        n_censored=estimate.n_censored if estimate else 0,
     )
 
 

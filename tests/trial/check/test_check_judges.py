@@ -435,7 +435,7 @@ def test_what_a_robot_says_cannot_garble_the_terminal(text: str) -> None:
         ("10.42.0.254 51000 10.42.0.1 22", Control.SEPARATE, WARN, "does not say control: radio"),
         ("192.168.1.9 51000 192.168.1.5 22", Control.SEPARATE, OK, "it comes to 192.168.1.5"),
         ("192.168.1.9 51000 192.168.1.5 22", Control.RADIO, OK, "it comes to 192.168.1.5"),
-        ("", Control.SEPARATE, OK, "does not say which way"),
+        ("", Control.SEPARATE, OK, "does not report the addresses"),
     ],
 )
 def test_the_way_of_ssh_is_seen_and_not_believed(
@@ -461,26 +461,26 @@ def test_an_interface_that_is_not_there_says_nothing_of_the_right_to_capture(fil
         ("1000", "sudo apt-get", "sudo apt-get install iw", "sudo apt-get install iw"),
         ("0", "apt-get", "sudo apt-get install iw", "apt-get install iw"),
         ("1000", "apt-get", "sudo apt-get install iw", "as root: apt-get install iw"),
-        ("0", "", "sudo apt-get install iw", "install iw (so called in Debian)"),
+        ("0", "", "sudo apt-get install iw", "install iw (package name in Debian)"),
         ("0", "sudo", "sudo ip link set wlan0 up", "ip link set wlan0 up"),
         ("1000", "", "sudo ip link set wlan0 up", "as root: ip link set wlan0 up"),
-        ("1000", "sudo", "sudo setcap x y", "sudo setcap x y # setcap is of Debian's libcap2-bin"),
+        ("1000", "sudo", "sudo setcap x y", "sudo setcap x y # setcap is in Debian's libcap2-bin"),
         ("1000", "sudo setcap", "sudo setcap x y", "sudo setcap x y"),
         ("1000", "sudo", "fieldkit abort", "fieldkit abort"),
     ],
 )
 def test_a_remedy_can_be_typed_on_the_robot_at_hand(user: str, programs: str, remedy: str, typed: str) -> None:
     report = Report("turtlebot-1")
-    report.means = system.means({"user": Said(user, 0), "means": Said("\n".join(programs.split()), 0)})
+    report.user_tools = system.user_tools({"user": Said(user, 0), "means": Said("\n".join(programs.split()), 0)})
     report.fail("iw", "not found", remedy)
     assert only(report.findings, "iw").remedy == typed
 
 
 def test_a_port_is_looked_for_by_what_the_robot_has() -> None:
     report = Report(RECEIVER.name)
-    report.means = system.means({"user": Said("0", 0), "means": Said("netstat", 0)})
+    report.user_tools = system.user_tools({"user": Said("0", 0), "means": Said("netstat", 0)})
     system.judge(PLAN, Role.RECEIVER, {"listeners": Said(LISTENER, 0)}, report)
-    assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # names it; end it"
+    assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # shows it; stop it"
 
 
 def test_a_clock_is_set_by_what_the_robot_has() -> None:
@@ -490,7 +490,7 @@ def test_a_clock_is_set_by_what_the_robot_has() -> None:
         ("1000", "", "ssh -t -p 2222 pi@robot \"su -c 'date -u -s @$(date +%s)'\""),
     ):
         report = Report("turtlebot-1")
-        report.means = system.means({"user": Said(user, 0), "means": Said(programs, 0)})
+        report.user_tools = system.user_tools({"user": Said(user, 0), "means": Said(programs, 0)})
         contact.judge_clock(Offset(5.0, 0.1), "-p 2222 pi@robot", report)
         assert only(report.findings, "clock").remedy == f"{command} # on the laptop"
 

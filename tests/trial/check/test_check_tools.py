@@ -74,14 +74,14 @@ def test_each_ping_is_told_by_its_version(text: bytes, kind: PingTool) -> None:
 def test_a_tool_that_is_missing_or_unknown_is_refused_with_a_remedy(tool: str) -> None:
     with pytest.raises(RobotError, match="there is no") as missing:
         tools.parse(USER + section(tool, b"sh: 4: nc: not found\n", 127), TURTLEBOT)
-    with pytest.raises(RobotError, match="none that is known: GNU something") as unknown:
+    with pytest.raises(RobotError, match="of an unknown kind: GNU something") as unknown:
         tools.parse(USER + section(tool, b"GNU something 0.7.1\n"), TURTLEBOT)
     assert "apt-get install" in missing.value.remedy
     assert "apt-get install" in unknown.value.remedy
 
 
 def test_a_recorder_that_was_killed_is_not_taken_for_one_that_is_missing() -> None:
-    with pytest.raises(RobotError, match="rosbag record --help did not end in time") as slow:
+    with pytest.raises(RobotError, match="rosbag record --help did not exit in time") as slow:
         tools.parse(USER + section("recorder", b"", 137), TURTLEBOT)
     assert "is the robot busy?" in slow.value.remedy
 
@@ -106,7 +106,7 @@ def test_whether_tcpdump_knows_immediate_mode_and_the_user_is_root() -> None:
 
 
 def test_an_answer_without_sections_is_refused() -> None:
-    with pytest.raises(RobotError, match="cannot tell its tools apart: This account is closed"):
+    with pytest.raises(RobotError, match="its tools cannot be identified: This account is closed"):
         tools.parse(b"This account is closed.\n", TURTLEBOT)
 
 
@@ -162,7 +162,7 @@ def test_a_tool_that_never_ends_is_ended(tmp_path: Path) -> None:
     output = subprocess.run(
         ("sh", *rest), stdin=subprocess.PIPE, capture_output=True, check=False, timeout=tools.PROBE_S, cwd=tmp_path
     ).stdout
-    with pytest.raises(RobotError, match="nc did not end in time"):
+    with pytest.raises(RobotError, match="nc did not exit in time"):
         tools.parse(output, profile)
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)

@@ -117,7 +117,7 @@ def test_one_that_ends_by_itself_is_told(up: EmulatedTestbed) -> None:
     with bridges.running(ends, up.shells, "s3", sink=told.append):
         wait_until(lambda: not jobs.left(up.shells[Role.SENDER], soon()), soon())
     (note,) = [one for one in told if isinstance(one, Note)]
-    assert note.text == "the bridge on turtlebot-1 ended before its time, with exit code 3"
+    assert note.text == "the bridge on turtlebot-1 exited early, with exit code 3"
 
 
 @pytest.mark.emulated

@@ -120,7 +120,7 @@ def test_it_may_die_at_any_write(tmp_path: Path, broken: set[str]) -> None:
 def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, broken: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, broken)
     journal.append(folder, JournalEntry(1, Protocol.TCP, 2, 0, Status.PLANNED))
-    with pytest.raises(EvidenceError, match="tcp-02 is planned again, though it was valid"):
+    with pytest.raises(EvidenceError, match="tcp-02 is planned again, although it was valid"):
         redo(folder)
 
 

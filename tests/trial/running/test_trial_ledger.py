@@ -177,7 +177,7 @@ def test_what_was_summed_stays_summed_and_a_difference_is_told(
     assert to.differences == what
     to.summarize()
     assert set(said) <= set(manifest.verify(trial))
-    with pytest.raises(EvidenceError, match="the tables stay as they are") as caught:
+    with pytest.raises(EvidenceError, match="the tables are not changed") as caught:
         rebuild(trial)
     assert all(one in caught.value.what for one in said)
     assert {name: (trial / name).read_bytes() for name in tables} == tables
@@ -207,7 +207,7 @@ def test_no_table_is_made_again_from_a_plan_or_a_journal_that_changed(trial: Pat
     text = (trial / name).read_text(encoding="utf-8")
     cut = "".join(text.splitlines(keepends=True)[:-1])
     (trial / name).write_text(cut if name == journal.JOURNAL_FILE else text + "\n", encoding="utf-8")
-    with pytest.raises(EvidenceError, match=f"the tables stay as they are: {name}: changed"):
+    with pytest.raises(EvidenceError, match=f"the tables are not changed: {name}: changed"):
         rebuild(trial)
     assert {name: (trial / name).read_bytes() for name in tables} == tables
 
@@ -245,7 +245,7 @@ def test_a_table_that_is_gone_is_made_again_and_told(trial: Path) -> None:
 
 def test_a_manifest_that_is_gone_or_no_manifest_is_told(trial: Path) -> None:
     (trial / store.MANIFEST_FILE).write_text("nonsense\n", encoding="utf-8")
-    with pytest.raises(EvidenceError, match="no readable manifest: this is no line of one: nonsense") as caught:
+    with pytest.raises(EvidenceError, match="no readable manifest: not a line of a manifest: nonsense") as caught:
         again(trial)
     assert caught.value.remedy == "restore the file from a copy"
     (trial / store.MANIFEST_FILE).unlink()

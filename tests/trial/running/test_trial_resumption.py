@@ -20,7 +20,7 @@ def test_rows_of_two_ways_to_measure_are_not_mixed(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
     assert resumption.resumable(TRIAL) == PLAN
     monkeypatch.setattr(resumption, "code_hash", lambda: "another")
-    with pytest.raises(ConfigurationError, match=f"begun by other code .fieldkit .*, {PLAN.code_sha256}") as caught:
+    with pytest.raises(ConfigurationError, match=f"started by other code .fieldkit .*, {PLAN.code_sha256}") as caught:
         resumption.resumable(TRIAL)
     assert caught.value.where == str(TRIAL)
     assert typed("fieldkit", "rebuild", TRIAL) in caught.value.remedy
@@ -28,7 +28,7 @@ def test_rows_of_two_ways_to_measure_are_not_mixed(monkeypatch: pytest.MonkeyPat
 
 def test_robots_of_another_backend_are_refused() -> None:
     resumption.demand_backend(PLAN, PLAN.backend, TRIAL)
-    with pytest.raises(ConfigurationError, match=f"it was begun on backend {PLAN.backend}, not imagined") as caught:
+    with pytest.raises(ConfigurationError, match=f"it was started on backend {PLAN.backend}, not imagined") as caught:
         resumption.demand_backend(PLAN, "imagined", TRIAL)
     assert caught.value.remedy == typed("fieldkit", "resume", TRIAL, "--backend", PLAN.backend)
 
@@ -51,7 +51,7 @@ def test_a_robot_that_drove_by_itself_needs_leave_again() -> None:
     by_hand = {role: robot.model_copy(update={"drives": False}) for role, robot in PLAN.cast.items()}
     plan = PLAN.model_copy(update={"procedure": shipped, "cast": driving})
     resumption.demand_cast(plan, driving)
-    with pytest.raises(ConfigurationError, match="moved by itself in this trial, and may not now") as caught:
+    with pytest.raises(ConfigurationError, match="moved without a person in this trial, and may not now") as caught:
         resumption.demand_cast(plan, by_hand)
     assert "--allow-motion" in caught.value.remedy
     # What the lab lets it do is no matter where nobody moves it, or a person did.

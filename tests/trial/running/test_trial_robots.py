@@ -87,9 +87,9 @@ def test_what_a_robot_did_not_give_stays_on_it(tmp_path: Path) -> None:
         "receiver-after.txt",
         "sender-unfetched.txt",
     }
-    assert robots.left() == {"turtlebot-1": [attempts["udp-01-1"]]}
-    robots.discard(attempts["udp-01-1"])
-    robots.discard()
+    assert robots.unfetched() == {"turtlebot-1": [attempts["udp-01-1"]]}
+    robots.delete_remote(attempts["udp-01-1"])
+    robots.delete_remote()
     kept = {role: sorted(path.name for path in (tmp_path / role / ".fieldkit").glob("*/*")) for role in shells}
     assert kept == {Role.SENDER: ["udp-01-1"], Role.RECEIVER: []}
 
@@ -177,4 +177,4 @@ def test_what_came_whole_does_not_stay_because_a_job_ended_badly(tmp_path: Path)
     (said,) = robots.fetch(remote, into, clean=True)
     assert said.endswith("job capture ended with exit code 3")
     assert "exit code 1" not in said, "it is said in the robot's own words"
-    assert robots.left() == {}
+    assert robots.unfetched() == {}

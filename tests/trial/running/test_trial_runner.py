@@ -95,7 +95,7 @@ def test_after_another_s_abort_no_folder_of_a_fetched_repeat_stays(
             raise LockLostError("the trial was aborted by anna@one at 12:00:00 UTC", where="turtlebot-1")
 
     monkeypatch.setattr(Robots, "begin", begin)
-    monkeypatch.setattr(Robots, "discard", lambda _, remote=None: removed.append(remote))
+    monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed.append(remote))
     with pytest.raises(LockLostError):
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
@@ -114,7 +114,7 @@ def test_an_attempt_that_somebody_aborts_is_none_of_those_allowed(
 
     monkeypatch.setattr(Robots, "measure", measure)
     monkeypatch.setattr(Robots, "demand_held", aborted)
-    monkeypatch.setattr(Robots, "discard", lambda _, remote=None: removed.append(remote))
+    monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed.append(remote))
     with pytest.raises(LockLostError):
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     (cut,) = journal.ended(journal.read(only(tmp_path)))
@@ -172,7 +172,7 @@ def test_evidence_that_was_gone_when_fieldkit_came_back_is_said_in_words(
     resume_trial(folder, IdleTestbed(), lambda _: None)
     first = journal.ended(journal.read(folder))[0]
     assert (first.status, first.excused) == (Status.VOID, True)
-    assert first.reason == f"fieldkit was killed before it had the evidence, which was not to be had later; {gone}"
+    assert first.reason == f"fieldkit was killed before it had the evidence, which could not be fetched later; {gone}"
 
 
 def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
@@ -191,7 +191,7 @@ def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
         run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     folder = only(tmp_path)
     told = Note(
-        f"turtlebot-1: evidence that was not fetched stays on it; delete it when nobody needs it: "
+        f"turtlebot-1: evidence that was not fetched stays on it; delete it when it is not needed: "
         f"~/.fieldkit/{folder.name}/tcp-01-1, ~/.fieldkit/{folder.name}/tcp-01-2"
     )
     assert told in events
@@ -331,7 +331,7 @@ def test_a_folder_that_is_moved_away_stops_the_trial_which_goes_on_where_it_is(
     monkeypatch.setattr(Robots, "fetch", moving)
     with pytest.raises(ConfigurationError, match="cannot be written: No such file or directory") as caught:
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
-    assert caught.value.remedy == "fieldkit resume FOLDER, where that is now"
+    assert caught.value.remedy == "fieldkit resume FOLDER, with the present path of the folder"
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(tmp_path / "moved", IdleTestbed(), lambda _: None)
     assert manifest.verify(tmp_path / "moved") == []
@@ -352,7 +352,7 @@ def test_who_goes_on_is_told_of_evidence_that_changed(tmp_path: Path, events: li
     folder = only(tmp_path)
     (folder / "repeats/tcp-02/ping.txt").write_text(PING.replace("time=2", "time=9"), encoding="utf-8")
     resume_trial(folder, IdleTestbed(), events.append)
-    assert Note("not as it was when it was kept, and left so: repeats/tcp-02/ping.txt: changed") in events
+    assert Note("the evidence has changed since it was stored: repeats/tcp-02/ping.txt: changed") in events
     assert manifest.verify(folder) == ["repeats/tcp-02/ping.txt: changed"]
 
 
@@ -365,7 +365,7 @@ def test_a_trial_begun_with_another_version_of_a_package_that_adds_steps_is_not_
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.0", "fieldkit": "stale"})
     assert resumable(folder) == begun
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.1"})
-    with pytest.raises(ConfigurationError, match=r"begun by other code \(lab-steps 1\.0\)"):
+    with pytest.raises(ConfigurationError, match=r"started by other code \(lab-steps 1\.0\)"):
         resumable(folder)
 
 
