@@ -32,7 +32,7 @@ seeds = st.integers(min_value=0, max_value=2**40)
 
 
 @given(trials, seeds, st.floats(min_value=1.0, max_value=6.0))
-def test_every_trial_comes_once_in_blocks_within_the_walk(
+def test_every_trial_occurs_once_in_blocks_within_the_walk(
     planned: set[PlannedTrial], seed: int, factor: float
 ) -> None:
     limit_m = factor * order.walk_m(order.shortest(sorted(planned, key=str)))
@@ -45,9 +45,7 @@ def test_every_trial_comes_once_in_blocks_within_the_walk(
 
 
 @given(trials, seeds)
-def test_equal_seeds_give_equal_orders_whatever_order_they_were_given_in(
-    planned: set[PlannedTrial], seed: int
-) -> None:
+def test_equal_seeds_give_equal_orders_for_any_input_order(planned: set[PlannedTrial], seed: int) -> None:
     forwards = sorted(planned, key=str)
     orders = {order.shuffled(given, seed=seed, limit_m=1e9) for given in (forwards, tuple(reversed(forwards)))}
     assert len(orders) == 1
@@ -75,7 +73,7 @@ def test_no_order_in_blocks_is_shorter_than_the_shortest(planned: set[PlannedTri
     assert order.walk_m(order.shortest(list(planned))) == pytest.approx(min(map(order.walk_m, every)))
 
 
-def test_the_walk_is_that_of_everybody_who_walks() -> None:
+def test_the_walk_counts_every_carried_robot() -> None:
     los, master, masterless = Scenario.LOS, Topology.MASTER, Topology.MASTERLESS
     there_and_back = [trial(10, los, master), trial(30, los, master), trial(20, los, master)]
     assert order.walk_m(there_and_back) == pytest.approx(2 * (10 + 20 + 10) * 0.3048), "two stations"
@@ -92,7 +90,7 @@ def every_first(limit: float) -> Iterator[PlannedTrial]:
     return (order.shuffled(planned, seed=seed, limit_m=limit_m)[0] for seed in range(320))
 
 
-def test_without_a_bound_each_of_16_trials_is_first_about_as_often() -> None:
+def test_without_a_limit_each_of_16_trials_is_first_equally_often() -> None:
     counts = Counter(every_first(100.0))
     assert len(counts) == 16
     # 20 are expected of each; a binomial count of 320 with p = 1/16 is outside 5..40 once in 10,000 times.
@@ -103,7 +101,7 @@ def test_within_three_times_the_shortest_walk_each_trial_is_first_sometimes() ->
     assert len(Counter(every_first(order.DEFAULT_WALK))) == 16
 
 
-def test_the_shortest_walk_leaves_sweeps_only() -> None:
+def test_the_shortest_walk_allows_only_sweeps() -> None:
     planned = [trial(feet, Scenario.LOS, Topology.MASTERLESS) for feet in (10, 20, 30, 40)]
     found = order.shuffled(planned, seed=3, limit_m=order.walk_m(order.shortest(planned)))
     assert found == order.shortest(planned)

@@ -24,7 +24,7 @@ def names(tmp_path: Path, text: str) -> list[str]:
     return [str(one) for one in trials_of(campaign, load_procedures(campaign, document), document)]
 
 
-def test_a_campaign_is_distances_by_procedures_by_topologies(tmp_path: Path) -> None:
+def test_a_campaign_combines_distances_procedures_and_topologies(tmp_path: Path) -> None:
     found = names(tmp_path, LAWN)
     assert sorted(found) == [
         f"{procedure} {distance} {topology}"
@@ -34,7 +34,7 @@ def test_a_campaign_is_distances_by_procedures_by_topologies(tmp_path: Path) -> 
     ]
 
 
-def test_what_is_left_out_matches_by_every_key_named(tmp_path: Path) -> None:
+def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
     found = names(tmp_path, f"{LAWN}except: [{{topology: master, distance: 240 cm}}]\n".replace("20ft", "2.4m"))
     assert len(found) == 6
     assert not [one for one in found if one.endswith("2.4m master")]
@@ -64,7 +64,7 @@ def test_what_is_left_out_matches_by_every_key_named(tmp_path: Path) -> None:
         ("seed: 7", "seed: 7\nexcept: [{}]", 6, "leaves out every trial"),
     ],
 )
-def test_a_wrong_file_is_told_with_its_line(tmp_path: Path, old: str, new: str, line: int, said: str) -> None:
+def test_a_wrong_file_is_reported_with_its_line(tmp_path: Path, old: str, new: str, line: int, said: str) -> None:
     assert old in LAWN
     with pytest.raises(ConfigurationError) as caught:
         names(tmp_path, LAWN.replace(old, new))
@@ -85,7 +85,7 @@ KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xY
 SHORTER = "turtlebot-2 moves 29.5 m away, at 0.22 m/s; 60 m away, at 2 m/s is beyond its limits"
 
 
-def test_what_robots_do_less_than_asked_is_said_once_before_the_first_trial(
+def test_reduced_values_are_reported_once_before_the_first_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

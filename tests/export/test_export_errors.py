@@ -51,7 +51,7 @@ def exported(path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> int:
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("name", [PLAN_FILE, JOURNAL_FILE, store.TRIAL_CSV])
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_trial_is_an_error_with_a_remedy_or_a_whole_file(
+def test_a_damaged_trial_gives_an_error_with_a_remedy_or_a_complete_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, name: str, damage: str
 ) -> None:
     trial = tmp_path / LOSSY.name
@@ -64,7 +64,7 @@ def test_a_damaged_trial_is_an_error_with_a_remedy_or_a_whole_file(
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("missing", ["none", "folder"])
-def test_what_is_no_trial_is_an_error(
+def test_a_path_without_a_trial_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, missing: str
 ) -> None:
     (tmp_path / "folder").mkdir()

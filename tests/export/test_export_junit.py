@@ -62,7 +62,7 @@ def test_a_repeat_that_failed_is_a_failure_with_its_reason(trial: Path) -> None:
     assert name == str(list(store.read_plan(trial).order())[-1])
 
 
-def test_a_repeat_that_is_not_over_is_skipped(trial: Path) -> None:
+def test_a_repeat_that_has_not_ended_is_skipped(trial: Path) -> None:
     edited(trial / JOURNAL_FILE, lambda text: "".join(text.splitlines(keepends=True)[:-1]))
     assert len(cases(suite(trial), "skipped")) == 1
 
@@ -115,7 +115,7 @@ def test_a_trial_without_its_table_passes_no_expectation(trial: Path, capsys: py
     assert "no repeat has ended" in capsys.readouterr().err + out.read_text(encoding="utf-8")
 
 
-def test_the_command_writes_what_a_parser_reads(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_valid_xml(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = trial.parent / "results.xml"
     assert main(["export", str(trial.parent), "--format", "junit", "-o", str(out)]) == 0
     assert "wrote" in capsys.readouterr().out
@@ -123,7 +123,7 @@ def test_the_command_writes_what_a_parser_reads(trial: Path, capsys: pytest.Capt
     assert found.get("name") == trial.name
 
 
-def test_nothing_that_a_robot_says_breaks_the_file(trial: Path) -> None:
+def test_no_text_from_a_robot_breaks_the_file(trial: Path) -> None:
     reason = "\\u0000\\u001b[31m]]>&<\\ud800\\uffff"
     edited(trial / JOURNAL_FILE, lambda text: text.replace('"reason": ""', f'"reason": "{reason}"', 3))
     assert len(suite(trial)) > 0

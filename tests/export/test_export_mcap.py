@@ -130,7 +130,7 @@ def test_each_packet_has_its_robots_time_and_its_fate(found: list[Read]) -> None
     }
 
 
-def test_every_topic_says_whose_clock_its_times_are_of(found: list[Read]) -> None:
+def test_every_topic_names_its_clock(found: list[Read]) -> None:
     assert {one.topic: one.clock for one in found} == {
         "/tf": "laptop",
         "/trial/log": "laptop",
@@ -157,7 +157,7 @@ def test_replies_and_phases_are_those_of_the_evidence(found: list[Read]) -> None
     assert begun == {"record": START_NS, "transfer": BEGIN_NS + 2 * SECOND_NS, "ping": BEGIN_NS + 3 * SECOND_NS}
 
 
-def test_the_robots_stand_where_the_plan_has_them(found: list[Read]) -> None:
+def test_the_robots_are_at_their_planned_places(found: list[Read]) -> None:
     transforms = [one for read in of(found, "/tf")[:3] for one in read.said["transforms"]]
     assert {one["child_frame_id"]: one["translation"] for one in transforms} == {
         "duckiedrone-1": {"x": 0, "y": 0, "z": 0},
@@ -201,7 +201,7 @@ def test_a_damaged_capture_gives_what_is_before_the_damage_and_no_fates(trial: P
 
 
 @pytest.mark.parametrize(("payload_bytes", "told"), [(1440, True), (2880, False)])
-def test_what_became_of_frames_of_offload_is_not_told(trial: Path, payload_bytes: int, told: bool) -> None:
+def test_frames_of_offload_have_no_fates(trial: Path, payload_bytes: int, told: bool) -> None:
     """Of TCP with offload, frames of one end are not those of the other."""
     plan = (trial / "trial.yaml").read_text(encoding="utf-8")
     (trial / "trial.yaml").write_text(plan.replace("protocols:\n- udp", "protocols:\n- tcp"), encoding="utf-8")
@@ -216,7 +216,7 @@ def test_what_became_of_frames_of_offload_is_not_told(trial: Path, payload_bytes
 
 
 @pytest.mark.parametrize(("ip_id", "target"), [(0, recorded.RECEIVER), (1, "10.42.0.9")])
-def test_what_became_of_packets_that_do_not_compare_is_not_told(trial: Path, ip_id: int, target: str) -> None:
+def test_packets_that_cannot_be_matched_have_no_fates(trial: Path, ip_id: int, target: str) -> None:
     """All alike, but for their times; or with another address at the receiver."""
     folder = trial / "repeats" / "udp-01"
     sent = timed([recorded.packet(number * ip_id) for number in range(10)])
@@ -228,7 +228,7 @@ def test_what_became_of_packets_that_do_not_compare_is_not_told(trial: Path, ip_
     assert not any("lost" in one.said or "copy" in one.said for one in found)
 
 
-def test_replies_without_a_time_stamp_are_left_out_and_told_of(trial: Path) -> None:
+def test_replies_without_a_time_stamp_are_left_out_and_reported(trial: Path) -> None:
     path = trial / "repeats" / "udp-01" / "ping.txt"
     text = path.read_text(encoding="utf-8")
     path.write_text("\n".join(line.partition("] ")[2] or line for line in text.split("\n")), encoding="utf-8")
@@ -238,9 +238,7 @@ def test_replies_without_a_time_stamp_are_left_out_and_told_of(trial: Path) -> N
     assert warning["message"] == "3 replies have no time stamp and are left out"
 
 
-def test_a_trial_without_an_ended_repeat_has_nothing_to_tell(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_trial_without_an_ended_repeat_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trial = recorded.make(tmp_path)
     path = trial / journal.JOURNAL_FILE
     path.write_text(path.read_text(encoding="utf-8").splitlines(keepends=True)[0], encoding="utf-8")
@@ -249,7 +247,7 @@ def test_a_trial_without_an_ended_repeat_has_nothing_to_tell(
     assert list(tmp_path.iterdir()) == [trial]
 
 
-def test_a_track_takes_the_place_of_the_plan(trial: Path) -> None:
+def test_a_track_replaces_the_planned_places(trial: Path) -> None:
     before = of(messages(exported(trial)), "/tf")
     folder = next(path for path in (trial / "repeats").iterdir() if path.name == "udp-01")
     began_ns = min(one.time_ns for one in before)
@@ -268,7 +266,7 @@ def test_a_track_takes_the_place_of_the_plan(trial: Path) -> None:
     assert times_ns[0] >= began_ns, "what held when the attempt began is told then"
 
 
-def test_what_was_told_of_robots_takes_the_place_of_the_testbeds_track(trial: Path) -> None:
+def test_added_positions_replace_the_testbeds_track(trial: Path) -> None:
     began_ns = min(one.time_ns for one in of(messages(exported(trial)), "/tf"))
     folder = trial / "repeats" / "udp-01"
     (folder / "track.csv").write_text(
@@ -289,7 +287,7 @@ def test_what_was_told_of_robots_takes_the_place_of_the_testbeds_track(trial: Pa
     assert fixes[0].time_ns == began_ns
 
 
-def test_what_radios_told_of_their_links_is_a_channel_of_each(trial: Path) -> None:
+def test_link_samples_have_a_channel_per_robot(trial: Path) -> None:
     folder = trial / "repeats" / "udp-01"
     known = StationSample("turtlebot-2", -51.25, 65_000_000, None, 7, 5, 1, 0)
     told = [LinkSample(BEGIN_NS, (known,), noise_dbm=-95.0, active_ns=2 * SECOND_NS, busy_ns=SECOND_NS)]

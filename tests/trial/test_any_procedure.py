@@ -198,7 +198,7 @@ def loaded(steps: list[Any]) -> Procedure | ConfigurationError:
 @pytest.mark.emulated  # needs tcpdump, which filters the captures
 @settings(max_examples=100)
 @given(steps=ANYTHING, **OTHERS)
-def test_anything_is_measured_rightly_or_refused(
+def test_any_procedure_is_measured_correctly_or_rejected(
     steps: list[Any], protocol: Protocol, loss: float, seed: int
 ) -> None:
     judge(steps, protocol, loss, seed)
@@ -206,7 +206,7 @@ def test_anything_is_measured_rightly_or_refused(
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("block", range(4))
-def test_what_people_write_is_measured_rightly_or_refused(block: int) -> None:
+def test_usual_procedures_are_measured_correctly_or_rejected(block: int) -> None:
     for seed in range(100 * block, 100 * block + 100):
         draw = random.Random(seed)
         judge(usual(seed), draw.choice(list(Protocol)), draw.choice([0.0, 0.2]), seed)
@@ -297,7 +297,7 @@ def _compare_transfer(
 
 
 @pytest.mark.emulated
-def test_enough_of_each_kind_was_tried(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
+def test_enough_procedures_of_each_kind_were_tried(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
     if not SEEN:
         pytest.fail("this runs behind the test above, in one process")
     record_property("said", f"random procedures: {dict(sorted(SEEN.items()))}")

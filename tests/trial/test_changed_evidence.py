@@ -109,7 +109,7 @@ SENT = "sender-iperf3.json"
         (Protocol.UDP, "bare.receiver-iperf3.json", everywhere("bytes", 10), "bit/s by its bytes"),
     ],
 )
-def test_iperf3_results_that_other_evidence_contradicts(
+def test_iperf3_results_contradicted_by_other_evidence(
     protocol: Protocol, name: str, change: Change, reason: str, tmp_path: Path
 ) -> None:
     demand(protocol, name, change, tmp_path, reason)
@@ -178,7 +178,7 @@ def test_pings_that_captures_contradict(protocol: Protocol, change: Change, reas
     demand(protocol, "ping.txt", change, tmp_path, reason)
 
 
-def test_a_ping_of_other_times_that_its_own_summary_confirms(tmp_path: Path) -> None:
+def test_changed_ping_times_with_a_consistent_summary(tmp_path: Path) -> None:
     """Every time of the file 5 ms longer: only the capture tells."""
 
     def longer(content: bytes) -> bytes:
@@ -201,12 +201,12 @@ def test_a_ping_of_other_times_that_its_own_summary_confirms(tmp_path: Path) -> 
         (lambda _: b"", "the kernel of the receiver refused 0"),
     ],
 )
-def test_a_udp_file_that_is_not_what_arrived(change: Change, reason: str, tmp_path: Path) -> None:
+def test_a_udp_file_that_differs_from_the_received_data(change: Change, reason: str, tmp_path: Path) -> None:
     assert len((attempt(Protocol.UDP).folder / "recv.bag").read_bytes()) > 8192
     demand(Protocol.UDP, "recv.bag", change, tmp_path, reason)
 
 
-def test_datagrams_that_the_kernel_refused_are_a_loss_of_the_receiver(tmp_path: Path) -> None:
+def test_datagrams_dropped_by_the_kernel_are_a_loss_of_the_receiver(tmp_path: Path) -> None:
     """A socket buffer overflow is legitimate: the kernel counts it (RcvbufErrors)."""
     stored_one = attempt(Protocol.UDP)
     for path in stored_one.folder.iterdir():

@@ -32,7 +32,7 @@ def test_at_first_a_good_link_is_assumed_and_a_dead_one_stated() -> None:
     assert ", up to 4" in str(lasts)
 
 
-def test_repeats_of_the_same_trial_say_it_best() -> None:
+def test_finished_repeats_of_the_same_trial_are_preferred() -> None:
     here, elsewhere = at("30ft"), at("10ft")
     known = [
         FinishedRepeat(here, TCP, 130.0),
@@ -44,7 +44,7 @@ def test_repeats_of_the_same_trial_say_it_best() -> None:
     assert of_repeats(here, UDP, 3, known) == TimeEstimate(24.0, 24.0), "each protocol by its own repeats"
 
 
-def test_a_place_farther_than_any_before_may_have_a_dead_link() -> None:
+def test_a_larger_distance_than_any_before_may_have_a_dead_link() -> None:
     known = [FinishedRepeat(at("10m"), TCP, 9.0), FinishedRepeat(at("20m"), TCP, 12.0)]
     farther = of_repeats(at("30m"), TCP, 1, known)
     assert farther.likely_s == 12.0, "as the farthest place so far"
@@ -55,14 +55,14 @@ def test_a_place_farther_than_any_before_may_have_a_dead_link() -> None:
     assert of_repeats(at("5m"), TCP, 1, known) == TimeEstimate(9.0, 12.0)
 
 
-def test_another_topology_says_something_where_the_same_says_nothing() -> None:
+def test_another_topology_is_used_if_the_same_has_no_repeats() -> None:
     other = next(topology for topology in Topology if topology is not LOS.topology)
     known = [FinishedRepeat(at("10m", other), TCP, 50.0)]
     assert of_repeats(at("10m"), TCP, 2, known) == TimeEstimate(100.0, 100.0)
     assert of_repeats(at("10m"), TCP, 2, [*known, FinishedRepeat(at("10m"), TCP, 7.0)]) == TimeEstimate(14.0, 14.0)
 
 
-def test_a_dead_link_campaign_is_announced_as_what_it_took() -> None:
+def test_finished_repeats_with_a_dead_link_are_used() -> None:
     """A campaign said 4 min and took 19: after its first trial with dead links the rest is known."""
     near, far = at("10m"), at("90m")
     before = of_trial(far, [FinishedRepeat(near, protocol, 8.0) for protocol in LOS.protocols])

@@ -40,13 +40,13 @@ def test_every_column_of_a_step_has_a_row() -> None:
     assert bare == set()
 
 
-def test_a_check_without_a_second_source_is_called_unchecked() -> None:
+def test_a_check_without_a_second_source_is_unchecked() -> None:
     for kind, check in evidence_sources.rows():
         assert (check.outcome is CheckOutcome.UNCHECKED) == (not check.against), (kind, check.quantity)
         assert check.tolerance, (kind, check.quantity)
 
 
-def test_no_row_names_a_column_that_no_step_has() -> None:
+def test_no_row_names_an_unknown_column() -> None:
     columns = {column.name for one in placed() for column in one.step.output_columns()}
     columns |= {column.name for step in base.step_types().values() for column in step.columns}
     columns |= {column.name for column in (*drive_log.COLUMNS, *fly_log.COLUMNS)}  # of robots that move by themselves

@@ -73,7 +73,7 @@ COMMANDS = [
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
-def test_a_link_to_a_file_of_ours_is_refused_in_one_sentence(
+def test_a_link_to_a_local_file_is_rejected_in_one_sentence(
     trial: Path, ours: Path, place: str, command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     (trial / place).unlink(missing_ok=True)
@@ -88,7 +88,7 @@ def test_a_link_to_a_file_of_ours_is_refused_in_one_sentence(
 
 @pytest.mark.parametrize("make", [pipe, unix_socket, lambda path: path.symlink_to("/dev/zero")])
 @pytest.mark.parametrize("place", ["trial.yaml", "journal.jsonl", "trial.csv", "repeats/udp-01/sender.pcap"])
-def test_what_could_keep_a_reader_waiting_is_refused(trial: Path, place: str, make: Callable[[Path], None]) -> None:
+def test_files_that_could_block_a_reader_are_rejected(trial: Path, place: str, make: Callable[[Path], None]) -> None:
     (trial / place).unlink()
     make(trial / place)
     with pytest.raises(EvidenceError, match="no file of its own") as caught:
@@ -97,7 +97,7 @@ def test_what_could_keep_a_reader_waiting_is_refused(trial: Path, place: str, ma
     assert any(line.startswith(f"{place}: it is a ") for line in manifest.verify(trial))
 
 
-def test_a_pipe_as_a_table_keeps_nobody_waiting(
+def test_a_pipe_as_a_table_does_not_block(
     trial: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (trial / "trial.csv").unlink()
@@ -107,14 +107,14 @@ def test_a_pipe_as_a_table_keeps_nobody_waiting(
 
 
 @pytest.mark.parametrize("name", ["repeats", "repeats/udp-01"])
-def test_a_folder_elsewhere_is_no_folder_of_the_trial(trial: Path, tmp_path: Path, name: str) -> None:
+def test_a_link_to_another_folder_is_not_a_folder_of_the_trial(trial: Path, tmp_path: Path, name: str) -> None:
     (trial / name).rename(tmp_path / "elsewhere")
     (trial / name).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(EvidenceError, match="it is a symbolic link"):
         store.read_plan(trial)
 
 
-def test_evidence_deeper_than_evidence_lies_is_refused(trial: Path) -> None:
+def test_evidence_in_too_deep_folders_is_rejected(trial: Path) -> None:
     (trial / "repeats/udp-01/a/b").mkdir(parents=True)
     with pytest.raises(EvidenceError, match="a folder, deeper than evidence can be"):
         store.read_plan(trial)
@@ -151,7 +151,7 @@ def test_a_file_that_is_replaced_is_never_what_a_link_leads_to(tmp_path: Path, o
     assert (tmp_path / "out.csv").read_bytes() == b"new"
 
 
-def test_names_that_are_no_text_stand_in_the_manifest_as_sha256sum_writes_them(trial: Path) -> None:
+def test_names_that_are_not_text_are_written_as_by_sha256sum(trial: Path) -> None:
     strange = ["a\nb.txt", "back\\slash", "re\rturn"]
     for name in strange:
         (trial / "repeats/udp-01" / name).write_text("x", encoding="utf-8")
@@ -185,7 +185,7 @@ RUNNING, VALID, VOID, MEASURED = Status.RUNNING, Status.VALID, Status.VOID, Stat
         ([(1_000_000_000, 1, RUNNING)], "the plan has no repeat udp-1000000000"),
     ],
 )
-def test_a_journal_that_contradicts_itself_or_the_plan_is_told_with_its_line(
+def test_a_contradictory_journal_is_reported_with_its_line(
     trial: Path, entries: list[tuple[int, int, Status]], why: str
 ) -> None:
     lie(trial, *(JournalEntry(1, Protocol.UDP, number, attempt, status) for number, attempt, status in entries))
@@ -212,7 +212,7 @@ def test_a_journal_that_contradicts_itself_or_the_plan_is_told_with_its_line(
     ],
     ids=str,
 )
-def test_a_line_that_is_no_entry_is_one_error_with_its_line(trial: Path, line: str) -> None:
+def test_an_invalid_line_is_one_error_with_its_line(trial: Path, line: str) -> None:
     with (trial / journal.JOURNAL_FILE).open("a", encoding="utf-8") as file:
         file.write(f"{line}\n")
     with pytest.raises(EvidenceError, match="not a journal entry") as caught:
@@ -220,7 +220,7 @@ def test_a_line_that_is_no_entry_is_one_error_with_its_line(trial: Path, line: s
     assert caught.value.where == f"{trial / journal.JOURNAL_FILE}:6"
 
 
-def test_a_reason_with_half_a_surrogate_pair_is_kept_with_a_mark(tmp_path: Path) -> None:
+def test_a_reason_with_half_a_surrogate_pair_is_stored_with_a_mark(tmp_path: Path) -> None:
     """Names of files that are no UTF-8 have such halves, and errors name files."""
     plan = los_plan(repeats=1, protocols=(Protocol.UDP,))
     folder = store.create(tmp_path, plan)

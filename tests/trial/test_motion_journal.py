@@ -43,7 +43,7 @@ def kept(folder: Path, placement: Placement = NEAR, *, may_return: bool = False)
     return KeptOrigins(MotionJournal(folder / MOTION_FILE), folder, ROBOTS, placement, may_return=may_return)
 
 
-def test_an_origin_holds_over_runs_and_placements_that_leave_the_robot_where_it_is(tmp_path: Path) -> None:
+def test_an_origin_is_valid_over_runs_that_leave_the_robot_at_its_place(tmp_path: Path) -> None:
     kept(tmp_path).record(Role.RECEIVER, ORIGIN)
     kept(tmp_path).record(Role.SENDER, replace(ORIGIN, x_m=9.0))
     assert kept(tmp_path).get(Role.RECEIVER) == ORIGIN
@@ -82,7 +82,7 @@ def test_only_a_confirmation_lets_robots_move_after_a_fault(tmp_path: Path, at_p
     assert again.get(Role.RECEIVER) == (None if at_place else ORIGIN)
 
 
-def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign_with_that_reason(tmp_path: Path) -> None:
+def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -> None:
     (tmp_path / laptop_files.CAMPAIGN).write_text("{}", encoding="utf-8")
     trials = tmp_path / "first", tmp_path / "second"
     first = KeptOrigins(MotionJournal(journal_of(trials[0])), trials[0], ROBOTS, NEAR)
@@ -95,7 +95,7 @@ def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign_with_that_reason(
     assert "fieldkit campaign, as before" in held.value.remedy
 
 
-def test_a_fieldkit_that_was_killed_in_a_motion_holds_robots(tmp_path: Path) -> None:
+def test_a_kill_during_a_motion_holds_the_robots(tmp_path: Path) -> None:
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.BEGUN, "rover-1")
     with pytest.raises(MotionHeldError, match="fieldkit stopped while it moved"):
         kept(tmp_path).demand()
@@ -116,7 +116,7 @@ def test_the_trials_of_a_campaign_have_one_journal(tmp_path: Path) -> None:
     assert journal_of(trial) == tmp_path / MOTION_FILE
 
 
-def test_a_log_may_begin_as_far_from_the_origin_as_a_robot_may_start() -> None:
+def test_a_log_may_start_as_far_from_the_origin_as_a_robot_may() -> None:
     assert drive_checks._START_M == START_M
 
 

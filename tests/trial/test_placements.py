@@ -47,7 +47,7 @@ PLANNED_M = math.dist(SCENE.places_m[Role.SENDER], SCENE.places_m[Role.RECEIVER]
 @pytest.mark.parametrize(
     ("apart_m", "agrees"), [(18.288, True), (18.897, True), (17.0, True), (24.0, False), (200.0, False)]
 )
-def test_a_place_in_metres_is_within_two_metres(apart_m: float, agrees: bool, tmp_path: Path) -> None:
+def test_positions_in_metres_have_a_tolerance_of_two_metres(apart_m: float, agrees: bool, tmp_path: Path) -> None:
     """31 ft instead of 30 ft are 18.897 m from one to the other."""
     why = placements.contradiction(SCENE, in_metres(tmp_path, apart_m))
     assert (why is None) is agrees
@@ -56,14 +56,16 @@ def test_a_place_in_metres_is_within_two_metres(apart_m: float, agrees: bool, tm
 
 
 @given(off_m=st.floats(-18, 300))
-def test_a_place_by_satellites_is_within_their_error(off_m: float, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_satellite_positions_have_the_tolerance_of_their_error(
+    off_m: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     found = placements.contradiction(SCENE, on_earth(tmp_path_factory.getbasetemp(), PLANNED_M + off_m))
     least_m = placements.SATELLITE_M + placements.SHARE * PLANNED_M
     if not math.isclose(abs(off_m), least_m, abs_tol=0.2):
         assert (found is None) is (abs(off_m) < least_m)
 
 
-def test_nobody_who_tells_of_positions_contradicts_nothing(tmp_path: Path) -> None:
+def test_missing_positions_contradict_nothing(tmp_path: Path) -> None:
     assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
     lone = Accounts({Role.RECEIVER: Account(place=(300.0, 0.0, 0.0), frame=LOCAL)})
     (tmp_path / accounts.FILE).write_text(accounts.text(lone), encoding="utf-8")
@@ -74,7 +76,9 @@ def test_nobody_who_tells_of_positions_contradicts_nothing(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("off_m", "why"), [(0.0, None), (200.0, "has the receiver 200.0 m from where it was placed")]
 )
-def test_a_place_that_the_laptop_wrote_is_the_planned_one(off_m: float, why: str | None, tmp_path: Path) -> None:
+def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
+    off_m: float, why: str | None, tmp_path: Path
+) -> None:
     places_m = SCENE.places_m
     x, y, z = places_m[Role.RECEIVER]
     evidence = stood(tmp_path, Account(place=(x + off_m, y, z)), Account(place=places_m[Role.SENDER]))

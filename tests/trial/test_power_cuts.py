@@ -75,7 +75,7 @@ def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -
 
 
 @strictest_in_ci
-def test_a_cut_at_any_write_loses_nothing_told(place: Path, file_system: FileSystem) -> None:
+def test_a_power_cut_at_any_write_loses_nothing_that_was_reported(place: Path, file_system: FileSystem) -> None:
     cuts, witness, _ = cuts_at_every_sync(Disk.make(file_system, place / "disk.img"), place)
     assert len(cuts) > 30, "hardly a write was met"
     assert any(cut.told for cut in cuts)
@@ -91,7 +91,7 @@ def test_a_cut_at_any_write_loses_nothing_told(place: Path, file_system: FileSys
                 demand_resumable(mounted / OUT)
 
 
-def test_each_sync_is_missed_when_it_is_taken_out(place: Path) -> None:
+def test_removing_any_sync_is_detected(place: Path) -> None:
     def lost(without: str) -> tuple[bool, set[str]]:
         file = place / "disk.img"
         cuts, witness, places = cuts_at_every_sync(Disk.make(STRICTEST, file), place, without=without)
@@ -114,7 +114,7 @@ def _lost(place: Path, cut: Cut, witness: Witness) -> list[str]:
         return cut.lost(mounted / OUT, witness)
 
 
-def test_nothing_of_it_stays_when_it_is_killed(tmp_path: Path) -> None:
+def test_a_killed_test_leaves_no_mounts(tmp_path: Path) -> None:
     """Mounts and loop devices are the machine's, so they must not need anybody to put them away."""
     with subprocess.Popen(
         (sys.executable, "-m", "tests.e2e.power_cuts"),

@@ -69,7 +69,7 @@ def trials(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("now", UNITS)
 @pytest.mark.parametrize("was", VALUES)
-def test_every_command_ends_with_a_table_or_an_error(
+def test_every_command_prints_a_table_or_an_error(
     trials: dict[str, Path],
     tmp_path: Path,
     was: str,

@@ -112,7 +112,7 @@ def of(protocol: Protocol, folder: Path, trial: Path = LOSSLESS) -> Attempt:
 
 @pytest.mark.parametrize("trial", [LOSSLESS, LOSSY], ids=["lossless", "lossy"])
 @pytest.mark.parametrize("protocol", Protocol)
-def test_whole_evidence_contradicts_nothing(protocol: Protocol, trial: Path, tmp_path: Path) -> None:
+def test_complete_evidence_has_no_contradictions(protocol: Protocol, trial: Path, tmp_path: Path) -> None:
     assert of(protocol, tmp_path, trial).problems(store.read_plan(trial)) == ()
 
 
@@ -141,7 +141,7 @@ def test_a_capture_without_its_beginning(attempt: Attempt, role: str) -> None:
         ("receiver", "a connection whose beginning is not in the receiver's capture"),
     ],
 )
-def test_a_handshake_that_one_capture_lacks(tcp: Attempt, role: str, reason: str) -> None:
+def test_a_handshake_missing_in_one_capture(tcp: Attempt, role: str, reason: str) -> None:
     tcp.capture(role, lambda packets: packets[3:])
     demand(tcp, reason)
 
@@ -167,7 +167,7 @@ def test_a_bag_that_is_missing_contradicts_nothing(attempt: Attempt) -> None:
     assert attempt.problems() == ("scan.bag: there is no bag",)
 
 
-def test_a_link_that_brought_nothing_contradicts_nothing(udp: Attempt) -> None:
+def test_a_link_that_lost_everything_contradicts_nothing(udp: Attempt) -> None:
     sender = udp.packets("sender.pcap")[0][1][8 + 12 : 8 + 16]
     udp.capture("receiver", lambda _: [])
     udp.capture("sender", lambda packets: [one for one in packets if one[1][8 + 12 : 8 + 16] == sender])
@@ -181,7 +181,7 @@ SECTIONS = ["boot", "clock", "date"]
 
 
 @pytest.mark.parametrize("section", SECTIONS)
-def test_robots_that_provide_no_such_section_contradict_nothing(attempt: Attempt, section: str) -> None:
+def test_sections_that_a_robot_never_provides_contradict_nothing(attempt: Attempt, section: str) -> None:
     """Neither before nor after: their tools cannot."""
     for role in ("sender", "receiver"):
         for moment in ("before", "after"):
@@ -193,13 +193,13 @@ def test_robots_that_provide_no_such_section_contradict_nothing(attempt: Attempt
 @pytest.mark.parametrize("moment", ["before", "after"])
 @pytest.mark.parametrize("section", SECTIONS)
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_a_section_that_is_there_at_one_moment_alone(attempt: Attempt, role: str, moment: str, section: str) -> None:
+def test_a_section_that_is_present_only_once(attempt: Attempt, role: str, moment: str, section: str) -> None:
     attempt.text(f"{role}-{moment}.txt", f"==> {section} <==", "==> other <==")
     demand(attempt, f"the section {section} is missing in its state")
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_jobs_of_which_nothing_is_noted(attempt: Attempt, role: str) -> None:
+def test_jobs_without_any_record(attempt: Attempt, role: str) -> None:
     attempt.text(f"{role}-after.txt", "==> jobs <==", "==> other <==")
     demand(attempt, "the section jobs is missing in its state")
 
@@ -212,7 +212,7 @@ def test_a_state_that_is_missing(attempt: Attempt, role: str, moment: str) -> No
 
 
 @pytest.mark.parametrize("job", ["capture asked 0 100000 1090.00\n", "listen itself 0 100000 1060.00\n"])
-def test_a_job_that_ran_without_a_note_of_its_end(attempt: Attempt, job: str) -> None:
+def test_a_job_without_a_record_of_its_end(attempt: Attempt, job: str) -> None:
     attempt.text("receiver-after.txt", job, "")
     demand(attempt, f"its job {job.partition(' ')[0]} ran, but its exit was not recorded")
 
@@ -225,7 +225,7 @@ def test_a_robot_that_a_step_reboots_may_reboot(tcp: Attempt) -> None:
     assert list(found) == ["turtlebot-1: the robot rebooted during the repeat"], "which only loses its link"
 
 
-def test_a_file_that_tcp_cannot_have_brought(tcp: Attempt) -> None:
+def test_a_file_that_tcp_cannot_have_delivered(tcp: Attempt) -> None:
     tcp.file("recv.bag", lambda data: data[:100] + bytes([data[100] ^ 1]) + data[101:])
     demand(tcp, "recv.bag is no beginning of scan.bag")
 
@@ -235,7 +235,7 @@ def test_a_file_with_more_than_arrived(attempt: Attempt) -> None:
     demand(attempt, "capture holds")
 
 
-def test_a_file_with_less_than_tcp_delivered_to_the_end(tcp: Attempt) -> None:
+def test_a_file_with_less_than_tcp_delivered(tcp: Attempt) -> None:
     tcp.file("recv.bag", lambda data: data[:-1])
     demand(tcp, "though its listener ended as if it had them all")
 
@@ -252,7 +252,7 @@ def test_more_bytes_than_the_file_has_left_the_sender(attempt: Attempt) -> None:
     demand(attempt, "bytes left the sender, and scan.bag has")
 
 
-def test_a_whole_file_beside_lost_packets_that_copies_make_up_for(udp: Attempt) -> None:
+def test_a_complete_file_with_lost_packets_replaced_by_copies(udp: Attempt) -> None:
     udp.file("recv.bag", lambda _: (udp.folder / "scan.bag").read_bytes())
     packets = udp.packets("sender.pcap")
 
@@ -264,13 +264,13 @@ def test_a_whole_file_beside_lost_packets_that_copies_make_up_for(udp: Attempt) 
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_answers_that_are_in_no_capture(attempt: Attempt, role: str) -> None:
+def test_replies_that_are_in_no_capture(attempt: Attempt, role: str) -> None:
     attempt.capture(role, lambda packets: packets[:-30])
     demand(attempt, f"and the {role}'s capture holds")
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_answers_that_only_another_pings_packets_could_make_up_for(attempt: Attempt, role: str) -> None:
+def test_replies_that_match_only_packets_of_another_ping(attempt: Attempt, role: str) -> None:
     """Of one that runs beside, with another identifier: half of each one's packets are as many as one's."""
 
     def shared(packets: list[Packet]) -> list[Packet]:
@@ -296,7 +296,7 @@ def test_a_ping_whose_counters_contradict_its_lines(attempt: Attempt) -> None:
     demand(attempt, f"ping counted {answers - 1} answers and printed {answers}")
 
 
-def test_an_answer_that_took_no_time(udp: Attempt) -> None:
+def test_a_reply_with_a_round_trip_time_of_zero(udp: Attempt) -> None:
     """As iputils prints it, beside "time of day goes back" in its log."""
     lines = (udp.folder / "ping.txt").read_text(encoding="utf-8")
     told = re.search(r"time=[0-9.]+ ms", lines)
@@ -357,7 +357,9 @@ def test_a_robot_that_rebooted(attempt: Attempt) -> None:
         ("sender", "ping itself 0", "ping asked 0", "its job ping was ended by fieldkit before it was done"),
     ],
 )
-def test_a_job_that_somebody_else_ended(attempt: Attempt, name: str, old: str, new: str, reason: str) -> None:
+def test_a_job_that_was_ended_by_another_program(
+    attempt: Attempt, name: str, old: str, new: str, reason: str
+) -> None:
     attempt.text(f"{name}-after.txt", old, new)
     (found,) = attempt.problems()
     assert reason in found
@@ -381,7 +383,7 @@ def test_a_traditional_netcat_that_caught_a_signal(attempt: Attempt) -> None:
         (2, "Ncat: Idle timeout expired (2000 ms). QUITTING.\n", False),
     ],
 )
-def test_a_listener_that_was_ended_or_could_not_write(attempt: Attempt, code: int, log: str, *, cut: bool) -> None:
+def test_a_listener_that_was_stopped_or_could_not_write(attempt: Attempt, code: int, log: str, *, cut: bool) -> None:
     attempt.text("receiver-after.txt", "listen itself 0", f"listen itself {code}")
     (attempt.folder / "receiver-listen.log").write_text(log, encoding="ascii")
     reason = "receiver-listen.log: netcat was ended by a signal, or could not write recv.bag"

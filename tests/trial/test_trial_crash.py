@@ -182,7 +182,7 @@ def demand_whole(out: Path) -> None:
     )
 
 
-def test_it_may_die_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robots_with_evidence(monkeypatch)
     out = tmp_path / "trials"
     moments = 0
@@ -194,7 +194,7 @@ def test_it_may_die_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert moments > 40, "hardly a write was met"
 
 
-def test_it_may_be_told_to_stop_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robots_with_evidence(monkeypatch)
     out = tmp_path / "trials"
     moments = 0
@@ -209,7 +209,7 @@ def test_it_may_be_told_to_stop_at_any_write(tmp_path: Path, monkeypatch: pytest
 
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(moments=st.lists(st.integers(1, 60), max_size=6))
-def test_it_may_die_again_while_it_resumes(
+def test_a_kill_during_recovery_is_recovered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moments: list[int]
 ) -> None:
     robots_with_evidence(monkeypatch)

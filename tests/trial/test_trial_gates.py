@@ -52,22 +52,22 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_whole_evidence_passes_and_lost_packets_are_no_reason(folder: Path) -> None:
+def test_complete_evidence_passes_even_with_lost_packets(folder: Path) -> None:
     assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
-def test_strangers_that_came_before_the_filter_are_no_reason(folder: Path) -> None:
+def test_packets_captured_before_the_filter_are_ignored(folder: Path) -> None:
     (folder / "sender-capture.log").write_text(log(matched=len(FRAMES) + 1), encoding="utf-8")
     assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
-def test_a_tcpdump_that_does_not_say_what_matched_is_no_reason(folder: Path) -> None:
+def test_a_tcpdump_without_a_match_count_is_accepted(folder: Path) -> None:
     said = [line for line in log().splitlines(keepends=True) if "received by filter" not in line]
     (folder / "sender-capture.log").write_text("".join(said), encoding="utf-8")
     assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
-def test_a_lab_that_kept_its_model_and_one_that_has_none_are_no_reason(folder: Path) -> None:
+def test_labs_with_an_intact_or_no_radio_model_are_accepted(folder: Path) -> None:
     (folder / "lateness.txt").write_text("bound 5000000\nlate 5000000 7\n", encoding="ascii")
     (folder / "track.csv").write_text(track.text([]), encoding="ascii")
     assert problems(PLAN, Protocol.UDP, folder) == ()
@@ -135,7 +135,7 @@ def fewer_frames(folder: Path) -> None:
         (text("ping.txt", PING.format(sent=7)), "ping.txt: ping sent 7 of 10 requests"),
     ],
 )
-def test_one_damage_is_one_reason(folder: Path, damage: Callable[[Path], object], reason: str) -> None:
+def test_one_damaged_file_gives_one_reason(folder: Path, damage: Callable[[Path], object], reason: str) -> None:
     plan = los_plan(record_s=4.0) if damage is short_bag else PLAN
     damage(folder)
     found = problems(plan, Protocol.UDP, folder)
@@ -144,9 +144,7 @@ def test_one_damage_is_one_reason(folder: Path, damage: Callable[[Path], object]
     assert not [one for one in found if "cannot be measured" in one], "it was foreseen"
 
 
-def test_a_step_that_cannot_measure_what_it_left_voids_the_attempt_and_raises_nothing(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_exception_while_measuring_makes_the_attempt_void(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def measure(step: PingStep, view: View) -> Measured:
         raise OverflowError("int too large to convert to float")
 
@@ -160,7 +158,9 @@ def test_a_step_that_cannot_measure_what_it_left_voids_the_attempt_and_raises_no
     assert judged.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size
 
 
-def test_a_figure_that_cannot_be_voids_and_is_missing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_impossible_value_makes_the_attempt_void_and_is_missing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A row that holds it would be in a table that nothing reads again."""
     measured = PingStep.measure
 
@@ -177,7 +177,7 @@ def test_a_figure_that_cannot_be_voids_and_is_missing(folder: Path, monkeypatch:
     assert not {"rtt_loss", "rtt_min_s"} & judged.measured.values.keys()
 
 
-def test_a_figure_that_is_neither_there_nor_missing_for_a_reason_voids(
+def test_a_value_missing_without_a_reason_makes_the_attempt_void(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     measured = PingStep.measure
@@ -190,7 +190,7 @@ def test_a_figure_that_is_neither_there_nor_missing_for_a_reason_voids(
     assert problems(PLAN, Protocol.UDP, folder) == ("the step ping gives neither a value nor a reason for rtt_loss",)
 
 
-def test_what_a_fault_disturbed_need_not_be_whole(tmp_path: Path) -> None:
+def test_evidence_disturbed_by_a_fault_may_be_incomplete(tmp_path: Path) -> None:
     """Its own evidence must be; the ping inside left nothing."""
     plan = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
     write_states(tmp_path)

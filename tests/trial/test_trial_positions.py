@@ -49,7 +49,7 @@ def means_m(trial: Path) -> list[str]:
     return [row["rtt_distance_mean_m"] for row in rows(trial) if row["status"] == "valid"]
 
 
-def test_what_is_given_fills_the_columns_is_summed_and_can_be_forgotten(
+def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
     trial: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()}
@@ -92,7 +92,7 @@ def test_what_is_given_fills_the_columns_is_summed_and_can_be_forgotten(
         (["receiver=walk.csv", "--clear"], 2, "--clear forgets"),
     ],
 )
-def test_what_cannot_be_is_refused_and_changes_nothing(
+def test_invalid_positions_are_rejected_and_change_nothing(
     trial: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, complaint: str
 ) -> None:
     walk(trial)
@@ -106,9 +106,7 @@ def test_what_cannot_be_is_refused_and_changes_nothing(
     assert {path: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
 
 
-def test_a_trial_whose_evidence_changed_or_that_runs_takes_nothing(
-    trial: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
     walk(trial)
     with journal.claimed(trial):
         assert said(capsys, "receiver=walk.csv")[0] == 2
@@ -120,9 +118,7 @@ def test_a_trial_whose_evidence_changed_or_that_runs_takes_nothing(
 
 
 @pytest.mark.parametrize("how", ["changed", "gone", "unsummed"])
-def test_given_files_that_differ_from_their_sums_make_no_table(
-    trial: Path, capsys: pytest.CaptureFixture[str], how: str
-) -> None:
+def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.CaptureFixture[str], how: str) -> None:
     walk(trial)
     assert said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")[0] == 0
     kept = trial / "positions-receiver.csv"
@@ -152,10 +148,10 @@ def test_given_files_that_differ_from_their_sums_make_no_table(
         ("sender=a=b.gpx", Path("a=b.gpx")),
     ],
 )
-def test_a_place_is_told_from_a_file(text: str, found: object) -> None:
+def test_a_place_is_distinguished_from_a_file(text: str, found: object) -> None:
     assert positions.told(text) == (Role.SENDER, found)
 
 
-def test_what_is_no_pair_is_refused() -> None:
+def test_an_invalid_pair_is_rejected() -> None:
     with pytest.raises(ConfigurationError, match="no ROLE=FILE"):
         positions.told("=walk.gpx")

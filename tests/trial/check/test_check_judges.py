@@ -90,7 +90,7 @@ def test_a_station_has_access_point_channel_signal_and_rate() -> None:
     assert {one.status for one in findings} == {OK}
 
 
-def test_a_signal_near_the_sensitivity_is_warned_of() -> None:
+def test_a_signal_near_the_sensitivity_is_a_warning() -> None:
     link = said("iw/link-station.txt")
     # The TurtleBot's sensitivity is -82 dBm.
     for dbm, status in ((-72, OK), (-73, WARN)):
@@ -99,7 +99,7 @@ def test_a_signal_near_the_sensitivity_is_warned_of() -> None:
         assert only(findings, "Wi-Fi").status is status
 
 
-def test_power_save_is_warned_of_with_the_command_that_ends_it() -> None:
+def test_power_save_is_a_warning_with_the_command_that_disables_it() -> None:
     findings = heard(
         SENDER,
         wifi_info=said("iw/info-station.txt"),
@@ -110,7 +110,7 @@ def test_power_save_is_warned_of_with_the_command_that_ends_it() -> None:
     assert (finding.status, finding.remedy) == (WARN, "sudo iw dev wlan0 set power_save off")
 
 
-def test_a_station_of_no_network_fails() -> None:
+def test_a_station_without_a_network_fails() -> None:
     findings = heard(SENDER, wifi_info=said("iw/info-txpower.txt"), wifi_link=said("iw/link-none.txt"))
     assert only(findings, "Wi-Fi").status is FAIL
 
@@ -121,13 +121,13 @@ def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
     assert "power save" not in {one.check for one in findings}
 
 
-def test_an_ad_hoc_cell_is_no_missing_network() -> None:
+def test_an_ad_hoc_cell_is_not_a_missing_network() -> None:
     ibss = Said(said("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
     findings = heard(SENDER, wifi_info=ibss, wifi_link=said("iw/link-ibss.txt"))
     assert only(findings, "Wi-Fi").detail == "IBSS 'knowhere', at 02:11:87:86:a3:0f, channel 11"
 
 
-def test_the_kernels_own_wifi_stack_is_read_in_every_mode() -> None:
+def test_outputs_of_the_kernels_wifi_stack_are_read_in_every_mode() -> None:
     station = heard(SENDER, wifi_info=said("iw/info-hwsim-station-6.txt"), wifi_link=said("iw/link-hwsim-6.txt"))
     assert only(station, "Wi-Fi").detail == "managed 'lawn', at 02:00:00:00:00:00, channel 6, -30 dBm, 1.0 MBit/s"
     relay = heard(RELAY, wifi_info=said("iw/info-hwsim-ap-6.txt"), wifi_stations=said("iw/stations-hwsim-ap-6.txt"))
@@ -138,12 +138,12 @@ def test_the_kernels_own_wifi_stack_is_read_in_every_mode() -> None:
     assert only(down, "Wi-Fi").detail == "joined to no network"
 
 
-def test_an_interface_that_is_no_radio_has_no_wifi_findings() -> None:
+def test_an_interface_without_a_radio_has_no_wifi_findings() -> None:
     findings = heard(SENDER, wifi_info=said("iw/no-wifi.txt", 1))
     assert {one.check for one in findings} == {"interface wlan0", "control", "offloads"}
 
 
-def test_a_radio_without_iw_is_warned_of() -> None:
+def test_a_radio_without_iw_is_a_warning() -> None:
     ether = Said(said("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
     findings = heard(SENDER, interface=ether, wireless=Said("/sys/class/net/wlan0/phy80211", 0))
     assert only(findings, "Wi-Fi").remedy == "sudo apt-get install iw"
@@ -184,7 +184,7 @@ def test_a_robot_s_disk_must_hold_an_attempt(role: Role, free_kib: int, status: 
     assert finding.status is status
 
 
-def test_a_disk_that_cannot_be_told_fails() -> None:
+def test_a_disk_with_unknown_space_fails() -> None:
     assert only(probed(Role.SENDER, disk=Said("df: .: Stale file handle", 1)), "disk").status is FAIL
 
 
@@ -196,7 +196,7 @@ def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
         assert only(report.findings, "disk").status is status
 
 
-def test_evidence_that_takes_long_to_fetch_is_warned_of_with_size_and_rate(tmp_path: Path) -> None:
+def test_evidence_that_takes_long_to_fetch_is_a_warning_with_size_and_rate(tmp_path: Path) -> None:
     report = Report("laptop")
     system.judge_laptop(PLAN, tmp_path, report)
     assert "fetch" not in {one.check for one in report.findings}
@@ -212,7 +212,7 @@ def test_evidence_that_takes_long_to_fetch_is_warned_of_with_size_and_rate(tmp_p
 LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1795259 1"
 
 
-def test_a_port_that_is_taken_fails_on_the_receiver_alone() -> None:
+def test_a_port_in_use_fails_on_the_receiver_only() -> None:
     taken = Said(LISTENER, 0)
     finding = only(probed(Role.RECEIVER, listeners=taken), "port 1234")
     assert finding.status is FAIL
@@ -221,7 +221,7 @@ def test_a_port_that_is_taken_fails_on_the_receiver_alone() -> None:
     assert "port 1234" not in {one.check for one in probed(Role.SENDER, listeners=taken)}
 
 
-def test_a_low_battery_is_warned_of() -> None:
+def test_a_low_battery_is_a_warning() -> None:
     findings = probed(Role.SENDER, batteries=Said("BAT0 81\nbq27000-0 19", 0))
     assert [(one.status, one.detail) for one in findings if one.check == "battery"] == [
         (OK, "BAT0 at 81 %"),
@@ -233,15 +233,13 @@ def test_a_low_battery_is_warned_of() -> None:
     ("offset_s", "error_s", "status"),
     [(0.9, 0.0, OK), (-1.1, 0.05, WARN), (1.3, 0.5, OK), (3600.0, 0.01, WARN), (-7200.0, 0.01, WARN)],
 )
-def test_a_clock_that_is_surely_off_by_a_second_is_warned_of(
-    offset_s: float, error_s: float, status: Verdict
-) -> None:
+def test_a_clock_with_an_error_above_a_second_is_a_warning(offset_s: float, error_s: float, status: Verdict) -> None:
     report = Report("turtlebot-1")
     contact.judge_clock(Offset(offset_s, error_s), "pi@robot", report)
     assert only(report.findings, "clock").status is status
 
 
-def test_an_hour_off_is_told_plainly() -> None:
+def test_an_error_of_an_hour_is_reported_in_hours() -> None:
     report = Report("turtlebot-1")
     contact.judge_clock(Offset(-3601.0, 0.01), "-p 2222 pi@robot", report)
     (finding,) = report.findings
@@ -306,14 +304,14 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
         ("run: {robot: sender, command: busybox uptime}", "busybox", "sudo apt-get install busybox"),
     ],
 )
-def test_a_program_of_a_step_that_is_missing_says_where_it_comes_from(step: str, program: str, remedy: str) -> None:
+def test_a_missing_program_of_a_step_is_reported_with_its_source(step: str, program: str, remedy: str) -> None:
     plan = PLAN.model_copy(update={"procedure": procedure_of(step)})
     sections = installed(plan) | {f"program {program}": Said("", 127)}
     (failed,) = [one for one in judged(sections, plan) if one.status is not OK]
     assert (failed.check, failed.remedy) == (program, remedy)
 
 
-def test_a_robot_without_ros_is_asked_for_no_recorder_and_no_topic() -> None:
+def test_a_robot_without_ros_needs_no_recorder_and_no_topic() -> None:
     procedure = procedure_of("ping: {from: sender, to: receiver}")
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}, "procedure": procedure})
@@ -325,7 +323,7 @@ def test_a_robot_without_ros_is_asked_for_no_recorder_and_no_topic() -> None:
     assert topics.recorded(plan, Role.SENDER) == ()
 
 
-def test_a_robot_without_ros_that_is_to_record_is_refused() -> None:
+def test_a_recording_on_a_robot_without_ros_is_rejected() -> None:
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
     with pytest.raises(ConfigurationError, match="is to record, and its profile turtlebot3_burger has no ros"):
@@ -341,13 +339,13 @@ def test_a_setup_file_that_is_missing_is_one_failure() -> None:
     assert software.can_record(PLAN, Role.RECEIVER, {}), "where nothing is recorded, nothing was asked for"
 
 
-def test_no_right_to_capture_fails_with_the_command_that_gives_it() -> None:
+def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:
     refused = Said("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
     (failed,) = [one for one in judged(installed() | {"right to capture": refused}) if one.status is not OK]
     assert failed.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
 
 
-def test_no_right_by_sudo_fails_with_the_rule_that_gives_it() -> None:
+def test_a_missing_sudo_permission_fails_with_the_rule_that_grants_it() -> None:
     tools = TURTLEBOT.tools.model_copy(update={"capture_right": "sudo"})
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"tools": tools})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
@@ -361,7 +359,7 @@ def test_no_right_by_sudo_fails_with_the_rule_that_gives_it() -> None:
         assert remedy in failed.remedy
 
 
-def test_ros_1_without_a_master_is_warned_of() -> None:
+def test_ros_1_without_a_master_is_a_warning() -> None:
     (warned,) = [one for one in judged(installed() | {"ROS": Said("noetic", 0)}) if one.status is not OK]
     assert "ROS_MASTER_URI" in warned.detail
 
@@ -382,19 +380,19 @@ def recorded(count: int, span_s: float) -> Bag:
         (None, FAIL),
     ],
 )
-def test_a_topic_must_be_alive_and_should_have_its_rate(bag: Bag | None, status: Verdict) -> None:
+def test_a_topic_must_be_published_and_should_have_its_rate(bag: Bag | None, status: Verdict) -> None:
     report = Report("turtlebot-1")
     topics.judge(SENDER, ["/scan"], bag, report)
     assert only(report.findings, "topic /scan").status is status
 
 
-def test_a_topic_that_the_profile_does_not_know_has_no_rate() -> None:
+def test_a_topic_missing_in_the_profile_has_no_rate() -> None:
     report = Report("turtlebot-1")
     topics.judge(SENDER, ["/tf_static"], Bag(3, 0, 1.0, MappingProxyType({"/tf_static": 3})), report)
     assert only(report.findings, "topic /tf_static").status is OK
 
 
-def test_a_check_records_what_the_procedure_records_long_enough_for_the_slowest() -> None:
+def test_a_check_records_long_enough_for_the_slowest_topic() -> None:
     assert topics.recorded(PLAN, Role.SENDER) == ("/scan",)
     assert topics.recorded(PLAN, Role.RELAY) == ()
     assert topics.recording(Role.SENDER, SENDER, ["/scan"]).duration == topics.RECORD_S
@@ -413,12 +411,12 @@ def test_a_check_records_what_the_procedure_records_long_enough_for_the_slowest(
 
 
 @given(st.text())
-def test_any_answer_can_be_parsed(text: str) -> None:
+def test_any_output_can_be_parsed(text: str) -> None:
     assert all(section.code >= 0 for section in parse(text).values())
 
 
 @given(st.text())
-def test_what_a_robot_says_cannot_garble_the_terminal(text: str) -> None:
+def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
     report = Report("turtlebot-1")
     everything = {name: Said(text, 0) for name in (*installed(), "system", "disk", "interface", "wifi-info")}
     system.judge(PLAN, Role.SENDER, everything, report)
@@ -438,16 +436,14 @@ def test_what_a_robot_says_cannot_garble_the_terminal(text: str) -> None:
         ("", Control.SEPARATE, OK, "does not report the addresses"),
     ],
 )
-def test_the_way_of_ssh_is_seen_and_not_believed(
-    connection: str, control: Control, status: Verdict, detail: str
-) -> None:
+def test_the_route_of_ssh_is_detected(connection: str, control: Control, status: Verdict, detail: str) -> None:
     finding = only(heard(SENDER.model_copy(update={"control": control}), control=Said(connection, 0)), "control")
     assert finding.status is status
     assert detail in finding.detail
 
 
 @pytest.mark.parametrize("file", ["ip/6.1.0/nope.txt", "busybox/1.35.0/ip-nope.txt"])
-def test_an_interface_that_is_not_there_says_nothing_of_the_right_to_capture(file: str) -> None:
+def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) -> None:
     refused = Said("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
     sections = installed() | {"right to capture": refused, "interface": said(file, 1)}
     assert "right to capture" not in {one.check for one in judged(sections)}
@@ -469,21 +465,21 @@ def test_an_interface_that_is_not_there_says_nothing_of_the_right_to_capture(fil
         ("1000", "sudo", "fieldkit abort", "fieldkit abort"),
     ],
 )
-def test_a_remedy_can_be_typed_on_the_robot_at_hand(user: str, programs: str, remedy: str, typed: str) -> None:
+def test_a_remedy_can_be_typed_on_this_robot(user: str, programs: str, remedy: str, typed: str) -> None:
     report = Report("turtlebot-1")
     report.user_tools = system.user_tools({"user": Said(user, 0), "means": Said("\n".join(programs.split()), 0)})
     report.fail("iw", "not found", remedy)
     assert only(report.findings, "iw").remedy == typed
 
 
-def test_a_port_is_looked_for_by_what_the_robot_has() -> None:
+def test_the_remedy_for_a_port_uses_an_available_tool() -> None:
     report = Report(RECEIVER.name)
     report.user_tools = system.user_tools({"user": Said("0", 0), "means": Said("netstat", 0)})
     system.judge(PLAN, Role.RECEIVER, {"listeners": Said(LISTENER, 0)}, report)
     assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # shows it; stop it"
 
 
-def test_a_clock_is_set_by_what_the_robot_has() -> None:
+def test_the_remedy_for_a_clock_uses_an_available_tool() -> None:
     for user, programs, command in (
         ("0", "", "ssh -t -p 2222 pi@robot date -u -s @$(date +%s)"),
         ("1000", "sudo", "ssh -t -p 2222 pi@robot sudo date -u -s @$(date +%s)"),
@@ -495,6 +491,6 @@ def test_a_clock_is_set_by_what_the_robot_has() -> None:
         assert only(report.findings, "clock").remedy == f"{command} # on the laptop"
 
 
-def test_no_remedy_names_a_file_that_the_operator_did_not_name() -> None:
+def test_no_remedy_names_an_unknown_file() -> None:
     finding = only(heard(SENDER, control=Said("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
     assert finding.remedy == "write control: radio in the site file, or give host another network"

@@ -12,7 +12,7 @@ SHELLS = [("dash",), ("bash",), ("busybox", "ash")]
 
 
 @pytest.mark.parametrize("shell", SHELLS, ids=" ".join)
-def test_every_section_is_answered(shell: tuple[str, ...]) -> None:
+def test_every_section_has_an_answer(shell: tuple[str, ...]) -> None:
     commands = {
         "program it's": ("printf", "%s", AWKWARD),
         "no such": ("no-such-tool",),

@@ -84,7 +84,7 @@ def first_heard(pid: int, address: str) -> bytes:
 
 
 @pytest.mark.emulated
-def test_another_robot_hears_over_dds_what_ros_1_publishes_while_the_session_lasts(up: EmulatedTestbed) -> None:
+def test_dds_nodes_receive_ros_1_messages_during_the_session(up: EmulatedTestbed) -> None:
     told: list[Event] = []
     shell, drone = up.shells[Role.SENDER], up.robots[Role.RECEIVER]
     with bridges.running(cast(), up.shells, "s1", sink=told.append):
@@ -97,7 +97,7 @@ def test_another_robot_hears_over_dds_what_ros_1_publishes_while_the_session_las
 
 
 @pytest.mark.emulated
-def test_one_that_does_not_start_is_told_with_what_it_says(up: EmulatedTestbed) -> None:
+def test_a_bridge_that_does_not_start_is_reported_with_its_output(up: EmulatedTestbed) -> None:
     wrong = cast(BRIDGE.model_copy(update={"topics": ("/scan:sensor_msgs/LasrScan",)}))
     with (
         pytest.raises(RobotError, match="LaserScan") as caught,
@@ -109,7 +109,7 @@ def test_one_that_does_not_start_is_told_with_what_it_says(up: EmulatedTestbed) 
 
 
 @pytest.mark.emulated
-def test_one_that_ends_by_itself_is_told(up: EmulatedTestbed) -> None:
+def test_a_bridge_that_exits_early_is_reported(up: EmulatedTestbed) -> None:
     told: list[Event] = []
     short = f"#!/bin/sh\necho {BRIDGE_IS_UP}\nexit 3\n"
     up.shells[Role.SENDER].run(("sh", "-c", "cat >short && chmod +x short"), stdin=short.encode(), deadline=soon())
@@ -121,7 +121,7 @@ def test_one_that_ends_by_itself_is_told(up: EmulatedTestbed) -> None:
 
 
 @pytest.mark.emulated
-def test_in_a_lab_to_play_with_it_is_a_service_of_the_robot() -> None:
+def test_in_an_interactive_lab_the_bridge_is_a_service_of_the_robot() -> None:
     members = {
         name: LabRobot(name, profile, address, ())
         for name, profile, address in (
@@ -150,7 +150,7 @@ def test_the_command_line_of_a_robot() -> None:
     )
 
 
-def test_of_robots_that_share_a_master_the_first_carries() -> None:
+def test_of_robots_with_a_common_master_only_the_first_has_a_bridge() -> None:
     master = EmulatedBackend(None, None).cast(Topology.MASTER)
     asking_both = {"profile": asking()}
     robots = {
@@ -175,7 +175,7 @@ def test_of_robots_that_share_a_master_the_first_carries() -> None:
         ("{to: dds, topic: ['/scan:sensor_msgs/LaserScan']}", "topics"),
     ],
 )
-def test_a_profile_that_asks_wrongly_is_told_where(text: str, said: str, tmp_path: Path) -> None:
+def test_a_wrong_profile_is_reported_with_its_location(text: str, said: str, tmp_path: Path) -> None:
     own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     file = tmp_path / "own.yaml"
     file.write_text(own.replace("ros:\n  variant: ros1\n", f"ros:\n  variant: ros1\n  bridge: {text}\n"))
@@ -184,7 +184,7 @@ def test_a_profile_that_asks_wrongly_is_told_where(text: str, said: str, tmp_pat
     assert "own.yaml:" in str(caught.value)
 
 
-def test_a_robot_with_ros_2_needs_none(tmp_path: Path) -> None:
+def test_a_robot_with_ros_2_needs_no_bridge(tmp_path: Path) -> None:
     own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     file = tmp_path / "own.yaml"
     asks = f"ros:\n  variant: ros2\n  bridge: {{to: dds, topics: ['{SCAN}']}}\n"
@@ -193,7 +193,7 @@ def test_a_robot_with_ros_2_needs_none(tmp_path: Path) -> None:
         schema.load(file, RobotProfile)
 
 
-def test_an_emulated_lab_without_debian_s_ros_refuses_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_emulated_lab_without_debian_s_ros_rejects_it(monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin}}\n"
     document = schema.parse(text, source="fieldkit.yaml")
     backend = EmulatedBackend(schema.validate(document, Site), document)
@@ -205,7 +205,7 @@ def test_an_emulated_lab_without_debian_s_ros_refuses_it(monkeypatch: pytest.Mon
         raise AssertionError("it is open")
 
 
-def test_preflight_looks_for_the_program() -> None:
+def test_preflight_checks_the_program() -> None:
     plan = los_plan()
     robot = plan.cast[Role.SENDER].model_copy(update={"profile": asking()})
     plan = plan.model_copy(update={"cast": {**plan.cast, Role.SENDER: robot}})

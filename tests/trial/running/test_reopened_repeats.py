@@ -54,7 +54,7 @@ def redo(folder: Path, told: list[Event] | None = None) -> Outcome:
     return outcome
 
 
-def test_a_failed_repeat_is_redone_and_what_failed_is_kept_as_void(tmp_path: Path, broken: set[str]) -> None:
+def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path, broken: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, broken)
     broken.clear()
     unasked = resume_trial(folder, IdleTestbed(), lambda _: None)
@@ -71,7 +71,7 @@ def test_a_failed_repeat_is_redone_and_what_failed_is_kept_as_void(tmp_path: Pat
     demand_agreement(folder)
 
 
-def test_it_has_all_attempts_again_and_may_fail_again(tmp_path: Path, broken: set[str]) -> None:
+def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: Path, broken: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, broken)
     assert redo(folder).failed == 1
     assert [row["status"] for row in rows(folder) if row["repeat"] == "1"] == ["void"] * 5 + ["failed"]
@@ -104,7 +104,7 @@ def moments(folder: Path) -> Iterator[Path]:
         assert code == KILLED
 
 
-def test_it_may_die_at_any_write(tmp_path: Path, broken: set[str]) -> None:
+def test_a_kill_at_any_write_is_recovered(tmp_path: Path, broken: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, broken)
     broken.clear()
     count = 0

@@ -65,9 +65,7 @@ def again(folder: Path) -> Ledger:
     return Ledger(store.read_plan(folder), folder, Stop())
 
 
-def test_what_a_trial_writes_and_renders_grows_as_the_trial_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the repeats take twice the bytes; by a table and a manifest anew for each, they would take four times."""
     monkeypatch.setattr(ledger, "TABLE_SHARE", 0.1)
     monkeypatch.setattr(os, "fsync", lambda _: None)
@@ -97,7 +95,7 @@ def test_what_a_trial_writes_and_renders_grows_as_the_trial_does(
     assert written[120] < 3 * written[60]
 
 
-def test_a_small_trial_has_every_row_at_once(trial: Path) -> None:
+def test_a_small_trial_writes_every_row_immediately(trial: Path) -> None:
     plan = store.read_plan(trial)
     before = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
     keep(again(trial), plan, trial, list(plan.order())[2])
@@ -106,7 +104,7 @@ def test_a_small_trial_has_every_row_at_once(trial: Path) -> None:
     assert after.count("\n") == before.count("\n") + 1
 
 
-def test_a_trial_that_is_opened_again_measures_and_sums_nothing_anew(
+def test_a_reopened_trial_measures_nothing_and_computes_no_checksum_again(
     trial: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table = (trial / store.TRIAL_CSV).read_bytes()
@@ -123,7 +121,7 @@ def test_a_trial_that_is_opened_again_measures_and_sums_nothing_anew(
     assert (trial / store.TRIAL_CSV).read_bytes() == table
 
 
-def test_rows_that_a_kill_kept_from_the_table_are_measured(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_missing_in_the_table_after_a_kill_are_measured(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = store.read_plan(trial)
     table = (trial / store.TRIAL_CSV).read_bytes()
     monkeypatch.setattr(ledger, "TABLE_SHARE", 2.0)
@@ -135,7 +133,7 @@ def test_rows_that_a_kill_kept_from_the_table_are_measured(trial: Path, monkeypa
     assert (trial / store.TRIAL_CSV).read_bytes().startswith(table)
 
 
-def test_tables_made_again_are_summed_again_and_nothing_else(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_rebuilt_tables_get_new_checksums(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another fieldkit measures other rows; a journal that another hand changed stays one that differs."""
     with (trial / "preflight.txt").open("a", encoding="utf-8") as file:
         file.write("changed\n")
@@ -164,7 +162,7 @@ def rot(path: Path) -> None:
     ],
     ids=["changed", "missing", "more", "moved"],
 )
-def test_what_was_summed_stays_summed_and_a_difference_is_told(
+def test_checksums_are_kept_and_differences_reported(
     trial: Path,
     befalls: Callable[[Path], object],
     what: dict[str, str],
@@ -187,7 +185,7 @@ def test_what_was_summed_stays_summed_and_a_difference_is_told(
     assert all(one in " ".join(capsys.readouterr().err.split()) for one in said)
 
 
-def test_a_plan_a_journal_and_a_table_that_changed_are_told(trial: Path) -> None:
+def test_changes_of_plan_journal_and_table_are_reported(trial: Path) -> None:
     for name in (store.TRIAL_CSV, "trial.yaml"):
         with (trial / name).open("a", encoding="utf-8") as file:
             file.write("\n" if name == "trial.yaml" else "x\n")
@@ -201,7 +199,7 @@ def test_a_plan_a_journal_and_a_table_that_changed_are_told(trial: Path) -> None
 
 
 @pytest.mark.parametrize("name", [journal.JOURNAL_FILE, "trial.yaml"])
-def test_no_table_is_made_again_from_a_plan_or_a_journal_that_changed(trial: Path, name: str) -> None:
+def test_no_table_is_rebuilt_from_a_changed_plan_or_journal(trial: Path, name: str) -> None:
     """A journal cut at the end of a line says that there were fewer repeats, a plan another distance."""
     tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
     text = (trial / name).read_text(encoding="utf-8")
@@ -212,7 +210,7 @@ def test_no_table_is_made_again_from_a_plan_or_a_journal_that_changed(trial: Pat
     assert {name: (trial / name).read_bytes() for name in tables} == tables
 
 
-def test_a_machine_of_too_little_memory_makes_no_table(
+def test_too_little_memory_leaves_the_table_unchanged(
     trial: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What one machine cannot hold says nothing of the evidence: no figure is left out for it."""
@@ -227,14 +225,14 @@ def test_a_machine_of_too_little_memory_makes_no_table(
     assert {name: (trial / name).read_bytes() for name in tables} == tables
 
 
-def test_a_table_is_not_made_again_from_evidence_that_changed(trial: Path) -> None:
+def test_a_table_is_not_rebuilt_from_changed_evidence(trial: Path) -> None:
     (trial / store.TRIAL_CSV).write_text("gone\n", encoding="utf-8")
     rot(trial / CHANGED)
     with pytest.raises(EvidenceError, match=rf"evidence is not what was measured: {CHANGED}: changed"):
         again(trial)
 
 
-def test_a_table_that_is_gone_is_made_again_and_told(trial: Path) -> None:
+def test_a_missing_table_is_rebuilt_and_reported(trial: Path) -> None:
     table = (trial / store.TRIAL_CSV).read_bytes()
     (trial / store.TRIAL_CSV).unlink()
     to = again(trial)
@@ -243,7 +241,7 @@ def test_a_table_that_is_gone_is_made_again_and_told(trial: Path) -> None:
     assert (trial / store.TRIAL_CSV).read_bytes() == table
 
 
-def test_a_manifest_that_is_gone_or_no_manifest_is_told(trial: Path) -> None:
+def test_a_missing_or_invalid_manifest_is_reported(trial: Path) -> None:
     (trial / store.MANIFEST_FILE).write_text("nonsense\n", encoding="utf-8")
     with pytest.raises(EvidenceError, match="no readable manifest: not a line of a manifest: nonsense") as caught:
         again(trial)
@@ -252,7 +250,7 @@ def test_a_manifest_that_is_gone_or_no_manifest_is_told(trial: Path) -> None:
     assert again(trial).differences.keys() == {store.MANIFEST_FILE}
 
 
-def test_a_report_leaves_out_evidence_that_changed_and_says_so(trial: Path) -> None:
+def test_a_report_leaves_out_changed_evidence_with_a_note(trial: Path) -> None:
     rot(trial / CHANGED)
     page = trial.parent / "report.html"
     assert main(["report", str(trial), "-o", str(page)]) == 0

@@ -58,7 +58,7 @@ def begin(robot: LocalShell, holder: Holder) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo", token=holder.token)
 
 
-def test_a_held_robot_names_its_holder_and_is_given_back(robot: LocalShell) -> None:
+def test_a_locked_robot_names_its_holder_and_is_unlocked(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         with (
@@ -74,7 +74,7 @@ def test_a_held_robot_names_its_holder_and_is_given_back(robot: LocalShell) -> N
         begin(robot, BERT)
 
 
-def test_the_holder_is_told_without_taking_the_robot(robot: LocalShell) -> None:
+def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     assert locks.holder(robot) is None
     with taken({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=60):
@@ -87,12 +87,12 @@ def test_the_holder_is_told_without_taking_the_robot(robot: LocalShell) -> None:
     assert locks.holder(robot) is None
 
 
-def test_the_same_trial_takes_its_own_lock_again(robot: LocalShell) -> None:
+def test_the_same_trial_can_lock_its_robot_again(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet), taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
 
 
-def test_of_many_laptops_at_once_one_gets_the_robot(robot: LocalShell) -> None:
+def test_only_one_of_many_simultaneous_laptops_locks_the_robot(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     holders = [Holder(f"trial-{number}", f"laptop-{number}", "x") for number in range(12)]
 
@@ -109,7 +109,7 @@ def test_of_many_laptops_at_once_one_gets_the_robot(robot: LocalShell) -> None:
         assert turn < 3
 
 
-def test_a_number_that_was_used_and_removed_meanwhile_wins_nothing(robot: LocalShell) -> None:
+def test_a_lock_number_that_was_used_and_removed_is_not_valid(robot: LocalShell) -> None:
     """A laptop that read the lock before two others had changed it finds its next number free again."""
     jobs.install(robot, Deadline.after(30))
     script = """set -- needs; . "$1"; base=.fieldkit; newest
@@ -121,7 +121,7 @@ def test_a_number_that_was_used_and_removed_meanwhile_wins_nothing(robot: LocalS
     assert record(robot)[:2] == ["held", "trial-c"]
 
 
-def test_an_expired_lock_is_taken_over_and_its_holder_told(robot: LocalShell) -> None:
+def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (4, "1"))
         with taken({Role.SENDER: robot}, BERT, sink=quiet):
@@ -131,7 +131,7 @@ def test_an_expired_lock_is_taken_over_and_its_holder_told(robot: LocalShell) ->
             begin(robot, BERT)
 
 
-def test_a_lock_of_an_earlier_boot_goes_by_the_clock(robot: LocalShell) -> None:
+def test_a_lock_of_an_earlier_boot_expires_by_the_clock(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (2, "another-boot"), (4, "1"))
         with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
@@ -153,14 +153,14 @@ def test_begin_renews_at_half_time_and_not_before(robot: LocalShell) -> None:
         assert renewed[7:] == fresh[7:]
 
 
-def test_an_expired_lock_that_nobody_took_is_renewed(robot: LocalShell) -> None:
+def test_an_expired_lock_without_a_new_holder_is_renewed(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (4, "1"))
         begin(robot, ANNA)
         assert int(record(robot)[4]) > 1
 
 
-def test_abort_ends_jobs_of_any_trial_and_tells_the_holder_who_did_it(robot: LocalShell) -> None:
+def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         evidence.begin(robot, jobs.work_folder("older", "udp-03-1"), "sender", "lo")
@@ -187,9 +187,7 @@ def test_abort_ends_jobs_of_any_trial_and_tells_the_holder_who_did_it(robot: Loc
 
 
 @pytest.mark.parametrize("says", ["", "exit 1", "echo no zone", "echo no zone; echo 1800000000"])
-def test_a_robot_whose_date_tells_no_time_is_locked_all_the_same(
-    robot: LocalShell, tmp_path: Path, says: str
-) -> None:
+def test_a_robot_without_a_working_date_can_be_locked(robot: LocalShell, tmp_path: Path, says: str) -> None:
     (tmp_path / "bin" / "date").unlink(missing_ok=True)
     (tmp_path / "bin" / "date").write_text(f"#!/bin/sh\n{says}\n", encoding="ascii")
     (tmp_path / "bin" / "date").chmod(0o755)
@@ -199,7 +197,7 @@ def test_a_robot_whose_date_tells_no_time_is_locked_all_the_same(
         assert [ended.locked for ended in locks.abort({"turtlebot-1": robot}, "bert@two").values()] == [True]
 
 
-def test_a_torn_record_holds_nobody_up_for_long(robot: LocalShell) -> None:
+def test_a_torn_record_does_not_block_for_long(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     for content in ("", "held", "held trial-b boot x y z 1 bert trial"):
         (robot.home / ".fieldkit" / "lock.7").write_text(content, encoding="ascii")
@@ -209,7 +207,7 @@ def test_a_torn_record_holds_nobody_up_for_long(robot: LocalShell) -> None:
             path.unlink()
 
 
-def test_a_record_that_says_nothing_hides_no_lock(robot: LocalShell) -> None:
+def test_an_empty_record_hides_no_lock(robot: LocalShell) -> None:
     """As an older fieldkit leaves one where power ends just after it was written."""
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         (robot.home / ".fieldkit" / "lock.9").touch()
@@ -274,7 +272,7 @@ def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -
     assert not (robot.home / FOLDER / "started").exists()
 
 
-def test_no_job_starts_in_a_folder_that_was_made_while_somebody_aborted(robot: LocalShell, tmp_path: Path) -> None:
+def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tmp_path: Path) -> None:
     called, go = robot.home / "called", robot.home / "go"
     with taken({Role.SENDER: robot}, ANNA, sink=quiet), ThreadPoolExecutor(1) as pool:
         real = "busybox df" if (tmp_path / "bin" / "df").exists() else "/bin/df"
@@ -292,7 +290,7 @@ def test_no_job_starts_in_a_folder_that_was_made_while_somebody_aborted(robot: L
     assert not (robot.home / FOLDER / "started").exists()
 
 
-def test_a_free_robot_is_not_said_to_have_been_locked(robot: LocalShell) -> None:
+def test_aborting_a_free_robot_reports_no_lock(robot: LocalShell) -> None:
     for _ in range(2):
         (ended,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
         assert (ended.locked, ended.error) == (False, None)
@@ -301,7 +299,7 @@ def test_a_free_robot_is_not_said_to_have_been_locked(robot: LocalShell) -> None
     assert not locks.abort({"turtlebot-1": robot}, "bert@two")["turtlebot-1"].locked
 
 
-def test_who_lost_a_robot_is_told_when_it_asks(robot: LocalShell, tmp_path: Path) -> None:
+def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Path) -> None:
     """Also where another robot cannot tell."""
     plan = los_plan()
     anna = Holder(plan.session, "anna@one", plan.trial)
@@ -314,7 +312,7 @@ def test_who_lost_a_robot_is_told_when_it_asks(robot: LocalShell, tmp_path: Path
             robots.demand_held()
 
 
-def test_what_was_fetched_does_not_stay_on_a_robot_whose_lock_was_broken(robot: LocalShell) -> None:
+def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         locks.abort({"turtlebot-1": robot}, "bert@two")
@@ -345,14 +343,14 @@ def cast(tmp_path: Path) -> dict[Role, Unreachable]:
     return shells
 
 
-def test_all_robots_are_taken_or_none(cast: dict[Role, Unreachable]) -> None:
+def test_all_robots_are_locked_or_none(cast: dict[Role, Unreachable]) -> None:
     with taken({Role.SENDER: cast[Role.SENDER]}, BERT, sink=quiet):
         with pytest.raises(RobotError, match="zoe: bert@two holds it"), taken(cast, ANNA, sink=quiet):
             raise AssertionError("taken")
         assert record(cast[Role.RECEIVER])[0] == "free", "taken first, in the order of names, and given back"
 
 
-def test_a_robot_that_cannot_be_given_back_is_told(cast: dict[Role, Unreachable]) -> None:
+def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, Unreachable]) -> None:
     told: list[Event] = []
     with taken(cast, ANNA, sink=told.append):
         cast[Role.SENDER].left = 0
@@ -362,7 +360,7 @@ def test_a_robot_that_cannot_be_given_back_is_told(cast: dict[Role, Unreachable]
     assert record(cast[Role.RECEIVER])[0] == "free"
 
 
-def test_a_robot_that_cannot_be_reached_keeps_no_other_from_being_aborted(cast: dict[Role, Unreachable]) -> None:
+def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, Unreachable]) -> None:
     with ExitStack() as stack:
         stack.enter_context(taken(cast, ANNA, sink=lambda event: None))
         cast[Role.RECEIVER].left = 0
@@ -378,7 +376,7 @@ def test_the_user_of_this_machine_has_a_name() -> None:
     assert machine
 
 
-def test_a_second_fieldkit_with_the_token_leaves_the_first_one_its_robots(cast: dict[Role, Unreachable]) -> None:
+def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[Role, Unreachable]) -> None:
     # A trial without a session is its own, and its name may be longer than that of a socket.
     anna = Holder(uuid.uuid4().hex + "_of_a_long_procedure" * 10, "anna@one", "trial-a")
     with held(cast, anna, sink=quiet):
@@ -393,7 +391,7 @@ def test_a_second_fieldkit_with_the_token_leaves_the_first_one_its_robots(cast: 
         begin(cast[Role.SENDER], anna)
 
 
-def test_ctrl_c_hangs_up_before_the_robots_are_given_back(cast: dict[Role, Unreachable]) -> None:
+def test_ctrl_c_closes_connections_before_the_robots_are_unlocked(cast: dict[Role, Unreachable]) -> None:
     """A link that was lost must not be awaited for the site's patience once more."""
     done: list[str] = []
     for shell in cast.values():

@@ -147,7 +147,7 @@ def test_trials_run_one_after_the_other_on_robots_opened_once(
         ("hold", RobotError("x"), ["open", "meet", "hold", "open ends"]),
     ],
 )
-def test_robots_that_are_not_reached_or_held_are_let_go_before_any_trial(
+def test_robots_are_released_if_one_cannot_be_reached_or_locked(
     recorder: Callable[..., Recorder], tmp_path: Path, failing: str, error: FieldkitError, done: list[str]
 ) -> None:
     made = recorder(**{failing: error})
@@ -162,7 +162,7 @@ def test_robots_that_are_not_reached_or_held_are_let_go_before_any_trial(
     ("failing", "told"),
     [("run_10ft", ["not begun: 20ft, 30ft"]), ("run_20ft", ["not begun: 30ft"]), ("run_30ft", [])],
 )
-def test_a_trial_that_stops_gives_the_robots_back_and_tells_which_were_not_begun(
+def test_a_stopped_trial_unlocks_the_robots_and_reports_trials_not_started(
     recorder: Callable[..., Recorder], tmp_path: Path, error: BaseException, failing: str, told: list[str]
 ) -> None:
     made = recorder(**{failing: error})
@@ -186,7 +186,7 @@ def resume(made: Recorder, folder: Path, backend: str = "field") -> Outcome | No
     return opening.resume(folder, backend, made, failed=False, sink=made.told.append, operator=Nobody(), stop=Stop())
 
 
-def test_a_trial_is_resumed_by_the_same_way(recorder: Callable[..., Recorder], tmp_path: Path) -> None:
+def test_a_trial_is_resumed_through_the_same_steps(recorder: Callable[..., Recorder], tmp_path: Path) -> None:
     made, plan = recorder(), los_plan()
     folder = store.create(tmp_path, plan)
     assert resume(made, folder) == Outcome(folder, (), 2, 0)
@@ -194,7 +194,7 @@ def test_a_trial_is_resumed_by_the_same_way(recorder: Callable[..., Recorder], t
     assert made.holder == Holder(plan.session, runtime.me(), plan.trial)
 
 
-def test_a_trial_of_another_backend_is_refused_before_anything_is_opened(
+def test_a_trial_of_another_backend_is_rejected_before_robots_are_opened(
     recorder: Callable[..., Recorder], tmp_path: Path
 ) -> None:
     made, folder = recorder(), store.create(tmp_path, los_plan())

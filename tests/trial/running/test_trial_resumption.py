@@ -16,7 +16,7 @@ TRIAL: Path = min(TRIALS.iterdir())
 PLAN = store.read_plan(TRIAL)
 
 
-def test_rows_of_two_ways_to_measure_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_different_code_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
     assert resumption.resumable(TRIAL) == PLAN
     monkeypatch.setattr(resumption, "code_hash", lambda: "another")
@@ -26,7 +26,7 @@ def test_rows_of_two_ways_to_measure_are_not_mixed(monkeypatch: pytest.MonkeyPat
     assert typed("fieldkit", "rebuild", TRIAL) in caught.value.remedy
 
 
-def test_robots_of_another_backend_are_refused() -> None:
+def test_robots_of_another_backend_are_rejected() -> None:
     resumption.demand_backend(PLAN, PLAN.backend, TRIAL)
     with pytest.raises(ConfigurationError, match=f"it was started on backend {PLAN.backend}, not imagined") as caught:
         resumption.demand_backend(PLAN, "imagined", TRIAL)
@@ -34,7 +34,7 @@ def test_robots_of_another_backend_are_refused() -> None:
 
 
 @pytest.mark.parametrize("change", [{"name": "other"}, {"address": "10.42.0.99"}, None])
-def test_other_robots_are_refused(change: dict[str, str] | None) -> None:
+def test_other_robots_are_rejected(change: dict[str, str] | None) -> None:
     resumption.demand_cast(PLAN, PLAN.cast)
     changed = dict(PLAN.cast)
     sender = changed.pop(Role.SENDER)
@@ -45,7 +45,7 @@ def test_other_robots_are_refused(change: dict[str, str] | None) -> None:
     assert caught.value.where == PLAN.trial
 
 
-def test_a_robot_that_drove_by_itself_needs_leave_again() -> None:
+def test_a_self_moving_robot_needs_permission_again() -> None:
     shipped = load_procedure("driveaway")
     driving = {role: robot.model_copy(update={"drives": True}) for role, robot in PLAN.cast.items()}
     by_hand = {role: robot.model_copy(update={"drives": False}) for role, robot in PLAN.cast.items()}
@@ -59,7 +59,7 @@ def test_a_robot_that_drove_by_itself_needs_leave_again() -> None:
     resumption.demand_cast(plan.model_copy(update={"cast": by_hand}), driving)
 
 
-def test_a_trial_whose_program_has_changed_does_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_with_a_changed_program_is_not_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     program = tmp_path / "probe"
     program.write_bytes(b"1")

@@ -47,7 +47,7 @@ def slow_testbed(home: Path) -> IdleTestbed:
     )
 
 
-def test_ctrl_c_hangs_up_and_waits_until_nobody_writes_evidence(tmp_path: Path) -> None:
+def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: Path) -> None:
     into = tmp_path / "into"
     into.mkdir()
     robots = Robots(los_plan(), slow_testbed(tmp_path))
@@ -69,7 +69,7 @@ class Unreachable(LocalShell):
 
 
 @pytest.mark.emulated
-def test_what_a_robot_did_not_give_stays_on_it(tmp_path: Path) -> None:
+def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
     plan, shells = los_plan(), {}
     attempts = {name: jobs.work_folder(plan.trial, name) for name in ("udp-01-1", "udp-01-2")}
     for role, kind in ((Role.SENDER, Unreachable), (Role.RECEIVER, LocalShell)):
@@ -136,7 +136,7 @@ class Impatient(LocalShell):
 
 
 @pytest.mark.emulated
-def test_no_piece_is_asked_for_after_somebody_hung_up(tmp_path: Path) -> None:
+def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path) -> None:
     plan = los_plan()
     remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
     for role in (Role.SENDER, Role.RECEIVER):
@@ -159,7 +159,7 @@ def test_no_piece_is_asked_for_after_somebody_hung_up(tmp_path: Path) -> None:
 
 
 @pytest.mark.emulated
-def test_what_came_whole_does_not_stay_because_a_job_ended_badly(tmp_path: Path) -> None:
+def test_completely_fetched_evidence_is_deleted_even_if_a_job_failed(tmp_path: Path) -> None:
     plan = los_plan()
     remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
     for role in (Role.SENDER, Role.RECEIVER):

@@ -52,7 +52,7 @@ def only(folder: Path) -> Path:
     return found.parent
 
 
-def test_the_time_left_is_that_of_repeats_that_are_over(
+def test_the_remaining_time_is_estimated_from_finished_repeats(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def clock() -> Iterator[float]:
@@ -70,7 +70,7 @@ def test_the_time_left_is_that_of_repeats_that_are_over(
     assert second.left_s == 0
 
 
-def test_the_repeat_that_ctrl_c_lets_end_is_told(
+def test_the_repeat_that_ctrl_c_lets_finish_is_reported(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stop, fetch = Stop(), Robots.fetch
@@ -85,7 +85,7 @@ def test_the_repeat_that_ctrl_c_lets_end_is_told(
     assert [one.status for one in ended(events)] == [Status.VOID, Status.VALID]
 
 
-def test_after_another_s_abort_no_folder_of_a_fetched_repeat_stays(
+def test_after_an_abort_by_another_user_fetched_folders_are_deleted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     removed: list[str | None] = []
@@ -101,9 +101,7 @@ def test_after_another_s_abort_no_folder_of_a_fetched_repeat_stays(
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
 
 
-def test_an_attempt_that_somebody_aborts_is_none_of_those_allowed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_aborted_attempt_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     removed: list[str | None] = []
 
     def measure(*_: object) -> None:
@@ -123,7 +121,7 @@ def test_an_attempt_that_somebody_aborts_is_none_of_those_allowed(
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
 
 
-def test_what_to_do_about_a_step_that_failed_is_told(
+def test_the_remedy_of_a_failed_step_is_reported(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failures = iter([RobotError("sending began too late", remedy="a larger `idle` leaves it more time")])
@@ -139,7 +137,7 @@ def test_what_to_do_about_a_step_that_failed_is_told(
     assert not any(remedy for _, remedy in told[1:])
 
 
-def test_a_step_that_fails_as_nobody_foresaw_is_told_from_an_interruption(
+def test_an_unexpected_exception_of_a_step_is_not_an_interruption(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def measure(*_: object) -> None:
@@ -152,9 +150,7 @@ def test_a_step_that_fails_as_nobody_foresaw_is_told_from_an_interruption(
     assert (cut.status, cut.excused, cut.reason) == (Status.VOID, True, "KeyError: 'load'")
 
 
-def test_evidence_that_was_gone_when_fieldkit_came_back_is_said_in_words(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evidence_missing_after_a_kill_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = store.create(tmp_path, of_two())
     (repeat, _) = of_two().order()
     journal.append(
@@ -175,7 +171,7 @@ def test_evidence_that_was_gone_when_fieldkit_came_back_is_said_in_words(
     assert first.reason == f"fieldkit was killed before it had the evidence, which could not be fetched later; {gone}"
 
 
-def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
+def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fetch = Robots.fetch
@@ -204,7 +200,7 @@ def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
     assert manifest.verify(folder) == []
 
 
-def test_what_the_laptop_s_memory_cannot_hold_makes_an_attempt_void_and_ends_no_trial(
+def test_too_little_memory_makes_an_attempt_void_and_does_not_end_the_trial(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     judge, calls = gates.judge, 0
@@ -232,7 +228,7 @@ def interrupt(*_words: object, **_more: object) -> list[str]:
     raise KeyboardInterrupt
 
 
-def test_an_attempt_that_is_stopped_while_it_is_fetched_is_fetched_by_who_goes_on(
+def test_an_attempt_stopped_during_fetching_is_fetched_by_resume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
@@ -256,7 +252,7 @@ def test_an_attempt_that_is_stopped_while_it_is_fetched_is_fetched_by_who_goes_o
     assert fetched[0] == first.remote(folder.name)
 
 
-def test_what_is_stopped_while_it_is_measured_stays_on_the_robots_and_is_told(
+def test_evidence_of_an_attempt_stopped_during_its_steps_stays_on_the_robots(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
@@ -317,7 +313,7 @@ def test_a_disk_may_be_full_at_any_write(tmp_path: Path, monkeypatch: pytest.Mon
     assert moment > 30, "hardly a write was met"
 
 
-def test_a_folder_that_is_moved_away_stops_the_trial_which_goes_on_where_it_is(
+def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fetch = Robots.fetch
@@ -338,7 +334,7 @@ def test_a_folder_that_is_moved_away_stops_the_trial_which_goes_on_where_it_is(
     assert [one.status for one in journal.ended(journal.read(tmp_path / "moved"))] == ["void", "valid", "valid"]
 
 
-def test_a_trial_that_runs_is_not_rebuilt(tmp_path: Path) -> None:
+def test_a_running_trial_is_not_rebuilt(tmp_path: Path) -> None:
     run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     with (
         journal.claimed(only(tmp_path)),
@@ -347,7 +343,7 @@ def test_a_trial_that_runs_is_not_rebuilt(tmp_path: Path) -> None:
         rebuild(only(tmp_path))
 
 
-def test_who_goes_on_is_told_of_evidence_that_changed(tmp_path: Path, events: list[Event]) -> None:
+def test_changed_evidence_is_reported_on_resume(tmp_path: Path, events: list[Event]) -> None:
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     folder = only(tmp_path)
     (folder / "repeats/tcp-02/ping.txt").write_text(PING.replace("time=2", "time=9"), encoding="utf-8")
@@ -356,7 +352,7 @@ def test_who_goes_on_is_told_of_evidence_that_changed(tmp_path: Path, events: li
     assert manifest.verify(folder) == ["repeats/tcp-02/ping.txt: changed"]
 
 
-def test_a_trial_begun_with_another_version_of_a_package_that_adds_steps_is_not_gone_on_with(
+def test_a_trial_started_with_another_version_of_a_step_package_is_not_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun = of_two()
