@@ -1,4 +1,4 @@
-"""Trials in Python hold what their tables, their exports and their captures hold."""
+"""Trials in Python have the same content as their tables, exports and captures."""
 
 import csv
 import io
@@ -62,8 +62,8 @@ def test_repeats_equal_the_export(named: Path, tmp_path: Path) -> None:
         out = tmp_path / "out.parquet"
         assert main(["export", *map(str, paths), "--format", "parquet", "-o", str(out)]) == 0
         written = pyarrow.parquet.read_table(out)
-        found = fieldkit.load(*paths).repeats
-        assert found.equals(written, check_metadata=True)
+        repeats = fieldkit.load(*paths).repeats
+        assert repeats.equals(written, check_metadata=True)
         out.unlink()
 
 
@@ -90,7 +90,7 @@ def test_cells_can_be_grouped_by_source() -> None:
 
 @pytest.mark.parametrize("folder", STORED, ids=lambda path: path.name)
 def test_packets_count_as_the_trial_does(folder: Path) -> None:
-    """What was measured of all packets follows from each of them."""
+    """The measures of a trial follow from its packets."""
     trials = fieldkit.load(folder)
     valid = [row for row in trials.repeats.to_pylist() if row["status"] == "valid"]
     assert valid
@@ -281,15 +281,15 @@ def test_a_cell_has_its_figures_by_name(named: Path) -> None:
         for row in trials.cells(quantities="file_loss").to_pylist()
         if (row["protocol"], row["quantity"]) == ("udp", "file_loss")
     )
-    found = cell.file_loss
-    assert (found.value, found.low, found.high, found.n) == (row["value"], row["low"], row["high"], row["n"])
-    assert (found.name, found.unit, cell.n_valid, cell.condition["protocol"]) == (
+    figure = cell.file_loss
+    assert (figure.value, figure.low, figure.high, figure.n) == (row["value"], row["low"], row["high"], row["n"])
+    assert (figure.name, figure.unit, cell.n_valid, cell.condition["protocol"]) == (
         "file_loss",
         "share",
         row["n"],
         "udp",
     )
-    assert found in list(cell)
+    assert figure in list(cell)
     with pytest.warns(UserWarning, match="Echo requests of several sizes"):
         up = fieldkit.load(named).cell(trial="named-0", protocol="udp")["up.file_loss"]
     assert (up.n, up.unit) == (8, "share")

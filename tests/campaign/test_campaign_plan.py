@@ -1,4 +1,4 @@
-"""The campaign file: what it means, and what is said of a wrong one."""
+"""The campaign file: its meaning, and its error messages."""
 
 from pathlib import Path
 
@@ -21,12 +21,12 @@ def names(tmp_path: Path, text: str) -> list[str]:
     path = tmp_path / "lawn.yaml"
     path.write_text(text, encoding="utf-8")
     campaign, document = load_campaign(path)
-    return [str(one) for one in trials_of(campaign, load_procedures(campaign, document), document)]
+    return [str(trial) for trial in trials_of(campaign, load_procedures(campaign, document), document)]
 
 
 def test_a_campaign_combines_distances_procedures_and_topologies(tmp_path: Path) -> None:
-    found = names(tmp_path, LAWN)
-    assert sorted(found) == [
+    trial_names = names(tmp_path, LAWN)
+    assert sorted(trial_names) == [
         f"{procedure} {distance} {topology}"
         for procedure in ("los", "nlos")
         for distance in ("10ft", "20ft")
@@ -35,9 +35,9 @@ def test_a_campaign_combines_distances_procedures_and_topologies(tmp_path: Path)
 
 
 def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
-    found = names(tmp_path, f"{LAWN}except: [{{topology: master, distance: 240 cm}}]\n".replace("20ft", "2.4m"))
-    assert len(found) == 6
-    assert not [one for one in found if one.endswith("2.4m master")]
+    trial_names = names(tmp_path, f"{LAWN}except: [{{topology: master, distance: 240 cm}}]\n".replace("20ft", "2.4m"))
+    assert len(trial_names) == 6
+    assert not [name for name in trial_names if name.endswith("2.4m master")]
     assert len(names(tmp_path, f"{LAWN}except: [{{procedure: nlos}}]\n")) == 4
 
 

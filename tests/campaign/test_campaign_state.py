@@ -1,4 +1,4 @@
-"""What a campaign remembers: its frozen inputs, and what became of each trial, whatever tore the journal."""
+"""The stored state of a campaign: its frozen inputs, and the progress of each trial, also after a torn journal."""
 
 from pathlib import Path
 
@@ -56,10 +56,10 @@ def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) 
     with journal.kept(asked):
         lawn.write_text(f"# dry grass\n{LAWN}", encoding="utf-8")
     again, document = plan.make_plan(lawn, "field")
-    found = plan.begun(journal.folder, again, document)
-    assert found is not None
-    assert found.order == asked.order
-    assert found.trials() == asked.trials()
+    frozen = plan.begun(journal.folder, again, document)
+    assert frozen is not None
+    assert frozen.order == asked.order
+    assert frozen.trials() == asked.trials()
 
 
 @pytest.mark.parametrize(
@@ -163,9 +163,9 @@ def test_a_damaged_journal_and_a_second_process_are_rejected(lawn: Path) -> None
 
 
 def planned(asked: CampaignPlan, journal: CampaignJournal, backend: Backend) -> CampaignPlanned:
-    told: list[Event] = []
-    CampaignRun(asked, journal, backend, told.append).announce()
-    (event,) = told
+    events: list[Event] = []
+    CampaignRun(asked, journal, backend, events.append).announce()
+    (event,) = events
     assert isinstance(event, CampaignPlanned)
     return event
 
@@ -192,11 +192,11 @@ def test_the_estimate_uses_measured_placing_times(lawn: Path) -> None:
 def test_a_disk_too_small_for_the_evidence_is_reported_before_robots_are_placed(lawn: Path) -> None:
     lawn.write_text(LAWN.replace("repeats: 3", "repeats: 100000"), encoding="utf-8")
     asked, journal = begin(lawn)
-    told: list[Event] = []
-    campaign = CampaignRun(asked, journal, load_backend("emulated", None, None), told.append)
+    events: list[Event] = []
+    campaign = CampaignRun(asked, journal, load_backend("emulated", None, None), events.append)
     with pytest.raises(ConfigurationError, match="GB are free"):
         campaign.run(Nobody(), Stop())
-    assert [type(event) for event in told] == [CampaignEnded], "no robot was started"
+    assert [type(event) for event in events] == [CampaignEnded], "no robot was started"
     assert journal.folder.is_dir(), "and the order is kept"
 
 
@@ -209,10 +209,10 @@ def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> 
             journal.add(trial, TrialProgress.STARTED, trial=str(count))
             journal.add(trial, TrialProgress.ENDED, trial=str(count), failed=count)
     assert str(failed) not in planned(asked, journal, backend).trials
-    told: list[Event] = []
-    campaign = CampaignRun(asked, journal, backend, told.append, failed=True)
+    events: list[Event] = []
+    campaign = CampaignRun(asked, journal, backend, events.append, failed=True)
     campaign.announce()
-    (event,) = told
+    (event,) = events
     assert isinstance(event, CampaignPlanned)
     assert str(failed) in event.trials
     assert str(whole) not in event.trials

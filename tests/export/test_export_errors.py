@@ -1,4 +1,4 @@
-"""Every form of export with everything that can be wrong with a trial: an error with a remedy, or a whole file."""
+"""Every export format with damaged trials: an error with a remedy, or a complete file."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""The rows of trials as one table: CSV as they stand on disk, Parquet with types, units and meanings."""
+"""The rows of trials as one table: CSV as stored on disk, Parquet with types, units and meanings."""
 
 from pathlib import Path
 
@@ -46,9 +46,9 @@ def test_tables_with_different_columns_are_combined(trial: Path, tmp_path: Path)
     text = "".join(line.rpartition(",")[0] + "\n" for line in lines)
     old.write_text(text.replace(trial.name, "older"), encoding="utf-8")
     exported(trial, old, kind="csv")
-    found = rows(tmp_path, "out.csv")
-    assert [row["trial"] for row in found] == [trial.name, trial.name, "older", "older"]
-    assert [row[last] for row in found] == [*(line.rpartition(",")[2] for line in lines[1:]), "", ""]
+    exported_rows = rows(tmp_path, "out.csv")
+    assert [row["trial"] for row in exported_rows] == [trial.name, trial.name, "older", "older"]
+    assert [row[last] for row in exported_rows] == [*(line.rpartition(",")[2] for line in lines[1:]), "", ""]
 
 
 def test_undeclared_columns_are_kept_as_text(trial: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

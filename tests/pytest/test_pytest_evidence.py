@@ -1,4 +1,4 @@
-"""Evidence folders of tests: made late, removed unless kept, never one over another."""
+"""Evidence folders of tests: created on first use, removed unless kept, never overwritten."""
 
 from pathlib import Path
 
@@ -37,7 +37,7 @@ def test_a_folder_remains_if_it_must_be_kept(tmp_path: Path, *, keep: Keep, fail
 
 def test_a_rerun_of_a_test_has_a_separate_folder(tmp_path: Path) -> None:
     tries = [EvidenceFolder(tmp_path / "test_a") for _ in range(3)]
-    assert [one.path.name for one in tries] == ["test_a", "test_a-2", "test_a-3"]
+    assert [folder.path.name for folder in tries] == ["test_a", "test_a-2", "test_a-3"]
 
 
 def test_a_folder_that_cannot_be_created_is_reported_with_the_option(tmp_path: Path) -> None:

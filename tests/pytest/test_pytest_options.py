@@ -1,4 +1,4 @@
-"""Options and configuration of the plugin, what is wrong with them, and tests that do not use it."""
+"""Options and configuration of the plugin, their errors, and tests that do not use it."""
 
 import os
 from pathlib import Path
@@ -75,12 +75,12 @@ def test_operator(pytestconfig):
 
 
 def run(pytester: pytest.Pytester, *words: str) -> pytest.RunResult:
-    """Run the tests of the current folder in this process, which has imported fieldkit already."""
+    """Run the tests of the current folder in this process, which has already imported fieldkit."""
     return pytester.runpytest_inprocess("-p", "no:cacheprovider", *words)
 
 
 def field(folder: Path) -> str:
-    """Return a site file with two robots that are off."""
+    """Return a site file with two robots that are switched off."""
     host_key = " ".join(make_key(folder / "host_key").split()[:2])
     make_key(folder / "key")
     access = f"port: {free_port()}, user: pi, key: {folder / 'key'}, host_key: {host_key}"
@@ -93,7 +93,7 @@ def field(folder: Path) -> str:
 
 
 def test_tests_without_its_fixtures_import_no_other_module(tmp_path: Path) -> None:
-    """Fixtures of their own that have the same names are theirs."""
+    """Other fixtures with the same names are not affected."""
     suites.write(tmp_path, site="robots: [", test_others=OTHERS, conftest=OWN)
     done = suites.run(tmp_path)
     assert (done.code, set(done.ended.values())) == (0, {"passed"}), done.said

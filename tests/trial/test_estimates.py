@@ -1,4 +1,4 @@
-"""Estimates of time: what a good link and a dead one take at first, then what repeats really took."""
+"""Estimates of durations: from a good and a dead link at first, then from finished repeats."""
 
 import pytest
 from hypothesis import given
@@ -63,7 +63,7 @@ def test_another_topology_is_used_if_the_same_has_no_repeats() -> None:
 
 
 def test_finished_repeats_with_a_dead_link_are_used() -> None:
-    """A campaign said 4 min and took 19: after its first trial with dead links the rest is known."""
+    """A campaign estimated 4 min and took 19: after its first trial with dead links, the rest can be estimated."""
     near, far = at("10m"), at("90m")
     before = of_trial(far, [FinishedRepeat(near, protocol, 8.0) for protocol in LOS.protocols])
     dead_s = sum(estimates.dead_link_s(LOS.procedure, protocol) for protocol in LOS.protocols) * LOS.repeats

@@ -1,4 +1,4 @@
-"""A folder from a colleague: nothing in it leads out of it, keeps a command waiting, or has a second word to say."""
+"""A trial's folder from another person: links do not lead out of it, pipes do not block, errors are brief."""
 
 import json
 import os
@@ -46,7 +46,7 @@ def pipe(path: Path) -> None:
 
 def unix_socket(path: Path) -> None:
     here = Path.cwd()
-    os.chdir(path.parent)  # its path has a limit of 108 characters
+    os.chdir(path.parent)  # a socket path is limited to 108 characters
     try:
         with socket.socket(socket.AF_UNIX) as one:
             one.bind(path.name)
@@ -121,7 +121,7 @@ def test_evidence_in_too_deep_folders_is_rejected(trial: Path) -> None:
 
 
 def test_a_journal_with_a_second_name_is_not_written(trial: Path, ours: Path) -> None:
-    """A hard link into a backup, or to a file of ours: what is written here would change it there."""
+    """A hard link to a backup or another local file: writing here would change it there."""
     (trial / "journal.jsonl").unlink()
     (trial / "journal.jsonl").hardlink_to(ours)
     with (
@@ -156,9 +156,9 @@ def test_names_that_are_not_text_are_written_as_by_sha256sum(trial: Path) -> Non
     for name in strange:
         (trial / "repeats/udp-01" / name).write_text("x", encoding="utf-8")
     Path(os.fsdecode(os.fsencode(trial / "repeats/udp-01") + b"/\xff.txt")).write_text("x", encoding="utf-8")
-    told = manifest.verify(trial)
-    assert len(told) == len(strange) + 1
-    assert all(line.isprintable() and line.endswith(": not in the manifest") for line in told)
+    lines = manifest.verify(trial)
+    assert len(lines) == len(strange) + 1
+    assert all(line.isprintable() and line.endswith(": not in the manifest") for line in lines)
     (trial / store.MANIFEST_FILE).unlink()
     ledger = Ledger(store.read_plan(trial), trial, Stop())
     ledger.summarize()
@@ -221,7 +221,7 @@ def test_an_invalid_line_is_one_error_with_its_line(trial: Path, line: str) -> N
 
 
 def test_a_reason_with_half_a_surrogate_pair_is_stored_with_a_mark(tmp_path: Path) -> None:
-    """Names of files that are no UTF-8 have such halves, and errors name files."""
+    """Names of files that are not UTF-8 contain such halves, and errors contain names of files."""
     plan = los_plan(repeats=1, protocols=(Protocol.UDP,))
     folder = store.create(tmp_path, plan)
     with journal.claimed(folder):

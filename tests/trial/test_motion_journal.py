@@ -1,4 +1,4 @@
-"""The journal of motions, and the fence over random attempts, faults and resumes of a robot whose base brakes."""
+"""The journal of motions, and the fence over random attempts, faults and resumes of a robot that brakes slowly."""
 
 import math
 from dataclasses import replace
@@ -25,7 +25,7 @@ TICK_S = 0.05
 BRAKES_M_S2 = 1.0
 SPEED_M_S = 1.0
 MARGIN_M = SPEED_M_S * 2 * TICK_S + SPEED_M_S**2 / (2 * BRAKES_M_S2)
-"""Beyond the fence: the way of two turns of the loop, and the braking distance v^2 / (2 a)."""
+"""Distance beyond the fence: two cycles of the control loop, and the braking distance v^2 / (2 a)."""
 TASK = DriveTask(
     legs=[(4.0, 0.0)],
     speed_m_s=SPEED_M_S,
@@ -39,7 +39,7 @@ TASK = DriveTask(
 
 
 def kept(folder: Path, placement: Placement = NEAR, *, may_return: bool = False) -> KeptOrigins:
-    """Return the origins of a trial as another run of fieldkit reads them."""
+    """Return the origins of a trial as read by another run of fieldkit."""
     return KeptOrigins(MotionJournal(folder / MOTION_FILE), folder, ROBOTS, placement, may_return=may_return)
 
 
@@ -121,7 +121,7 @@ def test_a_log_may_start_as_far_from_the_origin_as_a_robot_may() -> None:
 
 
 class BrakingBase:
-    """A base that slows down by `BRAKES_M_S2`, not at once, and whose odometry is right."""
+    """A base that decelerates with `BRAKES_M_S2` instead of immediately, with exact odometry."""
 
     def __init__(self) -> None:
         self.pose = OdometryPose(0.0, 0.0, 0.0)
@@ -142,7 +142,7 @@ ATTEMPTS = st.lists(st.tuples(st.integers(0, 400), st.sampled_from(["lease", "su
 @settings(max_examples=30, deadline=None)
 @given(ATTEMPTS)
 def test_no_sequence_of_attempts_leaves_the_fence_of_the_trial(attempts: list[tuple[int, str]]) -> None:
-    """Each attempt is a new run, with the option that lets the robot move from where a fault stopped it."""
+    """Each attempt is a new run, with the option that allows motion from the position after a fault."""
     base, now_s = BrakingBase(), 0.0
     farthest_m = 0.0
     with TemporaryDirectory() as text:

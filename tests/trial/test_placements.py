@@ -1,4 +1,4 @@
-"""Recorded positions against the placement that was planned: what an operator's tape allows, and what it does not."""
+"""Recorded positions compared with the planned placement: accepted and rejected differences."""
 
 import math
 from dataclasses import replace
@@ -19,12 +19,12 @@ from fieldkit.trial import placements
 from tests.helpers.casts import los_plan
 
 DEGREE_M = 110_574.28
-"""A degree north, on the equator."""
+"""Metres per degree of latitude at the equator."""
 
 
 def stood(folder: Path, receiver: Account, sender: Account) -> AttemptEvidence:
-    told = Accounts({Role.SENDER: sender, Role.RECEIVER: receiver})
-    (folder / accounts.FILE).write_text(accounts.text(told), encoding="utf-8")
+    stored = Accounts({Role.SENDER: sender, Role.RECEIVER: receiver})
+    (folder / accounts.FILE).write_text(accounts.text(stored), encoding="utf-8")
     return AttemptEvidence(folder)
 
 
@@ -41,14 +41,14 @@ def on_earth(folder: Path, apart_m: float) -> AttemptEvidence:
 PLAN = los_plan()
 SCENE = PLAN.scene(next(iter(PLAN.order())), "")
 PLANNED_M = math.dist(SCENE.places_m[Role.SENDER], SCENE.places_m[Role.RECEIVER])
-"""30 ft from the relay to each."""
+"""30 ft from the relay to each of the stations."""
 
 
 @pytest.mark.parametrize(
     ("apart_m", "agrees"), [(18.288, True), (18.897, True), (17.0, True), (24.0, False), (200.0, False)]
 )
 def test_positions_in_metres_have_a_tolerance_of_two_metres(apart_m: float, agrees: bool, tmp_path: Path) -> None:
-    """31 ft instead of 30 ft are 18.897 m from one to the other."""
+    """31 ft instead of 30 ft is a distance of 18.897 m between the stations."""
     why = placements.contradiction(SCENE, in_metres(tmp_path, apart_m))
     assert (why is None) is agrees
     if why:
@@ -59,10 +59,10 @@ def test_positions_in_metres_have_a_tolerance_of_two_metres(apart_m: float, agre
 def test_satellite_positions_have_the_tolerance_of_their_error(
     off_m: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    found = placements.contradiction(SCENE, on_earth(tmp_path_factory.getbasetemp(), PLANNED_M + off_m))
+    contradiction = placements.contradiction(SCENE, on_earth(tmp_path_factory.getbasetemp(), PLANNED_M + off_m))
     least_m = placements.SATELLITE_M + placements.SHARE * PLANNED_M
     if not math.isclose(abs(off_m), least_m, abs_tol=0.2):
-        assert (found is None) is (abs(off_m) < least_m)
+        assert (contradiction is None) is (abs(off_m) < least_m)
 
 
 def test_missing_positions_contradict_nothing(tmp_path: Path) -> None:
@@ -82,8 +82,8 @@ def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
     places_m = SCENE.places_m
     x, y, z = places_m[Role.RECEIVER]
     evidence = stood(tmp_path, Account(place=(x + off_m, y, z)), Account(place=places_m[Role.SENDER]))
-    found = list(follow.problems(View(SCENE, evidence), ()))
-    assert (found == []) if why is None else [why in reason for reason in found] == [True]
+    problems = list(follow.problems(View(SCENE, evidence), ()))
+    assert (problems == []) if why is None else [why in reason for reason in problems] == [True]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The rule of `fieldkit middleware recommend`, on repeats of which the answer is known."""
+"""The rule of `fieldkit middleware recommend`, on repeats with known results."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,7 +28,7 @@ def cell(
     status: Sequence[str] = (),
     size_bytes: float = SIZE,
 ) -> LinkCell:
-    """Return repeats that lost so many of 100 samples handed over."""
+    """Return repeats that lost the given numbers of 100 samples."""
     n = len(lost)
     delay = np.array([*delay_s] or [0.01] * n)
     numbers = {
@@ -59,7 +59,7 @@ def test_a_repeat_at_the_bound_passes_and_one_above_fails() -> None:
 
 
 def test_a_bound_is_compared_as_a_decimal() -> None:
-    # In binary, 2.9 times 0.01 is less than 29/1000.
+    # In binary floating point, 2.9 times 0.01 is less than 29/1000.
     bound = parse_amount("2.9%", "share", "bound")
     assert judge(cell(5 * [29], sent=1000), criterion=LinkCriterion(bound)).passed
     assert judge(cell(5 * [30], sent=1000), criterion=LinkCriterion(bound)).failed
@@ -85,7 +85,7 @@ def test_void_and_failed_repeats_do_not_count() -> None:
     own = cell(6 * [0], status=["valid", "void", "valid", "failed", "valid", "valid"])
     assert own.attempts == 6
     assert judge(own).lacking == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
-    # What a void repeat lost proves nothing either.
+    # The loss of a void repeat proves nothing either.
     assert judge(cell([0, 0, 0, 0, 0, 90], status=[*5 * ["valid"], "void"])).passed
 
 
@@ -119,7 +119,7 @@ def test_a_missing_delay_never_passes() -> None:
     assessment = judge(own, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
     assert not assessment.failed
     assert "1 of 5 repeats have no value" in assessment.lacking[0]
-    assert judge(own).passed  # without a limit of the delay it is not needed
+    assert judge(own).passed  # without a delay limit it is not needed
 
 
 def test_a_censored_delay_never_passes() -> None:
@@ -129,7 +129,7 @@ def test_a_censored_delay_never_passes() -> None:
     assessment = judge(own, criterion=lenient)
     assert not assessment.failed
     assert "in 1 of 5 repeats it has no value over all that was sent" in assessment.lacking[0]
-    # What arrived was late already: then it fails whatever the lost ones would have been.
+    # The received samples were already late, so it fails whatever the lost ones would have been.
     late = cell(5 * [10], delay_s=5 * [0.3], delay_sent_s=5 * [UNKNOWN])
     assert judge(late, criterion=lenient).failed
 
@@ -165,7 +165,7 @@ def test_the_rank_is_the_loss_of_the_worst_cell_and_then_the_delay() -> None:
     empty = cell([0, 0], status=["void", "void"])
     assert judge(fast).rank == (0, 0.01)
     assert judge(slow).rank == judge(fast, slow).rank == (0, 0.3)
-    assert judge(unknown).rank == (0, float("inf"))  # a delay that is unknown is not short
+    assert judge(unknown).rank == (0, float("inf"))  # an unknown delay is not short
     assert judge(lossy).rank == judge(fast, lossy).rank == (3 / 500, 0.01)
     assert judge(fast, empty).rank == (float("inf"), float("inf"))
 

@@ -1,4 +1,4 @@
-"""The columns of a trial: of every trial, of its steps, as its plan has them and as its table is read by others."""
+"""The columns of a trial: common columns, those of its steps, in its plan, and as read from its table."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -31,7 +31,7 @@ EVERYWHERE = [column.name for column in trial_columns()]
 
 @st.composite
 def declared_columns(draw: st.DrawFn) -> Column:
-    """A column as anybody may declare it."""
+    """Any valid column."""
     name, unit, meaning = draw(NAMES), draw(UNITS), draw(WORDS)
     plain = Column(name, unit, meaning)
     if plain.type is str:
@@ -45,14 +45,14 @@ def declared_columns(draw: st.DrawFn) -> Column:
 
 @st.composite
 def tables_of_columns(draw: st.DrawFn) -> tuple[list[Column], dict[str, Value]]:
-    """Columns of one trial, and a value of each."""
-    found = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
-    kept = [column for column in found if column.name not in EVERYWHERE]
+    """Columns of one trial, and a value for each."""
+    drawn = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
+    kept = [column for column in drawn if column.name not in EVERYWHERE]
     return kept, {column.name: draw(values(column)) for column in kept}
 
 
 def values(column: Column) -> st.SearchStrategy[Value]:
-    """Values that a column can have, as a CSV has them."""
+    """Return a strategy for the values of a column, as in a CSV file."""
     low, high = column.possible
     if column.type is str:
         return WORDS
@@ -76,7 +76,7 @@ def test_any_valid_column_is_read_back_from_plan_and_table(
     assert [*frozen.read(folder / "trial.yaml")] == columns
     assert store.read_plan(folder).table == plan.table == (*trial_columns(), *columns)
     read = repeats.parse(rows.to_csv([row], plan.table).encode(), plan.table)
-    # A cell has nine digits of a number, and a bound may have more.
+    # A cell has nine digits of a number; a bound may have more.
     kept = [float(f"{value:.9g}") if isinstance(value, float) else value for value in row.values()]
     assert [read.column(name)[0] for name in row] == kept
 
@@ -130,9 +130,9 @@ def test_a_named_column_has_named_figures_and_counts() -> None:
     ],
 )
 def test_a_column_that_cannot_be_read_or_shown_is_rejected(column: Column, flaw: str) -> None:
-    found = column.flaw()
-    assert found is not None
-    assert flaw in found
+    problem = column.flaw()
+    assert problem is not None
+    assert flaw in problem
 
 
 # Steps.
@@ -143,11 +143,11 @@ def meters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An installed package with `meter`."""
     write_package(tmp_path / "installed", "meters", f"[{plugins.STEPS}]\nmeter = {meter.TARGET}\n")
     monkeypatch.syspath_prepend(tmp_path / "installed")
-    for one in (step_types, installed):
-        one.cache_clear()
+    for cached in (step_types, installed):
+        cached.cache_clear()
     yield
-    for one in (step_types, installed):
-        one.cache_clear()
+    for cached in (step_types, installed):
+        cached.cache_clear()
 
 
 def procedure(*steps: str) -> Procedure:
@@ -208,7 +208,7 @@ def written(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bo
 
 def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Path) -> None:
     found = tables.declared_in([written(tmp_path, "one", varied.VENDOR)])
-    assert found == (*trial_columns(), *(Column(**{**vars(one), "rank": 100}) for one in varied.VENDOR))
+    assert found == (*trial_columns(), *(Column(**{**vars(column), "rank": 100}) for column in varied.VENDOR))
 
 
 def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Evidence of stored attempts that is whole passes; one piece of it changed contradicts the others, and voids."""
+"""Complete evidence of stored attempts passes; one changed file contradicts the others and voids the attempt."""
 
 import re
 import shutil
@@ -36,15 +36,15 @@ tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes
 """
 
 HEADS = 8
-"""Bytes of a record's lengths, behind which its IP packet begins."""
+"""Offset of a record's lengths, after which its IP packet starts."""
 ICMP = 1
 Packet = tuple[int, bytes]
-"""Time in microseconds since 1970, and the rest of the record from its lengths on."""
+"""Time in microseconds since 1970, and the rest of the record from its lengths."""
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A copy of a stored attempt, with notes of its robots as today's job script writes them."""
+    """A copy of a stored attempt, with the state of its robots in the format of the present job script."""
 
     folder: Path
     protocol: Protocol
@@ -63,15 +63,15 @@ class Attempt:
         path.write_bytes(change(path.read_bytes()))
 
     def packets(self, name: str) -> list[Packet]:
-        data, at, found = (self.folder / name).read_bytes(), 24, list[Packet]()
+        data, at, packets = (self.folder / name).read_bytes(), 24, list[Packet]()
         while at < len(data):
             seconds, micros, kept = struct.unpack_from("<3I", data, at)
-            found.append((seconds * 10**6 + micros, data[at + 8 : at + 16 + kept]))
+            packets.append((seconds * 10**6 + micros, data[at + 8 : at + 16 + kept]))
             at += 16 + kept
-        return found
+        return packets
 
     def capture(self, role: str, change: Callable[[list[Packet]], Sequence[Packet]]) -> None:
-        """Change the packets of a capture, and what tcpdump counted with them."""
+        """Change the packets of a capture, and adapt the counts of tcpdump."""
         name = f"{role}.pcap"
         packets = self.packets(name)
         changed = change(packets)
@@ -117,13 +117,13 @@ def test_complete_evidence_has_no_contradictions(protocol: Protocol, trial: Path
 
 
 def demand(attempt: Attempt, *reasons: str) -> None:
-    found = attempt.problems()
-    assert all(any(reason in one for one in found) for reason in reasons), found
+    problems = attempt.problems()
+    assert all(any(reason in problem for problem in problems) for reason in reasons), problems
 
 
 @pytest.mark.parametrize(("role", "held"), [("sender", "sender"), ("receiver", "receiver")])
 def test_a_capture_that_ended_in_the_middle(attempt: Attempt, role: str, held: str) -> None:
-    """It looks whole: exit code 0, counters that agree."""
+    """It looks complete: exit code 0, consistent counters."""
     attempt.capture(role, lambda packets: packets[: len(packets) // 3])
     demand(attempt, f"the {held}'s capture")
 
@@ -148,7 +148,7 @@ def test_a_handshake_missing_in_one_capture(tcp: Attempt, role: str, reason: str
 
 @pytest.mark.parametrize(("calls", "is_told"), [(1, True), (2, False)])
 def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_told: bool) -> None:
-    """At once, nobody listened; after calls that the link lost, perhaps since the listener was at its limit."""
+    """An immediate refusal: no listener; a refusal after lost calls: perhaps the listener was at its time limit."""
 
     def refused(packets: list[Packet]) -> list[Packet]:
         (at, call), (answered, answer) = packets[:2]
@@ -158,8 +158,8 @@ def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_told: boo
     for role in ("sender", "receiver"):
         tcp.capture(role, refused)
     tcp.file("recv.bag", lambda _: b"")
-    told = "the receiver refused the connection: nobody listened when the sender began"
-    assert (told in " ".join(tcp.problems())) == is_told
+    message = "the receiver refused the connection: nobody listened when the sender began"
+    assert (message in " ".join(tcp.problems())) == is_told
 
 
 def test_a_bag_that_is_missing_contradicts_nothing(attempt: Attempt) -> None:
@@ -170,7 +170,7 @@ def test_a_bag_that_is_missing_contradicts_nothing(attempt: Attempt) -> None:
 def test_a_link_that_lost_everything_contradicts_nothing(udp: Attempt) -> None:
     sender = udp.packets("sender.pcap")[0][1][8 + 12 : 8 + 16]
     udp.capture("receiver", lambda _: [])
-    udp.capture("sender", lambda packets: [one for one in packets if one[1][8 + 12 : 8 + 16] == sender])
+    udp.capture("sender", lambda packets: [packet for packet in packets if packet[1][8 + 12 : 8 + 16] == sender])
     (udp.folder / "recv.bag").write_bytes(b"")
     sent = "10 packets transmitted, 0 received, 100% packet loss, time 1800ms\n"
     (udp.folder / "ping.txt").write_text(f"PING 10.42.0.2 (10.42.0.2) 8192(8220) bytes of data.\n\n{sent}")
@@ -182,7 +182,7 @@ SECTIONS = ["boot", "clock", "date"]
 
 @pytest.mark.parametrize("section", SECTIONS)
 def test_sections_that_a_robot_never_provides_contradict_nothing(attempt: Attempt, section: str) -> None:
-    """Neither before nor after: their tools cannot."""
+    """The section is missing before and after, because the robot lacks the tool."""
     for role in ("sender", "receiver"):
         for moment in ("before", "after"):
             note = attempt.folder / f"{role}-{moment}.txt"
@@ -221,8 +221,8 @@ def test_a_robot_that_a_step_reboots_may_reboot(tcp: Attempt) -> None:
     procedure, scene = load_procedure("selfheal"), PLAN.scene(RepeatId(Protocol.TCP, 1), "")
     for role in ("sender", "receiver"):
         tcp.text(f"{role}-after.txt", BOOT, BOOT.replace("a", "b"))
-    found = hosts.problems(procedure, scene, AttemptEvidence(tcp.folder))
-    assert list(found) == ["turtlebot-1: the robot rebooted during the repeat"], "which only loses its link"
+    problems = hosts.problems(procedure, scene, AttemptEvidence(tcp.folder))
+    assert list(problems) == ["turtlebot-1: the robot rebooted during the repeat"], "which only loses its link"
 
 
 def test_a_file_that_tcp_cannot_have_delivered(tcp: Attempt) -> None:
@@ -271,12 +271,12 @@ def test_replies_that_are_in_no_capture(attempt: Attempt, role: str) -> None:
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
 def test_replies_that_match_only_packets_of_another_ping(attempt: Attempt, role: str) -> None:
-    """Of one that runs beside, with another identifier: half of each one's packets are as many as one's."""
+    """Of a parallel ping with another identifier: half of the packets of each are as many as those of one."""
 
     def shared(packets: list[Packet]) -> list[Packet]:
         echoes = [at for at, (_, rest) in enumerate(packets) if rest[HEADS + 9] == ICMP and not _is_later(rest)]
         assert len(echoes) > 4
-        # Requests and answers take turns: of every other exchange both.
+        # Requests and replies alternate: keep both of every other exchange.
         every_other = [at for number, at in enumerate(echoes) if number // 2 % 2]
         others = {at: packets[at][1][: HEADS + 24] + b"??" + packets[at][1][HEADS + 26 :] for at in every_other}
         return [(time_us, others.get(at, rest)) for at, (time_us, rest) in enumerate(packets)]
@@ -297,11 +297,11 @@ def test_a_ping_whose_counters_contradict_its_lines(attempt: Attempt) -> None:
 
 
 def test_a_reply_with_a_round_trip_time_of_zero(udp: Attempt) -> None:
-    """As iputils prints it, beside "time of day goes back" in its log."""
+    """The output of iputils if its log has "time of day goes back"."""
     lines = (udp.folder / "ping.txt").read_text(encoding="utf-8")
-    told = re.search(r"time=[0-9.]+ ms", lines)
-    assert told
-    udp.text("ping.txt", told[0], "time=0.000 ms")
+    match = re.search(r"time=[0-9.]+ ms", lines)
+    assert match
+    udp.text("ping.txt", match[0], "time=0.000 ms")
     reason = "ping.txt has an answer that took no time: the clock was set back while ping waited"
     assert reason in udp.problems(), "beside others"
 
@@ -327,8 +327,8 @@ def test_a_clock_that_was_set_back_within_a_capture_and_ahead_again(attempt: Att
 def test_a_clock_that_was_set(attempt: Attempt, role: str) -> None:
     name, robot = f"{role}-after.txt", {"sender": "turtlebot-1", "receiver": "turtlebot-2"}[role]
     first_ns = 1_000 * attempt.packets(f"{role}.pcap")[0][0]
-    true, told = (note(first_ns + 50 * 10**9 + step_ns, AFTER_S) for step_ns in (0, 200_000_000))
-    attempt.text(name, true, told)
+    true, changed = (note(first_ns + 50 * 10**9 + step_ns, AFTER_S) for step_ns in (0, 200_000_000))
+    attempt.text(name, true, changed)
     assert attempt.problems() == (
         f"{robot}: its clock was set ahead by 0.200 s (known to 0.010 s) during the repeat",
     )
@@ -361,8 +361,8 @@ def test_a_job_that_was_ended_by_another_program(
     attempt: Attempt, name: str, old: str, new: str, reason: str
 ) -> None:
     attempt.text(f"{name}-after.txt", old, new)
-    (found,) = attempt.problems()
-    assert reason in found
+    (problem,) = attempt.problems()
+    assert reason in problem
 
 
 def test_a_traditional_netcat_that_caught_a_signal(attempt: Attempt) -> None:

@@ -1,4 +1,4 @@
-"""Packets of an earlier attempt that arrive in this one make it void; what honestly stands at the edges does not."""
+"""Packets of an earlier attempt that arrive in this one make it void; legitimate packets at the edges do not."""
 
 import random
 import tempfile
@@ -17,7 +17,7 @@ from tests.trial.test_trial_contradictions import LOSSLESS, Attempt, Packet, of
 
 EARLIER = "packets of an earlier attempt were still on the way"
 HEADS = 8
-"""Bytes of a record's lengths, behind which its IP packet begins: the captures are of link type RAW."""
+"""Offset of a record's lengths, after which its IP packet starts: the captures have link type RAW."""
 KEPT = sorted(TRIALS.glob("*/repeats/*-0[0-9]"))
 
 Chosen = Callable[[bytes], bool]
@@ -40,7 +40,7 @@ def _is_later_echo(packet: bytes) -> bool:
 
 
 def _is_load(packet: bytes) -> bool:
-    """Whether it is of the transfer: a first fragment of UDP, or a frame of TCP with payload."""
+    """Return True for a packet of the transfer: a first fragment of UDP, or a TCP frame with payload."""
     return not _is_icmp(packet) and not _is_later(packet) and int.from_bytes(packet[2:4], "big") > 60
 
 
@@ -55,7 +55,7 @@ def _left(packets: list[Packet], role: str, chosen: Chosen) -> list[Packet]:
 
 
 def _waiting(attempt: Attempt, role: str, chosen: Chosen) -> list[Packet]:
-    """Return what left a robot in the other repeat, as if it was on the way until this one began."""
+    """Return packets sent in the other repeat, as if they were delayed until the start of this one."""
     other = Attempt(LOSSLESS / "repeats" / f"{attempt.protocol}-02", attempt.protocol)
     began_us, _ = attempt.packets("receiver.pcap")[0]
     found = [(began_us, rest) for _, rest in _left(other.packets(f"{role}.pcap"), role, chosen)]
@@ -97,7 +97,7 @@ def test_packets_of_an_earlier_attempt_make_an_attempt_void(
 
 @pytest.mark.parametrize("protocol", Protocol)
 def test_earlier_packets_queued_at_the_sender_make_an_attempt_void(tmp_path: Path, protocol: Protocol) -> None:
-    """As many datagrams of this one never left, so that the sums agree; of TCP a SYN waited."""
+    """The same number of datagrams of this attempt never left, so the sums agree; for TCP a SYN was queued."""
     attempt = of(protocol, tmp_path)
     chosen = _is_load if protocol is Protocol.UDP else lambda packet: packet[9] == 6 and packet[33] == 2
     waiting = _waiting(attempt, "sender", chosen)[:1]
@@ -130,7 +130,7 @@ def test_only_earlier_packets_arrived(tmp_path: Path, chosen: Chosen) -> None:
 @given(st.sampled_from(Protocol), st.integers(0, 2**32), st.sampled_from((0.0, 0.1, 0.6, 1.0)))
 @settings(max_examples=20)
 def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Protocol, seed: int, lost: float) -> None:
-    """The ends of two captures differ by what is on the way; a user's ping or stray acknowledgments run beside."""
+    """Two captures differ at their ends by packets in flight; a user's ping or stray ACKs run in parallel."""
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory() as place:
         attempt = of(protocol, Path(place))

@@ -1,4 +1,4 @@
-"""Evidence that is whole passes every gate; damaged in one place, it gives the one reason for it."""
+"""Complete evidence passes every check; damaged in one place, it gives exactly one reason."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +19,7 @@ from tests.helpers.plans import problems, write_states
 from tests.measure.evidence.test_measure_bag import write_bag
 
 PLAN = los_plan(record_s=2.0, protocols=(Protocol.UDP,))
-FRAMES = timed([one for number in range(4) for one in datagram(number, 8192)])
+FRAMES = timed([frame for number in range(4) for frame in datagram(number, 8192)])
 
 LOG = """\
 tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes
@@ -138,10 +138,10 @@ def fewer_frames(folder: Path) -> None:
 def test_one_damaged_file_gives_one_reason(folder: Path, damage: Callable[[Path], object], reason: str) -> None:
     plan = los_plan(record_s=4.0) if damage is short_bag else PLAN
     damage(folder)
-    found = problems(plan, Protocol.UDP, folder)
-    assert any(reason in one for one in found), found
-    assert len(found) <= 2, "one cause, at most its sign in two places"
-    assert not [one for one in found if "cannot be measured" in one], "it was foreseen"
+    reasons = problems(plan, Protocol.UDP, folder)
+    assert any(reason in other for other in reasons), reasons
+    assert len(reasons) <= 2, "one cause, at most its sign in two places"
+    assert not [other for other in reasons if "cannot be measured" in other], "it was foreseen"
 
 
 def test_an_exception_while_measuring_makes_the_attempt_void(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,12 +161,12 @@ def test_an_exception_while_measuring_makes_the_attempt_void(folder: Path, monke
 def test_an_impossible_value_makes_the_attempt_void_and_is_missing(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A row that holds it would be in a table that nothing reads again."""
+    """A table with such a row could not be read again."""
     measured = PingStep.measure
 
     def impossible(self: PingStep, view: View) -> Measured:
-        found = measured(self, view)
-        return Measured({**found.values, "rtt_loss": -38460.0, "rtt_min_s": float("nan")}, found.missing)
+        result = measured(self, view)
+        return Measured({**result.values, "rtt_loss": -38460.0, "rtt_min_s": float("nan")}, result.missing)
 
     monkeypatch.setattr(PingStep, "measure", impossible)
     judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
@@ -183,16 +183,16 @@ def test_a_value_missing_without_a_reason_makes_the_attempt_void(
     measured = PingStep.measure
 
     def forgetful(self: PingStep, view: View) -> Measured:
-        found = measured(self, view)
-        return Measured({name: value for name, value in found.values.items() if name != "rtt_loss"}, found.missing)
+        result = measured(self, view)
+        return Measured({name: value for name, value in result.values.items() if name != "rtt_loss"}, result.missing)
 
     monkeypatch.setattr(PingStep, "measure", forgetful)
     assert problems(PLAN, Protocol.UDP, folder) == ("the step ping gives neither a value nor a reason for rtt_loss",)
 
 
 def test_evidence_disturbed_by_a_fault_may_be_incomplete(tmp_path: Path) -> None:
-    """Its own evidence must be; the ping inside left nothing."""
+    """The evidence of the fault must be complete; the ping inside left none."""
     plan = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
     write_states(tmp_path)
-    found = problems(plan, Protocol.TCP, tmp_path)
-    assert [one.partition(":")[0] for one in found] == ["fault-link-down.txt", "fault-reboot.txt"]
+    reasons = problems(plan, Protocol.TCP, tmp_path)
+    assert [reason.partition(":")[0] for reason in reasons] == ["fault-link-down.txt", "fault-reboot.txt"]

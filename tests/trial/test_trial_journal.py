@@ -34,7 +34,7 @@ def test_a_torn_journal_gives_every_complete_entry(
     path.write_bytes(kept)
     complete = kept.count(b"\n")
     read = journal.read(folder)
-    # A last line that lost only its end of line is whole all the same.
+    # A last line that lost only its line end is still complete.
     assert read in (written[:complete], written[: complete + 1])
 
 

@@ -1,4 +1,4 @@
-"""Positions given after a trial, by the command as its user types it: kept, summed, refused, forgotten."""
+"""Positions added after a trial with the command: stored, summed, rejected, removed."""
 
 import shutil
 from pathlib import Path
@@ -18,7 +18,7 @@ from tests.helpers.stored_trials import TRIALS
 
 @pytest.fixture
 def trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a copy of a stored trial, in the folder that one is in."""
+    """Return a copy of a stored trial; its parent is the current folder."""
     (stored,) = TRIALS.glob("*_driveaway_*")
     shutil.copytree(stored, tmp_path / "trial")
     monkeypatch.chdir(tmp_path)
@@ -31,18 +31,18 @@ def replies_ns(trial: Path) -> list[int]:
 
 
 def walk(trial: Path, name: str = "walk.csv", *, late_ns: int = 0) -> list[int]:
-    """Write how somebody walked at 1 m/s from 5 m on while all of the trial went on; return the times of replies."""
+    """Write a walk at 1 m/s starting at 5 m during the whole trial; return the times of the replies."""
     at_ns = replies_ns(trial)
     first_ns, last_ns = min(at_ns) - 60 * 10**9, max(at_ns) + 60 * 10**9
     lines = (f"{first_ns - late_ns},5,0", f"{last_ns - late_ns},{5 + (last_ns - first_ns) / 1e9},0")
     Path(name).write_text("\n".join(("t_ns,x_m,y_m", *lines, "")), encoding="ascii")
-    return [one - first_ns for one in at_ns]
+    return [time_ns - first_ns for time_ns in at_ns]
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
     code = main(["positions", "trial", *words])
-    told = capsys.readouterr()
-    return code, told.out + told.err
+    output = capsys.readouterr()
+    return code, output.out + output.err
 
 
 def means_m(trial: Path) -> list[str]:
@@ -54,20 +54,20 @@ def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
 ) -> None:
     before = {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()}
     elapsed_ns = walk(trial)
-    code, told = said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")
-    assert code == 0, told
-    assert told.startswith("changed: trial.csv")
-    found = [float(metres) for metres in means_m(trial)]
-    assert all(65 <= metres <= 5 + max(elapsed_ns) / 1e9 for metres in found)
+    code, output = said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")
+    assert code == 0, output
+    assert output.startswith("changed: trial.csv")
+    means = [float(metres) for metres in means_m(trial)]
+    assert all(65 <= metres <= 5 + max(elapsed_ns) / 1e9 for metres in means)
     assert manifest.verify(trial) == []
     assert {path.name for path in trial.glob("positions*")} == {"positions.json", "positions-receiver.csv"}
-    assert said(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(found)
+    assert said(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(means)
 
     walk(trial, "again.CSV", late_ns=2 * 10**9)
     said(capsys, "receiver=again.CSV", "sender=0m,0m", "--gap", "1000min", "--offset", "-1s")
-    assert [float(metres) for metres in means_m(trial)] == pytest.approx([one + 3 for one in found])
+    assert [float(metres) for metres in means_m(trial)] == pytest.approx([metres + 3 for metres in means])
     said(capsys, "receiver=again.CSV", "sender=0m,0m")
-    assert means_m(trial) == [""] * len(found)
+    assert means_m(trial) == [""] * len(means)
     assert "has a gap of" in said(capsys)[1]
 
     assert said(capsys, "--clear")[0] == 0
@@ -101,8 +101,8 @@ def test_invalid_positions_are_rejected_and_change_nothing(
     with Path("huge.gpx").open("wb") as huge:
         huge.truncate(positions.MOST_BYTES + 1)
     before = {path: path.read_bytes() for path in trial.iterdir() if path.is_file()}
-    found, told = said(capsys, *words)
-    assert (found, complaint in told) == (code, True), told
+    exit_code, output = said(capsys, *words)
+    assert (exit_code, complaint in output) == (code, True), output
     assert {path: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
 
 
@@ -112,8 +112,8 @@ def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pyte
         assert said(capsys, "receiver=walk.csv")[0] == 2
     file = next(trial.glob("repeats/*/ping.txt"))
     file.write_bytes(file.read_bytes() + b"\n")
-    code, told = said(capsys, "receiver=walk.csv")
-    assert (code, "the evidence is not what was measured" in told) == (4, True)
+    code, output = said(capsys, "receiver=walk.csv")
+    assert (code, "the evidence is not what was measured" in output) == (4, True)
     assert not list(trial.glob("positions*"))
 
 

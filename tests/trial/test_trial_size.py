@@ -1,4 +1,4 @@
-"""The estimate of a trial's evidence against what trials left."""
+"""The estimated size of a trial's evidence compared with real sizes."""
 
 from fieldkit.core.model import FIXED_ROLES, Protocol, Role
 from fieldkit.trial import size

@@ -1,4 +1,4 @@
-"""Which tables paths name, for aggregate and its like."""
+"""The tables found at paths, for `aggregate` and other commands."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,25 +29,25 @@ def test_trials_below_a_folder_are_sorted_without_hidden_ones(tmp_path: Path) ->
     trial(tmp_path, "copy.partial")
     trial(tmp_path, "ones/1/repeats/udp-01")
     write(tmp_path, [ROW], "notes.csv")
-    assert read_from(tmp_path) == [str(one) for one in wanted]
+    assert read_from(tmp_path) == [str(table) for table in wanted]
 
 
 def test_a_table_with_several_paths_counts_once(tmp_path: Path) -> None:
-    one = trial(tmp_path, "1")
-    (tmp_path / "again").symlink_to(one, target_is_directory=True)
-    (one / "circle").symlink_to(tmp_path, target_is_directory=True)
+    table = trial(tmp_path, "1")
+    (tmp_path / "again").symlink_to(table, target_is_directory=True)
+    (table / "circle").symlink_to(tmp_path, target_is_directory=True)
     (tmp_path / "circle").symlink_to(tmp_path, target_is_directory=True)
     notes: list[str] = []
-    assert len(load([tmp_path, one, one / "trial.csv"], notes)) == 2
+    assert len(load([tmp_path, table, table / "trial.csv"], notes)) == 2
     assert not notes
 
 
 def test_a_copy_counts_once_with_a_note(tmp_path: Path) -> None:
-    one = trial(tmp_path, "1")
+    table = trial(tmp_path, "1")
     copy = write(tmp_path, repeats(replace(ROW, trial="1"), 2), "copy.csv")
     notes: list[str] = []
-    assert len(load([one, copy], notes)) == 2
-    assert notes == [f"{copy}: 2 rows of {one} again, counted once"]
+    assert len(load([table, copy], notes)) == 2
+    assert notes == [f"{copy}: 2 rows of {table} again, counted once"]
 
 
 def test_a_trial_without_a_table_is_named(tmp_path: Path) -> None:

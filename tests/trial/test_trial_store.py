@@ -42,7 +42,7 @@ def test_a_plan_contains_the_inputs_of_the_numbers() -> None:
 
 @pytest.mark.parametrize("name", ["../..", ".", "a/b", "", "-rf"])
 def test_a_plan_with_an_invalid_folder_name_is_rejected(folder: Path, name: str) -> None:
-    """Robots are told to remove the folder of that name."""
+    """The folder of that name is removed on robots."""
     path = folder / "trial.yaml"
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(f"trial: {los_plan().trial}", f"trial: '{name}'"), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What is made of a robot's answers: verbatim outputs of the tools in, findings out."""
+"""Checks of a robot: verbatim outputs of tools as input, findings as output."""
 
 import re
 from collections.abc import Sequence
@@ -36,12 +36,12 @@ def said(name: str, code: int = 0) -> Said:
 
 
 def only(findings: Sequence[Finding], check: str) -> Finding:
-    (finding,) = [one for one in findings if one.check == check]
+    (finding,) = [finding for finding in findings if finding.check == check]
     return finding
 
 
 def heard(robot: Robot, **sections: Said) -> list[Finding]:
-    """Judge the radio; an underscore in a section's name stands for a hyphen."""
+    """Judge the radio; an underscore in the name of a section is replaced by a hyphen."""
     base = {"interface": said("ip/6.1.0/up.txt")}
     report = Report(robot.name)
     radio.judge(robot, base | {name.replace("_", "-"): text for name, text in sections.items()}, report)
@@ -87,7 +87,7 @@ def test_a_station_has_access_point_channel_signal_and_rate() -> None:
     assert only(findings, "Wi-Fi").detail == (
         "managed 'knowhere', at f0:99:bf:0e:86:98, channel 11, -65 dBm, 65.0 MBit/s"
     )
-    assert {one.status for one in findings} == {OK}
+    assert {finding.status for finding in findings} == {OK}
 
 
 def test_a_signal_near_the_sensitivity_is_a_warning() -> None:
@@ -118,7 +118,7 @@ def test_a_station_without_a_network_fails() -> None:
 def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
     findings = heard(RELAY, wifi_info=said("iw/info-ap.txt"), wifi_stations=said("iw/stations-ap.txt"))
     assert only(findings, "Wi-Fi").detail == "AP 'xx', channel 1, 1 stations, -57 dBm"
-    assert "power save" not in {one.check for one in findings}
+    assert "power save" not in {finding.check for finding in findings}
 
 
 def test_an_ad_hoc_cell_is_not_a_missing_network() -> None:
@@ -140,7 +140,7 @@ def test_outputs_of_the_kernels_wifi_stack_are_read_in_every_mode() -> None:
 
 def test_an_interface_without_a_radio_has_no_wifi_findings() -> None:
     findings = heard(SENDER, wifi_info=said("iw/no-wifi.txt", 1))
-    assert {one.check for one in findings} == {"interface wlan0", "control", "offloads"}
+    assert {finding.check for finding in findings} == {"interface wlan0", "control", "offloads"}
 
 
 def test_a_radio_without_iw_is_a_warning() -> None:
@@ -150,7 +150,7 @@ def test_a_radio_without_iw_is_a_warning() -> None:
 
 
 def probed(role: Role, **changes: Said) -> list[Finding]:
-    """Judge the system of a robot that has everything, but for `changes`."""
+    """Judge the system of a robot that has everything except for `changes`."""
     sections: dict[str, Said] = {
         "system": Said("Raspbian GNU/Linux 10 (buster), Linux 5.10.63-v7+ armv7l", 0),
         "disk": Said(
@@ -173,7 +173,7 @@ def probed(role: Role, **changes: Said) -> list[Finding]:
         (Role.RECEIVER, (100 << 10) + 1_000, OK),
         (Role.RECEIVER, 100 << 10, FAIL),
         (Role.RECEIVER, 0, FAIL),
-        # The one that records does so by rosbag, which leaves 1 GiB free.
+        # The recording robot uses rosbag, which leaves 1 GiB free.
         (Role.SENDER, (1 << 20) + 1_000, OK),
         (Role.SENDER, 1 << 20, FAIL),
     ],
@@ -199,7 +199,7 @@ def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
 def test_evidence_that_takes_long_to_fetch_is_a_warning_with_size_and_rate(tmp_path: Path) -> None:
     report = Report("laptop")
     system.judge_laptop(PLAN, tmp_path, report)
-    assert "fetch" not in {one.check for one in report.findings}
+    assert "fetch" not in {finding.check for finding in report.findings}
     (entry, *others) = PLAN.procedure.steps
     long = type(entry)(entry.kind, entry.step.with_record(36_000.0))
     procedure = PLAN.procedure.model_copy(update={"steps": (long, *others)})
@@ -218,12 +218,12 @@ def test_a_port_in_use_fails_on_the_receiver_only() -> None:
     assert finding.status is FAIL
     assert "1234" in finding.remedy
     assert only(probed(Role.RECEIVER, listeners=Said(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status is OK
-    assert "port 1234" not in {one.check for one in probed(Role.SENDER, listeners=taken)}
+    assert "port 1234" not in {finding.check for finding in probed(Role.SENDER, listeners=taken)}
 
 
 def test_a_low_battery_is_a_warning() -> None:
     findings = probed(Role.SENDER, batteries=Said("BAT0 81\nbq27000-0 19", 0))
-    assert [(one.status, one.detail) for one in findings if one.check == "battery"] == [
+    assert [(finding.status, finding.detail) for finding in findings if finding.check == "battery"] == [
         (OK, "BAT0 at 81 %"),
         (WARN, "bq27000-0 at 19 %"),
     ]
@@ -273,21 +273,21 @@ def judged(sections: Sections, plan: Plan = PLAN) -> list[Finding]:
 
 
 def procedure_of(step: str) -> Procedure:
-    """A procedure of this one step."""
+    """A procedure with this step only."""
     head = "name: x\nsummary: X\nscenario: los\ntopology: master\nprotocols: [tcp]\nrepeats: 1\nsteps:\n"
     return schema.validate(schema.parse(f"{head}- {step}\n", source="x.yaml"), Procedure)
 
 
 def test_a_robot_that_has_everything_passes() -> None:
     findings = judged(installed())
-    assert {one.status for one in findings} == {OK}
+    assert {finding.status for finding in findings} == {OK}
     tools = "traditional netcat, ping from iputils 20221126, tcpdump version 4.99.3"
     assert only(findings, "tools").detail == tools
 
 
 def test_a_missing_program_is_one_failure_with_its_package() -> None:
     sections = installed() | {"program nc.traditional": Said("", 1)}
-    (failed,) = [one for one in judged(sections) if one.status is not OK]
+    (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
     assert failed.check == "nc.traditional"
     assert failed.remedy == "sudo apt-get install netcat-traditional"
 
@@ -307,7 +307,7 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
 def test_a_missing_program_of_a_step_is_reported_with_its_source(step: str, program: str, remedy: str) -> None:
     plan = PLAN.model_copy(update={"procedure": procedure_of(step)})
     sections = installed(plan) | {f"program {program}": Said("", 127)}
-    (failed,) = [one for one in judged(sections, plan) if one.status is not OK]
+    (failed,) = [finding for finding in judged(sections, plan) if finding.status is not OK]
     assert (failed.check, failed.remedy) == (program, remedy)
 
 
@@ -316,7 +316,7 @@ def test_a_robot_without_ros_needs_no_recorder_and_no_topic() -> None:
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}, "procedure": procedure})
     sections = installed(plan)
-    assert {one.status for one in judged(sections, plan)} == {OK}
+    assert {finding.status for finding in judged(sections, plan)} == {OK}
     assert not any("ros" in " ".join(argv) for argv in software.commands(plan, Role.SENDER).values())
     assert software.can_record(plan, Role.SENDER, sections)
     assert topics.battery_of(robot) == ""
@@ -333,7 +333,7 @@ def test_a_recording_on_a_robot_without_ros_is_rejected() -> None:
 def test_a_setup_file_that_is_missing_is_one_failure() -> None:
     missing = "bash: line 1: /opt/ros/noetic/setup.bash: No such file or directory"
     sections = installed() | {"ROS": Said(missing, 1), "program rosbag": Said(missing, 1)}
-    (failed,) = [one for one in judged(sections) if one.status is not OK]
+    (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
     assert (failed.check, failed.detail) == ("ROS", missing)
     assert not software.can_record(PLAN, Role.SENDER, sections)
     assert software.can_record(PLAN, Role.RECEIVER, {}), "where nothing is recorded, nothing was asked for"
@@ -341,7 +341,9 @@ def test_a_setup_file_that_is_missing_is_one_failure() -> None:
 
 def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:
     refused = Said("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
-    (failed,) = [one for one in judged(installed() | {"right to capture": refused}) if one.status is not OK]
+    (failed,) = [
+        finding for finding in judged(installed() | {"right to capture": refused}) if finding.status is not OK
+    ]
     assert failed.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
 
 
@@ -354,13 +356,15 @@ def test_a_missing_sudo_permission_fails_with_the_rule_that_grants_it() -> None:
         (Said("sh: 9: sudo: not found", Said.MISSING), "capture_right: direct"),
     ):
         (failed,) = [
-            one for one in judged(installed(plan) | {"right to capture": said}, plan) if one.status is not OK
+            finding
+            for finding in judged(installed(plan) | {"right to capture": said}, plan)
+            if finding.status is not OK
         ]
         assert remedy in failed.remedy
 
 
 def test_ros_1_without_a_master_is_a_warning() -> None:
-    (warned,) = [one for one in judged(installed() | {"ROS": Said("noetic", 0)}) if one.status is not OK]
+    (warned,) = [finding for finding in judged(installed() | {"ROS": Said("noetic", 0)}) if finding.status is not OK]
     assert "ROS_MASTER_URI" in warned.detail
 
 
@@ -446,7 +450,7 @@ def test_the_route_of_ssh_is_detected(connection: str, control: Control, status:
 def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) -> None:
     refused = Said("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
     sections = installed() | {"right to capture": refused, "interface": said(file, 1)}
-    assert "right to capture" not in {one.check for one in judged(sections)}
+    assert "right to capture" not in {finding.check for finding in judged(sections)}
     there = judged(sections | {"interface": said("ip/6.1.0/up.txt")})
     assert only(there, "right to capture").status is FAIL
 

@@ -1,4 +1,4 @@
-"""The probe in the shells that robots have."""
+"""The probe in the shells of robots."""
 
 import subprocess
 

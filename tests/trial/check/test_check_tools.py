@@ -1,4 +1,4 @@
-"""Which variant a tool is, told from what the tool itself says."""
+"""Detection of a tool's variant from its output."""
 
 import contextlib
 import os
@@ -50,8 +50,8 @@ def with_tools(**names: str) -> RobotProfile:
     ],
 )
 def test_each_netcat_is_identified_by_its_help(file: str, kind: Netcat, version: str) -> None:
-    found = tools.parse(USER + section("netcat", about(file), 1), TURTLEBOT)
-    assert (found.netcat, found.versions) == (kind, {Tool.NETCAT: version})
+    detected = tools.parse(USER + section("netcat", about(file), 1), TURTLEBOT)
+    assert (detected.netcat, detected.versions) == (kind, {Tool.NETCAT: version})
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ SHELLS = {"dash": ("dash",), "bash": ("bash",), "ash": ("busybox", "ash")}
 
 
 def run(profile: RobotProfile, shell: str = "dash") -> bytes:
-    """What the probe prints on this machine."""
+    """Return the output of the probe on this machine."""
     _, *rest = tools.probe(profile)
     return subprocess.run((*SHELLS[shell], *rest), capture_output=True, check=False, timeout=tools.PROBE_S).stdout
 
@@ -147,9 +147,14 @@ def test_the_probe_finds_this_machines_tools_in_every_shell(shell: str, netcat: 
     link = tmp_path / "nc"
     link.symlink_to("/bin/busybox")
     profile = with_tools(netcat=programs.get(netcat, str(link)))
-    found = tools.parse(run(profile, shell), profile)
-    assert (found.netcat, found.ping, found.immediate_mode, found.root) == (netcat, PingTool.IPUTILS, True, True)
-    assert found.versions.keys() == {Tool.NETCAT, Tool.PING, Tool.CAPTURE}
+    detected = tools.parse(run(profile, shell), profile)
+    assert (detected.netcat, detected.ping, detected.immediate_mode, detected.root) == (
+        netcat,
+        PingTool.IPUTILS,
+        True,
+        True,
+    )
+    assert detected.versions.keys() == {Tool.NETCAT, Tool.PING, Tool.CAPTURE}
 
 
 @pytest.mark.emulated
@@ -170,5 +175,5 @@ def test_a_tool_that_does_not_exit_is_killed(tmp_path: Path) -> None:
 
 def test_output_of_a_tool_may_look_like_a_section_header() -> None:
     said = b"OpenBSD netcat\n==> ping <==\nmore"
-    found = tools.parse(USER + section("netcat", said, 1) + b"==> capture <==\nno end", TURTLEBOT)
-    assert (found.netcat, set(found.versions)) == (Netcat.OPENBSD, {Tool.NETCAT})
+    detected = tools.parse(USER + section("netcat", said, 1) + b"==> capture <==\nno end", TURTLEBOT)
+    assert (detected.netcat, set(detected.versions)) == (Netcat.OPENBSD, {Tool.NETCAT})

@@ -1,4 +1,4 @@
-"""Bridges that profiles ask for: what is started on robots and when, and a scan that crosses from ROS 1 to DDS."""
+"""Bridges in profiles: the jobs on robots and their times, and a laser scan that is bridged from ROS 1 to DDS."""
 
 import json
 import subprocess
@@ -51,9 +51,9 @@ def asking(bridge: RobotBridge = BRIDGE) -> RobotProfile:
 
 
 def cast(bridge: RobotBridge = BRIDGE) -> Cast:
-    """Return a TurtleBot that asks for a bridge, and a drone."""
-    found = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
-    return {**found, Role.SENDER: found[Role.SENDER].model_copy(update={"profile": asking(bridge)})}
+    """Return a TurtleBot with a bridge, and a drone."""
+    robots = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
+    return {**robots, Role.SENDER: robots[Role.SENDER].model_copy(update={"profile": asking(bridge)})}
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def soon() -> Deadline:
 
 
 def first_heard(pid: int, address: str) -> bytes:
-    """Return the first scan that a node of DDS hears in a robot's network."""
+    """Return the first scan that a DDS node receives in a robot's network."""
     network = json.dumps({"address": address, "node": "ears", "domain": BRIDGE.domain})
     kind, profile = "sensor_msgs/LaserScan", PROFILES["sensor_data"]
     topic = json.dumps(topics.describe(shipped(), "/scan", kind, profile, domain=BRIDGE.domain, node="ears"))
@@ -85,15 +85,15 @@ def first_heard(pid: int, address: str) -> bytes:
 
 @pytest.mark.emulated
 def test_dds_nodes_receive_ros_1_messages_during_the_session(up: EmulatedTestbed) -> None:
-    told: list[Event] = []
+    events: list[Event] = []
     shell, drone = up.shells[Role.SENDER], up.robots[Role.RECEIVER]
-    with bridges.running(cast(), up.shells, "s1", sink=told.append):
+    with bridges.running(cast(), up.shells, "s1", sink=events.append):
         (left,) = jobs.left(shell, soon())
         assert f"/{bridges.folder_of('s1')}/" in left
         scan: Any = shipped().ros2.deserialize_cdr(first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan")
     assert (scan.header.frame_id, len(scan.ranges)) == ("base_scan", 360)
     assert jobs.left(shell, soon()) == ()
-    assert not [one for one in told if isinstance(one, Note)], "it ended well"
+    assert not [event for event in events if isinstance(event, Note)], "it ended well"
 
 
 @pytest.mark.emulated
@@ -110,13 +110,13 @@ def test_a_bridge_that_does_not_start_is_reported_with_its_output(up: EmulatedTe
 
 @pytest.mark.emulated
 def test_a_bridge_that_exits_early_is_reported(up: EmulatedTestbed) -> None:
-    told: list[Event] = []
+    events: list[Event] = []
     short = f"#!/bin/sh\necho {BRIDGE_IS_UP}\nexit 3\n"
     up.shells[Role.SENDER].run(("sh", "-c", "cat >short && chmod +x short"), stdin=short.encode(), deadline=soon())
     ends = cast(BRIDGE.model_copy(update={"program": "/root/short"}))
-    with bridges.running(ends, up.shells, "s3", sink=told.append):
+    with bridges.running(ends, up.shells, "s3", sink=events.append):
         wait_until(lambda: not jobs.left(up.shells[Role.SENDER], soon()), soon())
-    (note,) = [one for one in told if isinstance(one, Note)]
+    (note,) = [event for event in events if isinstance(event, Note)]
     assert note.text == "the bridge on turtlebot-1 exited early, with exit code 3"
 
 
@@ -136,9 +136,9 @@ def test_in_an_interactive_lab_the_bridge_is_a_service_of_the_robot() -> None:
 
 
 def test_the_command_line_of_a_robot() -> None:
-    found = bridges.jobs_of(cast(), "s1")
-    assert found.keys() == {Role.SENDER}
-    assert found[Role.SENDER].argv == (
+    jobs_by_role = bridges.jobs_of(cast(), "s1")
+    assert jobs_by_role.keys() == {Role.SENDER}
+    assert jobs_by_role[Role.SENDER].argv == (
         *("bash", "-c", '. /opt/ros/noetic/setup.bash && exec "$@"', "bash"),
         *("fieldkit", "bridge", "--from", "ros1", "--to", "dds", "--address", "10.42.0.1", "--domain", "7"),
         *("--patience", "5", "--back", TWIST, SCAN),
@@ -158,9 +158,9 @@ def test_of_robots_with_a_common_master_only_the_first_has_a_bridge() -> None:
     }
     assert bridges.jobs_of(robots, "s1").keys() == {Role.SENDER, Role.RECEIVER}, "each has a master of its own"
     shared = {role: robot.model_copy(update={"ros_master": "10.42.0.3"}) for role, robot in robots.items()}
-    found = bridges.jobs_of(shared, "s1")
-    assert found.keys() == {Role.SENDER}
-    assert "10.42.0.3" in found[Role.SENDER].argv
+    jobs_by_role = bridges.jobs_of(shared, "s1")
+    assert jobs_by_role.keys() == {Role.SENDER}
+    assert "10.42.0.3" in jobs_by_role[Role.SENDER].argv
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`resume --failed`: failed repeats are run once more, what they left is kept, and the tables always agree."""
+"""`resume --failed`: failed repeats are run again, their evidence is kept, and the tables are always consistent."""
 
 import os
 import shutil
@@ -25,7 +25,7 @@ FIRST = RepeatId(Protocol.TCP, 1)
 
 @pytest.fixture
 def broken(monkeypatch: pytest.MonkeyPatch) -> set[str]:
-    """Repeats whose evidence is not whole."""
+    """Repeats whose evidence is incomplete."""
     robots_with_evidence(monkeypatch)
     names: set[str] = set()
 
@@ -47,8 +47,8 @@ def with_a_failed_repeat(out: Path, broken: set[str]) -> Path:
     return outcome.folder
 
 
-def redo(folder: Path, told: list[Event] | None = None) -> Outcome:
-    events: list[Event] = [] if told is None else told
+def redo(folder: Path, received: list[Event] | None = None) -> Outcome:
+    events: list[Event] = [] if received is None else received
     outcome = resume_trial(folder, IdleTestbed(), events.append, failed=True)
     assert outcome is not None
     return outcome
@@ -79,13 +79,13 @@ def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: P
     broken.clear()
     assert redo(folder).failed == 0
     demand_agreement(folder)
-    told: list[Event] = []
-    assert redo(folder, told).valid == 2
-    assert Note("no repeat of this trial failed") in told
+    received: list[Event] = []
+    assert redo(folder, received).valid == 2
+    assert Note("no repeat of this trial failed") in received
 
 
 def moments(folder: Path) -> Iterator[Path]:
-    """Yield the trial's folder as a process left it that died at each of its writes while it redid a repeat."""
+    """Yield the trial's folder after a kill at each of the writes while a repeat is run again."""
     moment, kept = 0, folder.with_name("kept")
     shutil.copytree(folder, kept)
     while True:

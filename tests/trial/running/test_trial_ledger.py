@@ -1,4 +1,4 @@
-"""The ledger: linear in the repeats, nothing measured or summed twice, and no evidence blessed that has changed."""
+"""The ledger: linear cost, no repeated measurement or checksum, and no acceptance of changed evidence."""
 
 import os
 from collections import Counter
@@ -34,7 +34,7 @@ CHANGED = "repeats/tcp-02/ping.txt"
 
 
 def begin(out: Path, repeats: int) -> tuple[Ledger, Plan, Path]:
-    """Begin a trial of so many repeats, of one ping each."""
+    """Start a trial with this number of repeats, each with one ping."""
     request = TrialRequest(validate(parse(PROCEDURE, source="x"), Procedure), parse_distance("30ft"), repeats=repeats)
     plan = make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, 12, 0, tzinfo=UTC))
     folder = store.create(out / str(repeats), plan)
@@ -53,7 +53,7 @@ def keep(to: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> None:
 
 @pytest.fixture
 def trial(tmp_path: Path) -> Path:
-    """A trial of three repeats of which two are over."""
+    """A trial of three repeats, of which two have ended."""
     to, plan, folder = begin(tmp_path, 3)
     for repeat in list(plan.order())[:2]:
         keep(to, plan, folder, repeat)
@@ -66,7 +66,7 @@ def again(folder: Path) -> Ledger:
 
 
 def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Twice the repeats take twice the bytes; by a table and a manifest anew for each, they would take four times."""
+    """Twice the repeats take twice the bytes; with a new table and manifest after each they would take four times."""
     monkeypatch.setattr(ledger, "TABLE_SHARE", 0.1)
     monkeypatch.setattr(os, "fsync", lambda _: None)
     written: Counter[int] = Counter()
@@ -134,7 +134,7 @@ def test_rows_missing_in_the_table_after_a_kill_are_measured(trial: Path, monkey
 
 
 def test_only_rebuilt_tables_get_new_checksums(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another fieldkit measures other rows; a journal that another hand changed stays one that differs."""
+    """Another version of fieldkit measures other rows; an edited journal is still reported as changed."""
     with (trial / "preflight.txt").open("a", encoding="utf-8") as file:
         file.write("changed\n")
     again(trial).summarize()
@@ -177,12 +177,12 @@ def test_checksums_are_kept_and_differences_reported(
     assert set(said) <= set(manifest.verify(trial))
     with pytest.raises(EvidenceError, match="the tables are not changed") as caught:
         rebuild(trial)
-    assert all(one in caught.value.what for one in said)
+    assert all(text in caught.value.what for text in said)
     assert {name: (trial / name).read_bytes() for name in tables} == tables
     assert main(["aggregate", str(trial), "--rebuild"]) == 0
-    assert all(one in " ".join(capsys.readouterr().err.split()) for one in said)
+    assert all(text in " ".join(capsys.readouterr().err.split()) for text in said)
     assert main(["export", str(trial), "--format", "mcap", "-o", str(trial.parent / "out.mcap")]) == 0
-    assert all(one in " ".join(capsys.readouterr().err.split()) for one in said)
+    assert all(text in " ".join(capsys.readouterr().err.split()) for text in said)
 
 
 def test_changes_of_plan_journal_and_table_are_reported(trial: Path) -> None:
@@ -200,7 +200,7 @@ def test_changes_of_plan_journal_and_table_are_reported(trial: Path) -> None:
 
 @pytest.mark.parametrize("name", [journal.JOURNAL_FILE, "trial.yaml"])
 def test_no_table_is_rebuilt_from_a_changed_plan_or_journal(trial: Path, name: str) -> None:
-    """A journal cut at the end of a line says that there were fewer repeats, a plan another distance."""
+    """A journal cut at the end of a line has fewer repeats, an edited plan has another distance."""
     tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
     text = (trial / name).read_text(encoding="utf-8")
     cut = "".join(text.splitlines(keepends=True)[:-1])
@@ -213,7 +213,7 @@ def test_no_table_is_rebuilt_from_a_changed_plan_or_journal(trial: Path, name: s
 def test_too_little_memory_leaves_the_table_unchanged(
     trial: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What one machine cannot hold says nothing of the evidence: no figure is left out for it."""
+    """Too little memory is not a property of the evidence, so no value is left out because of it."""
     tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
 
     def exhausted(_path: Path) -> ping.Ping:

@@ -1,4 +1,4 @@
-"""Locks on robots: one holder at a time whatever happens, expiry, abort from another laptop."""
+"""Locks on robots: one holder at a time in any case, expiry, abort from another laptop."""
 
 import re
 import uuid
@@ -78,10 +78,10 @@ def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None
     jobs.install(robot, Deadline.after(30))
     assert locks.holder(robot) is None
     with taken({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=60):
-        found = locks.holder(robot)
-        assert found is not None
-        assert found.holder == ANNA
-        assert 50 < found.left_s <= 60
+        lock = locks.holder(robot)
+        assert lock is not None
+        assert lock.holder == ANNA
+        assert 50 < lock.left_s <= 60
         alter(robot, (4, "0"))
         assert locks.holder(robot) is None, "it has expired"
     assert locks.holder(robot) is None
@@ -105,12 +105,12 @@ def test_only_one_of_many_simultaneous_laptops_locks_the_robot(robot: LocalShell
             won = [holder for holder, taken in zip(holders, pool.map(take, holders), strict=True) if taken]
         (winner,) = won
         assert record(robot)[:2] == ["held", winner.token]
-        alter(robot, (4, "1"), (5, "0"), (6, "1"))  # expired: the next turn is about who takes it over
+        alter(robot, (4, "1"), (5, "0"), (6, "1"))  # expired: in the next round, laptops compete to replace it
         assert turn < 3
 
 
 def test_a_lock_number_that_was_used_and_removed_is_not_valid(robot: LocalShell) -> None:
-    """A laptop that read the lock before two others had changed it finds its next number free again."""
+    """A laptop that read the lock before two others changed it finds its next number free again."""
     jobs.install(robot, Deadline.after(30))
     script = """set -- needs; . "$1"; base=.fieldkit; newest
     for words in "lock trial-b 60 bert x" "unlock trial-b" "lock trial-c 60 carl x"; do sh "$0" $words || exit; done
@@ -136,7 +136,7 @@ def test_a_lock_of_an_earlier_boot_expires_by_the_clock(robot: LocalShell) -> No
         alter(robot, (2, "another-boot"), (4, "1"))
         with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
             raise AssertionError("taken twice")
-        alter(robot, (5, "99999999999"), (6, "99999999999"))  # the robot booted into the past: it has no clock
+        alter(robot, (5, "99999999999"), (6, "99999999999"))  # the robot's clock is in the past: it has no battery
         with taken({Role.SENDER: robot}, BERT, sink=quiet):
             begin(robot, BERT)
 
@@ -208,7 +208,7 @@ def test_a_torn_record_does_not_block_for_long(robot: LocalShell) -> None:
 
 
 def test_an_empty_record_hides_no_lock(robot: LocalShell) -> None:
-    """As an older fieldkit leaves one where power ends just after it was written."""
+    """An older fieldkit leaves such a record if the power fails just after it was written."""
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         (robot.home / ".fieldkit" / "lock.9").touch()
         with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
@@ -252,9 +252,9 @@ def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
-        found = locks.holder(robot)
-        assert found is not None
-        assert found.left_s > 7200
+        lock = locks.holder(robot)
+        assert lock is not None
+        assert lock.left_s > 7200
         fresh = record(robot)
         jobs.run(robot, Job(folder=FOLDER, name="short", argv=("true",), limit_s=60, log="log"))
         assert record(robot) == fresh
@@ -278,7 +278,7 @@ def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tm
         real = "busybox df" if (tmp_path / "bin" / "df").exists() else "/bin/df"
         (tmp_path / "bin" / "df").unlink(missing_ok=True)
         waits = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
-        (tmp_path / "bin" / "df").write_text(waits, encoding="ascii")  # called after the lock was looked at
+        (tmp_path / "bin" / "df").write_text(waits, encoding="ascii")  # called after the lock was checked
         (tmp_path / "bin" / "df").chmod(0o755)
         begun = pool.submit(begin, robot, ANNA)
         wait_until(called.exists, Deadline.after(30))
@@ -300,7 +300,7 @@ def test_aborting_a_free_robot_reports_no_lock(robot: LocalShell) -> None:
 
 
 def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Path) -> None:
-    """Also where another robot cannot tell."""
+    """The holder is also notified if another robot does not answer."""
     plan = los_plan()
     anna = Holder(plan.session, "anna@one", plan.trial)
     shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
@@ -322,7 +322,7 @@ def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> N
 
 
 class Unreachable(LocalShell):
-    """A robot that goes out of range after so many commands."""
+    """A robot that goes out of range after a number of commands."""
 
     left = 0
 
@@ -351,10 +351,10 @@ def test_all_robots_are_locked_or_none(cast: dict[Role, Unreachable]) -> None:
 
 
 def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, Unreachable]) -> None:
-    told: list[Event] = []
-    with taken(cast, ANNA, sink=told.append):
+    events: list[Event] = []
+    with taken(cast, ANNA, sink=events.append):
         cast[Role.SENDER].left = 0
-    (note,) = told
+    (note,) = events
     assert isinstance(note, Note)
     assert note.text.startswith("zoe stays locked until its lock expires")
     assert record(cast[Role.RECEIVER])[0] == "free"
@@ -377,7 +377,7 @@ def test_the_user_of_this_machine_has_a_name() -> None:
 
 
 def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[Role, Unreachable]) -> None:
-    # A trial without a session is its own, and its name may be longer than that of a socket.
+    # A trial without a session uses its name as the token, which may be longer than the name of a socket.
     anna = Holder(uuid.uuid4().hex + "_of_a_long_procedure" * 10, "anna@one", "trial-a")
     with held(cast, anna, sink=quiet):
         with (
@@ -392,7 +392,7 @@ def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[R
 
 
 def test_ctrl_c_closes_connections_before_the_robots_are_unlocked(cast: dict[Role, Unreachable]) -> None:
-    """A link that was lost must not be awaited for the site's patience once more."""
+    """The program must not wait again for a lost link."""
     done: list[str] = []
     for shell in cast.values():
         shell.close = lambda name=shell.robot: done.append(name)  # type: ignore[method-assign,misc]

@@ -1,4 +1,4 @@
-"""A kept trial goes on with the code, the backend and the robots that it began with, and with no others."""
+"""A trial can only be resumed with the code, the backend and the robots with which it started."""
 
 from pathlib import Path
 
@@ -54,7 +54,7 @@ def test_a_self_moving_robot_needs_permission_again() -> None:
     with pytest.raises(ConfigurationError, match="moved without a person in this trial, and may not now") as caught:
         resumption.demand_cast(plan, by_hand)
     assert "--allow-motion" in caught.value.remedy
-    # What the lab lets it do is no matter where nobody moves it, or a person did.
+    # Permission to move does not matter if nothing moves the robot, or if a person does.
     resumption.demand_cast(PLAN.model_copy(update={"cast": driving}), by_hand)
     resumption.demand_cast(plan.model_copy(update={"cast": by_hand}), driving)
 

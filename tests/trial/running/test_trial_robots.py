@@ -1,4 +1,4 @@
-"""Ctrl-C while robots are served at once: nothing is written into an attempt any more once it is kept."""
+"""Ctrl-C during parallel operations on robots: nothing is written into an attempt's folder after it was stored."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ from tests.helpers.userlands import LocalShell
 
 
 class Slow(LocalShell):
-    """A robot that sends its evidence only until somebody hangs up, which takes it a moment."""
+    """A robot that sends its evidence until the connection is closed, and needs a moment to stop."""
 
     def __init__(self, home: Path, fetching: Callable[[], None]) -> None:
         super().__init__(home)
@@ -40,7 +40,7 @@ class Slow(LocalShell):
 
 
 def slow_testbed(home: Path) -> IdleTestbed:
-    """Return a testbed of slow robots; fetching from the last of them, the operator presses Ctrl-C."""
+    """Return a testbed of slow robots; the operator presses Ctrl-C while the last one is fetched."""
     barrier = threading.Barrier(2, action=lambda: os.kill(os.getpid(), signal.SIGINT))
     return IdleTestbed(
         {role: Slow(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
@@ -62,7 +62,7 @@ def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: P
 
 
 class Unreachable(LocalShell):
-    """A robot whose link breaks whenever it sends its evidence."""
+    """A robot whose link fails whenever it sends its evidence."""
 
     def fetch(self, argv: object, to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         raise LinkError("the connection broke", where="turtlebot-1")
@@ -95,7 +95,7 @@ def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
 
 
 class Rebooted(LocalShell):
-    """A robot that lost its power after an attempt began, and what it had not written to its disk."""
+    """A robot that lost power after the start of an attempt, with the data not yet written to its disk."""
 
     boots = 0
 
@@ -115,12 +115,12 @@ def test_a_void_attempt_says_that_its_robot_rebooted(tmp_path: Path) -> None:
     said = robots.fetch("x", tmp_path, clean=False)
     reasons = [f"{name}: the robot rebooted during the repeat" for name in ("turtlebot-2", "turtlebot-1")]
     assert sorted(said) == sorted(reasons)
-    told = hosts.without_effects(["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *said])
-    assert sorted(told) == sorted(["scan.bag: there is no bag", *reasons])
+    shown = hosts.without_effects(["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *said])
+    assert sorted(shown) == sorted(["scan.bag: there is no bag", *reasons])
 
 
 class Impatient(LocalShell):
-    """A robot of which somebody hangs up after the first piece of a large file."""
+    """A robot whose connection is closed after the first segment of a large file."""
 
     def __init__(self, home: Path) -> None:
         super().__init__(home)

@@ -1,4 +1,4 @@
-"""What a trial tells and leaves behind while it runs, without robots: everything but them is the real thing."""
+"""Events and files of a running trial without robots; everything else is real."""
 
 import errno
 import os
@@ -48,8 +48,8 @@ def ended(events: list[Event]) -> list[RepeatEnded]:
 
 
 def only(folder: Path) -> Path:
-    (found,) = folder.glob("*/trial.yaml")
-    return found.parent
+    (plan_file,) = folder.glob("*/trial.yaml")
+    return plan_file.parent
 
 
 def test_the_remaining_time_is_estimated_from_finished_repeats(
@@ -82,7 +82,7 @@ def test_the_repeat_that_ctrl_c_lets_finish_is_reported(
     monkeypatch.setattr(Robots, "fetch", asked)
     with pytest.raises(KeyboardInterrupt):
         run_trial(of_two(), IdleTestbed(), tmp_path, events.append, stop)
-    assert [one.status for one in ended(events)] == [Status.VOID, Status.VALID]
+    assert [event.status for event in ended(events)] == [Status.VOID, Status.VALID]
 
 
 def test_after_an_abort_by_another_user_fetched_folders_are_deleted(
@@ -132,9 +132,9 @@ def test_the_remedy_of_a_failed_step_is_reported(
 
     monkeypatch.setattr(Robots, "measure", measure)
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    told = [(event.reason, event.remedy) for event in ended(events)]
-    assert told[0] == ("sending began too late", "a larger `idle` leaves it more time")
-    assert not any(remedy for _, remedy in told[1:])
+    reasons_and_remedies = [(event.reason, event.remedy) for event in ended(events)]
+    assert reasons_and_remedies[0] == ("sending began too late", "a larger `idle` leaves it more time")
+    assert not any(remedy for _, remedy in reasons_and_remedies[1:])
 
 
 def test_an_unexpected_exception_of_a_step_is_not_an_interruption(
@@ -186,17 +186,17 @@ def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
     with pytest.raises(LockLostError):
         run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     folder = only(tmp_path)
-    told = Note(
+    note = Note(
         f"turtlebot-1: evidence that was not fetched stays on it; delete it when it is not needed: "
         f"~/.fieldkit/{folder.name}/tcp-01-1, ~/.fieldkit/{folder.name}/tcp-01-2"
     )
-    assert told in events
+    assert note in events
     kept = folder / "repeats/tcp-01.void1" / unfetched_file(Role.SENDER)
     assert "the link broke ?\nturtlebot-1 has it in ~/.fieldkit/" in kept.read_text(encoding="utf-8")
     events.clear()
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(folder, IdleTestbed(), events.append)
-    assert told in events
+    assert note in events
     assert manifest.verify(folder) == []
 
 
@@ -216,7 +216,7 @@ def test_too_little_memory_makes_an_attempt_void_and_does_not_end_the_trial(
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     void, exhausting, *valid = ended(events)
     assert exhausting.reason == "this machine has too little memory to measure it"
-    assert [one.status for one in (void, exhausting, *valid)] == [
+    assert [attempt.status for attempt in (void, exhausting, *valid)] == [
         Status.VOID,
         Status.VOID,
         Status.VALID,
@@ -265,15 +265,15 @@ def test_evidence_of_an_attempt_stopped_during_its_steps_stays_on_the_robots(
         kept = folder / "repeats/tcp-01.void1" / unfetched_file(role)
         assert kept.read_text(encoding="utf-8").startswith("interrupted\n")
     for _ in range(2):
-        told = [event.text for event in events if isinstance(event, Note)]
-        assert sum("was not fetched stays" in one and remote in one for one in told) == 2
+        notes = [event.text for event in events if isinstance(event, Note)]
+        assert sum("was not fetched stays" in note and remote in note for note in notes) == 2
         events.clear()
         resume_trial(folder, IdleTestbed(), events.append)
     assert manifest.verify(folder) == []
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> list[str]:
-    """Let the `moment`-th call that writes, and all after it, fail; return the calls that did."""
+    """Make the `moment`-th writing call and all later ones fail; return the calls that failed."""
     count, failed = 0, []
 
     def watched(name: str, call: Callable[..., object]) -> Callable[..., object]:
@@ -308,7 +308,7 @@ def test_a_disk_may_be_full_at_any_write(tmp_path: Path, monkeypatch: pytest.Mon
             resume_trial(folder, IdleTestbed(), lambda _: None)
             assert manifest.verify(folder) == []
             assert rebuild(folder).changed == ()
-            assert sum(one.status is Status.VALID for one in journal.ended(journal.read(folder))) == 1
+            assert sum(attempt.status is Status.VALID for attempt in journal.ended(journal.read(folder))) == 1
         shutil.rmtree(out, ignore_errors=True)
     assert moment > 30, "hardly a write was met"
 
@@ -331,7 +331,11 @@ def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(tmp_path / "moved", IdleTestbed(), lambda _: None)
     assert manifest.verify(tmp_path / "moved") == []
-    assert [one.status for one in journal.ended(journal.read(tmp_path / "moved"))] == ["void", "valid", "valid"]
+    assert [attempt.status for attempt in journal.ended(journal.read(tmp_path / "moved"))] == [
+        "void",
+        "valid",
+        "valid",
+    ]
 
 
 def test_a_running_trial_is_not_rebuilt(tmp_path: Path) -> None:
