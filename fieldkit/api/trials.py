@@ -34,9 +34,9 @@ class Trials:
     metadata of its field. Missing values are null, never 0.
     """
 
-    def __init__(self, sources: Sources) -> None:
-        self._sources = sources
-        self._attempts = sources.read(undeclared=True)
+    def __init__(self, trial_sources: Sources) -> None:
+        self._sources = trial_sources
+        self._attempts = trial_sources.read(undeclared=True)
         self._evidence: dict[str, Evidence] = {}
 
     @cached_property

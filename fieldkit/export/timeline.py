@@ -50,7 +50,7 @@ def about(plan: Plan) -> dict[str, str]:
         "notes": plan.notes,
         "schema_version": str(plan.schema_version),
         "code_sha256": plan.code_sha256,
-        **{role: robot.name for role, robot in plan.cast.items()},
+        **{role: member.name for role, member in plan.cast.items()},
     }
 
 
