@@ -70,7 +70,7 @@ _COMMAND: Final = re.compile(r"(\bfieldkit [a-z][^;,\n`]*)")
 
 
 def as_pytest_option(remedy: str) -> str:
-    """Return a remedy with the plugin's options, such as `--fieldkit-topology`; commands of fieldkit are unchanged."""
+    """Return a remedy with the options of the plugin, such as `--fieldkit-topology`; commands are unchanged."""
     parts = _COMMAND.split(remedy)
     return "".join(part if _COMMAND.fullmatch(part) else _SHARED_OPTION.sub("--fieldkit-", part) for part in parts)
 
