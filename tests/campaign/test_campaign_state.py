@@ -98,7 +98,7 @@ def test_a_changed_procedure_is_rejected(lawn: Path, monkeypatch: pytest.MonkeyP
 
 def test_an_impossible_walk_is_rejected_with_the_minimum(lawn: Path) -> None:
     lawn.write_text(LAWN.replace("333ft", "5m"), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="the shortest way") as caught:
+    with pytest.raises(ConfigurationError, match="the shortest path") as caught:
         plan.make_plan(lawn, "field")
     assert caught.value.where == f"{lawn}:8"
     walk = caught.value.remedy.split("m ")[0].removeprefix("walk: ")

@@ -153,5 +153,5 @@ def test_a_place_is_distinguished_from_a_file(text: str, found: object) -> None:
 
 
 def test_an_invalid_pair_is_rejected() -> None:
-    with pytest.raises(ConfigurationError, match="no ROLE=FILE"):
+    with pytest.raises(ConfigurationError, match="not ROLE=FILE"):
         positions.told("=walk.gpx")

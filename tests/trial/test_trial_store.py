@@ -89,7 +89,7 @@ def test_a_folder_without_a_trial_is_an_error(tmp_path: Path) -> None:
 
 def test_an_out_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="cannot make"):
+    with pytest.raises(ConfigurationError, match="cannot create"):
         store.create(tmp_path / "file", los_plan())
 
 

@@ -160,7 +160,7 @@ def test_robots_are_released_if_one_cannot_be_reached_or_locked(
 @pytest.mark.parametrize("error", [RobotError("x"), KeyboardInterrupt()])
 @pytest.mark.parametrize(
     ("failing", "expected_notes"),
-    [("run_10ft", ["not begun: 20ft, 30ft"]), ("run_20ft", ["not begun: 30ft"]), ("run_30ft", [])],
+    [("run_10ft", ["not started: 20ft, 30ft"]), ("run_20ft", ["not started: 30ft"]), ("run_30ft", [])],
 )
 def test_a_stopped_trial_unlocks_the_robots_and_reports_trials_not_started(
     recorder: Callable[..., Recorder], tmp_path: Path, error: BaseException, failing: str, expected_notes: list[str]
