@@ -65,7 +65,6 @@ def trial_columns(additional: Iterable[Column] = ()) -> tuple[Column, ...]:
 
     Args:
         additional: Columns that not every trial has, as in the trial's plan.
-
     """
     everywhere = _everywhere()
     return (*everywhere.values(), *(column for column in additional if column.name not in everywhere))
@@ -101,7 +100,6 @@ def clash(column: Column, filled: Collection[str]) -> str | None:
 
     Args:
         column: The column.
-
         filled: Names of the columns that other steps fill.
     """
     if flaw := column.flaw():

@@ -116,17 +116,17 @@ def _tools(plan: Plan, role: Role) -> set[Tool]:
 
 def _judge_tools(profile: RobotProfile, said: Said, report: Report) -> Variants:
     try:
-        present = tools.parse(said.text.encode(), profile)
+        detected = tools.parse(said.text.encode(), profile)
     except RobotError as error:
         report.fail(_TOOLS, error.what, error.remedy)
         return variants.expected(profile)
     # The versions that netcats print are too different to be shown, or missing.
     words = [
-        f"{present.netcat} netcat" if tool is Tool.NETCAT else version for tool, version in present.versions.items()
+        f"{detected.netcat} netcat" if tool is Tool.NETCAT else version for tool, version in detected.versions.items()
     ]
     if words:
         report.ok(_TOOLS, ", ".join(words))
-    return present
+    return detected
 
 
 def can_record(plan: Plan, role: Role, sections: Sections) -> bool:
