@@ -73,7 +73,6 @@ class Manifest:
         """Write the manifest: the attempts that were added, and the top-level files as they are now.
 
         The plan never changes, so its first checksum is kept.
-
         """
         top_level = {path.name: _sha256(path) for path in self._folder.iterdir() if _is_top_level(path)}
         if PLAN_FILE in self._top_level:

@@ -105,7 +105,7 @@ def compare(row: dict[str, Any], packets: Table) -> None:
         assert columns["lost"].count(True) == row["ip_packets_sent"] - row["ip_packets_received"]
         assert [time is None for time in columns["received_ns"]] == columns["lost"]
     elif row["tcp_sent_bytes"] is None:
-        assert not packets.num_rows, "no connection came about"
+        assert not packets.num_rows, "no connection was established"
     else:
         assert columns["sent_again"].count(True) == row["tcp_retransmitted_segments"]
         assert (columns["lost"].count(True) > 0) is (row["tcp_byte_loss"] > 0)
@@ -127,7 +127,7 @@ def test_each_packet_has_the_times_at_which_it_was_captured(recorded_trial: Path
     assert [number for number, lost in enumerate(packets["lost"]) if lost] == list(LOST)
     assert set(packets["wire_bytes"]) == {1042}
     assert set(packets["payload_bytes"]) == {1008}
-    assert set(packets["delay_s"]) == {None}, "nothing went back, so that no offset of the clocks is known"
+    assert set(packets["delay_s"]) == {None}, "without packets in the other direction the clock offset is unknown"
 
 
 def test_packets_of_a_step_are_selected_by_its_name(recorded_trial: Path) -> None:

@@ -47,7 +47,7 @@ def test_every_trial_occurs_once_in_blocks_within_the_walk(
                 for planned_trial in shuffled
             )
         ]
-        assert len(blocks) == len(set(blocks)), "a block is left once"
+        assert len(blocks) == len(set(blocks)), "each block is contiguous"
 
 
 @given(trials, seeds)
@@ -87,7 +87,7 @@ def test_the_walk_counts_every_carried_robot() -> None:
     assert order.walk_m([trial(30, los, master), trial(30, los, masterless)]) == pytest.approx((60 + 30) * 0.3048)
     assert order.walk_m([trial(9, los, master, procedure) for procedure in ("a", "b")]) == pytest.approx(
         18 * 0.3048
-    ), "once there"
+    ), "one way"
 
 
 def every_first(limit: float) -> Iterator[PlannedTrial]:

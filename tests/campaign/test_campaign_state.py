@@ -197,7 +197,7 @@ def test_a_disk_too_small_for_the_evidence_is_reported_before_robots_are_placed(
     with pytest.raises(ConfigurationError, match="GB are free"):
         campaign.run(Nobody(), Stop())
     assert [type(event) for event in events] == [CampaignEnded], "no robot was started"
-    assert journal.folder.is_dir(), "and the order is kept"
+    assert journal.folder.is_dir(), "the order is unchanged"
 
 
 def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> None:

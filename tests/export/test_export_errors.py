@@ -43,7 +43,7 @@ def exported(path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> int:
     code = main(["export", str(path), "--format", form, "-o", str(out)])
     said = capsys.readouterr().err
     assert code in {0, 2, 4}
-    assert out.exists() is (code == 0), "a file that is not whole is not left behind"
+    assert out.exists() is (code == 0), "an incomplete file is removed"
     assert code == 0 or ("error: " in said and "remedy: " in said)
     return code
 

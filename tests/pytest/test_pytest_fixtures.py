@@ -213,7 +213,7 @@ def test_a_failure_is_reported_with_the_line_of_the_test(ran: SuiteRun) -> None:
     said = part(ran.said, "test_fails_because_of_a_program")
     assert '>       robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])' in said
     assert "rover: `sh -c 'echo broken >&2; exit 3'` exited with code 3: broken" in said
-    assert "/fieldkit/" not in said, "nothing of fieldkit's own is shown"
+    assert "/fieldkit/" not in said, "no internals of fieldkit are shown"
     assert "rover: `sleep 60` did not end in time" in part(ran.said, "test_fails_because_of_a_timeout")
     assert "where inf = CellFigure(name='file_loss', unit='share', n=1" in part(
         ran.said, "test_fails_because_of_a_figure"
@@ -276,7 +276,7 @@ def test_nothing_remains_after_ctrl_c(tmp_path: Path) -> None:
     )
     wait_until(lambda: (tmp_path / "up").exists() or process.poll() is not None, Deadline.after(120))
     started = descendants(process.pid)
-    assert len(started) > 3, "two robots and what carries their packets"
+    assert len(started) > 3, "two robots and the radio model"
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=120)
     assert (process.returncode, "KeyboardInterrupt" in said) == (2, True), said

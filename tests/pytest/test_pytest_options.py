@@ -133,7 +133,7 @@ def test_an_invalid_lab_is_an_error_of_set_up(
     assert "ERROR at setup of test_asks" in said
     assert what in said
     assert remedy in said
-    assert "/fieldkit/" not in said, "nothing of fieldkit's own is shown"
+    assert "/fieldkit/" not in said, "no internals of fieldkit are shown"
 
 
 def test_a_full_traceback_is_shown_on_request(pytester: pytest.Pytester) -> None:

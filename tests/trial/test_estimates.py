@@ -47,7 +47,7 @@ def test_finished_repeats_of_the_same_trial_are_preferred() -> None:
 def test_a_larger_distance_than_any_before_may_have_a_dead_link() -> None:
     known = [FinishedRepeat(at("10m"), TCP, 9.0), FinishedRepeat(at("20m"), TCP, 12.0)]
     farther = of_repeats(at("30m"), TCP, 1, known)
-    assert farther.likely_s == 12.0, "as the farthest place so far"
+    assert farther.likely_s == 12.0, "as at the farthest place so far"
     assert farther.most_s == estimates.dead_link_s(LOS.procedure, TCP)
     assert of_repeats(at("15m"), TCP, 1, known) == TimeEstimate(10.5, 12.0), (
         "between two places, no longer than they took"

@@ -61,7 +61,7 @@ def test_a_place_is_new_if_the_last_origin_is_of_another_one(tmp_path: Path) -> 
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.CONFIRMED, "rover-2")
     assert kept(tmp_path, FAR).is_new_place(Role.SENDER), "confirmed at the former place"
     kept(tmp_path, FAR).record(Role.SENDER, ORIGIN)
-    assert kept(tmp_path, NEAR).is_new_place(Role.SENDER), "back at the first one, and nobody put it there"
+    assert kept(tmp_path, NEAR).is_new_place(Role.SENDER), "back at the first place without a person"
 
 
 @pytest.mark.parametrize("at_place", [True, False])

@@ -77,7 +77,7 @@ def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -
 @strictest_in_ci
 def test_a_power_cut_at_any_write_loses_nothing_that_was_reported(place: Path, file_system: FileSystem) -> None:
     cuts, witness, _ = cuts_at_every_sync(Disk.make(file_system, place / "disk.img"), place)
-    assert len(cuts) > 30, "hardly a write was met"
+    assert len(cuts) > 30, "too few writes were interrupted"
     assert any(cut.told for cut in cuts)
     resumed = []
     for cut in cuts:

@@ -170,7 +170,7 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
     assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled)
     assert not {"ip_loss", "file_loss"} & set(filled)
     plan = los_plan().model_copy(update={"procedure": made})
-    assert plan.table == (*trial_columns(), *own), "a plan of an earlier version, which has none of them"
+    assert plan.table == (*trial_columns(), *own), "a plan of an earlier version, without columns"
 
 
 @pytest.mark.parametrize(

@@ -222,7 +222,9 @@ def test_a_robot_that_a_step_reboots_may_reboot(tcp: Attempt) -> None:
     for role in ("sender", "receiver"):
         tcp.text(f"{role}-after.txt", BOOT, BOOT.replace("a", "b"))
     problems = hosts.problems(procedure, scene, AttemptEvidence(tcp.folder))
-    assert list(problems) == ["turtlebot-1: the robot rebooted during the repeat"], "which only loses its link"
+    assert list(problems) == ["turtlebot-1: the robot rebooted during the repeat"], (
+        "of the robot that only loses its link"
+    )
 
 
 def test_a_file_that_tcp_cannot_have_delivered(tcp: Attempt) -> None:
@@ -303,7 +305,7 @@ def test_a_reply_with_a_round_trip_time_of_zero(udp: Attempt) -> None:
     assert match
     udp.text("ping.txt", match[0], "time=0.000 ms")
     reason = "ping.txt has an answer that took no time: the clock was set back while ping waited"
-    assert reason in udp.problems(), "beside others"
+    assert reason in udp.problems(), "among other reasons"
 
 
 @pytest.mark.parametrize(

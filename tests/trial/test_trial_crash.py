@@ -193,7 +193,7 @@ def test_a_kill_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.Mo
         demand_whole(out)
         shutil.rmtree(out)
     demand_whole(out)
-    assert moments > 40, "hardly a write was met"
+    assert moments > 40, "too few writes were interrupted"
 
 
 def test_a_stop_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,7 +206,7 @@ def test_a_stop_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.Mo
         assert run(out)
         demand_whole(out)
         shutil.rmtree(out)
-    assert moments > 40, "hardly a write was met"
+    assert moments > 40, "too few writes were interrupted"
 
 
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

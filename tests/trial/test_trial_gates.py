@@ -140,8 +140,8 @@ def test_one_damaged_file_gives_one_reason(folder: Path, damage: Callable[[Path]
     damage(folder)
     reasons = problems(plan, Protocol.UDP, folder)
     assert any(reason in other for other in reasons), reasons
-    assert len(reasons) <= 2, "one cause, at most its sign in two places"
-    assert not [other for other in reasons if "cannot be measured" in other], "it was foreseen"
+    assert len(reasons) <= 2, "one cause has at most two symptoms"
+    assert not [other for other in reasons if "cannot be measured" in other], "the damage is handled"
 
 
 def test_an_exception_while_measuring_makes_the_attempt_void(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -336,7 +336,7 @@ def test_a_setup_file_that_is_missing_is_one_failure() -> None:
     (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
     assert (failed.check, failed.detail) == ("ROS", missing)
     assert not software.can_record(PLAN, Role.SENDER, sections)
-    assert software.can_record(PLAN, Role.RECEIVER, {}), "where nothing is recorded, nothing was asked for"
+    assert software.can_record(PLAN, Role.RECEIVER, {}), "without a recording nothing is needed"
 
 
 def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:

@@ -24,7 +24,9 @@ def test_every_section_has_an_answer(shell: tuple[str, ...]) -> None:
     sections = parse(done.stdout.decode())
     assert sections["program it's"].text == AWKWARD
     assert sections["no such"].code == Said.MISSING
-    assert (sections["reads"].text, sections["reads"].code) == ("", 0), "it must not eat the script"
+    assert (sections["reads"].text, sections["reads"].code) == ("", 0), (
+        "commands must not read the script from standard input"
+    )
     assert (sections["fails"].text, sections["fails"].code) == ("said", 3)
     assert "LOOPBACK" in sections["interface"].text
     assert sections["disk"].ok

@@ -93,7 +93,7 @@ def test_dds_nodes_receive_ros_1_messages_during_the_session(up: EmulatedTestbed
         scan: Any = shipped().ros2.deserialize_cdr(first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan")
     assert (scan.header.frame_id, len(scan.ranges)) == ("base_scan", 360)
     assert jobs.left(shell, soon()) == ()
-    assert not [event for event in events if isinstance(event, Note)], "it ended well"
+    assert not [event for event in events if isinstance(event, Note)], "the bridge exited successfully"
 
 
 @pytest.mark.emulated
@@ -156,7 +156,7 @@ def test_of_robots_with_a_common_master_only_the_first_has_a_bridge() -> None:
     robots = {
         role: robot.model_copy(update=asking_both if role is not Role.RELAY else {}) for role, robot in master.items()
     }
-    assert bridges.jobs_of(robots, "s1").keys() == {Role.SENDER, Role.RECEIVER}, "each has a master of its own"
+    assert bridges.jobs_of(robots, "s1").keys() == {Role.SENDER, Role.RECEIVER}, "each robot has a separate master"
     shared = {role: robot.model_copy(update={"ros_master": "10.42.0.3"}) for role, robot in robots.items()}
     jobs_by_role = bridges.jobs_of(shared, "s1")
     assert jobs_by_role.keys() == {Role.SENDER}

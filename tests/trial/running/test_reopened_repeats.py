@@ -59,7 +59,7 @@ def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path
     broken.clear()
     unasked = resume_trial(folder, IdleTestbed(), lambda _: None)
     assert unasked is not None
-    assert unasked.failed == 1, "nobody asked for it"
+    assert unasked.failed == 1, "failed repeats are not repeated without the option"
     outcome = redo(folder)
     assert (outcome.valid, outcome.failed) == (2, 0)
     table = rows(folder)
@@ -114,7 +114,7 @@ def test_a_kill_at_any_write_is_recovered(tmp_path: Path, broken: set[str]) -> N
         assert Status.FAILED not in {attempt.status for attempt in journal.ended(journal.read(died))}
         assert [row["repeat"] for row in rows(died) if row["status"] == "valid"].count("1") == 1
         demand_agreement(died)
-    assert count > 10, "hardly a write was met"
+    assert count > 10, "too few writes were interrupted"
 
 
 def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, broken: set[str]) -> None:

@@ -126,7 +126,7 @@ def test_rows_missing_in_the_table_after_a_kill_are_measured(trial: Path, monkey
     table = (trial / store.TRIAL_CSV).read_bytes()
     monkeypatch.setattr(ledger, "TABLE_SHARE", 2.0)
     keep(again(trial), plan, trial, list(plan.order())[2])
-    assert (trial / store.TRIAL_CSV).read_bytes() == table, "a kill comes here"
+    assert (trial / store.TRIAL_CSV).read_bytes() == table, "the process is killed here"
     again(trial).summarize()
     assert manifest.verify(trial) == []
     assert rebuild(trial).changed == ()

@@ -347,7 +347,7 @@ def test_all_robots_are_locked_or_none(cast: dict[Role, Unreachable]) -> None:
     with taken({Role.SENDER: cast[Role.SENDER]}, BERT, sink=quiet):
         with pytest.raises(RobotError, match="zoe: bert@two holds it"), taken(cast, ANNA, sink=quiet):
             raise AssertionError("taken")
-        assert record(cast[Role.RECEIVER])[0] == "free", "taken first, in the order of names, and given back"
+        assert record(cast[Role.RECEIVER])[0] == "free", "locked first, in the order of names, and unlocked"
 
 
 def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, Unreachable]) -> None:

@@ -28,7 +28,7 @@ TESTBED = IdleTestbed()
 
 
 class Nobody:
-    """An operator who must not be asked."""
+    """An operator that must not be asked."""
 
     def ask(self, request: str, *, may_skip: bool = False) -> Any:  # noqa: ANN401 (never returns)
         raise AssertionError(request, may_skip)

@@ -57,7 +57,7 @@ def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: P
     robots.hang_up()
     kept = into.rename(tmp_path / "kept")
     wait_until(lambda: others.issuperset(threading.enumerate()), Deadline.after(60))
-    assert list(kept.iterdir()) == [], "what was being fetched is cleared away before the attempt is kept"
+    assert list(kept.iterdir()) == [], "partially fetched files are removed before the attempt is stored"
     assert not into.exists()
 
 
@@ -155,7 +155,7 @@ def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path)
     for path in into.glob("*.txt"):
         path.unlink()
     assert robots.fetch(remote, into, clean=True) == []
-    assert shells[Role.SENDER].pieces == 3, "it goes on where it was"
+    assert shells[Role.SENDER].pieces == 3, "fetching resumes at the same segment"
 
 
 @pytest.mark.emulated
@@ -176,5 +176,5 @@ def test_completely_fetched_evidence_is_deleted_even_if_a_job_failed(tmp_path: P
     into.mkdir()
     (said,) = robots.fetch(remote, into, clean=True)
     assert said.endswith("job capture ended with exit code 3")
-    assert "exit code 1" not in said, "it is said in the robot's own words"
+    assert "exit code 1" not in said, "the message is from the robot"
     assert robots.unfetched() == {}

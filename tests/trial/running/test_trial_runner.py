@@ -66,7 +66,7 @@ def test_the_remaining_time_is_estimated_from_finished_repeats(
     void, first, second = ended(events)
     assert (void.status, void.left_s) == (Status.VOID, 2 * of_two().procedure.expected_s(Protocol.TCP))
     assert first.status is Status.VALID
-    assert first.left_s == first.left_most_s >= STEP_S, "as long as the one that is over, void attempts included"
+    assert first.left_s == first.left_most_s >= STEP_S, "the duration of the finished repeat with its void attempts"
     assert second.left_s == 0
 
 
@@ -310,7 +310,7 @@ def test_a_disk_may_be_full_at_any_write(tmp_path: Path, monkeypatch: pytest.Mon
             assert rebuild(folder).changed == ()
             assert sum(attempt.status is Status.VALID for attempt in journal.ended(journal.read(folder))) == 1
         shutil.rmtree(out, ignore_errors=True)
-    assert moment > 30, "hardly a write was met"
+    assert moment > 30, "too few writes were interrupted"
 
 
 def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
