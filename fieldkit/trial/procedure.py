@@ -54,7 +54,7 @@ class Procedure(catalog.Named):
     procedure](add-a-procedure.md). Steps of a kind are distinguished by their `name`: without one, a procedure has at
     most one `transfer` and one `ping`, one `record`, one `capture` and one `move` per robot, and one `fault` of a
     kind. Files must have different names; simultaneous steps need different ports or different listening robots;
-    steps in one capture must differ in port, sender or receiver. A procedure that cannot be measured is refused when
+    steps in one capture must differ in port, sender or receiver. A procedure that cannot be measured is rejected when
     it is loaded, with its line.
 
     In `master` the distance is between each station and the relay, with the stations on opposite sides; in
@@ -66,9 +66,9 @@ class Procedure(catalog.Named):
         topology: `master` or `masterless`; the command line may override it.
         protocols: List of `tcp`, `udp`; the command line may override it.
         repeats: Repeats per protocol; the command line may override it.
-        attempts: Maximum number of attempts at a repeat whose evidence is not whole.
+        attempts: Maximum number of attempts at a repeat whose evidence is incomplete.
         needs_ros_master: Whether it needs one ROS master for all robots; a site file without `ros_master` is then
-            refused.
+            rejected.
         places: Positions of robots in additional roles, by role.
         on_abort: What a drone does when a repeat is aborted, by role: `land` where it is, or `return`; see
             [MAVLink](mavlink.md#where-a-trial-is-cut-short).
