@@ -1,1 +1,1 @@
-"""Trials in Python: `fieldkit.load` and what it returns. Other names of this package may change; these stay."""
+"""Trials in Python: `fieldkit.load` and the objects it returns. Only these are stable; other names may change."""

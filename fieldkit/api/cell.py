@@ -1,4 +1,4 @@
-"""The figures of the repeats under one condition, by name: what a test asserts on."""
+"""The figures of the repeats under one condition, by name, for use in assertions of tests."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -13,11 +13,11 @@ class CellFigure:
     """A figure with its 95 % interval.
 
     Attributes:
-        name: The column that it is made of.
+        name: The column that it is calculated from.
         unit: Its unit.
-        n: Valid repeats that have it.
+        n: Number of valid repeats that have it.
         value: The figure.
-        low: Lower end of the interval; minus infinity for a single repeat, which tells none.
+        low: Lower end of the interval; minus infinity for a single repeat, which has no interval.
         high: Upper end; infinity for a single repeat.
     """
 
@@ -30,16 +30,16 @@ class CellFigure:
 
 
 class TrialCell:
-    """The repeats under one condition: `cell.file_loss.high`, or `cell["up.file_loss"]` of a step that has a name.
+    """The repeats under one condition: `cell.file_loss.high`, or `cell["up.file_loss"]` for a step with a name.
 
     Args:
         cell: The cell.
 
     Attributes:
         condition: The condition, by column.
-        n_valid: Valid repeats; all figures are of these.
-        n_void: Attempts whose evidence was not whole.
-        n_failed: Attempts that failed.
+        n_valid: Number of valid repeats; all figures are of these.
+        n_void: Number of attempts whose evidence was incomplete.
+        n_failed: Number of attempts that failed.
     """
 
     def __init__(self, cell: Cell) -> None:
@@ -54,12 +54,12 @@ class TrialCell:
             ConfigurationError: No valid repeat has it.
         """
         if name not in self._estimates:
-            remedy = nearest(name, self._estimates, f"there are: {', '.join(self._estimates) or 'none'}")
+            remedy = nearest(name, self._estimates, f"its figures: {', '.join(self._estimates) or 'none'}")
             raise ConfigurationError(f"none of {self.n_valid} valid repeats has a figure {name!r}", remedy=remedy)
         return _figure(self._estimates[name])
 
     def __getattr__(self, name: str) -> CellFigure:
-        """Return a figure; as `cell[name]`."""
+        """Return a figure, like `cell[name]`."""
         if name.startswith("_"):
             raise AttributeError(name)
         return self[name]
@@ -69,16 +69,18 @@ class TrialCell:
         return map(_figure, self._estimates.values())
 
     def __repr__(self) -> str:
-        said = ", ".join(f"{name}={value!r}" for name, value in self.condition.items() if value not in {None, ""})
-        return f"<fieldkit cell {said}: {self.n_valid} valid>"
+        condition = ", ".join(
+            f"{name}={value!r}" for name, value in self.condition.items() if value not in {None, ""}
+        )
+        return f"<fieldkit cell {condition}: {self.n_valid} valid>"
 
 
-def _figure(found: Estimate) -> CellFigure:
+def _figure(estimate: Estimate) -> CellFigure:
     return CellFigure(
-        name=found.quantity.name,
-        unit=found.quantity.unit,
-        n=found.n,
-        value=found.value,
-        low=-math.inf if found.low is None else found.low,
-        high=math.inf if found.high is None else found.high,
+        name=estimate.quantity.name,
+        unit=estimate.quantity.unit,
+        n=estimate.n,
+        value=estimate.value,
+        low=-math.inf if estimate.low is None else estimate.low,
+        high=math.inf if estimate.high is None else estimate.high,
     )

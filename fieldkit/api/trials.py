@@ -1,4 +1,4 @@
-"""Trials in memory: their repeats, cells and packets as tables of Arrow."""
+"""Trials in memory: their repeats, cells and packets as Arrow tables."""
 
 import warnings
 from collections.abc import Iterable, Sequence
@@ -27,85 +27,89 @@ _SOURCE: Column = Column(SOURCE, "text", "Folder of the trial, or CSV file, that
 
 
 class Trials:
-    """Attempts at the repeats of one trial or many, as `fieldkit.load` found them.
+    """Attempts at the repeats of one or more trials, as loaded by `fieldkit.load`.
 
-    Tables are `pyarrow.Table`: `.to_pandas()` of one gives a data frame where pandas is installed, which fieldkit
-    itself does not need (`pip install "fieldkit[pandas]"`). Each column's unit and meaning are in its field's
-    metadata. What is missing is null, never 0.
+    Tables are `pyarrow.Table`. Their method `.to_pandas()` returns a data frame if pandas is installed
+    (`pip install "fieldkit[pandas]"`); fieldkit does not require it. The unit and meaning of each column are in the
+    metadata of its field. Missing values are null, never 0.
     """
 
-    def __init__(self, found: Sources) -> None:
-        self._found = found
-        self._attempts = found.read(undeclared=True)
+    def __init__(self, trial_sources: Sources) -> None:
+        self._sources = trial_sources
+        self._attempts = trial_sources.read(undeclared=True)
         self._evidence: dict[str, Evidence] = {}
 
     @cached_property
     def repeats(self) -> Table:
-        """A row per attempt at a repeat, void and failed ones too: what `fieldkit export --format parquet` writes."""
+        """A row per attempt at a repeat, including void and failed ones, as in `fieldkit export --format parquet`."""
         return table.of_repeats(self._attempts)
 
     def cells(self, by: str | Iterable[str] = DEFAULT_BY, quantities: str | Iterable[str] | None = None) -> Table:
-        """Return a row per condition and quantity, with value and 95 % interval: what `fieldkit aggregate` prints.
+        """Return a row per condition and quantity with value and 95 % interval, as printed by `fieldkit aggregate`.
 
         Args:
-            by: Columns that tell one condition from another, or one of them.
-            quantities: Columns to estimate, or whose words to count, or one; None for all.
+            by: One or more columns that define a condition.
+            quantities: One or more columns to aggregate, or whose words are counted; None for all.
 
         Raises:
-            ConfigurationError: There is no such column, or no figures are made of it.
+            ConfigurationError: There is no such column, or it cannot be aggregated.
         """
-        chosen, words = self._found.chosen(_names(quantities or ()), asked="quantities")
-        keys = self._found.condition(",".join(_names(by)), asked="by")
-        self._tell_mixtures(keys)
+        chosen, words = self._sources.chosen(_names(quantities or ()), asked="quantities")
+        keys = self._sources.condition(",".join(_names(by)), asked="by")
+        self._warn_of_mixtures(keys)
         declared = {column.name: column for column in (*self._attempts.columns, _SOURCE)}
         cells = aggregate(self._attempts, keys, quantities=chosen, words=words)
         return table.of_cells([declared[name] for name in keys], cells)
 
     def cell(self, **condition: str | float) -> TrialCell:
-        """Return the figures of the only cell with some values: `trials.cell(protocol="udp").file_loss.high`.
+        """Return the figures of the only cell that matches a condition: `trials.cell(protocol="udp").file_loss.high`.
 
         Args:
-            condition: Value by column, of those that tell one condition from another.
+            condition: Values by column.
 
         Raises:
-            ConfigurationError: There is no such column, or no such cell, or several.
+            ConfigurationError: There is no such column, no such cell, or several.
         """
-        keys = self._found.condition(",".join((*DEFAULT_BY, *condition)), asked="cell")
-        self._tell_mixtures(keys)
+        keys = self._sources.condition(",".join((*DEFAULT_BY, *condition)), asked="cell")
+        self._warn_of_mixtures(keys)
         cells = aggregate(self._attempts, keys)
-        found = [cell for cell in cells if all(cell.key[name] == value for name, value in condition.items())]
-        if len(found) == 1:
-            return TrialCell(found[0])
-        among = found or cells
-        values = {name: dict.fromkeys(cell.key[name] for cell in among) for name in keys}
-        apart = "; ".join(f"{name}: {', '.join(map(repr, of))}" for name, of in values.items() if len(of) > 1)
+        matches = [cell for cell in cells if all(cell.key[name] == value for name, value in condition.items())]
+        if len(matches) == 1:
+            return TrialCell(matches[0])
+        candidates = matches or cells
+        values = {name: dict.fromkeys(cell.key[name] for cell in candidates) for name in keys}
+        differences = "; ".join(
+            f"{name}: {', '.join(map(repr, distinct))}" for name, distinct in values.items() if len(distinct) > 1
+        )
         asked = ", ".join(f"{name}={value!r}" for name, value in condition.items()) or "any condition"
         raise ConfigurationError(
-            f"{len(found) or 'no'} cells have {asked}, and not one",
-            where=self._found.where,
-            remedy=f"they differ in {apart}" if apart else "there is one cell: ask for it without a condition",
+            f"{len(matches) or 'no'} cells have {asked}; exactly one must",
+            where=self._sources.where,
+            remedy=f"they differ in {differences}" if differences else "there is one cell: leave out the condition",
         )
 
     def packets(self, repeat: str, step: str | None = None) -> Table:
-        """Return a row per packet that the transfers of an attempt sent, in the order of sending.
+        """Return a row per packet sent by the transfers of an attempt, in the order of sending.
 
         Args:
-            repeat: The attempt by its folder below `repeats/`: `udp-07`, or `udp-07.void1` of one that was done
-                again; where several trials have one of that name, `TRIAL/udp-07`.
-            step: Name of the transfer's step, `""` of one without a name; None for all, one after the other.
+            repeat: Name of the attempt's folder below `repeats/`: `udp-07`, or `udp-07.void1` for an attempt that was
+                repeated; `TRIAL/udp-07` if several trials have an attempt of this name.
+            step: Name of the transfer's step, `""` for one without a name; None for all in order.
 
         Raises:
             ConfigurationError: There is no such attempt or transfer, or several.
-            EvidenceError: The attempt's evidence is not at hand, not as it was kept, or does not tell.
+            EvidenceError: The attempt's evidence is missing, changed or insufficient.
         """
         row = self._attempts.row(repeat)
-        evidence, at = self._beside(row)
+        evidence, at = self._evidence_of(row)
         attempt, plan = evidence.attempt(at), evidence.plan(at)
         source = self._attempts.texts[SOURCE][row]
         if attempt is None or plan is None:
-            remedy = "packets are told from the folder of a trial that has its raw evidence, as it was kept"
+            remedy = "load the folder of a trial with unchanged raw evidence"
             raise EvidenceError(
-                "; ".join((f"the evidence of {repeat} is not at hand", *evidence.unread)), where=source, remedy=remedy
+                "; ".join((f"the evidence of {repeat} is not available", *evidence.unread)),
+                where=source,
+                remedy=remedy,
             )
         transfers = {
             transfer.name: transfer for transfer in plan.transfers(Protocol(self._attempts.texts["protocol"][row]))
@@ -117,8 +121,8 @@ class Trials:
                 where=source,
                 remedy=nearest(step, transfers, f"its transfers: {named}"),
             )
-        wanted = transfers if step is None else {step: transfers[step]}
-        return table.of_packets({name: crossings.read(attempt, one) for name, one in wanted.items()})
+        selected = transfers if step is None else {step: transfers[step]}
+        return table.of_packets({name: crossings.read(attempt, transfer) for name, transfer in selected.items()})
 
     def __len__(self) -> int:
         """Return the number of attempts."""
@@ -126,14 +130,14 @@ class Trials:
 
     def __repr__(self) -> str:
         trials = len(set(self._attempts.texts["trial"]))
-        return f"<fieldkit.Trials: {len(self)} attempts of {trials} trials at {self._found.where}>"
+        return f"<fieldkit.Trials: {len(self)} attempts of {trials} trials at {self._sources.where}>"
 
-    def _tell_mixtures(self, keys: Sequence[str]) -> None:
+    def _warn_of_mixtures(self, keys: Sequence[str]) -> None:
         for mixture in mixtures(self._attempts, keys):
             _note(mixture.removesuffix("."), stacklevel=4)
 
-    def _beside(self, row: int) -> tuple[Evidence, int]:
-        """Return what lies beside the table that a row was read from, and the row's place in it."""
+    def _evidence_of(self, row: int) -> tuple[Evidence, int]:
+        """Return the evidence of the table that a row was read from, and the row's index in the table."""
         source = self._attempts.texts[SOURCE][row]
         rows = np.flatnonzero(self._attempts.texts[SOURCE] == source)
         if source not in self._evidence:
@@ -152,15 +156,15 @@ def _note(sentence: str, stacklevel: int = 2) -> None:
 def load(*paths: str | PathLike[str], rebuild: bool = False) -> Trials:
     """Return the trials at some paths.
 
-    What `fieldkit aggregate` says as a note, on a trial that is left out for example, is a `UserWarning` here.
+    Notes of `fieldkit aggregate`, for example on a trial that is left out, are issued as `UserWarning`.
 
     Args:
-        paths: Folders of trials, folders with trials somewhere below, or CSV files with the columns of trial.csv.
+        paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
         rebuild: Whether to measure the raw evidence again instead of reading trial.csv; nothing is written.
 
     Raises:
-        ConfigurationError: A path does not exist or has no trial, or a file is no table of repeats; as a
-            `fieldkit.core.errors.FieldkitError` it says what, where, and a remedy.
+        ConfigurationError: A path does not exist or has no trial, or a file is not a table of repeats. It is a
+            `fieldkit.core.errors.FieldkitError`, with a message, a location and a remedy.
         EvidenceError: A table is damaged, or no repeat has ended.
     """
     if not paths:

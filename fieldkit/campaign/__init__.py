@@ -1,1 +1,1 @@
-"""A day in the field: many trials, in an order that a person can walk, stopped and gone on with at will."""
+"""Campaigns: many trials in an order that limits walking, which can be interrupted and resumed."""

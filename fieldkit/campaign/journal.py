@@ -1,4 +1,4 @@
-"""The journal of a campaign: what became of each of its trials, on disk before anything goes on."""
+"""The journal of a campaign: the progress of each of its trials, synced to disk before the campaign continues."""
 
 import time
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ JOURNAL_FILE: Final = "journal.jsonl"
 
 
 class TrialProgress(StrEnum):
-    """What happened to a trial."""
+    """Progress of a trial."""
 
     STARTED = "started"
     PLACED = "placed"
@@ -34,15 +34,15 @@ class CampaignEntry:
     """One line of a campaign's journal.
 
     Attributes:
-        utc_ns: When, in nanoseconds since 1970 UTC.
-        planned: Which trial, as campaign.yaml calls it.
-        progress: What happened.
-        trial: Name of its folder, once it has one.
-        note: What the operator noted.
-        took_s: How long placing took, in seconds.
-        valid: Repeats that ended valid.
-        failed: Repeats that failed.
-        unmet: Expectations that its figures do not show to hold.
+        utc_ns: Time of the entry, in nanoseconds since 1970 UTC.
+        planned: Name of the trial in campaign.yaml.
+        progress: Progress of the trial.
+        trial: Name of its folder, if it has one.
+        note: Note of the operator.
+        took_s: Duration of placing the robots, in seconds.
+        valid: Number of valid repeats.
+        failed: Number of failed repeats.
+        unmet: Number of expectations that its figures do not show to hold.
     """
 
     utc_ns: int
@@ -60,7 +60,7 @@ _CODEC: Final = schema.Codec(CampaignEntry)
 
 
 class CampaignJournal:
-    """The journal of the campaign in a folder; empty where there is none yet.
+    """The journal of the campaign in a folder; empty if there is none yet.
 
     Args:
         folder: The campaign's folder.
@@ -75,18 +75,18 @@ class CampaignJournal:
         self._entries = self._read()
 
     @contextmanager
-    def kept(self, made: CampaignPlan) -> Iterator[None]:
-        """Keep the journal on disk while the body runs, and every other fieldkit off it.
+    def kept(self, plan: CampaignPlan) -> Iterator[None]:
+        """Store the journal on disk and lock the campaign against other processes while the body runs.
 
         Raises:
-            ConfigurationError: Another one has it, or the folder cannot be written.
+            ConfigurationError: Another process runs the campaign, or the folder cannot be written.
         """
         store.prepare(self.folder)
         with jsonl.claimed(self._path, "campaign"):
             jsonl.mend(self._path, _CODEC.parse)
             self._entries = self._read()
             if not (self.folder / CAMPAIGN_FILE).is_file():
-                files.write(self.folder / CAMPAIGN_FILE, schema.dump(made).encode())
+                files.write(self.folder / CAMPAIGN_FILE, schema.dump(plan).encode())
             yield
 
     def _read(self) -> list[CampaignEntry]:
@@ -95,30 +95,30 @@ class CampaignJournal:
         return jsonl.read(self._path, _CODEC.parse, remedy="choose another --out")
 
     def add(self, planned: PlannedTrial, progress: TrialProgress, **details: Any) -> None:  # noqa: ANN401 (the other fields of CampaignEntry)
-        """Enter what happened to a trial."""
+        """Record the progress of a trial."""
         entry = CampaignEntry(time.time_ns(), str(planned), progress, **details)
         jsonl.append(self._path, _CODEC.dump(entry))
         self._entries.append(entry)
 
     def ended(self) -> dict[str, CampaignEntry]:
-        """Return the last entry of each trial that is over; one that was begun once more is not."""
-        over: dict[str, CampaignEntry] = {}
+        """Return the last entry of each trial that has ended; a trial that was started again is left out."""
+        ended: dict[str, CampaignEntry] = {}
         for entry in self._entries:
             if entry.progress is TrialProgress.ENDED:
-                over[entry.planned] = entry
+                ended[entry.planned] = entry
             elif entry.progress is TrialProgress.STARTED:
-                over.pop(entry.planned, None)
-        return over
+                ended.pop(entry.planned, None)
+        return ended
 
     def interrupted(self, planned: PlannedTrial) -> Path | None:
-        """Return the folder that a trial which is not over began in, None where there is nothing to go on with."""
-        mine = (entry for entry in self._entries if entry.planned == str(planned))
-        started = [entry.trial for entry in mine if entry.progress is TrialProgress.STARTED]
+        """Return the folder of a trial that started and has not ended, or None if there is nothing to resume."""
+        entries = (entry for entry in self._entries if entry.planned == str(planned))
+        started = [entry.trial for entry in entries if entry.progress is TrialProgress.STARTED]
         folder = self.folder / started[-1] if started else None
         return folder if folder and (folder / PLAN_FILE).is_file() else None
 
     def placing_s(self, assumed_s: float) -> float:
-        """Return how long it takes to place robots, from the times so far; `assumed_s` before the first."""
+        """Return the mean duration of placing robots so far; `assumed_s` before the first time."""
         return fmean(
             [entry.took_s for entry in self._entries if entry.progress is TrialProgress.PLACED] or [assumed_s]
         )

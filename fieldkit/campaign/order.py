@@ -1,8 +1,9 @@
-"""The order of a campaign: shuffled, as far as people can walk it.
+"""The order of a campaign: random, within a limit on the walking distance.
 
-Whatever drifts during a day (sun, batteries, other people's Wi-Fi) must not look like an effect of distance, so the
-order is random. Rigging robots anew is dearest and carrying them is dear, so it is random within blocks: all trials
-of a topology, in it all of a scenario, in it all at a distance; and the way between the places has a bound.
+Slow changes during a day (sun, batteries, other Wi-Fi networks) must not look like an effect of distance, so the
+order is random. Setting up robots for another topology takes longest, and carrying them takes long, so the order is
+random within blocks: all trials of a topology; in it all of a scenario; in it all at a distance. The total path is
+limited.
 """
 
 import random
@@ -16,11 +17,11 @@ from fieldkit.core.model import Distance, Placement, Scenario, Topology
 
 @dataclass(frozen=True)
 class PlannedTrial:
-    """One trial of a campaign; `str` gives the name by which campaign.yaml and people call it, `los 30ft master`.
+    """One trial of a campaign; `str` gives its name in campaign.yaml and in messages, `los 30ft master`.
 
     Attributes:
         procedure: Name of its procedure.
-        scenario: The procedure's.
+        scenario: Scenario of the procedure.
         topology: Topology.
         distance: Distance.
     """
@@ -32,7 +33,7 @@ class PlannedTrial:
 
     @property
     def placement(self) -> Placement:
-        """Places where the robots are to stand."""
+        """The places of the robots."""
         return Placement(self.scenario, self.topology, self.distance)
 
     def __str__(self) -> str:
@@ -42,7 +43,7 @@ class PlannedTrial:
 Order = tuple[PlannedTrial, ...]
 
 DEFAULT_WALK: Final = 3.0
-"""Bound on the way where the file gives none, as a multiple of the shortest."""
+"""Default limit on the path, as a multiple of the shortest path."""
 
 _WALKERS: Final = {Topology.MASTER: 2, Topology.MASTERLESS: 1}
 _SWAPS_PER_TRIAL: Final = 50
@@ -50,9 +51,10 @@ _ROUNDING_M: Final = 1e-6
 
 
 def walk_m(trials: Iterable[PlannedTrial]) -> float:
-    """Return the way of all robots that are carried, from place to place, in metres.
+    """Return the length of the path along which robots are carried, in metres.
 
-    In `master` both stations walk, from and to the relay; in `masterless` the sender does. Each topology begins at 0.
+    In `master` both stations are carried, starting at the relay; in `masterless` the sender is. Each topology starts
+    at 0.
     """
     total_m = 0.0
     for topology, block in groupby(trials, key=lambda trial: trial.topology):
@@ -64,35 +66,36 @@ def walk_m(trials: Iterable[PlannedTrial]) -> float:
 
 
 def shortest(trials: Sequence[PlannedTrial]) -> Order:
-    """Return an order with the shortest way.
+    """Return an order with the shortest path.
 
-    All places of a scenario lie on a line, so the shortest way through them is a sweep, up or down.
+    All places of a scenario are on a line, so the shortest path through them is a sweep, up or down.
     """
     return tuple(chain.from_iterable(min(_sweeps(block), key=walk_m) for block in _blocks(trials)))
 
 
 def shuffled(trials: Sequence[PlannedTrial], *, seed: int, limit_m: float) -> Order:
-    """Return a random order whose way is at most `limit_m`.
+    """Return a random order whose path is at most `limit_m`.
 
-    A random walk over the orders within the limit: swap two blocks or trials at random, and take that back if the way
-    grows too long. A swap and its opposite are equally likely, so that no order that can be reached is preferred.
+    This is a random walk over the orders within the limit: two blocks or trials are swapped at random, and the swap
+    is undone if the path becomes too long. A swap and its inverse are equally likely, so all reachable orders are
+    equally likely.
 
     Args:
-        trials: The trials; their own order does not matter.
+        trials: The trials in any order.
         seed: Equal seeds give equal orders.
-        limit_m: At least the way of `shortest`.
+        limit_m: At least the path of `shortest`.
     """
-    draw = random.Random(seed)  # noqa: S311 (an order, no secret)
-    order = shortest(sorted(trials, key=_path))
+    rng = random.Random(seed)  # noqa: S311 (not for cryptography)
+    order = shortest(sorted(trials, key=_blocks_of))
     for _ in range(_SWAPS_PER_TRIAL * len(order)):
-        other = _swapped(order, draw)
+        other = _swapped(order, rng)
         if walk_m(other) <= limit_m + _ROUNDING_M:
             order = other
     return order
 
 
-def _path(trial: PlannedTrial) -> tuple[str | float, ...]:
-    """Return the blocks that a trial lies in, from the outermost to itself."""
+def _blocks_of(trial: PlannedTrial) -> tuple[str | float, ...]:
+    """Return the keys of the blocks that contain a trial, from the outermost to the trial itself."""
     return trial.topology, trial.scenario, trial.distance.metres, trial.procedure
 
 
@@ -113,18 +116,18 @@ def _sweeps(block: list[PlannedTrial]) -> Iterator[list[PlannedTrial]]:
             ]
 
 
-def _swapped(order: Order, draw: random.Random) -> Order:
-    """Return the order with two blocks swapped that lie in the same larger one; they may be one and the same."""
-    depth = 1 + _below(len(_path(order[0])), draw)
-    blocks = [tuple(block) for _, block in groupby(order, key=lambda trial: _path(trial)[:depth])]
-    parents = [_path(block[0])[: depth - 1] for block in blocks]
-    one = _below(len(blocks), draw)
-    siblings = [index for index, parent in enumerate(parents) if parent == parents[one]]
-    other = siblings[_below(len(siblings), draw)]
-    blocks[one], blocks[other] = blocks[other], blocks[one]
+def _swapped(order: Order, rng: random.Random) -> Order:
+    """Return the order after a swap of two random blocks of the same larger block, which may be the same block."""
+    depth = 1 + _below(len(_blocks_of(order[0])), rng)
+    blocks = [tuple(block) for _, block in groupby(order, key=lambda trial: _blocks_of(trial)[:depth])]
+    parents = [_blocks_of(block[0])[: depth - 1] for block in blocks]
+    first = _below(len(blocks), rng)
+    siblings = [index for index, parent in enumerate(parents) if parent == parents[first]]
+    second = siblings[_below(len(siblings), rng)]
+    blocks[first], blocks[second] = blocks[second], blocks[first]
     return tuple(chain.from_iterable(blocks))
 
 
-def _below(count: int, draw: random.Random) -> int:
-    # Of random.Random only `random` gives the same numbers in every version of Python.
-    return int(draw.random() * count)
+def _below(count: int, rng: random.Random) -> int:
+    # Only `random` of random.Random returns the same numbers in every version of Python.
+    return int(rng.random() * count)

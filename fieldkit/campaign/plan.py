@@ -1,4 +1,4 @@
-"""The plan of a campaign: the trials that its file asks for, in their order, frozen in its folder when it begins."""
+"""The plan of a campaign: its trials in order, frozen in its folder when it starts."""
 
 import hashlib
 import secrets
@@ -13,7 +13,7 @@ from fieldkit.config.schema import AfterValidator, Document, Duration, Field, In
 from fieldkit.core import laptop_files
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Topology
-from fieldkit.trial.procedure import Procedure, Repeats, expecting, load_procedure
+from fieldkit.trial.procedure import Procedure, Repeats, load_procedure, with_expectation
 
 CAMPAIGN_FILE: Final = laptop_files.CAMPAIGN
 
@@ -23,7 +23,7 @@ Item = TypeVar("Item")
 def _distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
     def check(items: tuple[Item, ...]) -> tuple[Item, ...]:
         if len({key(item) for item in items}) < len(items):
-            raise schema.complaint("something is named twice")
+            raise schema.complaint("an entry occurs twice")
         return items
 
     return AfterValidator(check)
@@ -33,7 +33,7 @@ _ONCE: Final = (Field(min_length=1), _distinct(lambda item: item))
 
 
 class LeftOut(Strict):
-    """Trials that a campaign leaves out: those that agree with everything named here.
+    """Trials that a campaign leaves out: those that match all given keys.
 
     Attributes:
         procedure: Name of a procedure.
@@ -46,7 +46,7 @@ class LeftOut(Strict):
     distance: Span | None = None
 
     def covers(self, trial: PlannedTrial) -> bool:
-        """Return whether it leaves out a trial."""
+        """Return True if it leaves out a trial."""
         return (
             self.procedure in {None, trial.procedure}
             and self.topology in {None, trial.topology}
@@ -79,7 +79,7 @@ class CampaignFile(Strict):
         str, schema.shaped(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$", "a name: letters, digits, - and _, 61 in all")
     ]
     procedures: Annotated[tuple[str, ...], *_ONCE]
-    distances: Annotated[tuple[Span, ...], Field(min_length=1), _distinct(lambda one: one.metres)]
+    distances: Annotated[tuple[Span, ...], Field(min_length=1), _distinct(lambda distance: distance.metres)]
     topologies: Annotated[tuple[Topology, ...], *_ONCE]
     protocols: Annotated[tuple[Protocol, ...], _distinct(lambda item: item)] = ()
     repeats: Repeats | None = None
@@ -97,20 +97,20 @@ def load_campaign(path: Path) -> tuple[CampaignFile, Document]:
 
 
 def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedure, ...]:
-    """Return the procedures of a campaign, which expect what the campaign expects of what they measure.
+    """Return the procedures of a campaign; expectations of the campaign are added to those that measure the figure.
 
     Raises:
-        ConfigurationError: As `load_procedure`; one that does not exist is named with its line, and so is an
-            expectation of what none of them measures.
+        ConfigurationError: As for `load_procedure`, with the line; or no procedure measures the figure of an
+            expectation.
     """
-    found = []
+    procedures = []
     for index, name in enumerate(campaign.procedures):
         with document.naming("procedures", index):
-            found.append(load_procedure(name))
+            procedures.append(load_procedure(name))
     for index, text in enumerate(campaign.expect):
         with document.naming("expect", index):
-            found = expecting(found, text)
-    return tuple(found)
+            procedures = with_expectation(procedures, text)
+    return tuple(procedures)
 
 
 def trials_of(
@@ -121,20 +121,20 @@ def trials_of(
     Raises:
         ConfigurationError: An entry under `except` leaves out nothing, or nothing is left.
     """
-    every = [
+    combinations = [
         PlannedTrial(procedure.name, procedure.scenario, topology, distance)
         for topology in campaign.topologies
         for procedure in procedures
         for distance in campaign.distances
     ]
     for index, left_out in enumerate(campaign.left_out):
-        if not any(map(left_out.covers, every)):
+        if not any(map(left_out.covers, combinations)):
             raise ConfigurationError(
-                "this leaves out no trial: the campaign has none like it",
+                "this leaves out no trial: no trial of the campaign matches",
                 where=document.where(("except", index)),
-                remedy="name what stands under procedures, topologies and distances",
+                remedy="use values of procedures, topologies and distances",
             )
-    kept = tuple(trial for trial in every if not _covered(trial, campaign.left_out))
+    kept = tuple(trial for trial in combinations if not _covered(trial, campaign.left_out))
     if not kept:
         raise ConfigurationError(
             "except leaves out every trial", where=document.where(("except",)), remedy="leave out fewer"
@@ -151,11 +151,11 @@ class CampaignPlan(Strict):
 
     Attributes:
         file_sha256: Hash of the campaign file.
-        backend: Where the robots come from.
-        session: Names the campaign on the robots' locks.
+        backend: Name of the backend.
+        session: Identifies the campaign in the robots' locks.
         campaign: The campaign file.
         procedures: Its procedures.
-        order: Its trials, in the order in which they are run.
+        order: The names of its trials, in the order of execution.
     """
 
     file_sha256: str
@@ -167,8 +167,8 @@ class CampaignPlan(Strict):
 
     def trials(self) -> tuple[PlannedTrial, ...]:
         """Return the trials in order."""
-        every = {str(trial): trial for trial in trials_of(self.campaign, self.procedures, _nowhere())}
-        return tuple(every[name] for name in self.order)
+        by_name = {str(trial): trial for trial in trials_of(self.campaign, self.procedures, _empty_document())}
+        return tuple(by_name[name] for name in self.order)
 
     def procedure(self, trial: PlannedTrial) -> Procedure:
         """Return the procedure of a trial."""
@@ -176,22 +176,22 @@ class CampaignPlan(Strict):
 
 
 def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:
-    """Return what a campaign file asks for, its trials in order, and its document for messages with lines.
+    """Return the plan of a campaign file, and its document for messages with lines.
 
     Raises:
-        ConfigurationError: As `load_campaign`, `load_procedures` and `trials_of`, or `walk` is too short for
+        ConfigurationError: As for `load_campaign`, `load_procedures` and `trials_of`, or `walk` is too short for
             any order.
     """
     campaign, document = load_campaign(path)
     procedures = load_procedures(campaign, document)
-    every = trials_of(campaign, procedures, document)
-    shortest_m = order.walk_m(order.shortest(every))
+    trials = trials_of(campaign, procedures, document)
+    shortest_m = order.walk_m(order.shortest(trials))
     limit_m = order.DEFAULT_WALK * shortest_m if campaign.walk is None else campaign.walk
     if limit_m < shortest_m:
         raise ConfigurationError(
-            f"the shortest way through all places is {shortest_m:.1f} m, walk allows {limit_m:g} m",
+            f"the shortest path through all places is {shortest_m:.1f} m, walk allows {limit_m:g} m",
             where=document.where(("walk",)),
-            remedy=f"walk: {shortest_m + 0.05:.1f}m leaves sweeps up and down; twice that, some choice",
+            remedy=f"walk: {shortest_m + 0.05:.1f}m allows only sweeps up and down; twice that allows a random order",
         )
     plan = CampaignPlan(
         file_sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -199,21 +199,21 @@ def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:
         session=secrets.token_hex(8),
         campaign=campaign,
         procedures=procedures,
-        order=tuple(map(str, order.shuffled(every, seed=campaign.seed, limit_m=limit_m))),
+        order=tuple(map(str, order.shuffled(trials, seed=campaign.seed, limit_m=limit_m))),
     )
     return plan, document
 
 
 def begun(folder: Path, asked: CampaignPlan, document: Document) -> CampaignPlan | None:
-    """Return what the campaign in `folder` was begun with, None when there is none yet.
+    """Return the frozen plan of the campaign in `folder`, or None if it has not started.
 
     Args:
         folder: The campaign's folder.
-        asked: What its file asks for now.
-        document: The file.
+        asked: The plan of its file now.
+        document: The document of the file.
 
     Raises:
-        ConfigurationError: The file now asks for something else, or campaign.yaml was edited.
+        ConfigurationError: The file has changed since the start, or campaign.yaml was edited.
     """
     if not (folder / CAMPAIGN_FILE).is_file():
         return None
@@ -222,18 +222,18 @@ def begun(folder: Path, asked: CampaignPlan, document: Document) -> CampaignPlan
     changed = [key for key in now if now[key] != before[key]]
     if changed:
         raise ConfigurationError(
-            f"changed since the campaign was begun: {', '.join(changed)}",
+            f"changed since the campaign started: {', '.join(changed)}",
             where=document.where((changed[0],)),
-            remedy=f"undo that ({folder / CAMPAIGN_FILE} says what it was), or begin another campaign: change name",
+            remedy=f"undo that ({folder / CAMPAIGN_FILE} has the old values), or start another campaign: change name",
         )
     return plan
 
 
 def _keys(plan: CampaignPlan) -> dict[str, Any]:
-    """Return what must not change under a campaign, as a file says it, by the name that a person knows it by."""
+    """Return the values that must not change during a campaign, by their key in the file or a description."""
     data = plan.model_dump(mode="json", by_alias=True)
     return {**data["campaign"], "a file of its procedures": data["procedures"], "backend": data["backend"]}
 
 
-def _nowhere() -> Document:
+def _empty_document() -> Document:
     return Document(data=None, source=CAMPAIGN_FILE, lines={})

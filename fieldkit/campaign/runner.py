@@ -1,4 +1,4 @@
-"""Run a campaign, or go on with one: each trial once, those that the operator skips offered again at the end."""
+"""Run or resume a campaign: each trial once; trials that the operator skips are offered again at the end."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,7 +19,7 @@ from fieldkit.core.model import Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.core.units import TimeEstimate, format_bytes
 from fieldkit.trial import estimates, journal
-from fieldkit.trial.estimates import Taken
+from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running.opening import opened
@@ -29,18 +29,18 @@ from fieldkit.trial.running.stop import Stop
 from fieldkit.trial.size import trial_bytes
 
 PLACING_S: Final = 60.0
-"""How long a person is assumed to carry robots to a place, before the first was timed."""
+"""Assumed duration of carrying the robots to a place, before the first was measured."""
 
 
 @dataclass(frozen=True)
 class CampaignOutcome:
-    """What a campaign came to.
+    """Result of a campaign.
 
     Attributes:
-        left: Trials that are not over.
-        failed: Repeats that failed in those that are.
-        unmet: Expectations that their figures do not show to hold.
-        folders: Folders of those that are.
+        left: Trials that have not ended.
+        failed: Number of failed repeats in the others.
+        unmet: Number of expectations that their figures do not show to hold.
+        folders: Folders of the trials that have ended.
     """
 
     left: tuple[PlannedTrial, ...]
@@ -53,11 +53,11 @@ class CampaignRun:
     """A campaign with its robots.
 
     Args:
-        plan: What it was begun with.
-        journal: What became of its trials so far.
-        backend: Where its robots come from.
-        sink: Told what happens.
-        failed: Whether failed repeats of trials that are over are redone.
+        plan: Its frozen plan.
+        journal: Its journal.
+        backend: The backend.
+        sink: Receives events.
+        failed: Whether failed repeats of trials that have ended are repeated.
 
     Raises:
         ConfigurationError: A trial lacks a robot for a role.
@@ -72,15 +72,15 @@ class CampaignRun:
         self._failed = self._redoes = failed
         self._sink = sink
         self._trials = plan.trials()
-        self._rigged: Topology | None = None
-        self._rig_note = ""
+        self._set_up_topology: Topology | None = None
+        self._set_up_note = ""
         self._plans = {trial: self._trial_plan(trial, backend.cast(trial.topology)) for trial in self._trials}
 
     def announce(self) -> None:
-        """Tell what there is to be done, and what of it is less than the procedures ask for."""
+        """Report the remaining work, and what the campaign reduces or cannot decide compared with its procedures."""
         left = self._left()
-        needed_bytes, free_bytes = self._room(left)
-        lasts = self._lasts(left)
+        needed_bytes, free_bytes = self._needed_and_free_bytes(left)
+        lasts = self._estimate(left)
         self._sink(
             CampaignPlanned(
                 name=self._plan.campaign.name,
@@ -102,39 +102,39 @@ class CampaignRun:
             self._sink(Note(line))
 
     def run(self, operator: Operator, stop: Stop) -> CampaignOutcome:
-        """Run what is left; trials that are skipped are offered once more after the others.
+        """Run the remaining trials; skipped trials are offered once more after the others.
 
         Args:
-            operator: Rigs and places the robots.
-            stop: Tells the campaign to stop.
+            operator: Sets up and places the robots.
+            stop: Request to stop the campaign.
 
         Raises:
-            ConfigurationError: The folder cannot be written or has too little room, or an interrupted trial cannot
-                be gone on with.
+            ConfigurationError: The folder cannot be written or has too little space, or an interrupted trial cannot
+                be resumed.
             LinkError: A robot did not answer.
             RobotError: A robot cannot do what a trial needs.
-            KeyboardInterrupt: `stop` was asked for.
+            KeyboardInterrupt: A stop was requested.
         """
         with self._journal.kept(self._plan):
             try:
-                self._demand_room()
+                self._demand_space()
                 self._reopen()
                 self._offer(self._left(), operator, stop)
-                # All that were skipped are left; without any, nothing is.
+                # Only skipped trials remain; this does nothing if there are none.
                 self._offer(self._left(), operator, stop)
             finally:
                 done = len(self._trials) - len(self._left())
                 self._sink(CampaignEnded(str(self._journal.folder), done, len(self._trials)))
         ended = self._journal.ended().values()
-        failed, unmet = (sum(getattr(entry, what) for entry in ended) for what in ("failed", "unmet"))
+        failed, unmet = (sum(getattr(entry, field) for entry in ended) for field in ("failed", "unmet"))
         folders = tuple(self._journal.folder / entry.trial for entry in ended)
         return CampaignOutcome(self._left(), failed, unmet, folders)
 
     def _offer(self, trials: Sequence[PlannedTrial], operator: Operator, stop: Stop) -> None:
         for topology, block in groupby(trials, key=lambda trial: trial.topology):
-            trials_of_it = list(block)
-            cast = {role: robot for trial in trials_of_it for role, robot in self._plans[trial].cast.items()}
-            self._rig(topology, cast, operator)
+            topology_trials = list(block)
+            cast = {role: robot for trial in topology_trials for role, robot in self._plans[trial].cast.items()}
+            self._set_up(topology, cast, operator)
             with opened(
                 self._backend,
                 cast,
@@ -144,14 +144,14 @@ class CampaignRun:
                 sink=self._sink,
                 operator=operator,
             ) as testbed:
-                for trial in trials_of_it:
+                for trial in topology_trials:
                     self._run(trial, cast, testbed, stop)
 
-    def _rig(self, topology: Topology, cast: Cast, operator: Operator) -> None:
-        if self._backend.by_hand and self._rigged not in {None, topology}:
+    def _set_up(self, topology: Topology, cast: Cast, operator: Operator) -> None:
+        if self._backend.by_hand and self._set_up_topology not in {None, topology}:
             roles = ", ".join(f"{robot.name} as {role}" for role, robot in cast.items())
-            self._rig_note = operator.ask(f"set the robots up for topology {topology}: {roles}").note
-        self._rigged = topology
+            self._set_up_note = operator.ask(f"set the robots up for topology {topology}: {roles}").note
+        self._set_up_topology = topology
 
     def _run(self, trial: PlannedTrial, cast: Cast, testbed: Testbed, stop: Stop) -> None:
         total = len(self._trials)
@@ -163,25 +163,25 @@ class CampaignRun:
         else:
             plan = resumable(folder)
             demand_cast(plan, cast)
-        placing = place(plan, testbed, self._sink)
-        progress = TrialProgress.SKIPPED if placing.answer.skip else TrialProgress.PLACED
-        self._journal.add(trial, progress, note=placing.answer.note, took_s=placing.took_s)
-        if not placing.answer.skip:
-            # A trial that stops is gone on with by the campaign's own command.
+        placement = place(plan, testbed, self._sink)
+        progress = TrialProgress.SKIPPED if placement.answer.skip else TrialProgress.PLACED
+        self._journal.add(trial, progress, note=placement.answer.note, took_s=placement.took_s)
+        if not placement.answer.skip:
+            # A stopped trial is resumed by the campaign's command, so `report_resume` is False.
             if folder is None:
-                plan = plan.with_note(placing.answer.note)
-                outcome = begin(plan, testbed, self._journal.folder, self._sink, stop, told=False)
+                plan = plan.with_note(placement.answer.note)
+                outcome = begin(plan, testbed, self._journal.folder, self._sink, stop, report_resume=False)
             else:
-                outcome = go_on(folder, testbed, self._sink, stop, told=False, failed=self._failed)
+                outcome = go_on(folder, testbed, self._sink, stop, report_resume=False, failed=self._failed)
             trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
             unmet = sum(not judgement.holds for judgement in outcome.judgements)
             self._journal.add(trial, TrialProgress.ENDED, trial=trial_name, valid=valid, failed=failed, unmet=unmet)
         left = self._left()
-        lasts = self._lasts(left)
+        lasts = self._estimate(left)
         self._sink(CampaignWent(str(trial), total - len(left), total, lasts.likely_s, lasts.most_s))
 
     def _reopen(self) -> None:
-        """Enter that trials with failed repeats begin once more, if these are redone."""
+        """Record a new start of the trials with failed repeats, if these are repeated."""
         over = self._journal.ended()
         for trial in self._left():
             if entry := over.get(str(trial)):
@@ -189,16 +189,16 @@ class CampaignRun:
         self._redoes = False
 
     def _left(self) -> tuple[PlannedTrial, ...]:
-        """Return the trials that are not over, and with `--failed`, until `_reopen`, those with failed repeats."""
-        over = {name for name, entry in self._journal.ended().items() if not (self._redoes and entry.failed)}
-        return tuple(trial for trial in self._trials if str(trial) not in over)
+        """Return the trials that have not ended; with `--failed`, until `_reopen`, also those with failed repeats."""
+        ended = {name for name, entry in self._journal.ended().items() if not (self._redoes and entry.failed)}
+        return tuple(trial for trial in self._trials if str(trial) not in ended)
 
-    def _room(self, trials: Sequence[PlannedTrial]) -> tuple[int, int]:
-        """Return how many bytes trials need, and how many are free where they go."""
+    def _needed_and_free_bytes(self, trials: Sequence[PlannedTrial]) -> tuple[int, int]:
+        """Return the bytes that trials need, and the bytes that are free in the campaign's folder."""
         return sum(trial_bytes(self._plans[trial]) for trial in trials), files.free_bytes(self._journal.folder)
 
-    def _demand_room(self) -> None:
-        needed_bytes, free_bytes = self._room(self._left())
+    def _demand_space(self) -> None:
+        needed_bytes, free_bytes = self._needed_and_free_bytes(self._left())
         if free_bytes < needed_bytes:
             raise ConfigurationError(
                 f"the evidence may need {format_bytes(needed_bytes)}, {format_bytes(free_bytes)} are free",
@@ -206,25 +206,27 @@ class CampaignRun:
                 remedy="free some space, or choose another --out",
             )
 
-    def _lasts(self, trials: Sequence[PlannedTrial]) -> TimeEstimate:
-        """TimeEstimate how long trials take, by what those took that are over."""
+    def _estimate(self, trials: Sequence[PlannedTrial]) -> TimeEstimate:
+        """Return the estimated duration of trials, based on the finished ones."""
         placing_s = self._journal.placing_s(PLACING_S if self._backend.by_hand else 0.0)
-        placing = TimeEstimate(placing_s, placing_s)
-        known = self._known()
+        placement = TimeEstimate(placing_s, placing_s)
+        finished = self._finished_repeats()
         return estimates.total(
-            part for trial in trials for part in (placing, estimates.of_trial(self._plans[trial], known))
+            part for trial in trials for part in (placement, estimates.of_trial(self._plans[trial], finished))
         )
 
-    def _known(self) -> list[Taken]:
-        """Return what the repeats of trials took that are over; a journal that cannot be read says nothing here."""
-        known: list[Taken] = []
+    def _finished_repeats(self) -> list[FinishedRepeat]:
+        """Return the finished repeats of trials that have ended; trials with unreadable journals are ignored."""
+        finished: list[FinishedRepeat] = []
         for name, entry in self._journal.ended().items():
             plan = next((self._plans[trial] for trial in self._trials if str(trial) == name), None)
             with suppress(EvidenceError):
-                known += (
-                    [] if plan is None else estimates.taken(plan, journal.read(self._journal.folder / entry.trial))
+                finished += (
+                    []
+                    if plan is None
+                    else estimates.finished_repeats(plan, journal.read(self._journal.folder / entry.trial))
                 )
-        return known
+        return finished
 
     def _trial_plan(self, trial: PlannedTrial, cast: Cast) -> Plan:
         campaign = self._plan.campaign
@@ -246,4 +248,4 @@ class CampaignRun:
             session=self._plan.session,
             lab_bytes=self._backend.lab_bytes,
         )
-        return plan.with_note(self._rig_note)
+        return plan.with_note(self._set_up_note)

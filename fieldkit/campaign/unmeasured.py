@@ -1,4 +1,4 @@
-"""Trials of a campaign that have no attempt yet, for reports: a condition without data must not be overlooked."""
+"""Trials of a campaign without an attempt: reports list them, so that missing conditions are not overlooked."""
 
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
@@ -15,20 +15,20 @@ def unmeasured(paths: Iterable[Path], sources: Collection[str], note: Note) -> I
     """Yield the name of each planned trial without an attempt: `nlos 60m masterless`.
 
     Args:
-        paths: Folders of campaigns, or of the folder above: `trials`.
+        paths: Folders of campaigns, or folders that contain campaigns, such as `trials`.
         sources: Folders of the trials that have attempts.
-        note: Where a sentence goes about a campaign whose plan cannot be read.
+        note: Receives a sentence about each campaign whose plan cannot be read.
     """
-    for folder in dict.fromkeys(each for path in paths for each in (path, *_below(path))):
+    for folder in dict.fromkeys(candidate for path in paths for candidate in (path, *_below(path))):
         if (folder / CAMPAIGN_FILE).is_file():
             try:
                 yield from _unmeasured(folder, sources)
             except FieldkitError as error:
-                note(f"which trials are missing is not known: {error.located}")
+                note(f"the missing trials are not known: {error.located}")
 
 
 def _below(path: Path) -> list[Path]:
-    return sorted(each for each in path.iterdir() if each.is_dir()) if path.is_dir() else []
+    return sorted(child for child in path.iterdir() if child.is_dir()) if path.is_dir() else []
 
 
 def _unmeasured(folder: Path, sources: Collection[str]) -> Iterator[str]:

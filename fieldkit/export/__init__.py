@@ -1,1 +1,1 @@
-"""Trials in formats that other programs open: tables for pandas and R, a time line for Foxglove."""
+"""Export of trials for other programs: tables for pandas and R, timelines for Foxglove, JUnit XML."""

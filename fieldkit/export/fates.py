@@ -1,4 +1,4 @@
-"""Fates of the packets in the captures of an attempt: which were lost, which are further copies."""
+"""Fates of the packets in the captures of an attempt: lost packets and duplicates."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
@@ -14,34 +14,34 @@ from fieldkit.measure.transfers import strangers
 from fieldkit.measure.transfers.match import Match, match
 from fieldkit.measure.transfers.transfer import Transfer
 
-# An IP packet's payload where no offload joined several: the MTU of Ethernet and Wi-Fi without the shortest header.
+# Largest IP payload of a frame that offload did not join: the MTU of Ethernet and Wi-Fi without the shortest header.
 _LARGEST_PAYLOAD_BYTES: Final = 1480
 
 
-def told(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapping[str, MarkedPackets]:
-    """Return what became of the packets of each capture, as far as transfers that both ends captured tell.
+def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapping[str, MarkedPackets]:
+    """Return the fates of the packets of each capture, as far as they belong to transfers captured at both ends.
 
     Args:
-        captures: By file.
-        transfers: What tells the packets of each.
+        captures: The captures by file.
+        transfers: The packet filter of each transfer.
     """
-    found = {file: _unknown(capture.packets) for file, capture in captures.items()}
-    ways: dict[tuple[str, str, str, str], list[Transfer]] = {}
+    marked = {file: _unknown(capture.packets) for file, capture in captures.items()}
+    by_path: dict[tuple[str, str, str, str], list[Transfer]] = {}
     for transfer in transfers:
         here, there = transfer.captures
         if here is not None and there is not None and {here, there} <= captures.keys():
-            ways.setdefault((here, there, transfer.sender_address, transfer.receiver_address), []).append(transfer)
-    for (here, there, sender, receiver), alike in ways.items():
-        matched = _matched(captures[here], captures[there], alike)
+            by_path.setdefault((here, there, transfer.sender_address, transfer.receiver_address), []).append(transfer)
+    for (here, there, sender, receiver), same_path in by_path.items():
+        matched = _matched(captures[here], captures[there], same_path)
         if matched is None:
             continue
-        sent, came = found[here], found[there]
-        ours = sent.packets.are_from(sender) & sent.packets.are_to(receiver) & ~matched.doubtful
-        sent.lost[ours] = ~matched.arrived[ours]
-        in_doubt = np.append(matched.doubtful, False)[matched.sent_index]  # the last entry is that of match.NONE
-        ours = came.packets.are_from(sender) & came.packets.are_to(receiver) & ~in_doubt
-        came.copy[ours] = matched.duplicates[ours]
-    return found
+        sent, received = marked[here], marked[there]
+        forward = sent.packets.are_from(sender) & sent.packets.are_to(receiver) & ~matched.doubtful
+        sent.lost[forward] = ~matched.arrived[forward]
+        is_ambiguous = np.append(matched.doubtful, False)[matched.sent_index]  # the last entry is for match.NONE
+        forward = received.packets.are_from(sender) & received.packets.are_to(receiver) & ~is_ambiguous
+        received.copy[forward] = matched.duplicates[forward]
+    return marked
 
 
 def _unknown(packets: Packets) -> MarkedPackets:
@@ -49,15 +49,15 @@ def _unknown(packets: Packets) -> MarkedPackets:
     return MarkedPackets(packets, lost, copy)
 
 
-def _matched(here: Capture, there: Capture, alike: Sequence[Transfer]) -> Match | None:
-    """Return which packets of two captures are the same; None where that cannot be told of all transfers one way."""
+def _matched(here: Capture, there: Capture, same_path: Sequence[Transfer]) -> Match | None:
+    """Return the matching packets of two captures, or None if they cannot be matched for all transfers of a path."""
     sent, received = here.packets, there.packets
     if here.damage or there.damage:
         return None
-    is_tcp = any(transfer.protocol is Protocol.TCP for transfer in alike)
+    is_tcp = any(transfer.protocol is Protocol.TCP for transfer in same_path)
     if is_tcp and (_is_offloaded(sent) or _is_offloaded(received)):
         return None
-    if any(strangers.reason(sent, received, transfer) for transfer in alike):
+    if any(strangers.reason(sent, received, transfer) for transfer in same_path):
         return None
     try:
         return match(sent, received)
@@ -66,5 +66,5 @@ def _matched(here: Capture, there: Capture, alike: Sequence[Transfer]) -> Match 
 
 
 def _is_offloaded(captured: Packets) -> bool:
-    """Return whether a capture has frames of several segments: those of one end are not those of the other."""
+    """Return True if a capture has frames of several segments; they differ between the two ends."""
     return bool((captured.ip_payload_bytes > _LARGEST_PAYLOAD_BYTES).any())

@@ -1,6 +1,6 @@
-"""Trials as JUnit XML, which CI servers show: a suite per trial, a case per repeat and per expectation.
+"""Trials as JUnit XML for CI servers: a suite per trial, a case per repeat and per expectation.
 
-The form is that of Jenkins' xunit schema, which GitLab, GitHub actions and others read.
+The format is the xunit schema of Jenkins, which GitLab, GitHub Actions and others read.
 """
 
 from collections import defaultdict
@@ -20,19 +20,19 @@ from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 
-_UNDER: Final = "."
-"""Between the parts of a class name, by which servers make groups."""
+_SEPARATOR: Final = "."
+"""Separator of class names, by which servers group cases."""
 
 
 def write(path: Path, folders: Iterable[Path]) -> None:
-    """Write trials into a file, in place of what was there.
+    """Write trials into a file; an existing file is replaced.
 
     Args:
         path: The file.
         folders: The trials' folders.
 
     Raises:
-        ConfigurationError: A folder is no trial.
+        ConfigurationError: A folder is not a trial.
         EvidenceError: A journal or a table cannot be read.
         OSError: The file cannot be written.
     """
@@ -40,11 +40,11 @@ def write(path: Path, folders: Iterable[Path]) -> None:
 
 
 def text(folders: Iterable[Path]) -> bytes:
-    """Return trials as XML; errors as `write`."""
+    """Return trials as XML; errors as for `write`."""
     top = ET.Element("testsuites", name="fieldkit")
-    # A list: `extend` turns an error of what it is given into a TypeError of its own.
+    # A list, because `extend` converts an exception of an iterator into a TypeError.
     top.extend([_suite(folder) for folder in folders])
-    for element in top.iter():  # every text and attribute, whatever wrote it
+    for element in top.iter():  # all texts and attributes, from any source
         element.text = element.text and harmless(element.text)
         element.attrib.update({name: harmless(value) for name, value in element.attrib.items()})
     ET.indent(top)
@@ -53,43 +53,43 @@ def text(folders: Iterable[Path]) -> bytes:
 
 def _suite(folder: Path) -> ET.Element:
     plan = store.read_plan(folder)
-    cases = [*_repeats(plan, journal.history(folder, plan)), *map(_expected, _judgements(folder, plan))]
-    group = _UNDER.join(("fieldkit", plan.procedure.name, plan.distance.replace(_UNDER, "_"), plan.topology))
+    cases = [*_repeat_cases(plan, journal.history(folder, plan)), *map(_expectation_case, _judgements(folder, plan))]
+    group = _SEPARATOR.join(("fieldkit", plan.procedure.name, plan.distance.replace(_SEPARATOR, "_"), plan.topology))
     for case in cases:
         case.set("classname", group)
     failed, skipped = (sum(case.find(kind) is not None for case in cases) for kind in ("failure", "skipped"))
-    said = {"name": plan.trial, "tests": len(cases), "failures": failed, "errors": 0, "skipped": skipped}
-    suite = ET.Element("testsuite", {name: str(value) for name, value in said.items()})
+    attributes = {"name": plan.trial, "tests": len(cases), "failures": failed, "errors": 0, "skipped": skipped}
+    suite = ET.Element("testsuite", {name: str(value) for name, value in attributes.items()})
     suite.extend(cases)
     return suite
 
 
-def _repeats(plan: Plan, entries: Iterable[JournalEntry]) -> Iterator[ET.Element]:
-    """Yield a case per planned repeat, in order; one that is not over is skipped."""
+def _repeat_cases(plan: Plan, entries: Iterable[JournalEntry]) -> Iterator[ET.Element]:
+    """Yield a case per planned repeat, in order; a repeat that has not ended is skipped."""
     of_repeat = defaultdict[RepeatId, list[JournalEntry]](list)
     for entry in entries:
         of_repeat[entry.repeat].append(entry)
     for repeat in plan.order():
-        took_s, said = 0.0, list[str]()
-        began_ns, last = 0, Status.PLANNED
+        took_s, reasons = 0.0, list[str]()
+        started_ns, last = 0, Status.PLANNED
         for entry in of_repeat[repeat]:
-            began_ns = entry.utc_ns if entry.status is Status.RUNNING else began_ns
+            started_ns = entry.utc_ns if entry.status is Status.RUNNING else started_ns
             if entry.status in ENDED:
-                took_s += max(entry.utc_ns - began_ns, 0) / 1e9
-                said += [f"attempt {entry.attempt} {entry.status}: {entry.reason}"] if entry.reason else []
+                took_s += max(entry.utc_ns - started_ns, 0) / 1e9
+                reasons += [f"attempt {entry.attempt} {entry.status}: {entry.reason}"] if entry.reason else []
             last = entry.status
         case = ET.Element("testcase", name=str(repeat), time=f"{took_s:.3f}")
         if last is Status.FAILED:
-            _add(case, "failure", said[-1] if said else "")
+            _add(case, "failure", reasons[-1] if reasons else "")
         elif last is not Status.VALID:
-            _add(case, "skipped", "it is not over; fieldkit resume goes on with the trial")
-        if said:
-            ET.SubElement(case, "system-out").text = "\n".join(said)
+            _add(case, "skipped", "it has not ended; fieldkit resume continues the trial")
+        if reasons:
+            ET.SubElement(case, "system-out").text = "\n".join(reasons)
         yield case
 
 
 def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
-    """Judge what a trial expects; without its table, which it has from the first attempt on, nothing is decided."""
+    """Judge the expectations of a trial; without its table, which it has after the first attempt, none is decided."""
     if not plan.procedure.expect:
         return ()
     table = folder / store.TRIAL_CSV
@@ -98,10 +98,10 @@ def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
     return judgements.judge(plan.procedure.expectations, cells)
 
 
-def _expected(one: Judgement) -> ET.Element:
-    expected, of, measured, interval, ruling = wording.judged(one)
-    case = ET.Element("testcase", name=f"{expected} ({of})" if of else expected, time="0")
-    if not one.holds:
+def _expectation_case(judgement: Judgement) -> ET.Element:
+    expected, subject, measured, interval, ruling = wording.judged(judgement)
+    case = ET.Element("testcase", name=f"{expected} ({subject})" if subject else expected, time="0")
+    if not judgement.holds:
         _add(case, "failure", f"{ruling}: {measured} {interval}".rstrip())
     return case
 

@@ -1,6 +1,6 @@
-"""Messages of JSON in an MCAP file. The only module of fieldkit that writes one.
+"""Writer of JSON messages to an MCAP file; the only module of fieldkit that writes MCAP.
 
-File format: https://mcap.dev/spec; what Foxglove expects of JSON: https://docs.foxglove.dev, custom schema encodings.
+File format: https://mcap.dev/spec. JSON for Foxglove: https://docs.foxglove.dev, custom schema encodings.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,13 +20,13 @@ _SCHEMA_ENCODING: Final = "jsonschema"
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """One channel of the file.
+    """A channel of the file.
 
     Attributes:
         name: Its name.
-        schema: JSON Schema of its messages, whose title names it.
-        clock: Whose clock its times are of.
-        meaning: What a message says.
+        schema: JSON Schema of its messages; its title is the name of the schema.
+        clock: The clock of its times.
+        meaning: Description of its messages.
     """
 
     name: str
@@ -37,11 +37,11 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class Message:
-    """One message.
+    """A message.
 
     Attributes:
-        channel: Where it goes.
-        time_ns: When, nanoseconds since 1970 UTC by the channel's clock.
+        channel: Its channel.
+        time_ns: Its time in nanoseconds since 1970 UTC, by the channel's clock.
         content: Its values; they conform to the channel's schema.
     """
 
@@ -51,14 +51,12 @@ class Message:
 
 
 def write(file: BinaryIO, about: Mapping[str, str], messages: Iterable[Message]) -> None:
-    """Write messages, chunk by chunk as they come.
-
-    The same messages give the same bytes.
+    """Write messages in chunks; equal messages give equal bytes.
 
     Args:
-        file: Where to.
-        about: What the file is of; kept as metadata.
-        messages: In the order of their times, as far as their clocks agree.
+        file: The output file.
+        about: Metadata of the file.
+        messages: Messages in the order of their times, as far as their clocks agree.
 
     Raises:
         OSError: The file cannot be written.
@@ -69,7 +67,7 @@ def write(file: BinaryIO, about: Mapping[str, str], messages: Iterable[Message])
     channels = _Channels(writer)
     for message in messages:
         writer.add_message(
-            channel_id=channels.of(message.channel),
+            channel_id=channels.id_of(message.channel),
             log_time=message.time_ns,
             publish_time=message.time_ns,
             data=_encoded(message.content),
@@ -85,7 +83,7 @@ class _Channels:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
 
-    def of(self, channel: Channel) -> int:
+    def id_of(self, channel: Channel) -> int:
         if channel.name not in self._channels:
             self._channels[channel.name] = self._writer.register_channel(
                 topic=channel.name,

@@ -1,4 +1,4 @@
-"""The packets of one capture, each with what became of it, as messages of an MCAP file."""
+"""The packets of one capture, each with its fate, as messages of an MCAP file."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,20 +15,20 @@ from fieldkit.measure.captures.packets import NO_PORT, Packets
 
 NOT_KNOWN: Final = -1
 _SLICE: Final = 1 << 14
-"""How many packets are Python's objects at once."""
+"""Number of packets that are converted to Python objects at a time."""
 
-_LOST: Final[tuple[dict[str, bool], ...]] = ({"lost": False}, {"lost": True}, {})  # NOT_KNOWN is the last
+_LOST: Final[tuple[dict[str, bool], ...]] = ({"lost": False}, {"lost": True}, {})  # index -1 (NOT_KNOWN) is the last
 _COPY: Final[tuple[dict[str, bool], ...]] = ({"copy": False}, {"copy": True}, {})
 
 
 @dataclass(frozen=True, eq=False)
 class MarkedPackets:
-    """What one robot captured.
+    """The packets captured by one robot, with their fates.
 
     Attributes:
-        packets: They, in the order of the file.
-        lost: Per packet 1, 0 or `NOT_KNOWN`: whether it was lost, of those that this robot sent. Shape (n,).
-        copy: Likewise whether it is a further copy, of those that it received.
+        packets: The packets in the order of the file.
+        lost: 1 if a packet that this robot sent was lost, 0 if not, `NOT_KNOWN` otherwise. Shape (n,).
+        copy: 1 if a packet that it received is a duplicate, 0 if not, `NOT_KNOWN` otherwise. Shape (n,).
     """
 
     packets: Packets
@@ -36,28 +36,28 @@ class MarkedPackets:
     copy: NDArray[np.int8]
 
 
-def messages(channel: Channel, repeat: str, seen: MarkedPackets) -> Iterator[Message]:
+def messages(channel: Channel, repeat: str, captured: MarkedPackets) -> Iterator[Message]:
     """Yield a message per packet whose time is known, in the order of time.
 
     Args:
-        channel: Where they go.
+        channel: The channel.
         repeat: Name of the repeat's folder.
-        seen: The packets.
+        captured: The packets.
     """
-    time_ns = seen.packets.time_ns
+    time_ns = captured.packets.time_ns
     order = np.argsort(time_ns, kind="stable")
     order = order[time_ns[order] != NO_TIME]
     for start in range(0, len(order), _SLICE):
         chosen = order[start : start + _SLICE]
-        packets = seen.packets.where(chosen)
-        fates = (seen.lost[chosen].tolist(), seen.copy[chosen].tolist())
-        for t_ns, said, lost, copy in zip(packets.time_ns.tolist(), _contents(packets), *fates, strict=True):
+        packets = captured.packets.where(chosen)
+        fates = (captured.lost[chosen].tolist(), captured.copy[chosen].tolist())
+        for t_ns, fields, lost, copy in zip(packets.time_ns.tolist(), _contents(packets), *fates, strict=True):
             fate = _LOST[lost] | _COPY[copy]
-            yield Message(channel, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | said | fate)
+            yield Message(channel, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | fields | fate)
 
 
 def _contents(packets: Packets) -> Iterator[dict[str, object]]:
-    """Yield what the headers of each packet say."""
+    """Yield the header fields of each packet."""
     columns = {
         "protocol": packets.protocol.tolist(),
         "source": [written(*halves) for halves in packets.src.tolist()],

@@ -1,4 +1,4 @@
-"""Messages of an MCAP file from what the robots recorded in one attempt, each by its own clock."""
+"""MCAP messages from the robots' recordings of one attempt; each robot's times are by its clock."""
 
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,15 +22,15 @@ from fieldkit.trial.plan import Plan
 
 @dataclass(frozen=True, eq=False)
 class AttemptRecord:
-    """What is left of an attempt; what is missing or unreadable is not there.
+    """The readable recordings of an attempt; missing or unreadable ones are left out.
 
     Attributes:
         plan: The trial.
-        attempt: Which.
-        captures: What robots captured, by file, of a damaged one what is before the damage.
-        pings: What ping said, by file.
-        bags: What robots recorded.
-        links: What their radios told of their links.
+        attempt: The attempt.
+        captures: The captures by file; of a damaged capture the part before the damage.
+        pings: The outputs of ping by file.
+        bags: The recorded bags.
+        links: The samples of the radios' links.
     """
 
     plan: Plan
@@ -42,12 +42,12 @@ class AttemptRecord:
 
     @property
     def transfers(self) -> tuple[Transfer, ...]:
-        """What tells the packets of each of its transfers."""
+        """The packet filter of each of its transfers."""
         return self.plan.transfers(self.attempt.repeat.protocol)
 
 
 def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptRecord:
-    """Return what is left of an attempt."""
+    """Return the readable recordings of an attempt."""
     captures = {name: evidence.read_or_none(pcap.read, name) for name in plan.captures()}
     pings = {pinging.file: evidence.read_or_none(ping.read, pinging.file) for pinging in plan.pingings()}
     bags = {role: evidence.read_or_none(bag.read, name) for role, name in plan.bags().items()}
@@ -55,110 +55,113 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
         plan=plan,
         attempt=attempt,
         captures={name: capture for name, capture in captures.items() if capture},
-        pings={name: one for name, one in pings.items() if one},
-        bags={role: one for role, one in bags.items() if one},
+        pings={name: output for name, output in pings.items() if output},
+        bags={role: content for role, content in bags.items() if content},
         links={role: evidence.links(role) for role in plan.cast},
     )
 
 
-def flaws(found: AttemptRecord) -> Iterator[Json]:
-    """Yield a line of the log for whatever of the evidence the messages do not tell."""
+def flaws(record: AttemptRecord) -> Iterator[Json]:
+    """Yield a log message for each part of the evidence that the other messages do not contain."""
 
-    def line(said: str, file: str) -> Json:
-        name, t_ns = str(found.attempt.repeat), found.attempt.started_utc_ns
-        return schemas.log(t_ns, Level.WARNING, said, name=name, file=f"repeats/{found.attempt.folder}/{file}")
+    def line(text: str, file: str) -> Json:
+        name, t_ns = str(record.attempt.repeat), record.attempt.started_utc_ns
+        return schemas.log(t_ns, Level.WARNING, text, name=name, file=f"repeats/{record.attempt.folder}/{file}")
 
-    for file, capture in found.captures.items():
+    for file, capture in record.captures.items():
         if capture.damage:
             yield line(capture.damage, file)
-    for file, pings in found.pings.items():
+    for file, pings in record.pings.items():
         if untimed := sum(reply.at_utc_ns is None for reply in pings.replies):
             yield line(f"{untimed} replies have no time stamp and are left out", file)
 
 
-def messages(found: AttemptRecord) -> Iterator[Message]:
-    """Return what the robots recorded, in the order of their times as far as their clocks agree."""
+def messages(record: AttemptRecord) -> Iterator[Message]:
+    """Return the messages of the robots' recordings, in the order of their times as far as their clocks agree."""
     streams = []
-    told = fates.told(found.captures, found.transfers)
-    for file, role in found.plan.captures().items():
-        if file in found.captures:
-            what, meaning = _named("packets", _step(file)), "What its capture holds: IP packets, frames of offload."
-            channel = _channel(found, role, what, schemas.PACKET, meaning)
-            streams.append(packets.messages(channel, found.attempt.folder, told[file]))
-    for role in found.plan.cast:
-        short = [*_phases(found, role), *_links(found, role), *_rtts(found, role)]
+    marked = fates.packet_fates(record.captures, record.transfers)
+    for file, role in record.plan.captures().items():
+        if file in record.captures:
+            topic, meaning = (
+                _named("packets", _step(file)),
+                "What its capture holds: IP packets, frames of offload.",
+            )
+            channel = _channel(record, role, topic, schemas.PACKET, meaning)
+            streams.append(packets.messages(channel, record.attempt.folder, marked[file]))
+    for role in record.plan.cast:
+        short = [*_phases(record, role), *_links(record, role), *_rtts(record, role)]
         streams.append(iter(sorted(short, key=attrgetter("time_ns"))))
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
 
-def _channel(found: AttemptRecord, role: Role, what: str, schema: Json, meaning: str) -> Channel:
-    return Channel(f"/{role}/{what}", schema, f"{role} {found.plan.cast[role].name}", meaning)
+def _channel(record: AttemptRecord, role: Role, topic: str, schema: Json, meaning: str) -> Channel:
+    return Channel(f"/{role}/{topic}", schema, f"{role} {record.plan.cast[role].name}", meaning)
 
 
-def _named(what: str, step: str) -> str:
-    """Return what a topic is called below its robot's: `rtt`, of a step that has a name `rtt/busy`."""
-    return f"{what}/{step}" if step else what
+def _named(topic: str, step: str) -> str:
+    """Return the name of a topic below that of its robot: `rtt`, or `rtt/busy` for a step with a name."""
+    return f"{topic}/{step}" if step else topic
 
 
 def _step(file: str) -> str:
-    """Return the name of the step that a capture is of, empty where that has none."""
+    """Return the name of the step of a capture, empty if it has none."""
     return Path(file).stem.rpartition(".")[0]
 
 
-def _rtts(found: AttemptRecord, role: Role) -> Iterator[Message]:
-    """Yield the replies to ping that a robot printed, and the errors in place of one, when it did."""
-    for pinging in found.plan.pingings():
-        if pinging.role == role and pinging.file in found.pings:
-            yield from _replies(found, role, pinging.name, pinging.file)
+def _rtts(record: AttemptRecord, role: Role) -> Iterator[Message]:
+    """Yield the replies to ping that a robot printed, and ICMP errors, at the times of their output."""
+    for pinging in record.plan.pingings():
+        if pinging.role == role and pinging.file in record.pings:
+            yield from _replies(record, role, pinging.name, pinging.file)
 
 
-def _replies(found: AttemptRecord, role: Role, step: str, file: str) -> Iterator[Message]:
-    repeat, pings = found.attempt.folder, found.pings[file]
-    channel = _channel(found, role, _named("rtt", step), schemas.RTT, "Each reply to ping, when it was printed.")
+def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterator[Message]:
+    repeat, pings = record.attempt.folder, record.pings[file]
+    channel = _channel(record, role, _named("rtt", step), schemas.RTT, "Each reply to ping, when it was printed.")
     for reply in pings.replies:
         if reply.at_utc_ns is not None:
             yield Message(channel, reply.at_utc_ns, schemas.rtt(reply.at_utc_ns, repeat, reply))
-    log = _channel(found, role, "log", schemas.LOG, "ICMP errors in place of a reply to ping.")
+    log = _channel(record, role, "log", schemas.LOG, "ICMP errors in place of a reply to ping.")
     for problem in pings.problems:
         if problem.at_utc_ns is not None:
-            said = f"icmp_seq={problem.seq}: {problem.source} says {problem.text}"
+            text = f"icmp_seq={problem.seq}: {problem.source} says {problem.text}"
             yield Message(
                 log,
                 problem.at_utc_ns,
-                schemas.log(problem.at_utc_ns, Level.WARNING, said, name=repeat, file=file),
+                schemas.log(problem.at_utc_ns, Level.WARNING, text, name=repeat, file=file),
             )
 
 
-def _links(found: AttemptRecord, role: Role) -> Iterator[Message]:
-    channel = _channel(found, role, "link", schemas.LINK, "What its radio told of its links, five times a second.")
-    for sample in found.links[role]:
-        yield Message(channel, sample.utc_ns, schemas.link(found.attempt.folder, sample))
+def _links(record: AttemptRecord, role: Role) -> Iterator[Message]:
+    channel = _channel(record, role, "link", schemas.LINK, "What its radio told of its links, five times a second.")
+    for sample in record.links[role]:
+        yield Message(channel, sample.utc_ns, schemas.link(record.attempt.folder, sample))
 
 
-def _phases(found: AttemptRecord, role: Role) -> Iterator[Message]:
-    """Yield when a robot began to record, to send or receive, to ping, and when it ended; a named step by itself."""
+def _phases(record: AttemptRecord, role: Role) -> Iterator[Message]:
+    """Yield when a robot started and stopped recording, sending or receiving, and ping; named steps are separate."""
     meaning = "What it began to do, by the first and last stamp of its evidence."
-    for step, phase, begin_ns, end_ns in _spans(found, role):
-        channel = _channel(found, role, _named("phase", step), schemas.PHASE, meaning)
-        for t_ns, what in ((begin_ns, phase), (end_ns, "idle")):
-            yield Message(channel, t_ns, schemas.phase(t_ns, found.attempt.folder, what))
+    for step, phase, begin_ns, end_ns in _spans(record, role):
+        channel = _channel(record, role, _named("phase", step), schemas.PHASE, meaning)
+        for t_ns, name in ((begin_ns, phase), (end_ns, "idle")):
+            yield Message(channel, t_ns, schemas.phase(t_ns, record.attempt.folder, name))
 
 
-def _spans(found: AttemptRecord, role: Role) -> Iterator[tuple[str, str, int, int]]:
-    """Yield what a robot did: the name of the step, empty where it has none, the phase, from when until when."""
-    if recorded := found.bags.get(role):
+def _spans(record: AttemptRecord, role: Role) -> Iterator[tuple[str, str, int, int]]:
+    """Yield the phases of a robot: the step's name (empty if it has none), the phase, start and end."""
+    if recorded := record.bags.get(role):
         yield "", "record", recorded.started_utc_ns, recorded.started_utc_ns + round(recorded.duration_s * 1e9)
-    for transfer in found.transfers:
+    for transfer in record.transfers:
         for end, file in zip((transfer.source, transfer.destination), transfer.captures, strict=True):
-            if end == role and file is not None and file in found.captures:
-                forward = transfer.forward(found.captures[file].packets)
-                # Others may go the same way beside one that has a name.
+            if end == role and file is not None and file in record.captures:
+                forward = transfer.forward(record.captures[file].packets)
+                # Other transfers may have the same direction at the same time as one with a name.
                 times_ns = (forward.where(forward.dport == transfer.port) if transfer.name else forward).time_ns
                 if len(times_ns) and times_ns.min() != NO_TIME:
                     yield transfer.name, "transfer", int(times_ns.min()), int(times_ns.max())
-    for pinging in found.plan.pingings():
-        if pinging.role == role and pinging.file in found.pings:
-            replies = found.pings[pinging.file].replies
+    for pinging in record.plan.pingings():
+        if pinging.role == role and pinging.file in record.pings:
+            replies = record.pings[pinging.file].replies
             stamps_ns = [reply.at_utc_ns for reply in replies if reply.at_utc_ns is not None]
             if stamps_ns:
                 yield pinging.name, "ping", min(stamps_ns), max(stamps_ns)

@@ -1,6 +1,6 @@
-"""JSON Schemas of the messages in an MCAP file, and what the messages are made of.
+"""JSON Schemas of the messages in an MCAP file, and functions that create the messages.
 
-`foxglove.*` are well-known: Foxglove draws what has their names and fields
+`foxglove.*` are well-known schemas: Foxglove displays messages with these names and fields
 (https://docs.foxglove.dev/docs/sdk/schemas).
 """
 
@@ -19,7 +19,7 @@ from fieldkit.trial.columns import IDENTITY, Row
 
 
 class Level(IntEnum):
-    """How much a line of the log matters, by Foxglove's numbers."""
+    """Level of a log message, by Foxglove's numbers."""
 
     INFO = 2
     WARNING = 3
@@ -27,49 +27,49 @@ class Level(IntEnum):
 
 
 def time(t_ns: int) -> Json:
-    """Return a time stamp as Foxglove's messages hold it."""
+    """Return a time stamp in the format of Foxglove's messages."""
     seconds, rest_ns = divmod(t_ns, 1_000_000_000)
     return {"sec": seconds, "nsec": rest_ns}
 
 
-def log(t_ns: int, level: Level, said: str, *, name: str, file: str, line: int = 0) -> Json:
+def log(t_ns: int, level: Level, text: str, *, name: str, file: str, line: int = 0) -> Json:
     """Return a message of `LOG`.
 
     Args:
-        t_ns: When.
-        level: How much it matters.
-        said: What happened.
-        name: The repeat that it happened in.
-        file: File of the trial that says so.
-        line: Its line, 0 for the whole file.
+        t_ns: Time in nanoseconds since 1970 UTC.
+        level: Its level.
+        text: Its text.
+        name: The repeat.
+        file: File of the trial that it refers to.
+        line: Line in this file, 0 for the whole file.
     """
-    return {"timestamp": time(t_ns), "level": level, "message": said, "name": name, "file": file, "line": line}
+    return {"timestamp": time(t_ns), "level": level, "message": text, "name": name, "file": file, "line": line}
 
 
-def phase(t_ns: int, repeat: str, what: str) -> Json:
-    """Return a message of `PHASE`: what begins in the repeat whose folder is `repeat`."""
-    return {"timestamp": time(t_ns), "repeat": repeat, "phase": what}
+def phase(t_ns: int, repeat: str, name: str) -> Json:
+    """Return a message of `PHASE`: the phase that starts in the repeat whose folder is `repeat`."""
+    return {"timestamp": time(t_ns), "repeat": repeat, "phase": name}
 
 
 def rtt(t_ns: int, repeat: str, reply: Reply) -> Json:
     """Return a message of `RTT`, for a reply printed at `t_ns` in the repeat whose folder is `repeat`."""
     head = {"timestamp": time(t_ns), "repeat": repeat}
-    said = {"seq": reply.seq, "rtt_s": reply.rtt_s, "duplicate": reply.duplicate, "damaged": reply.damaged}
-    return {**head, **_known(said)}
+    fields = {"seq": reply.seq, "rtt_s": reply.rtt_s, "duplicate": reply.duplicate, "damaged": reply.damaged}
+    return {**head, **_present(fields)}
 
 
 def link(repeat: str, sample: LinkSample) -> Json:
-    """Return a message of `LINK`, for what a radio told in the repeat whose folder is `repeat`."""
+    """Return a message of `LINK` for a sample of a radio in the repeat whose folder is `repeat`."""
     radio = {
         "noise_dbm": sample.noise_dbm,
         "active_s": None if sample.active_ns is None else sample.active_ns / 1e9,
         "busy_s": None if sample.busy_ns is None else sample.busy_ns / 1e9,
     }
-    stations = [_known(asdict(station)) for station in sample.stations]
-    return {"timestamp": time(sample.utc_ns), "repeat": repeat, **_known(radio), "stations": stations}
+    stations = [_present(asdict(station)) for station in sample.stations]
+    return {"timestamp": time(sample.utc_ns), "repeat": repeat, **_present(radio), "stations": stations}
 
 
-def _known(values: Mapping[str, Any]) -> Json:
+def _present(values: Mapping[str, Any]) -> Json:
     return {name: value for name, value in values.items() if value is not None}
 
 
@@ -81,7 +81,7 @@ def repeat(t_ns: int, folder: str, row: Row, table: tuple[Column, ...]) -> Json:
 
 
 def transform(t_ns: int, child: str, position_m: Vector, frame: str = "field") -> Json:
-    """Return where a robot stands in a frame, as a message of `TRANSFORMS`; which way it looks is not known."""
+    """Return the position of a robot in a frame, as a message of `TRANSFORMS`; its orientation is unknown."""
     transform = {
         "timestamp": time(t_ns),
         "parent_frame_id": frame,
@@ -93,16 +93,16 @@ def transform(t_ns: int, child: str, position_m: Vector, frame: str = "field") -
 
 
 def location(t_ns: int, robot: str, place: Vector) -> Json:
-    """Return where on the earth a robot is, as a message of `LOCATION`.
+    """Return the geographic position of a robot, as a message of `LOCATION`.
 
     Args:
-        t_ns: When.
+        t_ns: Time in nanoseconds since 1970 UTC.
         robot: Its name.
-        place: Degrees north and east, and metres over the ellipsoid; NaN where no height is told.
+        place: Latitude and longitude in degrees, and height above the ellipsoid in metres; NaN without a height.
     """
     north, east, up_m = place
-    said = {"timestamp": time(t_ns), "frame_id": robot, "latitude": north, "longitude": east}
-    return said if math.isnan(up_m) else said | {"altitude": up_m}
+    fields = {"timestamp": time(t_ns), "frame_id": robot, "latitude": north, "longitude": east}
+    return fields if math.isnan(up_m) else fields | {"altitude": up_m}
 
 
 def _object(title: str, properties: Json, *, optional: tuple[str, ...] = ()) -> Json:
@@ -230,7 +230,7 @@ LINK: Final = _object(
 
 @cache
 def _measured(table: tuple[Column, ...]) -> Json:
-    """Return the schema of each measure of a table that is a number or a flag, by name."""
+    """Return the schema of each numeric or boolean measure of a table, by name."""
     kinds = {int: "integer", float: "number", bool: "boolean"}
     return {
         column.name: _typed(kinds[column.type], f"{column.meaning} Unit: {column.unit}.")
@@ -241,7 +241,7 @@ def _measured(table: tuple[Column, ...]) -> Json:
 
 @cache
 def repeat_schema(table: tuple[Column, ...]) -> Json:
-    """Return the schema of what `repeat` makes of the rows of a table."""
+    """Return the schema of the messages that `repeat` creates from the rows of a table."""
     measured = _measured(table)
     return _object(
         "fieldkit.Repeat",

@@ -1,4 +1,4 @@
-"""Arrow tables of repeats, cells and packets; those of repeats as files for pandas, polars and R: CSV, Parquet."""
+"""Arrow tables of repeats, cells and packets; tables of repeats as CSV and Parquet files for pandas, polars and R."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
@@ -39,7 +39,7 @@ def write_csv(file: BinaryIO, repeats: Repeats) -> None:
 
 
 def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
-    """Write the same columns with their types; units and meanings are each column's metadata.
+    """Write all columns with their types; units and meanings are metadata of the columns.
 
     Raises:
         OSError: The file cannot be written.
@@ -48,7 +48,7 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
 
 
 def of_repeats(repeats: Repeats) -> Table:
-    """Return all columns but the source, those of every trial first; unit and meaning are each one's metadata."""
+    """Return all columns but the source, those of every trial first, with units and meanings as metadata."""
     arrays = [
         _texts(repeats.texts[column.name])
         if column.name in repeats.texts
@@ -59,11 +59,11 @@ def of_repeats(repeats: Repeats) -> Table:
 
 
 def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
-    """Return what stands in `analysis.tables.to_csv`, its numbers with all digits.
+    """Return the content of `analysis.tables.to_csv` as a table, with all digits of the numbers.
 
     Args:
-        by: Columns that tell cells apart.
-        cells: What to tell of.
+        by: Columns that define a cell.
+        cells: The cells.
     """
     rows = [
         (*(cell.key[column.name] for column in by), *astuple(row)) for cell in cells for row in estimate_rows(cell)
@@ -73,22 +73,22 @@ def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
 
 
 def of_packets(transfers: Mapping[str, Crossings]) -> Table:
-    """Return the packets of transfers under each other, with the name of its step beside each.
+    """Return the packets of transfers in one table, with the name of the step in each row.
 
     Args:
-        transfers: By name of the step, empty where it has none.
+        transfers: Packets by name of the step, empty if it has none.
     """
     columns = (Column("step", "text", "Name of the step that sent it; empty where it has none."), *crossings.COLUMNS)
     schema = _schema(columns)
     parts = [
         Table.from_arrays(
             [
-                pa.array([name or None] * len(one.sent_ns), pa.string()).dictionary_encode(),
-                *(pa.array(getattr(one, field.name), field.type) for field in list(schema)[1:]),
+                pa.array([name or None] * len(packets.sent_ns), pa.string()).dictionary_encode(),
+                *(pa.array(getattr(packets, field.name), field.type) for field in list(schema)[1:]),
             ],
             schema=schema,
         )
-        for name, one in transfers.items()
+        for name, packets in transfers.items()
     ]
     return pa.concat_tables([schema.empty_table(), *parts]).unify_dictionaries().combine_chunks()
 
@@ -97,7 +97,7 @@ def _of_rows(columns: Sequence[Column], rows: Sequence[Sequence[Any]]) -> Table:
     schema = _schema(columns)
     values = zip(*rows, strict=True) if rows else [()] * len(columns)
     return Table.from_arrays(
-        [pa.array(one, field.type) for one, field in zip(values, schema, strict=True)], schema=schema
+        [pa.array(column, field.type) for column, field in zip(values, schema, strict=True)], schema=schema
     )
 
 

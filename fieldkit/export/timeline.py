@@ -1,6 +1,6 @@
-"""The time line of a trial as messages of an MCAP file: all of it out of journal and raw evidence.
+"""The timeline of a trial as messages of an MCAP file, from its journal and raw evidence.
 
-Laptop, sender and receiver have a clock each. Nothing is shifted: each channel says whose its times are.
+Laptop, sender and receiver have separate clocks. No time is shifted: each channel names its clock.
 """
 
 import heapq
@@ -26,9 +26,9 @@ from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
 
 _Evidence = Callable[[Attempt], AttemptEvidence]
-"""Opens the evidence of an attempt, the same object while it is in use."""
+"""Returns the evidence of an attempt; the same object while it is in use."""
 
-_AT_ONCE: Final = 2
+_OPEN_ATTEMPTS: Final = 2
 _LAPTOP: Final = "laptop"
 _LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
 
@@ -39,7 +39,7 @@ _PLACES: Final = Channel(
 
 
 def about(plan: Plan) -> dict[str, str]:
-    """Return what tells a trial from others, for the file's metadata."""
+    """Return the metadata of a trial for the file."""
     return {
         "trial": plan.trial,
         "procedure": plan.procedure.name,
@@ -57,7 +57,7 @@ def about(plan: Plan) -> dict[str, str]:
 def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     """Return the messages of a trial, in the order of their times as far as its clocks agree.
 
-    The streams go through the attempts together, so few are in memory at a time, and each is read once.
+    The streams advance through the attempts together, so few attempts are in memory at a time, and each is read once.
 
     Args:
         folder: The trial's folder.
@@ -70,30 +70,30 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     attempts = journal.ended(entries)
     if not attempts:
         raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=typed("fieldkit", "resume", folder))
-    # A plan and what tells where robots really were have different origins, so one file has one of them.
-    places = (folder, *(store.attempt_folder(folder, one.folder) for one in attempts))
-    tracked = any((place / name).exists() for place in places for name in (track.FILE, accounts.FILE))
+    # Planned and measured positions have different origins, so a file has only one kind.
+    places = (folder, *(store.attempt_folder(folder, attempt.folder) for attempt in attempts))
+    has_positions = any((place / name).exists() for place in places for name in (track.FILE, accounts.FILE))
     ended_ns = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status in ENDED}
 
-    @lru_cache(maxsize=_AT_ONCE)
+    @lru_cache(maxsize=_OPEN_ATTEMPTS)
     def evidence(attempt: Attempt) -> AttemptEvidence:
         return AttemptEvidence(store.attempt_folder(folder, attempt.folder))
 
     streams = (
-        _laptop(plan, evidence, entries, planned=not tracked),
+        _laptop(plan, evidence, entries, planned=not has_positions),
         _robots(plan, evidence, attempts),
-        _tracks(plan, evidence, [(one, ended_ns[one.repeat, one.number]) for one in attempts]),
+        _tracks(plan, evidence, [(attempt, ended_ns[attempt.repeat, attempt.number]) for attempt in attempts]),
     )
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
 
 def _laptop(plan: Plan, evidence: _Evidence, entries: list[JournalEntry], *, planned: bool) -> Iterator[Message]:
-    """Yield what the journal says, the `planned` places when an attempt begins, and its numbers when it ends."""
+    """Yield the journal's entries, the planned places at the start of an attempt, and its numbers at its end."""
     ended = iter(journal.ended(entries))
     for line, entry in enumerate(entries, start=1):
         if entry.status is Status.PLANNED:
             continue
-        yield Message(_LOG, entry.utc_ns, _said(entry, line))
+        yield Message(_LOG, entry.utc_ns, _log_message(entry, line))
         if entry.status is Status.RUNNING:
             yield from _places(plan, entry.utc_ns) if planned else ()
         elif entry.status is not Status.MEASURED:
@@ -101,10 +101,10 @@ def _laptop(plan: Plan, evidence: _Evidence, entries: list[JournalEntry], *, pla
             yield _numbers(plan, attempt, evidence(attempt), entry.utc_ns)
 
 
-def _said(entry: JournalEntry, line: int) -> Json:
+def _log_message(entry: JournalEntry, line: int) -> Json:
     level = _LEVELS.get(entry.status, Level.INFO)
-    said = ": ".join(filter(None, (f"attempt {entry.attempt} {entry.status}", entry.reason)))
-    return schemas.log(entry.utc_ns, level, said, name=str(entry.repeat), file=journal.JOURNAL_FILE, line=line)
+    text = ": ".join(filter(None, (f"attempt {entry.attempt} {entry.status}", entry.reason)))
+    return schemas.log(entry.utc_ns, level, text, name=str(entry.repeat), file=journal.JOURNAL_FILE, line=line)
 
 
 def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
@@ -114,22 +114,22 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
 
 
 def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, int]]) -> Iterator[Message]:
-    """Yield where robots were, attempt by attempt, each with its end: by whoever tells it best, as `where` has it."""
+    """Yield the positions of robots by attempt, each from the best source according to `where`."""
     for attempt, ended_ns in attempts:
-        told = where.told_of(evidence(attempt))
-        # What held when the attempt began is told then.
-        found = [
+        samples_by_role = where.told_of(evidence(attempt))
+        # A position from before the start of the attempt is reported at the start.
+        messages_of_attempt = [
             _place(plan, whereabouts.role, max(whereabouts.utc_ns, attempt.started_utc_ns), whereabouts.position_m)
             for whereabouts in evidence(attempt).read_or_none(track.read, track.FILE) or ()
-            if whereabouts.position_m is not None and whereabouts.role in plan.cast.keys() - told.keys()
+            if whereabouts.position_m is not None and whereabouts.role in plan.cast.keys() - samples_by_role.keys()
         ]
-        for role in filter(told.__contains__, plan.cast):
-            found += _told(plan, role, told[role], attempt.started_utc_ns, ended_ns)
-        yield from sorted(found, key=attrgetter("time_ns"))
+        for role in filter(samples_by_role.__contains__, plan.cast):
+            messages_of_attempt += _sampled(plan, role, samples_by_role[role], attempt.started_utc_ns, ended_ns)
+        yield from sorted(messages_of_attempt, key=attrgetter("time_ns"))
 
 
-def _told(plan: Plan, role: Role, samples: Samples, started_ns: int, ended_ns: int) -> Iterator[Message]:
-    """Yield where somebody says that a robot was during an attempt."""
+def _sampled(plan: Plan, role: Role, samples: Samples, started_ns: int, ended_ns: int) -> Iterator[Message]:
+    """Yield the sampled positions of a robot during an attempt."""
     first = max(int(samples.times_ns.searchsorted(started_ns, side="right")) - 1, 0)
     last = int(samples.times_ns.searchsorted(ended_ns, side="right"))
     for at_ns, place in zip(samples.times_ns[first:last].tolist(), samples.values[first:last].tolist(), strict=True):
@@ -146,15 +146,15 @@ def _place(plan: Plan, role: Role, t_ns: int, place: Vector, frame: str = "field
 
 
 def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int) -> Message:
-    what = "The numbers of each attempt, when it has ended."
-    channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(plan.table), _LAPTOP, what)
+    meaning = "The numbers of each attempt, when it has ended."
+    channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(plan.table), _LAPTOP, meaning)
     row = rebuild.row(plan, attempt, evidence)
     return Message(channel, t_ns, schemas.repeat(t_ns, attempt.folder, row, plan.table))
 
 
 def _robots(plan: Plan, evidence: _Evidence, attempts: Iterable[Attempt]) -> Iterator[Message]:
-    """Yield what the robots recorded, attempt by attempt."""
+    """Yield the messages of the robots' recordings, attempt by attempt."""
     for attempt in attempts:
-        found = robot.read(plan, attempt, evidence(attempt))
-        yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot.flaws(found))
-        yield from robot.messages(found)
+        record = robot.read(plan, attempt, evidence(attempt))
+        yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot.flaws(record))
+        yield from robot.messages(record)

@@ -1,1 +1,1 @@
-"""The pytest plugin: tests of robots' software on emulated or real robots (docs/pytest.md)."""
+"""The pytest plugin for tests of robot software on emulated or real robots (docs/pytest.md)."""

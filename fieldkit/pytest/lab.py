@@ -1,4 +1,4 @@
-"""The lab of a file of tests: its robots are brought up once, and gone when its last test has ended."""
+"""The lab of a test module: its robots are opened once, and closed after its last test."""
 
 import argparse
 import secrets
@@ -26,20 +26,20 @@ from fieldkit.trial.running import opening
 
 
 class OpenedLab:
-    """Robots of one topology at a time, brought up when they are first wanted; use as a context manager.
+    """Robots of one topology at a time, opened on first use; a context manager.
 
     Args:
-        options: What it is to be.
-        keeper: Takes what happens into the evidence.
-        operator: Does what the backend cannot do by itself.
-        workers: How many processes run tests at the same time.
+        options: Options of the lab.
+        keeper: Receives events and log lines as evidence.
+        operator: The person who does what the backend cannot do.
+        workers: Number of processes that run tests in parallel.
 
     Attributes:
-        options: What it is to be.
+        options: Options of the lab.
         keeper: See above.
-        session: Names it on the robots' locks.
-        topology: Whose robots are up; None before any are.
-        robots: They.
+        session: Identifies the lab in the robots' locks.
+        topology: Topology of the open robots; None before any are open.
+        robots: The robots.
     """
 
     def __init__(self, options: LabOptions, keeper: EvidenceKeeper, operator: Operator, *, workers: int) -> None:
@@ -50,7 +50,7 @@ class OpenedLab:
         self.robots = RobotHandles(self)
         self._operator = operator
         self._workers = workers
-        self._up = ExitStack()
+        self._open_robots = ExitStack()
         self._testbed: Testbed | None = None
         self._cast: Cast = {}
 
@@ -65,119 +65,122 @@ class OpenedLab:
 
     @property
     def backend_name(self) -> str:
-        """Where the robots come from."""
+        """Name of the backend."""
         return self._source[0]
 
     @property
     def backend(self) -> Backend:
-        """What brings them up."""
+        """The backend."""
         return self._source[1]
 
     @property
     def testbed(self) -> Testbed:
-        """The robots that are up; errors as `open`."""
+        """The testbed of the open robots; errors as for `open`."""
         return self.open()
 
     @property
     def cast(self) -> Cast:
-        """Who plays which role; errors as `open`."""
+        """The robot in each role; errors as for `open`."""
         self.open()
         return self._cast
 
     def open(self, topology: Topology | None = None) -> Testbed:
-        """Bring the robots up, unless they are; those of another topology end first.
+        """Open the robots unless they are open; robots of another topology are closed first.
 
         Args:
-            topology: Whose; None for those that are up, or those of the options.
+            topology: The topology; None for that of the open robots, or of the options.
 
         Raises:
             ConfigurationError: The backend, the site file or the topology is wrong, several workers would share
                 robots, or something is missing on this machine.
-            LinkError, RobotError: A robot cannot be reached, or somebody else has it.
+            LinkError, RobotError: A robot cannot be reached, or is locked by another user.
         """
-        wanted = topology or self.topology or self._first_topology()
-        if self._testbed is None or wanted != self.topology:
+        requested = topology or self.topology or self._first_topology()
+        if self._testbed is None or requested != self.topology:
             self._close()
-            self._bring_up(wanted)
+            self._open(requested)
         assert self._testbed is not None
         return self._testbed
 
     def place(self, distance: str, scenario: str = "los") -> None:
-        """Put the robots elsewhere, where they stay; a person is asked to carry real ones.
+        """Move the robots to other places, where they stay; a person is asked to carry real robots.
 
         Args:
-            distance: Between the robots, or between each of them and the relay: `30ft`.
-            scenario: `los`, or `nlos`: behind the wall.
+            distance: Distance between the robots, or between each of them and the relay: `30ft`.
+            scenario: `los`, or `nlos` for a place behind the wall.
 
         Raises:
-            ConfigurationError: That is no distance or scenario, or nobody is there to be asked.
+            ConfigurationError: The text is not a distance or scenario, or no person can be asked.
             LinkError: The robots could not be placed.
         """
         testbed = self.open()
         assert self.topology is not None
-        self.tell(f"place {distance}, {scenario}")
+        self.log(f"place {distance}, {scenario}")
         placement = Placement(one_of(Scenario, scenario, "scenario"), self.topology, parse_distance(distance))
         if note := testbed.place(placement).note:
-            self.tell(f"noted: {note}")
+            self.log(f"note: {note}")
 
     def fault(self, kind: str, robot: str, *, lasts: str = "", process: str = "") -> float | None:
-        """Do something to a robot on purpose; return when its cause is over, and not yet that the robot has healed.
+        """Inject a fault into a robot; return when its cause has ended, before the robot has necessarily recovered.
 
         Args:
             kind: `link-down`, `out-of-range`, `reboot`, or `kill`.
             robot: Its role or its name.
-            lasts: For how long the link is down, or the robot away: `3s`.
+            lasts: Duration for which the link is down or the robot is away: `3s`.
             process: Name of the process that is killed.
 
         Returns:
-            How many seconds the cause lasted, None where nobody knows.
+            Duration of the cause in seconds, or None if it is unknown.
 
         Raises:
-            ConfigurationError: There is no such fault or robot, or it lacks or has too much of the above.
-            LinkError, RobotError: It could not be done.
+            ConfigurationError: There is no such fault or robot, or a parameter is missing or superfluous.
+            LinkError, RobotError: The fault could not be injected.
         """
-        what, testbed = one_of(FaultKind, kind, "fault"), self.open()
-        is_lasting = what in {FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE}
-        for given, key, wanted in ((lasts, "lasts", is_lasting), (process, "process", what is FaultKind.KILL)):
-            if bool(given) is not wanted:
+        fault_kind, testbed = one_of(FaultKind, kind, "fault"), self.open()
+        has_duration = fault_kind in {FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE}
+        for value, key, is_required in (
+            (lasts, "lasts", has_duration),
+            (process, "process", fault_kind is FaultKind.KILL),
+        ):
+            if bool(value) is not is_required:
                 example = f'{key}="{"3s" if key == "lasts" else "roscore"}"'
                 raise ConfigurationError(
-                    f"the fault {what} {'needs' if wanted else 'takes no'} {key}",
-                    remedy=f"write {example}" if wanted else f"leave {key} out",
+                    f"the fault {fault_kind} {'needs' if is_required else 'has no parameter'} {key}",
+                    remedy=f"write {example}" if is_required else f"leave {key} out",
                 )
         duration_s = parse_duration_s(lasts) if lasts else 0.0
-        self.tell(f"{what} {robot} {lasts or process}")
-        return testbed.inject(Fault(what, self.robots[robot].role, duration_s, process))
+        self.log(f"{fault_kind} {robot} {lasts or process}")
+        return testbed.inject(Fault(fault_kind, self.robots[robot].role, duration_s, process))
 
     def moving(
         self, robot: str, *, away: str = "0m", left: str = "0m", speed: str = "0.2m/s"
     ) -> AbstractContextManager[None]:
-        """Return a context in which a robot moves from its place; it is back there afterwards.
+        """Return a context in which a robot moves away from its place; afterwards it is back at its place.
 
         Args:
             robot: Its role or its name.
-            away: So far from the robot at the other end of its link; towards it with a minus sign.
-            left: So far to its left then; to its right with a minus sign.
-            speed: How fast: `0.2m/s`.
+            away: Distance away from the robot at the other end of its link; negative towards it.
+            left: Distance to the left of this direction; negative to the right.
+            speed: Speed: `0.2m/s`.
 
         Raises:
-            ConfigurationError: There is no such robot, or that is no way.
+            ConfigurationError: There is no such robot, or the path is invalid.
         """
         leg = Leg(parse_offset_m(away), parse_offset_m(left))
         speed_m_s = parse_quantity(speed, METRES_PER_S_PER_UNIT, "speed")
         if leg == Leg() or speed_m_s == 0:
             raise ConfigurationError(f"{robot} would not move", remedy='write for example away="10m", speed="0.2m/s"')
-        self.tell(f"move {robot} {away} away, {left} left, at {speed}")
+        self.log(f"move {robot} {away} away, {left} left, at {speed}")
         return self.open().moving(Move(self.robots[robot].role, (leg,), speed_m_s))
 
-    def tell(self, text: str) -> None:
-        """Add a line to the evidence."""
+    def log(self, text: str) -> None:
+        """Add a line to the log of the evidence."""
         self.keeper.folder.add(text)
 
     @cached_property
     def _source(self) -> tuple[str, Backend]:
         arguments = argparse.Namespace(backend=self.options.backend, site=self.options.site)
-        return command_line.backend(arguments, self.keeper.told)
+        return command_line.backend(arguments, self.keeper.add_event)
 
     def _first_topology(self) -> Topology:
         if self.options.topology is not None:
@@ -185,14 +188,14 @@ class OpenedLab:
         site, _ = sites.lab_site(argparse.Namespace(site=self.options.site))
         return next(iter(site.roles), Topology.MASTER) if site else Topology.MASTER
 
-    def _bring_up(self, topology: Topology) -> None:
+    def _open(self, topology: Topology) -> None:
         if self.backend.by_hand and self._workers > 1:
             raise ConfigurationError(
                 f"{self._workers} workers of pytest-xdist cannot share the robots of the backend {self.backend_name}",
                 remedy="run these tests in one process: pytest -n 0",
             )
         cast = self.backend.cast(topology)
-        self.tell(f"open {self.backend_name}, {topology}")
+        self.log(f"open {self.backend_name}, {topology}")
         with ExitStack() as opened:
             testbed = opened.enter_context(
                 opening.opened(
@@ -201,15 +204,15 @@ class OpenedLab:
                     session=self.session,
                     what="pytest",
                     seed=self.options.seed,
-                    sink=self.keeper.told,
+                    sink=self.keeper.add_event,
                     operator=self._operator,
                 )
             )
             if not self.backend.by_hand:
                 testbed.place(Placement(Scenario.LOS, topology, parse_distance(self.options.distance)))
-            self._up = opened.pop_all()
+            self._open_robots = opened.pop_all()
         self._testbed, self._cast, self.topology = testbed, cast, topology
 
     def _close(self) -> None:
         self._testbed, self.topology = None, None
-        self._up.close()
+        self._open_robots.close()

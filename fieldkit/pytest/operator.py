@@ -1,4 +1,4 @@
-"""The person at the terminal where pytest runs, who carries real robots."""
+"""Questions to the person at the terminal of pytest, who carries real robots."""
 
 import sys
 from collections.abc import Callable
@@ -16,16 +16,16 @@ T = TypeVar("T")
 
 
 def operator_of(config: pytest.Config, options: LabOptions, sink: Sink) -> Operator:
-    """Return who is asked: nobody where the options say so, else who sits at the terminal."""
+    """Return the operator: none if the options say so, else the person at the terminal."""
     return NOBODY if options.yes else Uncaptured(config, sink)
 
 
 class Uncaptured:
-    """Asks past pytest's capture, which keeps output and closes the input.
+    """Asks questions at the terminal although pytest captures the output and closes the input.
 
     Args:
-        config: Pytest's.
-        sink: Told each request and its answer.
+        config: The configuration of pytest.
+        sink: Receives each request and its answer.
     """
 
     def __init__(self, config: pytest.Config, sink: Sink) -> None:
@@ -33,21 +33,21 @@ class Uncaptured:
         self._sink = sink
         self._terminal = Terminal(self._show)
 
-    def ask(self, request: str, *, may_skip: bool = False) -> Answer:  # noqa: ARG002 (a test that is left out is no test)
-        """See `Operator.ask`."""
-        return self._asking(request, lambda: self._terminal.ask(request))
+    def ask(self, request: str, *, may_skip: bool = False) -> Answer:  # noqa: ARG002 (a test cannot be skipped here)
+        """Ask a person to do something, as `Operator.ask`."""
+        return self._uncaptured(request, lambda: self._terminal.ask(request))
 
     def enter(self, question: Question) -> str:
-        """See `Operator.enter`."""
-        return self._asking(f"say: {question.text}", lambda: self._terminal.enter(question))
+        """Ask a person a question, as `Operator.enter`."""
+        return self._uncaptured(f"answer: {question.text}", lambda: self._terminal.enter(question))
 
-    def _asking(self, what: str, ask: Callable[[], T]) -> T:
+    def _uncaptured(self, task: str, ask: Callable[[], T]) -> T:
         if self._capture is not None:
             self._capture.suspend(in_=True)
         try:
             if not sys.stdin.isatty():
                 raise ConfigurationError(
-                    f"somebody must {what}, and there is no terminal to ask at",
+                    f"a person must {task}, but there is no terminal to ask at",
                     remedy="place the robots first, then add --fieldkit-yes",
                 )
             return ask()

@@ -1,4 +1,4 @@
-"""Options of pytest: the lab that tests want."""
+"""Options of the pytest plugin: the lab that tests need."""
 
 import re
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ OUTPUT: Final = "fieldkit-results"
 
 
 class Keep(StrEnum):
-    """Whose evidence is kept."""
+    """Which evidence is kept."""
 
     FAILED = "failed"
     ALL = "all"
@@ -25,16 +25,16 @@ class Keep(StrEnum):
 
 @dataclass(frozen=True)
 class LabOptions:
-    """The lab that a file of tests wants.
+    """The lab that a test module needs.
 
     Attributes:
-        backend: Name of the backend; None as the site file says, `emulated` without one.
+        backend: Name of the backend; None for that of the site file, or `emulated` without one.
         site: The site file; None for `fieldkit.yaml` in the current folder, if there is one.
-        topology: Whose robots are brought up, `master` or `masterless`; None for the first of the site file, and for
-            a trial that of its procedure.
-        distance: How far apart robots stand at first that nobody carries, in line of sight.
-        seed: Seed of everything random in the lab.
-        yes: Whether nobody is asked to carry anything: real robots stand where they are wanted.
+        topology: `master` or `masterless`; None for the first of the site file, and in a trial for that of its
+            procedure.
+        distance: Initial distance of emulated robots, in line of sight.
+        seed: Seed of all random numbers in the lab.
+        yes: Whether no person is asked: real robots are already at the required places.
     """
 
     backend: str | None = None
@@ -46,7 +46,7 @@ class LabOptions:
 
 
 def of(config: pytest.Config) -> LabOptions:
-    """Return the lab that pytest's command line and configuration ask for."""
+    """Return the options of the lab in pytest's command line and configuration."""
     return LabOptions(
         backend=_text(config, "backend"),
         site=_path(config, "site"),
@@ -61,25 +61,25 @@ def output(config: pytest.Config) -> Path:
 
 
 def keep(config: pytest.Config) -> Keep:
-    """Return whose evidence is kept."""
+    """Return which evidence is kept."""
     return Keep(_text(config, "keep") or Keep.FAILED)
 
 
-_SAME: Final = re.compile(r"(?<![\w-])--(?=(?:backend|site|topology|yes)\b)")
+_SHARED_OPTION: Final = re.compile(r"(?<![\w-])--(?=(?:backend|site|topology|yes)\b)")
 _COMMAND: Final = re.compile(r"(\bfieldkit [a-z][^;,\n`]*)")
 
 
 def as_pytest_option(remedy: str) -> str:
-    """Return a remedy with the options as pytest takes them: `--fieldkit-topology`; commands of fieldkit stay."""
+    """Return a remedy with the options of the plugin, such as `--fieldkit-topology`; commands are unchanged."""
     parts = _COMMAND.split(remedy)
-    return "".join(part if _COMMAND.fullmatch(part) else _SAME.sub("--fieldkit-", part) for part in parts)
+    return "".join(part if _COMMAND.fullmatch(part) else _SHARED_OPTION.sub("--fieldkit-", part) for part in parts)
 
 
 def one_of(words: type[Word], text: str, what: str) -> Word:
-    """Return the word of an enumeration that a text names.
+    """Return the member of an enumeration with this text.
 
     Raises:
-        ConfigurationError: It names none.
+        ConfigurationError: There is no such member.
     """
     try:
         return words(text)
@@ -93,8 +93,8 @@ def _text(config: pytest.Config, name: str) -> str | None:
 
 
 def _path(config: pytest.Config, name: str) -> Path | None:
-    """Return a path: one of the command line from the current folder on, one of the configuration from its own."""
-    given, written = config.getoption(f"fieldkit_{name}"), config.getini(f"fieldkit_{name}")
-    if given:
-        return Path(config.invocation_params.dir, given)
-    return Path(config.rootpath, written) if written else None
+    """Return a path; command-line paths start at the current folder, configured ones at the root folder."""
+    option, configured = config.getoption(f"fieldkit_{name}"), config.getini(f"fieldkit_{name}")
+    if option:
+        return Path(config.invocation_params.dir, option)
+    return Path(config.rootpath, configured) if configured else None

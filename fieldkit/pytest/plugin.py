@@ -1,6 +1,6 @@
-"""The plugin that pytest loads wherever fieldkit is installed: options, fixtures, the end of a test's evidence.
+"""The pytest plugin, loaded in every environment with fieldkit: options, fixtures, and clean-up of evidence.
 
-It imports nothing of fieldkit until a test asks for one of its fixtures: other tests pay for this module alone.
+It imports no other module of fieldkit until a test requests one of its fixtures, so that other tests start fast.
 """
 
 from collections.abc import Generator, Iterator
@@ -22,49 +22,49 @@ _STAMP: Final = pytest.StashKey[str]()
 _RUN: Final = "fieldkit_run"
 
 _OPTIONS: Final[dict[str, tuple[str, str, tuple[str, ...] | None]]] = {
-    "backend": ("NAME", "where robots come from, emulated or field; else as the site file says", None),
-    "site": ("FILE", "the lab's site file; else fieldkit.yaml where pytest was started, if there is one", None),
-    "topology": ("NAME", "whose robots are brought up; else the first of the site file", ("master", "masterless")),
-    "output": ("DIR", "folder for evidence; else fieldkit-results in pytest's root folder", None),
-    "keep": ("WHICH", "whose evidence is kept; else that of failed tests", ("failed", "all", "none")),
+    "backend": ("NAME", "backend of the robots, emulated or field; default: that of the site file", None),
+    "site": ("FILE", "the lab's site file; default: fieldkit.yaml in the current folder, if there is one", None),
+    "topology": ("NAME", "topology of the robots; default: the first of the site file", ("master", "masterless")),
+    "output": ("DIR", "folder for evidence; default: fieldkit-results in pytest's root folder", None),
+    "keep": ("WHICH", "which evidence is kept; default: that of failed tests", ("failed", "all", "none")),
 }
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options, each also as a key of pytest's configuration: `fieldkit_backend`."""
+    """Add the options; each is also a key of pytest's configuration: `fieldkit_backend`."""
     group = parser.getgroup("fieldkit", "fieldkit: tests on emulated or real robots")
     for name, (metavar, text, choices) in _OPTIONS.items():
         group.addoption(f"--fieldkit-{name}", metavar=metavar, choices=choices, help=text)
         parser.addini(f"fieldkit_{name}", text)
     group.addoption(
-        "--fieldkit-yes", action="store_true", help="ask nobody: real robots stand where the tests want them"
+        "--fieldkit-yes", action="store_true", help="ask no person: real robots are already at their places"
     )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Refuse what the configuration says wrong, as the command line does by itself."""
+    """Reject invalid values in the configuration file, as pytest does for the command line."""
     for name, (_, _, choices) in _OPTIONS.items():
-        written = config.getini(f"fieldkit_{name}")
-        if choices and written and written not in choices:
-            raise pytest.UsageError(f"fieldkit_{name} = {written}: choose from {', '.join(choices)}")
+        configured = config.getini(f"fieldkit_{name}")
+        if choices and configured and configured not in choices:
+            raise pytest.UsageError(f"fieldkit_{name} = {configured}: choose from {', '.join(choices)}")
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 (xdist tells no type)
-    """Let all workers of pytest-xdist put their evidence into the same folder."""
+def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 (xdist declares no type)
+    """Make all workers of pytest-xdist use the same evidence folder."""
     node.workerinput[_RUN] = _run(node.config)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Begin the evidence of a test that asks for robots."""
+    """Start the evidence of a test that uses robots."""
     if not _FIXTURES.isdisjoint(getattr(item, "fixturenames", ())):
         _keeper(item.config).begin(item)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_call(item: pytest.Item) -> None:
-    """Tell what the test itself does from what was set up for it, and perhaps for others."""
+    """Separate the evidence of the test itself from that of its set-up, which it may share with other tests."""
     if keeper := item.config.stash.get(_KEEPER, None):
         keeper.call(item)
 
@@ -73,7 +73,7 @@ def pytest_runtest_call(item: pytest.Item) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Name the evidence of a test that failed, and remove that of one that did not."""
+    """Report the evidence of a failed test, and remove that of a passed one."""
     report = yield
     if keeper := item.config.stash.get(_KEEPER, None):
         keeper.judge(item, call, report)
@@ -81,7 +81,7 @@ def pytest_runtest_makereport(
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Settle the evidence of the last file of tests."""
+    """Clean up the evidence of the last test module."""
     if keeper := session.config.stash.get(_KEEPER, None):
         keeper.end()
 
@@ -95,7 +95,7 @@ def _run(config: pytest.Config) -> str:
 
 
 def _keeper(config: pytest.Config) -> "EvidenceKeeper":
-    from fieldkit.pytest.evidence import EvidenceKeeper  # noqa: PLC0415 (see above; so in all of these)
+    from fieldkit.pytest.evidence import EvidenceKeeper  # noqa: PLC0415 (see the module docstring; also below)
     from fieldkit.pytest.options import keep, output  # noqa: PLC0415
 
     if _KEEPER not in config.stash:
@@ -106,7 +106,7 @@ def _keeper(config: pytest.Config) -> "EvidenceKeeper":
 
 @pytest.fixture(scope="module")
 def lab_options(pytestconfig: pytest.Config) -> "LabOptions":
-    """What the lab is to be; define a fixture of this name to change it for a file of tests."""
+    """Options of the lab; define a fixture of this name to change them for a test module."""
     from fieldkit.pytest.options import of  # noqa: PLC0415
 
     return of(pytestconfig)
@@ -114,28 +114,28 @@ def lab_options(pytestconfig: pytest.Config) -> "LabOptions":
 
 @pytest.fixture(scope="module")
 def _fieldkit_lab(request: pytest.FixtureRequest, lab_options: "LabOptions") -> "Iterator[OpenedLab]":
-    """The lab of a file of tests, whose robots are brought up when they are first asked for."""
+    """The lab of a test module; its robots are opened on first use."""
     from fieldkit.pytest.lab import OpenedLab  # noqa: PLC0415
     from fieldkit.pytest.operator import operator_of  # noqa: PLC0415
 
     keeper = _keeper(request.config)
     workers = getattr(request.config, "workerinput", {}).get("workercount", 1)
     with OpenedLab(
-        lab_options, keeper, operator_of(request.config, lab_options, keeper.told), workers=workers
+        lab_options, keeper, operator_of(request.config, lab_options, keeper.add_event), workers=workers
     ) as lab:
         yield lab
 
 
 @pytest.fixture(scope="module")
 def lab(_fieldkit_lab: "OpenedLab") -> "OpenedLab":
-    """The lab with its robots up: places them, takes links away, lets robots move."""
+    """The lab with its robots open; it places robots, injects faults and moves robots."""
     _fieldkit_lab.open()
     return _fieldkit_lab
 
 
 @pytest.fixture(scope="module")
 def robots(lab: "OpenedLab") -> "RobotHandles":
-    """The robots by role and by name: run programs on them, copy files, ask for addresses."""
+    """The robots by role and by name; they run programs, copy files and have addresses."""
     return lab.robots
 
 

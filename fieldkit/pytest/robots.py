@@ -1,4 +1,4 @@
-"""Robots in a test's hand: run programs on them, copy files, look at their links."""
+"""Robots in tests: run programs on them, copy files, read the state of their links."""
 
 import shlex
 import time
@@ -19,11 +19,11 @@ from fieldkit.remote.shell import Completed, Shell
 
 TIMEOUT_S: Final = 30.0
 FILE_BYTES: Final = 1 << 30
-"""The largest file that is fetched, unless more is asked for."""
+"""Default limit for the size of a fetched file."""
 
 _END_S: Final = 10.0
 _SHOWN: Final = 2000
-# The file is there whole, or as it was.
+# Replaces the file atomically: it is complete or unchanged.
 _PUT: Final = (
     'mkdir -p "$(dirname "$1")" && cat >"$1.$$" && [ "$(wc -c <"$1.$$")" -eq "$2" ] && chmod "$3" "$1.$$" '
     '&& mv "$1.$$" "$1"'
@@ -31,7 +31,7 @@ _PUT: Final = (
 
 
 class RobotsUp(Protocol):
-    """Robots that are up, as a lab has them; what they return raises as `OpenedLab.open`."""
+    """Open robots, as a lab provides them; errors as for `OpenedLab.open`."""
 
     @property
     def testbed(self) -> Testbed:
@@ -40,19 +40,19 @@ class RobotsUp(Protocol):
 
     @property
     def cast(self) -> Cast:
-        """Who plays which role."""
+        """The robot in each role."""
         ...
 
-    def tell(self, text: str) -> None:
-        """Add a line to the evidence."""
+    def log(self, text: str) -> None:
+        """Add a line to the log of the evidence."""
         ...
 
 
 class RobotHandle:
-    """A robot that is up.
+    """An open robot.
 
     Args:
-        role: What it plays.
+        role: Its role.
         lab: Its lab.
     """
 
@@ -87,100 +87,102 @@ class RobotHandle:
         stdin: str | bytes = b"",
         ros: bool = False,
     ) -> ProgramOutput:
-        """Run a program and wait for its end.
+        """Run a program and wait until it exits.
 
-        When the connection is lost it is made again, and the program run again from its start: run none twice that
-        must not be.
+        If the connection is lost, it is opened again and the program is run again from its start. So do not run
+        programs that must not run twice.
 
         Args:
-            argv: The program with its arguments; no shell sees them.
+            argv: The program with its arguments; they are not interpreted by a shell.
             timeout: Seconds after which the test fails.
-            check: Whether another exit code than 0 fails the test.
-            stdin: What it reads.
-            ros: Whether it runs in the robot's ROS environment, as its profile says.
+            check: Whether the test fails if the exit code is not 0.
+            stdin: Content of its standard input.
+            ros: Whether it runs in the ROS environment of the robot's profile.
 
         Raises:
-            ProgramError: It did not end in time, or with another exit code.
+            ProgramError: It did not exit in time, or its exit code is not 0.
             LinkError: The robot could not be reached.
         """
         __tracebackhide__ = True
-        given = stdin.encode() if isinstance(stdin, str) else stdin
+        content = stdin.encode() if isinstance(stdin, str) else stdin
         command, shell = self._command(argv, ros=ros), self._shell
-        return self._ended(
-            argv, lambda: shell.run(command, deadline=Deadline.after(timeout), stdin=given, check=False), check=check
+        return self._result(
+            argv,
+            lambda: shell.run(command, deadline=Deadline.after(timeout), stdin=content, check=False),
+            check=check,
         )
 
     @contextmanager
     def running(self, argv: Sequence[str], *, ros: bool = False) -> "Iterator[RunningProgram]":
-        """Let a program run while the body does, then end it as Ctrl-C does, if need be by SIGTERM and SIGKILL.
+        """Run a program while the body runs, then stop it with SIGINT, and if needed with SIGTERM and SIGKILL.
 
-        It ends also when this process does, or the connection to the robot.
+        It is also stopped if this process or the connection to the robot ends.
 
         Args:
-            argv: As `run`.
-            ros: As `run`.
+            argv: As for `run`.
+            ros: As for `run`.
 
         Raises:
             LinkError: The robot could not be reached.
         """
         command = until_closed(self._command(argv, ros=ros))
         session = self._shell.begin(command, deadline=Deadline.after(TIMEOUT_S))
-        self._lab.tell(f"{self.name} & {quote(argv)}")
+        self._lab.log(f"{self.name} & {quote(argv)}")
         program = RunningProgram()
         try:
             yield program
         finally:
-            program.output = self._ended(argv, lambda: session.end(deadline=Deadline.after(_END_S), check=False))
+            program.output = self._result(argv, lambda: session.end(deadline=Deadline.after(_END_S), check=False))
 
     def put(self, local: str | Path, remote: str) -> None:
-        """Copy a file to the robot, with its mode; folders that are missing are made.
+        """Copy a file with its mode to the robot; missing folders are created.
 
         Args:
-            local: The file here.
-            remote: Its path there, below the home of the login user where it does not begin with a slash.
+            local: The local file.
+            remote: Its path on the robot, absolute or relative to the home folder of the login user.
 
         Raises:
             ConfigurationError: The file cannot be read.
             LinkError: The robot could not be reached.
-            RobotError: It cannot be written there.
+            RobotError: The file cannot be written on the robot.
         """
         source = Path(local)
         try:
             content, mode = source.read_bytes(), source.stat().st_mode & 0o777
         except OSError as error:
             raise ConfigurationError(
-                f"cannot be read: {error.strerror}", where=str(source), remedy="name a file that is there"
+                f"cannot be read: {error.strerror}", where=str(source), remedy="name an existing file"
             ) from error
         command = ("sh", "-c", _PUT, "sh", remote, str(len(content)), f"{mode:o}")
         self._shell.run(command, deadline=Deadline.after(_seconds_for(len(content))), stdin=content)
-        self._lab.tell(f"{self.name} < {source} to {remote}")
+        self._lab.log(f"{self.name} < {source} to {remote}")
 
     def get(self, remote: str, local: str | Path, *, limit_bytes: int = FILE_BYTES) -> Path:
-        """Copy a file from the robot; return where it is.
+        """Copy a file from the robot; return its local path.
 
         Args:
-            remote: Its path there, as in `put`.
-            local: Where it goes; into a folder that is there under its own name.
-            limit_bytes: The most that is taken.
+            remote: Its path on the robot, as for `put`.
+            local: Local path; if it is an existing folder, the file keeps its name.
+            limit_bytes: Maximum size.
 
         Raises:
             LinkError: The robot could not be reached.
-            RobotError: It cannot be read there, or is larger.
+            RobotError: The file cannot be read on the robot, or is larger.
         """
         to = Path(local)
         to = to / Path(remote).name if to.is_dir() else to
         deadline = Deadline.after(_seconds_for(limit_bytes))
         self._shell.fetch(("cat", "--", remote), to, deadline=deadline, limit_bytes=limit_bytes)
-        self._lab.tell(f"{self.name} > {remote} to {to}")
+        self._lab.log(f"{self.name} > {remote} to {to}")
         return to
 
     def link(self) -> LinkSample:
-        """Return what its radio tells of its links now: signal, rates, counters per station.
+        """Return the present state of its radio's links: signal, rates, counters per station.
 
-        On a real robot that is what `iw` says; without `iw` there are no stations.
+        On a real robot this is the output of `iw`; without `iw` there are no stations.
 
         Raises:
-            LinkError: The robot, or the modelled radio, did not answer.
+            LinkError: The robot, or the process of the modelled radio, did not answer.
         """
         testbed = self._lab.testbed
         if testbed.oracle is not None:
@@ -194,8 +196,8 @@ class RobotHandle:
         cast = self._lab.cast
         if self.role not in cast:
             raise ConfigurationError(
-                f"nobody plays {self.role} any more: other robots were brought up",
-                remedy="ask for topology= in trials as the lab has it",
+                f"no robot has the role {self.role} any more: other robots were opened",
+                remedy="use the topology of the lab in trials",
             )
         return cast[self.role]
 
@@ -212,15 +214,15 @@ class RobotHandle:
             )
         if not ros:
             return tuple(argv)
-        has = self._robot.profile.ros
-        if has is None:
+        ros_profile = self._robot.profile.ros
+        if ros_profile is None:
             raise ConfigurationError(
                 f"its profile {self.profile} has no ros:", where=self.name, remedy="leave ros=True out"
             )
-        return with_environment(argv, setup=has.command.setup, environment=has.environment)
+        return with_environment(argv, setup=ros_profile.command.setup, environment=ros_profile.environment)
 
-    def _ended(self, argv: Sequence[str], wait: Callable[[], Completed], *, check: bool = False) -> ProgramOutput:
-        """Return what became of a program; that it takes too long is the test's matter, and not the robot's."""
+    def _result(self, argv: Sequence[str], wait: Callable[[], Completed], *, check: bool = False) -> ProgramOutput:
+        """Return the result of a program; a timeout fails the test and is not an error of the robot."""
         __tracebackhide__ = True
         words = f"{self.name} $ {quote(argv)}"
         try:
@@ -228,13 +230,13 @@ class RobotHandle:
         except LinkLostError:
             raise
         except LinkError as error:
-            self._lab.tell(f"{words}\n{error.what}")
+            self._lab.log(f"{words}\n{error.what}")
             raise ProgramError(f"{self.name}: {error.what}") from None
         out, err = (text.decode(errors="replace") for text in (done.stdout, done.stderr))
-        self._lab.tell(f"{words}\n{out}{err}exit code {done.exit_code}")
+        self._lab.log(f"{words}\n{out}{err}exit code {done.exit_code}")
         if check and done.exit_code != 0:
-            said = harmless((err or out).strip())[-_SHOWN:] or "it printed nothing"
-            raise ProgramError(f"{self.name}: `{quote(argv)}` ended with exit code {done.exit_code}: {said}")
+            excerpt = harmless((err or out).strip())[-_SHOWN:] or "it printed nothing"
+            raise ProgramError(f"{self.name}: `{quote(argv)}` exited with code {done.exit_code}: {excerpt}")
         return ProgramOutput(tuple(argv), done.exit_code, out, err)
 
 
@@ -255,15 +257,15 @@ class RobotHandles:
         """Return a robot by its role or its name.
 
         Raises:
-            ConfigurationError: There is none.
+            ConfigurationError: There is no such robot.
         """
         cast = self._lab.cast
         for role, robot in cast.items():
             if name in {role, robot.name}:
                 return RobotHandle(role, self._lab)
-        known = [*cast, *(robot.name for robot in cast.values())]
+        names = [*cast, *(robot.name for robot in cast.values())]
         raise ConfigurationError(
-            f"there is no robot {name!r} in this lab", remedy=nearest(name, known, f"there are: {', '.join(known)}")
+            f"there is no robot {name!r} in this lab", remedy=nearest(name, names, f"its robots: {', '.join(names)}")
         )
 
     def __getattr__(self, name: str) -> RobotHandle:
@@ -277,10 +279,10 @@ class RobotHandles:
         return (self[role] for role in self._lab.cast)
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of robots."""
         return len(self._lab.cast)
 
 
 def _seconds_for(size_bytes: int) -> float:
-    """Return how long a file may take: a way that carries less than 100 kB/s is no way for it."""
+    """Return the time limit for copying a file, which assumes at least 100 kB/s."""
     return TIMEOUT_S + size_bytes / 1e5

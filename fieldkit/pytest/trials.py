@@ -1,4 +1,4 @@
-"""Whole trials in tests: what `fieldkit trial` runs, and what `fieldkit.load` returns."""
+"""Complete trials in tests: run as by `fieldkit trial`, returned as by `fieldkit.load`."""
 
 import argparse
 from collections.abc import Iterable, Sequence
@@ -24,7 +24,7 @@ FOLDER: Final = "trials"
 
 
 class ExpectationError(AssertionError):
-    """A figure is not where the procedure expects it to be."""
+    """A figure does not meet an expectation of the procedure."""
 
 
 class TrialRunner:
@@ -51,32 +51,32 @@ class TrialRunner:
         """Run a trial and return it with all its evidence; arguments as the options of `fieldkit trial`.
 
         Args:
-            procedure: Its name.
-            distance: How far apart the robots are to stand: `30ft`.
-            topology: `master` or `masterless`; None for that of the options, or else of the procedure. Where other
-                robots are up, they end.
-            protocol: `tcp`, `udp`, or both; none of them for the procedure's.
-            repeats: Per protocol; None for the procedure's.
-            record: How long each recording lasts: `2s`; None for the procedure's.
-            notes: Told in the trial.
+            procedure: Name of the procedure.
+            distance: Distance of the robots: `30ft`.
+            topology: `master` or `masterless`; None for that of the options, or else of the procedure. Open robots of
+                another topology are closed.
+            protocol: `tcp`, `udp`, or both; empty for those of the procedure.
+            repeats: Repeats per protocol; None for the procedure's value.
+            record: Duration of each recording: `2s`; None for the procedure's value.
+            notes: Notes in the trial's plan.
 
         Raises:
-            ExpectationError: All repeats are valid, and a figure is not where the procedure expects it.
+            ExpectationError: All repeats are valid, but a figure does not meet an expectation of the procedure.
             ConfigurationError: An argument is wrong.
-            EvidenceError: A repeat failed for good.
-            FieldkitError: As `OpenedLab.open` and `runner.run_trial`.
+            EvidenceError: A repeat failed.
+            FieldkitError: As for `OpenedLab.open` and `runner.run_trial`.
         """
         __tracebackhide__ = True
         protocols = (protocol,) if isinstance(protocol, str) else tuple(protocol)
         chosen = topology or self._lab.options.topology
-        asked = argparse.Namespace(
+        arguments = argparse.Namespace(
             procedure=procedure,
             topology=chosen and one_of(Topology, chosen, "topology"),
             protocol=[one_of(Protocol, name, "protocol") for name in protocols],
             repeats=_positive(repeats),
             record=record,
         )
-        request = command_line.request(asked, parse_distance(distance), seed=self._lab.options.seed, notes=notes)
+        request = command_line.request(arguments, parse_distance(distance), seed=self._lab.options.seed, notes=notes)
         testbed = self._lab.open(request.chosen_topology)
         plan = make_plan(
             request,
@@ -88,9 +88,9 @@ class TrialRunner:
         )
         out = self._lab.keeper.folder.path / FOLDER
         store.prepare(out)
-        outcome = runner.run_trial(plan, testbed, out, self._lab.keeper.told)
-        assert outcome is not None, "nobody is asked whether to leave it"
-        return _demanded(outcome)
+        outcome = runner.run_trial(plan, testbed, out, self._lab.keeper.add_event)
+        assert outcome is not None, "a trial in a test cannot be skipped"
+        return _checked(outcome)
 
 
 def _positive(repeats: int | None) -> int | None:
@@ -99,13 +99,13 @@ def _positive(repeats: int | None) -> int | None:
     return repeats
 
 
-def _demanded(outcome: Outcome) -> Trials:
+def _checked(outcome: Outcome) -> Trials:
     __tracebackhide__ = True
     if outcome.failed:
         raise EvidenceError(
             f"{format_count(outcome.failed, 'repeat')} failed; reasons in {store.TRIAL_CSV}",
             where=str(outcome.folder),
-            remedy="see what its log says; what the robots lack is told by: fieldkit check",
+            remedy="see its log; to find what the robots lack: fieldkit check",
         )
     _demand_expected(outcome.judgements)
     return load(outcome.folder)

@@ -1,1 +1,1 @@
-"""One trial: planned, checked, run, journalled, kept on disk, and made again from its evidence."""
+"""One trial: planning, checks, execution, journal, storage, and rebuilding its tables from the evidence."""

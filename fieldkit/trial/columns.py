@@ -1,4 +1,4 @@
-"""The columns of trial.csv: what tells an attempt from others, then what steps and the testbed declare."""
+"""The columns of trial.csv: those that identify an attempt, and those that steps and the testbed declare."""
 
 from collections.abc import Collection, Iterable, Mapping
 from functools import cache
@@ -39,35 +39,35 @@ IDENTITY: Final = columns.columns(
     ("procedure_sha256", "hash", "First 16 digits of the hash of the procedure: its file and --record."),
     ("code_sha256", "hash", "First 16 digits of the hash over fieldkit's own source."),
 )
-"""What tells an attempt from others; the columns that its evidence fills follow."""
+"""Columns that identify an attempt; the columns that its evidence fills follow."""
 
-OTHERS: Final = Column("others", "text", "Robots in roles of the procedure's own: ROLE=ROBOT, a blank between them.")
-"""Only where a procedure has such roles."""
+OTHERS: Final = Column("others", "text", "Robots in further roles of the procedure: ROLE=ROBOT, separated by spaces.")
+"""The column is present only if a procedure has such roles."""
 
 ALWAYS: Final = (*lateness.COLUMNS, *link.COLUMNS)
-"""What is measured whatever the steps are."""
+"""Columns that are measured whatever the steps are."""
 
 Row = Mapping[str, Value]
-"""Values of one attempt by column; a column that is missing is not there."""
+"""Values of one attempt by column; missing values have no entry."""
 
 
 @cache
 def measures() -> tuple[Column, ...]:
-    """Return every column that evidence fills in every trial: the testbed's own, and fieldkit's own kinds'."""
-    own = kinds.own()
-    of_kinds = (column for kind, step in step_types().items() if kind in own for column in step.columns)
+    """Return every column that evidence fills in every trial: those of the testbed and of fieldkit's step kinds."""
+    shipped = kinds.own()
+    of_kinds = (column for kind, step in step_types().items() if kind in shipped for column in step.columns)
     filled = dict.fromkeys((*ALWAYS, *of_kinds))
     return tuple(sorted(filled, key=lambda column: column.rank))
 
 
-def trial_columns(beyond: Iterable[Column] = ()) -> tuple[Column, ...]:
-    """Return the columns of a trial.csv in order: what is in every one, then what its steps measure besides.
+def trial_columns(additional: Iterable[Column] = ()) -> tuple[Column, ...]:
+    """Return the columns of a trial.csv in order: those of every trial, then the others that its steps fill.
 
     Args:
-        beyond: Columns of the trial's own, as its plan has them.
+        additional: Columns that not every trial has, as in the trial's plan.
     """
     everywhere = _everywhere()
-    return (*everywhere.values(), *(column for column in beyond if column.name not in everywhere))
+    return (*everywhere.values(), *(column for column in additional if column.name not in everywhere))
 
 
 @cache
@@ -76,57 +76,57 @@ def _everywhere() -> Mapping[str, Column]:
 
 
 def of_step(step: Step) -> tuple[Column, ...]:
-    """Return the columns that a step fills, as a row has them."""
+    """Return the columns that a step fills, with the prefix of the step."""
     return tuple(named(step.prefix, column) for column in step.output_columns())
 
 
 def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
     """Return the columns of steps that are not in every trial, in the order of the steps.
 
-    Those of steps that have a name, of steps that declare columns of their own, and of other packages' kinds.
+    These are the columns of named steps, additional columns that a step declares, and those of other packages' kinds.
     """
     return tuple(column for step in steps for column in of_step(step) if column.name not in _everywhere())
 
 
 def filled_by(steps: Iterable[Step]) -> tuple[Column, ...]:
-    """Return the columns of a trial.csv that are not always empty where these steps run, in order."""
-    own = [column for step in steps for column in of_step(step)]
-    names = {column.name for column in (*IDENTITY, *ALWAYS, *own)}
-    return tuple(column for column in trial_columns(own) if column.name in names)
+    """Return the columns of a trial.csv that these steps, the testbed or the plan fill, in order."""
+    step_columns = [column for step in steps for column in of_step(step)]
+    names = {column.name for column in (*IDENTITY, *ALWAYS, *step_columns)}
+    return tuple(column for column in trial_columns(step_columns) if column.name in names)
 
 
 def clash(column: Column, filled: Collection[str]) -> str | None:
-    """Return why a step cannot fill a column, None where it can.
+    """Return the reason why a step cannot fill a column, or None if it can.
 
     Args:
-        column: Which.
+        column: The column.
         filled: Names of the columns that other steps fill.
     """
     if flaw := column.flaw():
         return f"a column {column.name!r}: {flaw}"
     if _everywhere().get(column.name, column) != column:
-        return f"a column {column.name!r} is fieldkit's own already; give the step a name, or the column another one"
+        return f"a column {column.name!r} is one of fieldkit's; give the step a name, or rename the column"
     if column.name in filled:
-        return f"a column {column.name!r} comes twice, and a row has room for one; give the step a name"
+        return f"a column {column.name!r} is filled by two steps; give the step a name"
     return None
 
 
 @cache
 def installed() -> tuple[Column, ...]:
-    """Return the columns of every trial, and those that other packages' kinds of step declare.
+    """Return the columns of every trial, and those declared by the step kinds of other packages.
 
     Raises:
-        ConfigurationError: As `step_types`, or a kind declares an invalid column, or one whose name is taken.
+        ConfigurationError: As for `step_types`, or a kind declares an invalid column, or one that exists already.
     """
-    found = dict(_everywhere())
+    by_name = dict(_everywhere())
     for kind, step in step_types().items():
         for column in step.columns:
             flaw = column.flaw()
-            if flaw or found.setdefault(column.name, column) != column:
+            if flaw or by_name.setdefault(column.name, column) != column:
                 raise ConfigurationError(
                     f"the kind of step {kind!r} declares a column {column.name!r}, "
-                    + (f"but {flaw}" if flaw else "which is another's already"),
+                    + (f"but {flaw}" if flaw else "which exists already"),
                     where=f"{step.__module__}:{step.__name__}",
                     remedy="rename it there, or uninstall its package",
                 )
-    return tuple(found.values())
+    return tuple(by_name.values())

@@ -1,4 +1,4 @@
-"""The table of quantities and their sources: those of every attempt, and those that kinds of step declare."""
+"""The table of cross-checks: those of every attempt, and those that the kinds of step declare."""
 
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
@@ -18,7 +18,7 @@ OF_EVERY_ATTEMPT: Final = (
     CrossCheck(
         "that a clock was not set",
         (),
-        "`ROLE-after.txt`: clock beside seconds since boot",
+        "`ROLE-after.txt`: clock and seconds since boot",
         ("`ROLE-before.txt`: the same",),
         "the error of the readings, 10 ms",
     ),
@@ -26,18 +26,18 @@ OF_EVERY_ATTEMPT: Final = (
         "that jobs ended as they should",
         (),
         "`ROLE-after.txt`: jobs",
-        ("the procedure", "logs and outputs of jobs: each job with one has an end"),
+        ("the procedure", "logs and outputs of jobs: each job that left one has an end"),
         "jobs of steps inside a fault",
     ),
     CrossCheck(
-        "that a robot's notes are whole",
+        "that a robot's notes are complete",
         (),
         "sections of `ROLE-after.txt`",
         ("sections of `ROLE-before.txt`",),
         "a section that a robot cannot provide is missing in both; trials before boots were noted have no jobs",
     ),
     CrossCheck(
-        "who wrote a file",
+        "which robot wrote a file",
         (),
         "name of each file in a robot's archive",
         ("names that only the laptop writes", "jobs of the other robots"),
@@ -48,27 +48,27 @@ OF_EVERY_ATTEMPT: Final = (
         ("emulator_*", "sender_*", "receiver_*"),
         "`lateness.txt`, `link.csv`; a robot's own `ROLE-link.txt`",
         (),
-        "the testbed, or the radio's driver, alone knows them",
+        "only the testbed or the radio's driver measures them",
         CheckOutcome.UNCHECKED,
     ),
 )
 
 
 def rows() -> Iterator[tuple[str, CrossCheck]]:
-    """Yield every check with the kind of step that it is of; the kind is empty for those of every attempt."""
+    """Yield every check with its kind of step; the kind is empty for the checks of every attempt."""
     yield from (("", check) for check in OF_EVERY_ATTEMPT)
     for kind, step in base.step_types().items():
         yield from ((kind, check) for check in step.cross_checks)
 
 
 def covers(kind: str, column: str) -> bool:
-    """Return whether a row of a kind of step names a column."""
-    own = (check for name, check in rows() if name == kind)
-    return any(fnmatchcase(column, pattern) for check in own for pattern in check.columns)
+    """Return True if a check of a kind of step covers a column."""
+    checks = (check for name, check in rows() if name == kind)
+    return any(fnmatchcase(column, pattern) for check in checks for pattern in check.columns)
 
 
 def markdown() -> str:
-    """Return the table as `docs/evidence.md` has it."""
+    """Return the table as it is in `docs/evidence.md`."""
     lines = [
         "| step | quantity | source | compared with | may differ by | else |",
         "| --- | --- | --- | --- | --- | --- |",

@@ -1,4 +1,4 @@
-"""The part of `trial.yaml` about tables: columns that are not in every one, and what is expected of figures."""
+"""The part of `trial.yaml` that describes its table: columns that not every trial has, and expectations."""
 
 import sys
 from collections import Counter
@@ -13,12 +13,12 @@ from fieldkit.core import files
 from fieldkit.core.columns import Column, Figure, Kind
 
 MOST_COLUMNS: Final = 2000
-"""Of one trial, beside those of every trial."""
-_MOST: Final = sys.float_info.max  # YAML here has no infinity, and a column no such value
+"""Limit per trial, not counting the columns of every trial."""
+_MOST: Final = sys.float_info.max  # YAML is read without infinity, and no column has such a value
 
 
 class FrozenFigure(Strict):
-    """As `fieldkit.core.columns.Figure`."""
+    """A frozen `fieldkit.core.columns.Figure`."""
 
     label: str
     kind: Kind
@@ -30,7 +30,7 @@ class FrozenFigure(Strict):
 
 
 class FrozenColumn(Strict):
-    """As `fieldkit.core.columns.Column`, whose rank is its place in the list."""
+    """A frozen `fieldkit.core.columns.Column`; its rank is its position in the list."""
 
     name: str
     unit: str
@@ -39,7 +39,7 @@ class FrozenColumn(Strict):
     figure: FrozenFigure | None = None
 
     @schema.model_validator(mode="after")
-    def _is_one(self) -> "FrozenColumn":
+    def _is_valid_column(self) -> "FrozenColumn":
         if flaw := self.column.flaw():
             raise schema.complaint(flaw, "name")
         return self
@@ -51,56 +51,56 @@ class FrozenColumn(Strict):
         return Column(self.name, self.unit, self.meaning, bounds=self.bounds, figure=figure)
 
 
-def _demand_different(columns: tuple[FrozenColumn, ...]) -> tuple[FrozenColumn, ...]:
-    for name, times in Counter(column.name for column in columns).items():
-        if times > 1:
-            raise schema.complaint(f"the column {name} is there twice")
+def _demand_unique_names(columns: tuple[FrozenColumn, ...]) -> tuple[FrozenColumn, ...]:
+    for name, count in Counter(column.name for column in columns).items():
+        if count > 1:
+            raise schema.complaint(f"the column {name} occurs twice")
     return columns
 
 
-Columns = Annotated[tuple[FrozenColumn, ...], Field(max_length=MOST_COLUMNS), AfterValidator(_demand_different)]
+Columns = Annotated[tuple[FrozenColumn, ...], Field(max_length=MOST_COLUMNS), AfterValidator(_demand_unique_names)]
 
 
-class _Beyond(Strict):
-    """Of a plan what says what its columns are."""
+class _PlanColumns(Strict):
+    """The part of a plan that lists its columns."""
 
     columns: Columns | None = None
 
 
 def read(path: Path) -> tuple[Column, ...]:
-    """Return the columns that a `trial.yaml` has, without asking for the kinds of step that its procedure names.
+    """Return the columns listed in a `trial.yaml`, without loading the step kinds of its procedure.
 
     Raises:
-        ConfigurationError: It cannot be read, or a column is none.
+        ConfigurationError: The file cannot be read, or an entry is not a valid column.
     """
     document = schema.read(path)
     if not isinstance(document.data, dict) or "columns" not in document.data:
         return ()
-    found = schema.validate(replace(document, data={"columns": document.data["columns"]}), _Beyond)
-    return tuple(frozen.column for frozen in found.columns or ())
+    plan = schema.validate(replace(document, data={"columns": document.data["columns"]}), _PlanColumns)
+    return tuple(frozen.column for frozen in plan.columns or ())
 
 
-class _Expecting(Strict):
-    """Of a procedure what it expects."""
+class _ProcedureExpectations(Strict):
+    """The part of a procedure that lists its expectations."""
 
     expect: tuple[str, ...] = ()
 
 
 def expected(path: Path) -> tuple[str, ...]:
-    """Return what the procedure in a `trial.yaml` expects of figures, likewise; most expect nothing.
+    """Return the expectations of the procedure in a `trial.yaml`, without loading its step kinds.
 
     Raises:
-        ConfigurationError: It cannot be read, or does not say so.
+        ConfigurationError: The file cannot be read, or its expectations are invalid.
     """
-    if b"expect:" not in files.read(path):  # which of a thousand plans are then read takes no time
+    if b"expect:" not in files.read(path):  # a fast test: most plans have no expectations, and need not be parsed
         return ()
     procedure = schema.read(path).part("procedure")
-    said = {"expect": procedure.data["expect"]} if "expect" in procedure.data else {}
-    return schema.validate(replace(procedure, data=said), _Expecting).expect
+    data = {"expect": procedure.data["expect"]} if "expect" in procedure.data else {}
+    return schema.validate(replace(procedure, data=data), _ProcedureExpectations).expect
 
 
 def freeze(columns: Iterable[Column]) -> tuple[FrozenColumn, ...]:
-    """Return columns as a plan holds them."""
+    """Return columns in the form in which a plan stores them."""
     return tuple(
         FrozenColumn(
             name=column.name,

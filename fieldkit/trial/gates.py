@@ -1,4 +1,4 @@
-"""Evidence gates and measures of an attempt, through one reading of its files."""
+"""Evidence checks and measures of an attempt; each evidence file is read once."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,8 +21,9 @@ class Judged:
     """Judgement on the evidence of an attempt.
 
     Attributes:
-        problems: The reasons for which it is not whole, so that the attempt is void; a sentence each.
-        measured: What it says all the same.
+        problems: Reasons why the evidence is incomplete or contradictory, so that the attempt is void; one sentence
+            each.
+        measured: The values that could be measured nevertheless.
     """
 
     problems: tuple[str, ...]
@@ -30,78 +31,83 @@ class Judged:
 
 
 def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
-    """Measure an attempt and say whether its evidence is whole.
+    """Measure an attempt and check that its evidence is complete.
 
-    Evidence of steps inside a fault need not be: they are what the fault disturbs. What steps declare is measured, or
-    missing for a reason; where it is neither, a figure got lost, and the attempt is void. So it is where a step
-    cannot measure what it left: a trial goes on, and is resumed and rebuilt, whatever one file holds.
+    The evidence of steps inside a fault may be incomplete, because the fault disturbs it. Each column that a step
+    declares must have a value or a reason why it is missing; if it has neither, a value was lost and the attempt is
+    void. The attempt is also void if a step raises an exception on its evidence: a trial must continue, and must be
+    resumable and rebuildable, whatever a file contains.
 
     Raises:
-        MemoryError: This machine has too little, which says nothing of the evidence.
+        MemoryError: This machine has too little memory; this is not a problem of the evidence.
     """
     scene = plan.scene(repeat, "")
-    # What happened to a robot comes first: it is the cause of much of the rest.
+    # The robots' states are judged first, because their problems cause many of the others.
     problems = list(hosts.problems(plan.procedure, scene, evidence))
     measured = lateness.measure(evidence.read_or_none(lateness.read, lateness.FILE))
     for role in link.ROLES:
         measured |= link.measure(role, evidence.links(role))
-    misplaced = placements.contradiction(scene, evidence)
+    placement_problem = placements.contradiction(scene, evidence)
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
         try:
-            found = placed.step.measure(view)
-            impossible = dict(_impossible(placed, found))
+            result = placed.step.measure(view)
+            impossible = dict(_impossible(placed, result))
             if not placed.disturbed:
                 problems += (_of_step(placed, why) for why in placed.step.check(view))
-                problems += _unexplained(placed, found)
+                problems += _unexplained(placed, result)
                 problems += impossible.values()
-            found = found.without(impossible)
-            if misplaced:
-                found = found.without({name: misplaced for name in found.values if placements.is_dependent(name)})
+            result = result.without(impossible)
+            if placement_problem:
+                dependent = {name: placement_problem for name in result.values if placements.is_dependent(name)}
+                result = result.without(dependent)
         except MemoryError:
             raise
-        except Exception as error:  # noqa: BLE001 (see above)
-            why = f"what {placed.called} left cannot be measured: {type(error).__name__}: {error}"
+        except Exception as error:  # noqa: BLE001 (see the docstring)
+            why = f"the evidence of {placed.called} cannot be measured: {type(error).__name__}: {error}"
             problems.append(why)
-            found = Measured.nothing(placed.step.output_columns(), why)
-        measured |= found.named(placed.step.prefix)
-    problems += _of_the_testbed(evidence)
+            result = Measured.nothing(placed.step.output_columns(), why)
+        measured |= result.named(placed.step.prefix)
+    problems += _testbed_problems(evidence)
     return Judged(tuple(problems), measured)
 
 
 def _of_step(placed: PlacedStep, why: str) -> str:
-    """Return what is wrong with what a step left, with its name, if it has one."""
+    """Return a problem of a step's evidence, preceded by the step's name if it has one."""
     return f"{placed.step.prefix}: {why}" if placed.step.prefix else why
 
 
-def _unexplained(placed: PlacedStep, found: Measured) -> Iterator[str]:
+def _unexplained(placed: PlacedStep, measured: Measured) -> Iterator[str]:
     for column in placed.step.output_columns():
-        if column.name not in found.values and column.name not in found.missing:
-            yield f"{placed.called} does not say why it has no {column.name}"
+        if column.name not in measured.values and column.name not in measured.missing:
+            yield f"{placed.called} gives neither a value nor a reason for {column.name}"
 
 
-def _impossible(placed: PlacedStep, found: Measured) -> Iterator[tuple[str, str]]:
-    """Yield what no such column can hold, with the reason: no table that has it would be read again."""
+def _impossible(placed: PlacedStep, measured: Measured) -> Iterator[tuple[str, str]]:
+    """Yield each column whose measured value is outside its declared range, and the reason.
+
+    Such values are removed, because a table that contains one could not be read again.
+    """
     for column in placed.step.output_columns():
-        text = "" if column.type is str else cell(found.values.get(column.name))
+        text = "" if column.type is str else cell(measured.values.get(column.name))
         if text and (problem := "not a number" if text == "nan" else column.problem(text)):
             yield column.name, f"the evidence gives {prefixed(placed.step.prefix, column.name)} as {text}, {problem}"
 
 
-_OF_THE_TESTBED: Final[tuple[tuple[Callable[[Path], object], str], ...]] = (
+_TESTBED_FILES: Final[tuple[tuple[Callable[[Path], object], str], ...]] = (
     (lateness.read, lateness.FILE),
     (track.read, track.FILE),
     (link_samples.read, link_samples.FILE),
 )
 
 
-def _of_the_testbed(evidence: AttemptEvidence) -> Iterator[str]:
-    """Yield what is wrong with what the testbed's oracle wrote, where it has one."""
-    for read, name in _OF_THE_TESTBED:
+def _testbed_problems(evidence: AttemptEvidence) -> Iterator[str]:
+    """Yield the problems of the files written by the testbed's oracle, if it has one."""
+    for read, name in _TESTBED_FILES:
         try:
-            found = evidence.read(read, name) if evidence.has(name) else None
+            content = evidence.read(read, name) if evidence.has(name) else None
         except EvidenceError as error:
             yield f"{name}: {error.what}"
             continue
-        if isinstance(found, Lateness) and (why := lateness.problem(found)):
+        if isinstance(content, Lateness) and (why := lateness.problem(content)):
             yield f"{name}: {why}"

@@ -1,4 +1,4 @@
-"""Hashes that tell whether two trials were measured alike, shortened to what a CSV column can bear."""
+"""Hashes that show whether two trials were measured in the same way, shortened to fit a CSV column."""
 
 import hashlib
 import json
@@ -10,12 +10,12 @@ _HASH_DIGITS: Final = 16
 
 
 def code_hash() -> str:
-    """Return the hash over fieldkit's own source files, names and contents."""
+    """Return the hash over the names and contents of fieldkit's source files."""
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parent.parent
     walked = (f"{folder}/{name}" for folder, _, names in os.walk(package) for name in names)
-    found = (path.removeprefix(f"{package}/") for path in walked if path.endswith((".py", ".sh")))
-    for name in sorted(found, key=lambda name: name.split("/")):
+    sources = (path.removeprefix(f"{package}/") for path in walked if path.endswith((".py", ".sh")))
+    for name in sorted(sources, key=lambda name: name.split("/")):
         digest.update(f"{name}\0".encode() + (package / name).read_bytes() + b"\0")
     return digest.hexdigest()[:_HASH_DIGITS]
 

@@ -1,4 +1,4 @@
-"""The journal: append-only, on disk before anything goes on, the truth about each repeat."""
+"""The journal of a trial: an append-only record of each repeat, synced to disk before the trial continues."""
 
 import time
 from collections.abc import Iterator
@@ -24,13 +24,13 @@ class JournalEntry:
     """One line of the journal.
 
     Attributes:
-        utc_ns: When, in nanoseconds since 1970 UTC.
+        utc_ns: Time of the entry, in nanoseconds since 1970 UTC.
         protocol: Protocol of the repeat.
         number: Number of the repeat.
         attempt: Number of the attempt, 0 while planned.
-        status: What became of it.
-        reason: Why it is not valid.
-        excused: Whether it was cut short from outside, so that it counts for nothing but its record.
+        status: Its status.
+        reason: Reason why it is not valid.
+        excused: Whether it was interrupted from outside, so that it does not count as one of the allowed attempts.
     """
 
     utc_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -57,12 +57,12 @@ class Attempt:
     Attributes:
         repeat: The repeat.
         number: Number of the attempt.
-        started_utc_ns: When it began.
-        status: How it ended.
-        reason: Why it is not valid.
-        excused: Whether it was cut short from outside, or its repeat was reopened later, so that it is none of the
-            attempts that the procedure allows.
-        reopened: Whether it failed, and its repeat was reopened later: it is void since then.
+        started_utc_ns: Its start.
+        status: Its final status.
+        reason: Reason why it is not valid.
+        excused: Whether it does not count as one of the allowed attempts, because it was interrupted from outside or
+            its repeat was reopened later.
+        reopened: Whether it failed and its repeat was reopened later, which makes the attempt void.
     """
 
     repeat: RepeatId
@@ -75,7 +75,7 @@ class Attempt:
 
     @property
     def folder(self) -> str:
-        """Name of its folder under `repeats/`: `udp-07`, or `udp-07.void1` for one that was redone."""
+        """Name of its folder under `repeats/`: `udp-07`, or `udp-07.void1` for an attempt that was repeated."""
         return self.repeat.folder(self.status, self.number)
 
     def remote(self, trial: str) -> str:
@@ -84,12 +84,12 @@ class Attempt:
 
     @property
     def folders(self) -> tuple[str, ...]:
-        """Every name that its folder may get, however it ends."""
+        """All names that its folder may get, depending on its final status."""
         return tuple(self.repeat.folder(status, self.number) for status in ENDED)
 
 
 def claimed(folder: Path) -> AbstractContextManager[None]:
-    """Keep every other fieldkit off a trial; raises as `jsonl.claimed`."""
+    """Return a context that locks a trial against other processes of fieldkit; raises as `jsonl.claimed`."""
     return jsonl.claimed(folder / JOURNAL_FILE, "trial")
 
 
@@ -99,13 +99,13 @@ def append(folder: Path, *entries: JournalEntry) -> None:
 
 
 def reopen_failed(folder: Path, plan: Plan) -> int:
-    """Plan every failed repeat of a claimed trial once more; return how many they are.
+    """Plan every failed repeat of a claimed trial again, and return the number of these repeats.
 
-    What failed is void from then on: `ended` says so.
+    `ended` reports the failed attempts as void from then on.
 
     Raises:
-        EvidenceError: As `history`.
-        OSError: The disk is full or gone.
+        EvidenceError: As for `history`.
+        OSError: The disk is full or was removed.
     """
     mend(folder)
     now = time.time_ns()
@@ -115,7 +115,7 @@ def reopen_failed(folder: Path, plan: Plan) -> int:
 
 
 def mend(folder: Path) -> None:
-    """Take off a last line that a crash has torn; see `jsonl.mend`."""
+    """Remove an incomplete last line that a crash has left; see `jsonl.mend`."""
     jsonl.mend(folder / JOURNAL_FILE, _CODEC.parse)
 
 
@@ -125,15 +125,15 @@ def read(folder: Path) -> list[JournalEntry]:
 
 
 def history(folder: Path, plan: Plan) -> list[JournalEntry]:
-    """Return the entries of a trial's journal, if they can have come about one after the other.
+    """Return the entries of a trial's journal after a check that their sequence is possible.
 
     Raises:
-        EvidenceError: As `read`; or an entry cannot follow those before it, or is of no repeat of the plan.
+        EvidenceError: As for `read`; or an entry cannot follow those before it, or its repeat is not in the plan.
     """
     entries = read(folder)
     for line, why in _impossible(entries, plan):
         raise EvidenceError(
-            f"this cannot have happened: {why}",
+            f"impossible entry: {why}",
             where=f"{folder / JOURNAL_FILE}:{line}",
             remedy="restore the file from a copy",
         )
@@ -142,8 +142,8 @@ def history(folder: Path, plan: Plan) -> list[JournalEntry]:
 
 def _impossible(entries: list[JournalEntry], plan: Plan) -> Iterator[tuple[int, str]]:
     """Yield line and reason of each entry that contradicts the plan or an entry before it."""
-    begun: set[tuple[RepeatId, int]] = set()
-    ended_before: set[tuple[RepeatId, int]] = set()
+    started: set[tuple[RepeatId, int]] = set()
+    ended: set[tuple[RepeatId, int]] = set()
     over: dict[RepeatId, Status] = {}
     for line, entry in enumerate(entries, start=1):
         repeat, attempt = entry.repeat, (entry.repeat, entry.attempt)
@@ -151,20 +151,20 @@ def _impossible(entries: list[JournalEntry], plan: Plan) -> Iterator[tuple[int, 
             yield line, f"the plan has no repeat {repeat}"
         elif entry.status is Status.PLANNED:
             if over.pop(repeat, Status.FAILED) is not Status.FAILED:
-                yield line, f"{repeat} is planned again, though it was valid"
+                yield line, f"{repeat} is planned again, although it was valid"
         elif entry.status is Status.RUNNING:
-            if attempt in begun or repeat in over or not entry.attempt:
-                yield line, f"attempt {entry.attempt} at {repeat} begins, though it or its repeat was over"
-            begun.add(attempt)
-        elif attempt not in begun or attempt in ended_before:
-            yield line, f"attempt {entry.attempt} at {repeat} is {entry.status}, though it does not run"
+            if attempt in started or repeat in over or not entry.attempt:
+                yield line, f"attempt {entry.attempt} at {repeat} starts, although it or its repeat has ended"
+            started.add(attempt)
+        elif attempt not in started or attempt in ended:
+            yield line, f"attempt {entry.attempt} at {repeat} is {entry.status}, although it is not running"
         elif entry.status in ENDED:
-            ended_before.add(attempt)
+            ended.add(attempt)
             over |= {repeat: entry.status} if entry.status is not Status.VOID else {}
 
 
 def ended(entries: list[JournalEntry]) -> list[Attempt]:
-    """Return the attempts that ended, in the order in which they ended; of a reopened repeat none is failed."""
+    """Return the attempts that ended, in this order; failed attempts of a reopened repeat are returned as void."""
     started = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING}
     planned_at = {entry.repeat: line for line, entry in enumerate(entries) if entry.status is Status.PLANNED}
 
@@ -188,9 +188,9 @@ def ended(entries: list[JournalEntry]) -> list[Attempt]:
 
 
 def cut_short(entries: list[JournalEntry]) -> list[Attempt]:
-    """Return the attempts that began and never ended, `running` or `measured`: fieldkit was killed meanwhile."""
+    """Return the attempts that started and did not end, `running` or `measured`, because fieldkit was killed."""
     over = {(attempt.repeat, attempt.number) for attempt in ended(entries)}
-    begun = {
+    started = {
         (entry.repeat, entry.attempt): entry.utc_ns
         for entry in entries
         if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in over
@@ -198,5 +198,5 @@ def cut_short(entries: list[JournalEntry]) -> list[Attempt]:
     measured = {(entry.repeat, entry.attempt) for entry in entries if entry.status is Status.MEASURED}
     return [
         Attempt(repeat, number, utc_ns, Status.MEASURED if (repeat, number) in measured else Status.RUNNING)
-        for (repeat, number), utc_ns in begun.items()
+        for (repeat, number), utc_ns in started.items()
     ]

@@ -1,4 +1,4 @@
-"""What a middleware must keep on a link, and the repeats that show it, for one size of samples at one place."""
+"""A criterion for a middleware on a link, and the repeats measured with one sample size at one place."""
 
 import math
 from collections.abc import Sequence
@@ -15,9 +15,9 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.core.columns import Kind, prefixed
 
 LEAST_REPEATS: Final = 5
-"""Losses over TCP may be bimodal (docs/studies/middleware-link.md); fewer repeats may all be of one kind."""
+"""Losses over TCP may be bimodal (docs/studies/middleware-link.md): fewer repeats may all be of one mode."""
 _DECIMALS: Final = 12
-"""The bound is rounded to these, so that 29 of 1,000 are at a bound of 2.9 %, which is less in binary."""
+"""Decimals of the bound: 29 of 1,000 must count as equal to a bound of 2.9 %, which is smaller in binary."""
 _WANTED: Final = "topic_wanted"
 _CELL: Final = "cell"
 _LOSS: Final = Quantity(
@@ -30,15 +30,14 @@ _DELAY: Final = Quantity(
 
 @dataclass(frozen=True)
 class LinkCriterion:
-    """What a middleware must keep on the link, in each repeat by itself.
+    """The requirements that a middleware must meet on the link in each repeat.
 
     Attributes:
         max_loss: Share of the samples that may be lost, 0 to 1; those that were never sent count as lost.
-        max_delay_s: Delay of 95 % of all samples sent; None without a limit.
-        size_bytes: Only samples of this size; None for all that were measured.
-        repeats: Valid repeats that a cell needs.
-        share: Share of all repeats that must be shown to keep it, with 95 % confidence; None if each measured repeat
-            must keep it.
+        max_delay_s: Limit for the delay of 95 % of all samples sent; None without a limit.
+        size_bytes: Only samples of this size count; None for all.
+        repeats: Number of valid repeats that a cell needs.
+        share: Share of all repeats that must meet it, shown with 95 % confidence; None if each measured repeat must.
     """
 
     max_loss: float
@@ -56,7 +55,7 @@ class LinkCriterion:
 
     @property
     def expectations(self) -> tuple[Expectation, ...]:
-        """The criterion as `fieldkit.analysis` judges it."""
+        """The criterion in the form that `fieldkit.analysis` judges."""
         bounds = [
             (_LOSS, round(self.max_loss, _DECIMALS)),
             *([] if self.max_delay_s is None else [(_DELAY, self.max_delay_s)]),
@@ -77,13 +76,13 @@ class LinkCriterion:
 
 @dataclass(frozen=True)
 class LinkCell:
-    """What was measured of a candidate with one size of samples at one place.
+    """The measurements of a candidate with one sample size at one place.
 
     Attributes:
-        place: Where, in words.
-        size_bytes: Data of a sample.
-        sources: Folders of trials.
-        cell: Its repeats, with the estimates of loss and delay that they have.
+        place: Description of the place.
+        size_bytes: Data bytes per sample.
+        sources: Folders of the trials.
+        cell: Its repeats, with the estimates of loss and delay.
     """
 
     place: str
@@ -98,17 +97,17 @@ class LinkCell:
 
     @property
     def delay(self) -> Estimate | None:
-        """The delay of 95 % of the samples, likewise."""
+        """The delay of 95 % of the samples; None if no valid repeat has one."""
         return self.cell.estimates.get(_DELAY.name)
 
     @property
     def attempts(self) -> int:
-        """Repeats, valid or not."""
+        """Number of attempts, valid or not."""
         return self.cell.n_valid + self.cell.n_void + self.cell.n_failed
 
     @property
     def largest_delay_s(self) -> float:
-        """The largest delay of 95 % of the samples sent of any repeat; infinity if a repeat has none."""
+        """Maximum over all repeats of the delay of 95 % of the samples sent; infinity if one is missing."""
         if self.delay is None or self.delay.sample is None or self.delay.missing:
             return math.inf
         return float(self.delay.sample.high.max())
@@ -118,34 +117,34 @@ class LinkCell:
 
 
 def topic_columns(rows: Repeats, prefix: str) -> Repeats:
-    """Return the columns that `link_cell` needs of one topic, without the name of its step; NaN where one is missing.
+    """Return the columns of one topic that `link_cell` needs, without the prefix of its step; missing ones are NaN.
 
     Args:
         rows: Attempts of a trial.
-        prefix: What the names of the step's columns begin with.
+        prefix: Prefix of the step's columns.
     """
     nothing = np.full(len(rows), np.nan)
 
-    def own(name: str) -> NDArray[np.float64]:
+    def values(name: str) -> NDArray[np.float64]:
         return np.asarray(rows.numbers.get(prefixed(prefix, name), nothing), dtype=np.float64)
 
     names = ("topic_sent", "topic_refused", "topic_skipped", "topic_received", _DELAY.name, _DELAY.of_sent or "")
     texts = {"status": rows.texts["status"], SOURCE: rows.texts[SOURCE]}
-    return Repeats({name: own(name) for name in names}, texts, ())
+    return Repeats({name: values(name) for name in names}, texts, ())
 
 
 def link_cell(place: str, size_bytes: float, tables: Sequence[Repeats]) -> LinkCell:
     """Return the estimates of one candidate, size and place.
 
     Args:
-        place: Where, in words.
-        size_bytes: Data of a sample.
+        place: Description of the place.
+        size_bytes: Data bytes per sample.
         tables: Attempts, as `topic_columns` returns them.
     """
     numbers = {name: np.concatenate([table.numbers[name] for table in tables]) for name in tables[0].numbers}
     texts = {name: np.concatenate([table.texts[name] for table in tables]) for name in tables[0].texts}
     wanted = numbers["topic_sent"] + numbers["topic_refused"] + numbers["topic_skipped"]
-    # A repeat in which nothing was to be sent is no evidence of a low loss: it has no value.
+    # A repeat in which no sample was due says nothing about the loss, so it has no value.
     numbers[_WANTED] = np.where(wanted > 0, wanted, np.nan)
     numbers[_LOSS.name] = (numbers[_WANTED] - numbers["topic_received"]) / numbers[_WANTED]
     texts[_CELL] = np.full(len(wanted), place, dtype=np.object_)
@@ -154,7 +153,7 @@ def link_cell(place: str, size_bytes: float, tables: Sequence[Repeats]) -> LinkC
 
 
 def figure(estimate: Estimate | None, factor: float) -> str:
-    """Return a figure with its 95 % interval and the value of every repeat, in a unit that is `factor` smaller."""
+    """Return an estimate with its 95 % interval and the value of each repeat, multiplied by `factor`."""
     if estimate is None or estimate.sample is None:
         return "unknown"
     low, high = (f"{factor * end:.2f}" if end is not None else "unknown" for end in (estimate.low, estimate.high))

@@ -1,4 +1,4 @@
-"""The manifest of a trial: a sum over each of its files, made when the file was kept and never again.
+"""The manifest of a trial: a SHA-256 checksum of each file, computed once when the file is stored.
 
 Its format is that of `sha256sum`.
 """
@@ -20,18 +20,18 @@ from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.store import MANIFEST_FILE
 
 Sums = Mapping[str, str]
-"""Sum of each file by its name below the trial's folder."""
+"""Checksum of each file by its name relative to the trial's folder."""
 
-_TOLD: Final = 5
+_MAX_LISTED: Final = 5
 _LIMIT_BYTES: Final = 1 << 28
 _HEX_DIGITS: Final = frozenset("0123456789abcdef")
 
-# As sha256sum writes names that do not fit into a line; the line then begins with a backslash.
+# sha256sum escapes names that contain a line break or backslash, and starts the line with a backslash.
 _ESCAPES: Final = (("\\", "\\\\"), ("\n", "\\n"), ("\r", "\\r"))
 
 
 class Manifest:
-    """Sums over a trial's files, kept up while the trial grows; opened on a folder with a past, it knows that too.
+    """Checksums of a trial's files, updated while the trial grows; an existing manifest is read first.
 
     Args:
         folder: The trial's folder.
@@ -42,65 +42,65 @@ class Manifest:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        was = read(folder) if (folder / MANIFEST_FILE).exists() else {}
-        self._own = {name: digest for name, digest in was.items() if "/" not in name}
-        self._lines = {attempt: _lines(sums) for attempt, sums in _by_attempt(was).items()}
+        previous = read(folder) if (folder / MANIFEST_FILE).exists() else {}
+        self._top_level = {name: digest for name, digest in previous.items() if "/" not in name}
+        self._lines = {attempt: _lines(sums) for attempt, sums in _by_attempt(previous).items()}
 
     def __contains__(self, attempt: str) -> bool:
-        """Return whether the evidence of an attempt was summed before; `attempt` is its folder's name."""
+        """Return True if the evidence of an attempt has checksums; `attempt` is the name of its folder."""
         return attempt in self._lines
 
-    def whole_lines(self, name: str) -> int | None:
-        """Return how many lines one of the trial's own files had when it was summed, None where they are others now.
+    def unchanged_lines(self, name: str) -> int | None:
+        """Return the number of lines that a top-level file had at its checksum; None if they have changed.
 
-        A file that only grows may have more by now. One that was never summed had none.
+        An append-only file may have more lines now. The result is 0 for a file without a checksum.
         """
-        return _whole_lines(self._folder / name, self._own[name]) if name in self._own else 0
+        return _unchanged_lines(self._folder / name, self._top_level[name]) if name in self._top_level else 0
 
     def add(self, attempt: Path) -> None:
-        """Take in the evidence of an attempt that was kept; nothing writes it twice, so it is summed once."""
+        """Add the checksums of a stored attempt; its evidence is never written again, so this is done once."""
         self._lines[attempt.name] = _lines(_sums(self._folder, attempt))
 
     def rename(self, attempt: str, name: str) -> None:
-        """Keep the sums of an attempt whose folder has another name now, which are not made again."""
+        """Rename an attempt's folder in the manifest; its checksums are kept, not computed again."""
         if attempt in self._lines:
-            before, after = (f"{store.REPEATS}/{one}/" for one in (attempt, name))
+            before, after = (f"{store.REPEATS}/{folder}/" for folder in (attempt, name))
             lines = self._lines.pop(attempt).splitlines(keepends=True)
             self._lines[name] = b"".join(line.replace(before.encode(), after.encode(), 1) for line in lines)
             self._save()
 
     def write(self) -> None:
-        """Write the manifest: the evidence taken in, and the trial's own files as they stand now.
+        """Write the manifest: the attempts that were added, and the top-level files as they are now.
 
-        The plan never changes, so its first sum stays.
+        The plan never changes, so its first checksum is kept.
         """
-        own = {path.name: _sha256(path) for path in self._folder.iterdir() if _is_own(path)}
-        if PLAN_FILE in self._own:
-            own[PLAN_FILE] = self._own[PLAN_FILE]
-        self._own = own
+        top_level = {path.name: _sha256(path) for path in self._folder.iterdir() if _is_top_level(path)}
+        if PLAN_FILE in self._top_level:
+            top_level[PLAN_FILE] = self._top_level[PLAN_FILE]
+        self._top_level = top_level
         self._save()
 
     def renew(self, names: Iterable[str]) -> None:
-        """Sum some of the trial's own files anew, which are made of the others; all other sums stay."""
-        self._own |= {name: _sha256(self._folder / name) for name in names}
+        """Compute the checksums of some top-level files again, which are derived from others; the rest is kept."""
+        self._top_level |= {name: _sha256(self._folder / name) for name in names}
         self._save()
 
     def renew_positions(self) -> None:
-        """Sum anew what tells where robots were, given after the trial; all other sums stay."""
-        own = {name: digest for name, digest in self._own.items() if not is_positions(name)}
-        given = (path.name for path in self._folder.iterdir() if is_positions(path.name) and _is_own(path))
-        self._own = own
-        self.renew(given)
+        """Compute the checksums of position files added after the trial again; all others are kept."""
+        top_level = {name: digest for name, digest in self._top_level.items() if not is_positions(name)}
+        added = (path.name for path in self._folder.iterdir() if is_positions(path.name) and _is_top_level(path))
+        self._top_level = top_level
+        self.renew(added)
 
     def _save(self) -> None:
-        # As sorted by whole names: the names of an attempt's files go on with a slash.
+        # The keys of attempts end with a slash, so that all lines are sorted by whole file names.
         parts = {f"{store.REPEATS}/{attempt}/": lines for attempt, lines in self._lines.items()}
-        parts |= {name: _line(name, digest) for name, digest in self._own.items()}
+        parts |= {name: _line(name, digest) for name, digest in self._top_level.items()}
         files.write(self._folder / MANIFEST_FILE, b"".join(parts[name] for name in sorted(parts)))
 
 
 def read(folder: Path) -> Sums:
-    """Return what a trial's manifest says.
+    """Return the checksums in a trial's manifest.
 
     Raises:
         EvidenceError: There is no manifest, or it cannot be read.
@@ -113,7 +113,7 @@ def read(folder: Path) -> Sums:
             "no readable manifest", where=str(path), remedy="name the folder of a trial that ran at least one repeat"
         ) from error
     except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else f"this is no line of one: {str(error)[:60]}"
+        why = error.strerror if isinstance(error, OSError) else f"not a line of a manifest: {str(error)[:60]}"
         raise EvidenceError(
             f"no readable manifest: {why}", where=str(path), remedy="restore the file from a copy"
         ) from error
@@ -129,19 +129,18 @@ def verify(folder: Path) -> list[str]:
         EvidenceError: There is no manifest, or it cannot be read.
     """
     listed = read(folder)
-    found = {str(path.relative_to(folder)): what for path, what in store.foreign(folder)}
+    unexpected = {str(path.relative_to(folder)): kind for path, kind in store.unexpected_files(folder)}
     present = {_name(folder, path): path for path in _plain_files(folder)}
     present.pop(MANIFEST_FILE, None)
-    return _told(_compared(listed.keys() - found.keys(), listed, present) | found)
+    return _sentences(_compared(listed.keys() - unexpected.keys(), listed, present) | unexpected)
 
 
 def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[str, str]:
-    """Return how the evidence of attempts differs from what was once summed, by file; those never summed do not.
+    """Return the changes of evidence since its checksums were made, by file; files without a checksum are ignored.
 
     Args:
-        folder: The trial's folder; one without a manifest has no sums.
-        attempts: Names of the attempts' folders, None for all, and for plan and journal, which say what they are, and
-            for what tells where robots were.
+        folder: The trial's folder; without a manifest there are no differences.
+        attempts: Names of the attempts' folders; None for all attempts, plan, journals and position files.
 
     Raises:
         EvidenceError: The manifest cannot be read.
@@ -150,51 +149,53 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[
         return {}
     sums = read(folder)
     summed = _by_attempt(sums)
-    own = _own_differences(folder, sums) if attempts is None else {}
-    asked = summed.keys() if attempts is None else summed.keys() & set(attempts)
+    top_level = _top_level_differences(folder, sums) if attempts is None else {}
+    selected = summed.keys() if attempts is None else summed.keys() & set(attempts)
 
     def compare(attempt: str) -> dict[str, str]:
         present = {_name(folder, path): path for path in _plain_files(store.attempt_folder(folder, attempt))}
         return _compared(summed[attempt].keys(), summed[attempt], present)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return own | {name: what for found in pool.map(compare, asked) for name, what in found.items()}
+        return top_level | {
+            name: change for changes in pool.map(compare, selected) for name, change in changes.items()
+        }
 
 
-def _own_differences(folder: Path, sums: Sums) -> dict[str, str]:
-    """Return how the plan and the journals differ; journals may have grown since they were summed."""
+def _top_level_differences(folder: Path, sums: Sums) -> dict[str, str]:
+    """Return the changes of the plan and the journals; journals may have grown since their checksums were made."""
     changed = {PLAN_FILE: PLAN_FILE in sums and _sha256(folder / PLAN_FILE) != sums[PLAN_FILE]}
     for name in (JOURNAL_FILE, laptop_files.MOTION):
-        changed[name] = name in sums and _whole_lines(folder / name, sums[name]) is None
+        changed[name] = name in sums and _unchanged_lines(folder / name, sums[name]) is None
     for name in filter(is_positions, sums.keys() | {path.name for path in folder.iterdir()}):
         changed[name] = not (folder / name).is_file() or _sha256(folder / name) != sums.get(name)
-    return {name: "changed" for name, has in changed.items() if has}
+    return {name: "changed" for name, is_changed in changed.items() if is_changed}
 
 
 def is_positions(name: str) -> bool:
-    """Return whether a trial's own file tells where robots were."""
+    """Return True if a top-level file of a trial contains positions of robots."""
     return name == accounts.FILE or name.startswith(store.POSITIONS)
 
 
-def _whole_lines(path: Path, digest: str) -> int | None:
-    """Return after how many lines a file has this sum, None where it never has."""
-    found, count = hashlib.sha256(), 0
+def _unchanged_lines(path: Path, digest: str) -> int | None:
+    """Return the number of lines after which a file has this checksum, or None if it never has."""
+    hasher, count = hashlib.sha256(), 0
     try:
         lines = files.read(path, _LIMIT_BYTES).splitlines(keepends=True)
     except OSError:
         return None
     for count, line in enumerate(lines, start=1):
-        found.update(line)
-        if found.hexdigest() == digest:
+        hasher.update(line)
+        if hasher.hexdigest() == digest:
             return count
     return None
 
 
 def few(problems: Mapping[str, str]) -> str:
-    """Return some differences in words, and how many there are beside them."""
-    told = _told(problems)
-    more = len(told) - _TOLD
-    return "; ".join(told[:_TOLD]) + (f"; and {more} more: fieldkit verify lists them" if more > 0 else "")
+    """Return a sentence with the first differences and the number of further ones."""
+    sentences = _sentences(problems)
+    more = len(sentences) - _MAX_LISTED
+    return "; ".join(sentences[:_MAX_LISTED]) + (f"; and {more} more: fieldkit verify lists them" if more > 0 else "")
 
 
 def _compared(names: Iterable[str], listed: Sums, present: Mapping[str, Path]) -> dict[str, str]:
@@ -205,18 +206,18 @@ def _compared(names: Iterable[str], listed: Sums, present: Mapping[str, Path]) -
     return problems
 
 
-def _told(problems: Mapping[str, str]) -> list[str]:
+def _sentences(problems: Mapping[str, str]) -> list[str]:
     return [f"{harmless(name).replace(chr(10), '?')}: {what}" for name, what in sorted(problems.items())]
 
 
 def _by_attempt(sums: Sums) -> dict[str, dict[str, str]]:
-    found: dict[str, dict[str, str]] = {}
+    by_attempt: dict[str, dict[str, str]] = {}
     for name, digest in sums.items():
         place, _, rest = name.partition("/")
         attempt, _, file = rest.partition("/")
         if place == store.REPEATS and file:
-            found.setdefault(attempt, {})[name] = digest
-    return found
+            by_attempt.setdefault(attempt, {})[name] = digest
+    return by_attempt
 
 
 def _sums(folder: Path, attempt: Path) -> Sums:
@@ -224,7 +225,7 @@ def _sums(folder: Path, attempt: Path) -> Sums:
 
 
 def _plain_files(folder: Path) -> Iterator[Path]:
-    """Yield the plain files at any depth below a folder, but for hidden ones: what is half done, or a desktop's."""
+    """Yield the plain files at any depth below a folder, except hidden ones (unfinished, or made by a desktop)."""
     for where, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
         paths = (Path(where, name) for name in names if not name.startswith("."))
@@ -235,7 +236,7 @@ def _name(folder: Path, path: Path) -> str:
     return path.relative_to(folder).as_posix()
 
 
-def _is_own(path: Path) -> bool:
+def _is_top_level(path: Path) -> bool:
     return path.name != MANIFEST_FILE and not path.name.startswith(".") and path.is_file() and not path.is_symlink()
 
 

@@ -1,7 +1,7 @@
-"""The journal of motions: origin of each robot that moves by itself, each motion, and who allowed the next one.
+"""The journal of motions: the origin of each self-moving robot, each motion, and each permission after a fault.
 
-It lies beside the journal of the trial, or of the campaign that the trial is of. It only grows, and each line is on
-disk before anything goes on (`fieldkit.core.jsonl`).
+It is stored next to the journal of the trial, or of the campaign that the trial belongs to. It is append-only, and
+each line is synced to disk before the program continues (`fieldkit.core.jsonl`).
 """
 
 import time
@@ -23,11 +23,11 @@ from fieldkit.steps.origins import RobotMotion
 MOTION_FILE: Final = laptop_files.MOTION
 
 _FIXED: Final = {Topology.MASTER: Role.RELAY, Topology.MASTERLESS: Role.RECEIVER}
-"""The robot that keeps its place when the distance changes (`FieldTestbed.place`)."""
+"""The robot that stays at its place when the distance changes (`FieldTestbed.place`)."""
 
 
 class MotionEvent(StrEnum):
-    """What happened to a robot that moves by itself."""
+    """Event of a robot that moves without a person."""
 
     ORIGIN = "origin"
     BEGUN = "begun"
@@ -42,14 +42,14 @@ class MotionEntry:
     """One line of the journal.
 
     Attributes:
-        utc_ns: When, in nanoseconds since 1970 UTC.
-        event: `origin`: `origin` holds from now on. `begun`: the robot may move from now on. `ended`: its motion
-            ended as it was to end. `held`: a fault stopped it, or it did not start. `confirmed`: a person confirmed
-            that it is at its place. `allowed`: the option allowed it to move from where it is.
+        utc_ns: Time of the entry, in nanoseconds since 1970 UTC.
+        event: `origin`: `origin` is valid from now on. `begun`: the robot may move from now on. `ended`: its motion
+            ended as planned. `held`: a fault stopped it, or it did not start. `confirmed`: a person confirmed that it
+            is at its place. `allowed`: an option allowed it to move from its present position.
         robot: Name of the robot.
-        place: The place that the origin is of, as `place_of` names it.
-        origin: The origin; with `ended`, where the robot was then, if it reported that.
-        reason: Why it is held, or how it was confirmed.
+        place: The place of the origin, as named by `place_of`.
+        origin: The origin; for `ended`, the robot's position at the end, if it reported one.
+        reason: Reason why it is held, or how it was confirmed.
     """
 
     utc_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -62,12 +62,12 @@ class MotionEntry:
 
 @dataclass(frozen=True)
 class MotionHold:
-    """Why a robot may not move.
+    """A robot that may not move, and the reason.
 
     Attributes:
-        robot: Its name.
-        reason: What stopped it.
-        utc_ns: When, in nanoseconds since 1970 UTC.
+        robot: Name of the robot.
+        reason: Cause of the stop.
+        utc_ns: Time of the stop, in nanoseconds since 1970 UTC.
     """
 
     robot: str
@@ -79,13 +79,13 @@ _CODEC: Final = Codec(MotionEntry)
 
 
 def journal_of(trial: Path) -> Path:
-    """Return the journal of motions of the trial in a folder: that of its campaign, if it is of one."""
+    """Return the path of the journal of motions of a trial, which is that of its campaign if it belongs to one."""
     campaign = trial.parent
     return (campaign if (campaign / laptop_files.CAMPAIGN).is_file() else trial) / MOTION_FILE
 
 
 def place_of(role: Role, placement: Placement) -> str:
-    """Return a name of the place of a robot that is the same in all trials in which people leave it there."""
+    """Return the name of a robot's place; it is the same in all trials in which the robot is left there."""
     if role == _FIXED[placement.topology]:
         return str(placement.topology)
     posts = "".join(f" {post}" for post in placement.posts if post.role == role)
@@ -93,33 +93,33 @@ def place_of(role: Role, placement: Placement) -> str:
 
 
 def origins(entries: Sequence[MotionEntry]) -> Mapping[str, MotionEntry]:
-    """Return the entry of the origin that holds for each robot, by its name; none after a person put it back."""
-    known: dict[str, MotionEntry] = {}
+    """Return the entry of the valid origin of each robot by name; a robot has none after a person moved it back."""
+    by_robot: dict[str, MotionEntry] = {}
     for entry in entries:
         if entry.event is MotionEvent.ORIGIN:
-            known[entry.robot] = entry
+            by_robot[entry.robot] = entry
         elif entry.event is MotionEvent.CONFIRMED:
-            known.pop(entry.robot, None)
-    return known
+            by_robot.pop(entry.robot, None)
+    return by_robot
 
 
 def last_places(entries: Sequence[MotionEntry]) -> Mapping[str, MotionOrigin]:
-    """Return where each robot was at the end of its last motion, by its name; unknown places are left out."""
-    known: dict[str, MotionOrigin] = {}
+    """Return the position of each robot at the end of its last motion, by name; unknown positions are left out."""
+    by_robot: dict[str, MotionOrigin] = {}
     for entry in entries:
         if entry.event in {MotionEvent.ENDED, MotionEvent.HELD} and entry.origin is not None:
-            known[entry.robot] = entry.origin
+            by_robot[entry.robot] = entry.origin
         elif entry.event in {MotionEvent.ORIGIN, MotionEvent.BEGUN, MotionEvent.CONFIRMED}:
-            known.pop(entry.robot, None)
-    return known
+            by_robot.pop(entry.robot, None)
+    return by_robot
 
 
 def holds(entries: Sequence[MotionEntry]) -> Sequence[MotionHold]:
-    """Return why robots may not move; empty if they may. In a motion without an end fieldkit was killed."""
+    """Return the robots that may not move; a motion without an end means that fieldkit was killed."""
     held: dict[str, MotionHold] = {}
     for entry in entries:
         if entry.event is MotionEvent.BEGUN:
-            held[entry.robot] = MotionHold(entry.robot, "fieldkit ended while it moved", entry.utc_ns)
+            held[entry.robot] = MotionHold(entry.robot, "fieldkit stopped while it moved", entry.utc_ns)
         elif entry.event is MotionEvent.HELD:
             held[entry.robot] = MotionHold(entry.robot, entry.reason, entry.utc_ns)
         elif entry.event is not MotionEvent.ORIGIN:
@@ -144,12 +144,12 @@ class MotionJournal:
 
     @property
     def holds(self) -> Sequence[MotionHold]:
-        """See the function `holds`."""
+        """The robots that may not move; see the function `holds`."""
         return holds(self._entries)
 
     @property
     def entries(self) -> Sequence[MotionEntry]:
-        """The entries, in the order in which they came."""
+        """The entries in order."""
         return tuple(self._entries)
 
     def add(
@@ -161,11 +161,11 @@ class MotionJournal:
         self._entries.append(entry)
 
     def confirm(self, how: str, *, at_place: bool) -> None:
-        """Let robots move again.
+        """Allow the held robots to move again.
 
         Args:
-            how: In words, how it was confirmed.
-            at_place: Whether a person confirmed that they are at their places. Their origins are recorded anew then.
+            how: Description of how it was confirmed.
+            at_place: Whether a person confirmed that they are at their places; their origins are then recorded again.
         """
         event = MotionEvent.CONFIRMED if at_place else MotionEvent.ALLOWED
         for hold in self.holds:
@@ -173,18 +173,18 @@ class MotionJournal:
 
 
 def read(path: Path) -> list[MotionEntry]:
-    """Return the entries of a journal of motions; none if there is no such file. Raises as `jsonl.read`."""
+    """Return the entries of a journal of motions; empty if there is no such file. Raises as `jsonl.read`."""
     return jsonl.read(path, _CODEC.parse, remedy="restore it from a copy") if path.is_file() else []
 
 
 class KeptOrigins:
-    """Origins of the robots of one trial that stay where a motion left them, on disk: see `Origins`.
+    """Implements `Origins` for robots that stay at the end of a motion, with a journal on disk.
 
     Args:
-        journal: Where they are recorded.
+        journal: The journal of motions.
         folder: The trial, for messages.
         robots: Name of the robot in each role.
-        placement: Where they were placed.
+        placement: The placement of the trial.
         may_return: See `Origins`.
     """
 
@@ -207,12 +207,12 @@ class KeptOrigins:
         self._places = {role: place_of(role, placement) for role in robots}
 
     def get(self, role: Role) -> MotionOrigin | None:
-        """See `Origins.get`."""
+        """Return the recorded origin of a robot at its present place, or None."""
         entry = origins(self._journal.entries).get(self._robots[role])
         return entry.origin if entry is not None and entry.place == self._places[role] else None
 
     def is_new_place(self, role: Role) -> bool:
-        """Return whether the robot's last recorded origin is of another place than the one where it must be now."""
+        """Return True if the last recorded origin is of a place other than the robot's place in this trial."""
         places = [
             entry.place
             for entry in self._journal.entries
@@ -221,29 +221,29 @@ class KeptOrigins:
         return bool(places) and places[-1] != self._places[role]
 
     def last(self, role: Role) -> MotionOrigin | None:
-        """See `Origins.last`."""
+        """Return the position of a robot at the end of its last motion, or None if it is unknown."""
         return last_places(self._journal.entries).get(self._robots[role])
 
     def record(self, role: Role, origin: MotionOrigin) -> None:
-        """See `Origins.record`."""
+        """Record the origin of a robot."""
         self._journal.add(MotionEvent.ORIGIN, self._robots[role], place=self._places[role], origin=origin)
 
     def refuse(self, role: Role, why: str) -> None:
-        """See `Origins.refuse`."""
+        """Record that a motion did not start, so that the robot is held."""
         self._journal.add(MotionEvent.HELD, self._robots[role], reason=f"it did not start: {why}")
 
     def demand(self) -> None:
-        """Return if robots may move.
+        """Check that robots may move; robots in motion are exempt.
 
         Raises:
-            MotionHeldError: One is held.
+            MotionHeldError: A robot is held.
         """
         if held := [hold for hold in self._journal.holds if hold.robot not in self._in_motion]:
             raise held_error(held, self._folder)
 
     @contextmanager
     def moving(self, role: Role) -> Iterator[RobotMotion]:
-        """See `Origins.moving`."""
+        """Record start and end of a motion; a motion that is not over when the body ends leaves the robot held."""
         self.demand()
         name, motion, why = self._robots[role], RobotMotion(), "it stopped on its way"
         self._journal.add(MotionEvent.BEGUN, name)
@@ -262,12 +262,12 @@ class KeptOrigins:
 
 
 def held_error(held: Sequence[MotionHold], folder: Path) -> MotionHeldError:
-    """Return the error of robots that may not move before a person has confirmed."""
+    """Return the error for robots that may not move before a person has confirmed."""
     robots = "; ".join(f"{hold.robot}: {hold.reason}" for hold in held)
     campaign = folder.parent / laptop_files.CAMPAIGN
     command = "fieldkit campaign, as before" if campaign.is_file() else typed("fieldkit", "resume", folder)
     return MotionHeldError(
-        f"a fault stopped a robot, and nothing moves again before a person has confirmed it: {robots}",
-        remedy=f"put the robot at its place, see that its way is free, then without --yes: {command}; or, if robots "
-        "may move from where they are, --allow-motion-after-fault",
+        f"a fault stopped a robot, and no robot moves before a person confirms: {robots}",
+        remedy=f"put the robot at its place, check that its path is free, then without --yes: {command}; or, if "
+        "robots may move from where they are, --allow-motion-after-fault",
     )

@@ -1,4 +1,4 @@
-"""The frozen inputs of a trial: what `trial.yaml` holds, and all that its CSV needs beside journal and evidence."""
+"""The frozen inputs of a trial: the content of `trial.yaml`, and the columns of its table."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -29,27 +29,27 @@ class Plan(Strict):
     """A trial's frozen inputs.
 
     Attributes:
-        schema_version: Version of the CSV columns when it was planned; a row has that of who measured it.
-        trial: Name of the trial, and of its folder.
+        schema_version: Version of the CSV columns at planning; a row has that of its own measurement.
+        trial: Name of the trial and of its folder.
         versions: Versions of fieldkit, Python, the packages that measure, and those that add steps or backends.
         code_sha256: Hash over fieldkit's source.
         profiles_sha256: Hash over the profiles of the cast.
         procedure_sha256: Hash of the procedure.
-        backend: Where the robots came from.
-        session: Names the run of fieldkit on the robots' locks; a resumed trial takes its own again.
-        seed: Seed of everything random.
-        notes: The operator's.
+        backend: Name of the backend.
+        session: Identifies the run of fieldkit in the robots' locks; a resumed trial uses the same again.
+        seed: Seed of all random numbers.
+        notes: Notes of the operator.
         topology: Topology.
-        distance: As the operator wrote it.
-        distance_m: In metres.
+        distance: Distance as the operator wrote it.
+        distance_m: Distance in metres.
         protocols: Protocols under test.
         repeats: Repeats per protocol.
-        cast: Who plays which role.
-        procedure: What is done.
-        lab_bytes: How many bytes the lab itself adds to an attempt at most.
+        cast: The robot in each role.
+        procedure: The procedure.
+        lab_bytes: Maximum number of bytes that the lab itself adds to an attempt.
         step_packages: The package of each kind of step that does not ship with fieldkit.
-        columns: What its steps measure beside the columns of every trial; None where they measure nothing else, or
-            an earlier fieldkit planned it.
+        columns: Columns of its steps that not every trial has; None if there are none, or if an earlier fieldkit
+            planned the trial.
     """
 
     schema_version: Int
@@ -81,7 +81,7 @@ class Plan(Strict):
         return trial_columns(frozen.column for frozen in self.columns)
 
     def order(self) -> Iterator[RepeatId]:
-        """Yield the planned repeats; protocols alternate, so that a slow change of the air meets each alike."""
+        """Yield the planned repeats; protocols alternate, so that slow changes of the channel affect both equally."""
         return (RepeatId(protocol, number + 1) for number in range(self.repeats) for protocol in self.protocols)
 
     @property
@@ -91,75 +91,75 @@ class Plan(Strict):
         return Placement(self.procedure.scenario, self.topology, distance, self.procedure.posts)
 
     def with_note(self, note: str) -> "Plan":
-        """Return this plan with one more note of the operator's; an empty one adds nothing."""
+        """Return this plan with a note of the operator appended; an empty note adds nothing."""
         return self.model_copy(update={"notes": "; ".join(filter(None, (self.notes, note)))})
 
     def scene(self, repeat: RepeatId, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})) -> Scene:
-        """Return what the command lines of one attempt depend on; `variants` as preflight found them."""
+        """Return the inputs of the command lines of one attempt; `variants` are those found by preflight."""
         scene = self.procedure.scene(repeat.protocol, self.cast, folder, variants)
         return replace(scene, placement=self.placement, repeat=repeat.number)
 
     def scenes(self, variants: Mapping[Role, Variants] = MappingProxyType({})) -> tuple[Scene, ...]:
-        """Return a scene per protocol, for what holds for all of its repeats."""
+        """Return a scene per protocol, for values that are the same in all of its repeats."""
         return tuple(self.procedure.scene(protocol, self.cast, "check", variants) for protocol in self.protocols)
 
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        """Yield every job of one attempt in the order in which it starts."""
+        """Yield every job of one attempt in the order of their starts."""
         for entry in self.procedure.steps:
             yield from entry.step.jobs(scene)
 
     def puts(self) -> tuple[PutProgram, ...]:
-        """Return the programs of the lab that every attempt copies to robots."""
+        """Return the programs of the lab that are copied to robots in every attempt."""
         planned = (job for scene in self.scenes() for job in self.jobs(scene))
         return tuple(dict.fromkeys(job.put for job in planned if job.put is not None))
 
     def refusals(self, variants: Mapping[Role, Variants]) -> tuple[Refusal, ...]:
-        """Return what of the procedure cannot work with the tools that the robots have, each once."""
+        """Return the parts of the procedure that cannot work with the robots' tools, without duplicates."""
         scenes, steps = self.scenes(variants), self.procedure.steps
-        found = (refusal for scene in scenes for entry in steps for refusal in entry.step.refusals(scene))
-        return tuple(dict.fromkeys((*found, *self._out_of_reach())))
+        step_refusals = (refusal for scene in scenes for entry in steps for refusal in entry.step.refusals(scene))
+        return tuple(dict.fromkeys((*step_refusals, *self._without_autopilot())))
 
-    def _out_of_reach(self) -> Iterator[Refusal]:
-        """Yield which robots nothing could bring down."""
+    def _without_autopilot(self) -> Iterator[Refusal]:
+        """Yield a refusal for each role of `on_abort` whose robot has no autopilot link to land it."""
         for role in self.procedure.on_abort:
             if self.cast[role].profile.mavlink is None:
-                why = "on_abort is to bring it down, and its profile has no mavlink"
-                yield Refusal(role, why, f"leave {role} out of on_abort, or take a drone")
+                why = "on_abort must bring it down, but its profile has no mavlink"
+                yield Refusal(role, why, f"leave {role} out of on_abort, or use a drone")
 
     def shortfalls(self) -> Iterator[str]:
-        """Yield what its expectations need and it does not have, in words."""
+        """Yield a sentence for each expectation that the plan cannot decide, for example with too few repeats."""
         return claims.shortfalls(self.procedure.expectations, self.procedure.figures, self.repeats)
 
     def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
-        """Return what the testbed does beside the commands of one repeat, in words."""
+        """Return descriptions of what the testbed does in one repeat besides running the commands."""
         on_abort = self.procedure.on_abort.items()
-        drones = (f"where it is cut short: {self.cast[role].name} is told to {how}" for role, how in on_abort)
+        drones = (f"if it is aborted: {self.cast[role].name} is commanded to {action}" for role, action in on_abort)
         return (*drones, *(line for entry in self.procedure.steps for line in entry.step.dry_run_notes(scene)))
 
     def abort_notes(self, scene: Scene) -> tuple[str, ...]:
-        """Return in words what each robot does that moves by itself where a repeat is stopped at once."""
+        """Return descriptions of what each robot that moves without a person does if a repeat is aborted."""
         watched = (role for role in self.procedure.on_abort if role not in self.procedure.moved())
-        told = (f"{self.cast[role].name} is told to {self.procedure.on_abort[role]}" for role in watched)
-        return (*told, *(line for entry in self.procedure.steps for line in entry.step.abort_notes(scene)))
+        commands = (f"{self.cast[role].name} is commanded to {self.procedure.on_abort[role]}" for role in watched)
+        return (*commands, *(line for entry in self.procedure.steps for line in entry.step.abort_notes(scene)))
 
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
-        """Return what tells the packets of each transfer, in the order in which they begin."""
+        """Return the packet filter of each transfer, in the order of their starts."""
         scene = self.procedure.scene(protocol, self.cast, "")
         transfers = (placed.step.transfer(scene, placed.within) for placed in self.procedure.walk())
         return tuple(transfer for transfer in transfers if transfer is not None)
 
     def pingings(self) -> tuple[Pinging, ...]:
-        """Return all round-trip times of a repeat, in the order in which they begin."""
+        """Return all round-trip time measurements of a repeat, in the order of their starts."""
         pingings = (placed.step.pinging() for placed in self.procedure.walk())
         return tuple(pinging for pinging in pingings if pinging is not None)
 
     def captures(self) -> Mapping[str, Role]:
-        """Return whose robot makes each capture, by its file."""
+        """Return the role of the robot that makes each capture, by capture file."""
         nests = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, Nest))
-        found = [(file, role) for nest in nests for role, file in nest.captures().items()]
-        return {file: role for role in self.cast for file, of in found if of == role}
+        roles_by_file = [(file, role) for nest in nests for role, file in nest.captures().items()]
+        return {file: role for role in self.cast for file, owner in roles_by_file if owner == role}
 
     def bags(self) -> Mapping[Role, str]:
-        """Return the first file that is recorded on each robot, by its name below an attempt's folder."""
+        """Return the first file that is recorded on each robot, by name below an attempt's folder."""
         scene = self.procedure.scene(self.protocols[0], self.cast, "")
-        return {role: made[0].name for role, made in scene.recorded.items()}
+        return {role: recordings[0].name for role, recordings in scene.recorded.items()}

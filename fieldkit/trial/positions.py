@@ -1,4 +1,4 @@
-"""Positions of robots that come after a trial: files of those who walked with them, kept beside its evidence."""
+"""Positions of robots that are added after a trial, for example GPX tracks; they are stored with its evidence."""
 
 import shutil
 from collections.abc import Iterator, Mapping
@@ -21,18 +21,18 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import Rebuilt, rebuild
 
 MOST_BYTES: Final = 64 << 20
-"""A day at 10 Hz, as GPX."""
+"""One day at 10 Hz as GPX."""
 
 
 @dataclass(frozen=True)
 class Spotted:
-    """What the columns of one attempt say of positions.
+    """The position columns of one attempt.
 
     Attributes:
         attempt: Its folder's name.
-        told_by: Who tells where robots were; None where nobody does but, perhaps, the testbed.
-        distances_m: Smallest and largest distance by what was measured: `transfer`, `rtt`, `up.rtt`.
-        missing: Why there is none, by the same.
+        told_by: Sources of the positions; None if there are none, except perhaps the testbed's.
+        distances_m: Smallest and largest distance by measurement: `transfer`, `rtt`, `up.rtt`.
+        missing: Reasons for missing distances, by measurement.
     """
 
     attempt: str
@@ -42,40 +42,43 @@ class Spotted:
 
 
 def give(
-    folder: Path, told: Mapping[Role, Path | Account], *, offset_s: float, gap_s: float, heights: bool
+    folder: Path, sources: Mapping[Role, Path | Account], *, offset_s: float, gap_s: float, heights: bool
 ) -> Rebuilt:
-    """Keep what tells where robots were with a trial, instead of what was given before, and make its tables anew.
+    """Store positions of robots with a trial, replacing those added before, and rebuild its tables.
 
     Args:
         folder: The trial's folder.
-        told: GPX or CSV, or a place in which the robot stood, by role; nobody to forget what was given.
-        offset_s: Added to the times of the files it makes them the laptop's.
-        gap_s: Longest time between two points in which a robot went straight.
-        heights: Whether heights over the ellipsoid count.
+        sources: GPX or CSV file, or a fixed place, by role; empty to remove those added before.
+        offset_s: Offset that is added to the times of the files to convert them to the laptop's clock, in seconds.
+        gap_s: Longest time between two points over which positions are interpolated linearly, in seconds.
+        heights: Whether heights above the ellipsoid are used.
 
     Raises:
-        ConfigurationError: `folder` is no trial, another fieldkit runs it, it has no such role, or a file is missing.
-        EvidenceError: A file cannot be read, or the trial's evidence is not as it was kept.
+        ConfigurationError: `folder` is not a trial, another fieldkit runs it, it has no such role, or a file is
+            missing.
+        EvidenceError: A file cannot be read, or the trial's evidence has changed.
     """
     plan = store.read_plan(folder)
-    for role, source in told.items():
+    for role, source in sources.items():
         _demand_role(plan, role)
         if isinstance(source, Path):
             _demand_file(source)
             recorded.read_file(source)
-    # What was given before is replaced, whatever became of it.
-    others = {name: what for name, what in manifest.differences(folder).items() if not manifest.is_positions(name)}
-    if others:
-        what = f"the evidence is not what was measured: {manifest.few(others)}"
-        raise EvidenceError(what, where=str(folder), remedy="restore it from a copy")
+    # Position files that were added before are replaced, so their changes do not matter.
+    changes = {
+        name: change for name, change in manifest.differences(folder).items() if not manifest.is_positions(name)
+    }
+    if changes:
+        problem = f"the evidence is not what was measured: {manifest.few(changes)}"
+        raise EvidenceError(problem, where=str(folder), remedy="restore it from a copy")
     with journal.claimed(folder):
-        kept = {role: _kept(folder, role, source, offset_s, gap_s) for role, source in told.items()}
-        if kept:
-            text = accounts.text(Accounts(kept, heights=heights))
+        accounts_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
+        if accounts_by_role:
+            text = accounts.text(Accounts(accounts_by_role, heights=heights))
             files.write(folder / accounts.FILE, text.encode())
         else:
             (folder / accounts.FILE).unlink(missing_ok=True)
-        _remove_others(folder, {account.file for account in kept.values()})
+        _remove_others(folder, {account.file for account in accounts_by_role.values()})
         if (folder / store.MANIFEST_FILE).exists():
             manifest.Manifest(folder).renew_positions()
     return rebuild(folder)
@@ -93,17 +96,17 @@ def _demand_file(path: Path) -> None:
             "there is no such file", where=str(path), remedy="name GPX, CSV, or a place: 48.1,11.5"
         )
     if (size_bytes := path.stat().st_size) > MOST_BYTES:
-        what = f"has {format_bytes(size_bytes)}, and {format_bytes(MOST_BYTES)} are read"
-        raise ConfigurationError(what, where=str(path), remedy="cut it to the time of the trial")
+        problem = f"it has {format_bytes(size_bytes)}, the limit is {format_bytes(MOST_BYTES)}"
+        raise ConfigurationError(problem, where=str(path), remedy="cut it to the time of the trial")
 
 
-def _kept(folder: Path, role: Role, source: Path | Account, offset_s: float, gap_s: float) -> Account:
-    """Return the account of a robot, its file kept in the trial's folder."""
+def _stored(folder: Path, role: Role, source: Path | Account, offset_s: float, gap_s: float) -> Account:
+    """Copy the position file of a robot into the trial's folder and return its account."""
     if isinstance(source, Account):
         return source
     name = f"{store.POSITIONS}{role}{source.suffix.lower()}"
-    with source.open("rb") as content, files.replacing(folder / name) as kept:
-        shutil.copyfileobj(content, kept)
+    with source.open("rb") as content, files.replacing(folder / name) as copy:
+        shutil.copyfileobj(content, copy)
     return Account(file=name, offset_s=offset_s, gap_s=gap_s)
 
 
@@ -114,12 +117,12 @@ def _remove_others(folder: Path, names: set[str]) -> None:
 
 
 def told(text: str) -> tuple[Role, Path | Account]:
-    """Return a role and what tells where its robot was: `receiver=walk.gpx`, `sender=48.1,11.5`, `sender=0m,5m`.
+    """Return a role and the position source of its robot: `receiver=walk.gpx`, `sender=48.1,11.5`, `sender=0m,5m`.
 
-    A third number is the height in metres over the ellipsoid.
+    A third number is the height above the ellipsoid in metres.
 
     Raises:
-        ConfigurationError: It is no such pair.
+        ConfigurationError: The text is not such a pair.
     """
     name, separator, source = text.partition("=")
     try:
@@ -127,25 +130,25 @@ def told(text: str) -> tuple[Role, Path | Account]:
     except ValueError:
         separator = ""
     if not separator or not source:
-        raise ConfigurationError(f"{text[:80]!r} is no ROLE=FILE", remedy="write for example receiver=walk.gpx")
+        raise ConfigurationError(f"{text[:80]!r} is not ROLE=FILE", remedy="write for example receiver=walk.gpx")
     return role, _place(source) or Path(source)
 
 
 def _place(text: str) -> Account | None:
-    """Return a place in which a robot stood; None if the text is none."""
+    """Return a fixed place, or None if the text is not one."""
     try:
-        (one, one_is_length), (two, is_length), *third = map(_degrees_or_m, text.split(","))
+        (first, first_is_length), (second, is_length), *third = map(_degrees_or_m, text.split(","))
     except ValueError:
         return None
-    fits = is_length or (abs(one) <= 90 and abs(two) <= 180)
-    if one_is_length is not is_length or not fits or len(third) > 1:
+    fits = is_length or (abs(first) <= 90 and abs(second) <= 180)
+    if first_is_length is not is_length or not fits or len(third) > 1:
         return None
     height_m = third[0][0] if third else 0.0 if is_length else None
-    return Account(place=(one, two, height_m), frame=LOCAL if is_length else WGS84)
+    return Account(place=(first, second, height_m), frame=LOCAL if is_length else WGS84)
 
 
 def _degrees_or_m(text: str) -> tuple[float, bool]:
-    """Return a number, and whether it is a length; raises `ValueError` where it is neither."""
+    """Return a number and True if it is a length; raises `ValueError` for any other text."""
     with suppress(ValueError):
         return float(text), False
     try:
@@ -155,10 +158,10 @@ def _degrees_or_m(text: str) -> tuple[float, bool]:
 
 
 def spotted(folder: Path) -> Iterator[Spotted]:
-    """Yield what each valid attempt of a trial says of positions, measured again.
+    """Yield the position columns of each valid attempt of a trial, measured again.
 
     Raises:
-        ConfigurationError: `folder` is no trial.
+        ConfigurationError: `folder` is not a trial.
         EvidenceError: The journal is damaged.
     """
     plan = store.read_plan(folder)
@@ -175,8 +178,8 @@ _SMALLEST: Final = "_distance_min_m"
 def _distances_m(measured: Measured) -> Iterator[tuple[str, tuple[float, float]]]:
     for name, least in measured.values.items():
         if name.endswith(_SMALLEST):
-            what = name.removesuffix(_SMALLEST)
-            yield what, (float(least), float(measured.values[f"{what}_distance_max_m"]))
+            measurement = name.removesuffix(_SMALLEST)
+            yield measurement, (float(least), float(measured.values[f"{measurement}_distance_max_m"]))
 
 
 def _missing(measured: Measured) -> Mapping[str, str]:

@@ -1,4 +1,4 @@
-"""Procedures (`procedures/*.yaml`) -> frozen objects: the scripted steps of a trial, spoken of in roles."""
+"""Procedures (`procedures/*.yaml`): the steps of a trial, which refer to robots by role."""
 
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
@@ -27,11 +27,11 @@ from fieldkit.steps.variants import Variants
 from fieldkit.trial import columns
 
 Repeats = Annotated[Int, Field(gt=0, le=MOST_REPEATS)]
-"""How often each protocol is measured."""
+"""Number of repeats per protocol."""
 
 
 class Place(PathLeg):
-    """Place of a robot in a role of the procedure's own; its directions are those of a piece of a way.
+    """Place of a robot in a role that the procedure defines; its directions are those of a leg of a path.
 
     Attributes:
         near: The robot under test that the position is relative to: `sender`, `receiver` or `relay`. At least one of
@@ -41,9 +41,9 @@ class Place(PathLeg):
     near: Role
 
     @schema.model_validator(mode="after")
-    def _near_one_under_test(self) -> "Place":
+    def _is_near_a_fixed_role(self) -> "Place":
         if self.near not in FIXED_ROLES:
-            raise schema.complaint(f"near is one of: {', '.join(FIXED_ROLES)}", "near")
+            raise schema.complaint(f"near must be one of: {', '.join(FIXED_ROLES)}", "near")
         return self
 
 
@@ -54,7 +54,7 @@ class Procedure(catalog.Named):
     procedure](add-a-procedure.md). Steps of a kind are distinguished by their `name`: without one, a procedure has at
     most one `transfer` and one `ping`, one `record`, one `capture` and one `move` per robot, and one `fault` of a
     kind. Files must have different names; simultaneous steps need different ports or different listening robots;
-    steps in one capture must differ in port, sender or receiver. A procedure that cannot be measured is refused when
+    steps in one capture must differ in port, sender or receiver. A procedure that cannot be measured is rejected when
     it is loaded, with its line.
 
     In `master` the distance is between each station and the relay, with the stations on opposite sides; in
@@ -66,9 +66,9 @@ class Procedure(catalog.Named):
         topology: `master` or `masterless`; the command line may override it.
         protocols: List of `tcp`, `udp`; the command line may override it.
         repeats: Repeats per protocol; the command line may override it.
-        attempts: Maximum number of attempts at a repeat whose evidence is not whole.
+        attempts: Maximum number of attempts at a repeat whose evidence is incomplete.
         needs_ros_master: Whether it needs one ROS master for all robots; a site file without `ros_master` is then
-            refused.
+            rejected.
         places: Positions of robots in additional roles, by role.
         on_abort: What a drone does when a repeat is aborted, by role: `land` where it is, or `return`; see
             [MAVLink](mavlink.md#where-a-trial-is-cut-short).
@@ -90,47 +90,47 @@ class Procedure(catalog.Named):
     @classmethod
     @override
     def written_out(cls, document: schema.Document) -> schema.Document:
-        """Every `for:`."""
+        """Return the document with every `for:` written out."""
         return loops.written_out(document, "steps")
 
     @schema.model_validator(mode="after")
-    def _has_a_place_for_everybody(self) -> "Procedure":
-        """Refuse a role that nothing says the place of, most likely one that is not spelled right."""
-        known = (*FIXED_ROLES, *self.places)
+    def _has_a_place_for_each_role(self) -> "Procedure":
+        """Reject a role without a place, which is most likely misspelled."""
+        known_roles = (*FIXED_ROLES, *self.places)
         for placed in self.walk():
-            for role in in_order(placed.step.roles() - set(known)):
-                say = f"say where it stands: places: {{{role}: {{near: sender, left: 5m}}}}"
-                raise schema.complaint(f"there is no role {role}; {nearest(role, known, say)}", *placed.at)
+            for role in in_order(placed.step.roles() - set(known_roles)):
+                remedy = f"give its place: places: {{{role}: {{near: sender, left: 5m}}}}"
+                raise schema.complaint(f"there is no role {role}; {nearest(role, known_roles, remedy)}", *placed.at)
         for role in self.on_abort:
             if role not in self.roles():
                 raise schema.complaint(f"no step has the role {role}", "on_abort", role)
         for role in self.places:
             if role in FIXED_ROLES:
-                raise schema.complaint(f"where the {role} stands the distance says", "places", role)
+                raise schema.complaint(f"the place of the {role} follows from the distance", "places", role)
             if role not in self.roles():
                 raise schema.complaint(f"no step has the role {role}", "places", role)
         return self
 
     @schema.model_validator(mode="after")
     def _can_be_measured(self) -> "Procedure":
-        """Refuse what would be measured wrongly, or not at all."""
-        of_robots = (name(role) for role in self.roles() for name in (host.before, host.after, link_samples.file))
-        claimed, files, earlier = set[tuple[str, str]](), set(of_robots), list[PlacedStep]()
+        """Reject steps that would be measured incorrectly or not at all."""
+        robot_files = (name(role) for role in self.roles() for name in (host.before, host.after, link_samples.file))
+        claimed, files, earlier = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
         filled = set[str]()
         for placed in self.walk():
             step = placed.step
-            before = [one.step for one in earlier if not placed.is_beside(one)]
+            before = [other.step for other in earlier if not placed.runs_beside(other)]
             if why := step.placement_error(before, placed.within):
                 raise schema.complaint(why, *placed.at)
             for claim in step.exclusive_resources():
                 if (step.prefix, claim) in claimed:
-                    raise schema.complaint(_twice(step, claim), *placed.at)
+                    raise schema.complaint(_claimed_twice(step, claim), *placed.at)
                 claimed.add((step.prefix, claim))
             for name in step.files():
-                if why := _taken(step, name, files):
+                if why := _file_conflict(step, name, files):
                     raise schema.complaint(why, *placed.at)
                 files.add(name)
-            if why := next(filter(None, map(placed.taken_for, earlier)), None):
+            if why := next(filter(None, map(placed.port_conflict, earlier)), None):
                 raise schema.complaint(why, *placed.at, "port")
             for column in columns.of_step(step):
                 if why := columns.clash(column, filled):
@@ -140,7 +140,7 @@ class Procedure(catalog.Named):
         return self
 
     @schema.model_validator(mode="after")
-    def _expects_what_it_measures(self) -> "Procedure":
+    def _has_valid_expectations(self) -> "Procedure":
         for index in range(len(self.expect)):
             try:
                 self._expectation(index)
@@ -150,36 +150,36 @@ class Procedure(catalog.Named):
 
     @property
     def expectations(self) -> tuple[Expectation, ...]:
-        """What is demanded of its figures."""
+        """The expectations of its figures."""
         return tuple(map(self._expectation, range(len(self.expect))))
 
     @property
     def figures(self) -> tuple[Quantity, ...]:
-        """The figures that repeats make of what its steps measure."""
+        """The figures that can be aggregated from the columns of its steps."""
         return quantities(columns.filled_by(placed.step for placed in self.walk()))
 
     def _expectation(self, index: int) -> Expectation:
         return expectations.parse(self.expect[index], self.figures)
 
     def walk(self) -> Iterator["PlacedStep"]:
-        """Yield every step in the order in which it begins, also those inside others."""
+        """Yield every step in the order of their starts, including nested ones."""
         return _walk(self.steps, ("steps",), ())
 
     def scene(
         self, protocol: Protocol, cast: Cast, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})
     ) -> Scene:
-        """Return what command lines and measures of one attempt depend on.
+        """Return the inputs of the command lines and measures of one attempt.
 
         Args:
             protocol: The transport protocol under test.
-            cast: Who plays which role.
+            cast: The robot in each role.
             folder: The attempt's folder on every robot.
-            variants: The tools of each robot, as preflight found them.
+            variants: The tools of each robot, as found by preflight.
         """
         recorded: dict[Role, tuple[RecordedFile, ...]] = {}
         for placed in self.walk():
-            for made in placed.step.recorded(cast):
-                recorded[made.role] = (*recorded.get(made.role, ()), made)
+            for file in placed.step.recorded(cast):
+                recorded[file.role] = (*recorded.get(file.role, ()), file)
         scene = Scene(protocol, cast, folder, recorded, variants, on_abort=self.on_abort)
         return replace(scene, flows=tuple(flow for placed in self.walk() for flow in placed.step.flows(scene)))
 
@@ -188,16 +188,16 @@ class Procedure(catalog.Named):
         return frozenset().union(*(entry.step.roles() for entry in self.steps))
 
     def moved(self) -> frozenset[Role]:
-        """Return the roles whose robots steps move."""
+        """Return the roles whose robots are moved by steps."""
         return frozenset().union(*(placed.step.moves() for placed in self.walk()))
 
     @property
     def posts(self) -> tuple[Post, ...]:
-        """The places of robots in roles of its own."""
+        """The places of robots in the roles that it defines."""
         return tuple(Post(role, place.near, place.leg) for role, place in self.places.items())
 
     def expected_s(self, protocol: Protocol) -> float:
-        """Return about how many seconds one repeat takes on a good link."""
+        """Return the estimated duration of one repeat on a good link, in seconds."""
         return 0.5 + sum(entry.step.expected_s(protocol) for entry in self.steps)
 
     def with_record(self, duration_s: float) -> "Procedure":
@@ -206,24 +206,24 @@ class Procedure(catalog.Named):
         return self.model_copy(update={"steps": steps})
 
     def resolved(self, cast: Cast) -> "Procedure":
-        """Return this procedure with what its steps leave to their robots filled in."""
+        """Return this procedure with the values that its steps leave to the robots filled in."""
         steps = tuple(StepEntry(entry.kind, entry.step.resolved(cast)) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
     def adjustments(self, cast: Cast) -> Iterator[str]:
-        """Yield in words of what `fitted` makes less than the steps say."""
+        """Yield a sentence for each value of a step that `resolved` reduces."""
         return (line for entry in self.steps for line in entry.step.adjustments(cast))
 
 
 @dataclass(frozen=True)
 class PlacedStep:
-    """A step where it stands in a procedure.
+    """A step and its position in a procedure.
 
     Attributes:
         step: The step.
         kind: Its kind.
-        within: The steps that it stands inside, the outermost first.
-        at: Where it stands in the file.
+        within: The steps that contain it, the outermost first.
+        at: Its location in the file.
     """
 
     step: Step
@@ -233,49 +233,50 @@ class PlacedStep:
 
     @property
     def disturbed(self) -> bool:
-        """Whether it may fail because of what it stands inside."""
+        """Whether it may fail because a step that contains it disturbs it."""
         return any(nest.disturbs for nest in self.within)
 
     @property
     def called(self) -> str:
-        """The step in words: `the step transfer up`."""
+        """Description of the step: `the step transfer up`."""
         return " ".join(filter(None, ("the step", self.kind, self.step.prefix)))
 
-    def taken_for(self, other: "PlacedStep") -> str | None:
-        """Return why an earlier step leaves it no port of its own, or none that tells their packets apart, or None.
+    def port_conflict(self, other: "PlacedStep") -> str | None:
+        """Return the reason why an earlier step conflicts with the ports of this one, or None.
 
-        A port of a robot takes one listener at a time. In one capture packets are told by both robots and the port.
+        A port of a robot accepts one listener at a time. In one capture, packets are distinguished by the two robots
+        and the port.
         """
-        at_once = self.is_beside(other) or any(nest is other.step for nest in self.within)
-        captured = any(nest.captures() and any(nest is around for around in other.within) for nest in self.within)
+        is_simultaneous = self.runs_beside(other) or any(nest is other.step for nest in self.within)
+        is_captured = any(nest.captures() and any(nest is around for around in other.within) for nest in self.within)
         for mine, theirs in product(self.step.listens(), other.step.listens()):
-            alone = not (mine.shared and theirs.shared)
-            if at_once and alone and (mine.role, mine.port) == (theirs.role, theirs.port):
+            is_exclusive = not (mine.shared and theirs.shared)
+            if is_simultaneous and is_exclusive and (mine.role, mine.port) == (theirs.role, theirs.port):
                 return f"port {mine.port} comes twice at the same time on {mine.role}; give one another {mine.by}"
-            if captured and mine.looks_like(theirs):
-                what = f"port {mine.port} comes twice in one capture, from {mine.peer} to {mine.role}"
-                return f"{what}; give one another {mine.by}, or each a capture of its own"
+            if is_captured and mine.looks_like(theirs):
+                conflict = f"port {mine.port} comes twice in one capture, from {mine.peer} to {mine.role}"
+                return f"{conflict}; give one another {mine.by}, or a separate capture each"
         return None
 
-    def is_beside(self, other: "PlacedStep") -> bool:
-        """Return whether an earlier step runs at the same time, neither inside the other."""
-        ways = zip((*self.within, self.step), (*other.within, other.step), strict=False)
-        parts = next((index for index, (mine, theirs) in enumerate(ways) if mine is not theirs), 0)
-        return parts > 0 and self.within[parts - 1].parallel
+    def runs_beside(self, other: "PlacedStep") -> bool:
+        """Return True if an earlier step runs at the same time and neither contains the other."""
+        paths = zip((*self.within, self.step), (*other.within, other.step), strict=False)
+        fork = next((index for index, (mine, theirs) in enumerate(paths) if mine is not theirs), 0)
+        return fork > 0 and self.within[fork - 1].parallel
 
 
-def _taken(step: Step, name: str, files: Set[str]) -> str | None:
-    """Return why a step cannot have a file of this name, None if it can."""
+def _file_conflict(step: Step, name: str, files: Set[str]) -> str | None:
+    """Return the reason why a step cannot have a file of this name, or None if it can."""
     if laptop_files.reserved(name) and name not in step.laptop_files():
         return f"only the laptop writes a file {name}; give it another name"
-    return f"a file {name} is there already; give it, or its step, another name" if name in files else None
+    return f"there is already a file {name}; give it, or its step, another name" if name in files else None
 
 
-def _twice(step: Step, claim: str) -> str:
-    """Return what is wrong where a step has what another of its name has."""
+def _claimed_twice(step: Step, claim: str) -> str:
+    """Return the message for two steps that claim the same exclusive resource under one name."""
     if step.prefix:
-        return f"{claim} named {step.prefix} comes twice; give one another name, inside for: one with its variable"
-    return f"{claim} comes twice; tell them apart by name:, inside for: one with its variable, name: p{{bytes}}"
+        return f"{claim} named {step.prefix} comes twice; give one another name, inside for: with its variable"
+    return f"{claim} comes twice; give each a name:, inside for: with its variable, name: p{{bytes}}"
 
 
 def _walk(entries: tuple[StepEntry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[PlacedStep]:
@@ -287,7 +288,7 @@ def _walk(entries: tuple[StepEntry, ...], at: schema.Location, within: tuple[Nes
 
 
 def load_procedure(name: str) -> Procedure:
-    """Return the procedure `name`, the lab's own folder first.
+    """Return the procedure `name`; the lab's folder is searched first.
 
     Raises:
         ConfigurationError: No such procedure (the nearest name is given), or an error in its file.
@@ -296,28 +297,28 @@ def load_procedure(name: str) -> Procedure:
 
 
 def read_procedure(path: Path) -> Procedure:
-    """Return the procedure in a file, wherever that is.
+    """Return the procedure in any file.
 
     Raises:
-        ConfigurationError: It cannot be read, or has an error.
+        ConfigurationError: The file cannot be read, or has an error.
     """
     return catalog.named(schema.read(path), Procedure, path.stem)
 
 
-def expecting(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
-    """Return procedures of which those that measure the figure expect something of it, beside what they expect.
+def with_expectation(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
+    """Return the procedures; those that measure the figure have the expectation in addition to their own.
 
     Args:
-        procedures: Some.
+        procedures: The procedures.
         text: The expectation.
 
     Raises:
-        ConfigurationError: It is none, or of a figure that none of them measures.
+        ConfigurationError: The text is not an expectation, or no procedure measures the figure.
     """
-    wanted = expectations.parse(text, (figure for procedure in procedures for figure in procedure.figures)).quantity
+    quantity = expectations.parse(text, (figure for procedure in procedures for figure in procedure.figures)).quantity
     return [
         procedure.model_copy(update={"expect": (*procedure.expect, text)})
-        if wanted in {figure.name for figure in procedure.figures}
+        if quantity in {figure.name for figure in procedure.figures}
         else procedure
         for procedure in procedures
     ]

@@ -1,4 +1,4 @@
-"""Make a trial's tables again from plan, journal and raw evidence alone: the same bytes, with no robot."""
+"""Rebuild a trial's tables from plan, journal and raw evidence alone: the same bytes, without a robot."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +19,9 @@ class Rebuilt:
 
     Attributes:
         cells: The summary.
-        changed: Files whose bytes differ from what stood there before; files that were missing count.
-        expected: Names of the quantities with an expectation.
-        is_summed: Whether there is a manifest, which says that the evidence is as it was.
+        changed: Files whose bytes differ from before, or that were missing.
+        expected: Names of the quantities that have an expectation.
+        is_summed: Whether there is a manifest, so that the evidence was verified to be unchanged.
     """
 
     cells: tuple[Cell, ...]
@@ -31,26 +31,27 @@ class Rebuilt:
 
 
 def rebuild(folder: Path) -> Rebuilt:
-    """Write trial.csv and summary.csv of the trial in `folder` anew.
+    """Write trial.csv and summary.csv of the trial in `folder` again.
 
     Raises:
-        ConfigurationError: `folder` is no trial, another fieldkit runs it, or it cannot be written.
-        EvidenceError: The journal cannot be read, or evidence is not as it was summed; nothing is written then.
+        ConfigurationError: `folder` is not a trial, another fieldkit runs it, or it cannot be written.
+        EvidenceError: The journal cannot be read, or the evidence differs from its checksums; nothing is written
+            then.
     """
     plan = store.read_plan(folder)
     if differences := manifest.differences(folder):
         raise EvidenceError(
-            f"the evidence is not what was measured, and the tables stay as they are: {manifest.few(differences)}",
+            f"the evidence is not what was measured; the tables are not changed: {manifest.few(differences)}",
             where=str(folder),
-            remedy="restore it from a copy; or look what it says now: "
+            remedy="restore it from a copy; or show the results of the evidence as it is now: "
             + typed("fieldkit", "aggregate", folder, "--rebuild"),
         )
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
     before = {name: _content(folder / name) for name in names}
     entries = journal.history(folder, plan)
-    with journal.claimed(folder):  # a trial that runs would lose the rows that it has written meanwhile
+    with journal.claimed(folder):  # rows that a running trial adds meanwhile would be lost
         table = rows.to_csv(_measured(folder, plan, entries), plan.table)
-        rows.summary(folder, plan, table)  # nothing is written if it cannot be made
+        rows.summary(folder, plan, table)  # if this fails, nothing has been written yet
         rows.write_table(folder, table)
         cells = rows.write_summary(folder, plan, table)
         if is_summed := (folder / store.MANIFEST_FILE).exists():
@@ -61,10 +62,10 @@ def rebuild(folder: Path) -> Rebuilt:
 
 
 def measured(folder: Path, plan: Plan) -> list[Row]:
-    """Return the rows of a trial's attempts, measured again; nothing is written.
+    """Return the rows of a trial's attempts, measured again from the evidence; nothing is written.
 
     Raises:
-        EvidenceError: As `journal.history`.
+        EvidenceError: As for `journal.history`.
     """
     return _measured(folder, plan, journal.history(folder, plan))
 
@@ -75,7 +76,7 @@ def _measured(folder: Path, plan: Plan, entries: list[JournalEntry]) -> list[Row
 
 
 def row(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Row:
-    """Return the row of an attempt; what its evidence does not say is missing."""
+    """Return the row of an attempt; values that its evidence does not contain are missing."""
     return rows.build(plan, attempt, gates.judge(plan, attempt.repeat, evidence).measured)
 
 

@@ -1,9 +1,10 @@
-"""Which settings of a middleware kept a criterion on a measured link, by the repeats of steps `topics`.
+"""Judge which middleware settings meet a criterion on a measured link, from the repeats of `topics` steps.
 
-A candidate is a middleware with its settings and quality of service. It passes only if it kept the criterion in every
-cell, which is a size of samples at a place. What is missing never counts as good: too few valid repeats, a delay that
-was withheld, or a publisher that found no subscription leave a candidate undecided. The rule is that of expectations
-(`fieldkit.analysis.judgements`): `every loss <= BOUND`, or `90 % of loss <= BOUND` with a share.
+A candidate is a middleware with its settings and its quality of service. It passes only if it meets the criterion in
+every cell, that is, for every sample size at every place. Missing data never counts as good: a candidate stays
+undecided if there are too few valid repeats, if a delay was withheld, or if a publisher found no subscription. The
+rule is that of expectations (`fieldkit.analysis.judgements`): `every loss <= BOUND`, or `90 % of loss <= BOUND` if a
+share is given.
 """
 
 import json
@@ -34,9 +35,9 @@ class Candidate:
 
     Attributes:
         over: The middleware.
-        transport: What carries Zenoh.
-        settings: Its settings by their path, as JSON with sorted keys.
-        quality: `reliability history depth` in ROS 2's words.
+        transport: Transport of Zenoh.
+        settings: Its settings by path, as JSON with sorted keys.
+        quality: `reliability history depth`, as named in ROS 2.
     """
 
     over: str
@@ -46,23 +47,23 @@ class Candidate:
 
     @property
     def by_path(self) -> Mapping[str, str]:
-        """Its settings by their path."""
+        """Its settings by path."""
         return dict(json.loads(self.settings))
 
     def __str__(self) -> str:
-        carried = f" by {self.transport}" if self.over == "zenoh" else ""
-        return f"{self.over}{carried}, {self.quality}, settings {self.settings}"
+        transport = f" by {self.transport}" if self.over == "zenoh" else ""
+        return f"{self.over}{transport}, {self.quality}, settings {self.settings}"
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """A candidate, judged.
+    """The assessment of one candidate.
 
     Attributes:
         candidate: The candidate.
-        cells: Its evidence.
-        failed: Why it does not keep the criterion; a sentence each.
-        lacking: What evidence is missing; a sentence each.
+        cells: Its measured cells.
+        failed: Reasons why it does not meet the criterion; one sentence each.
+        lacking: Missing evidence; one sentence each.
     """
 
     candidate: Candidate
@@ -72,25 +73,26 @@ class Assessment:
 
     @property
     def passed(self) -> bool:
-        """Whether every cell kept the criterion."""
+        """Whether every cell meets the criterion."""
         return not self.failed and not self.lacking
 
     @property
     def rank(self) -> tuple[float, float]:
-        """The loss of the worst cell, and the largest delay of any repeat: the smaller, the better.
+        """Largest loss of any cell and largest delay of any repeat; smaller is better.
 
-        Not the end of an interval: that of repeats without a loss is wider than that of repeats with few.
+        The ends of the intervals are not used: the interval of repeats without a loss is wider than that of repeats
+        with few losses.
         """
         losses = [math.inf if cell.loss is None else cell.loss.value for cell in self.cells]
         return max(losses), max(cell.largest_delay_s for cell in self.cells)
 
 
 def assess(attempts: Repeats, criterion: LinkCriterion) -> list[Assessment]:
-    """Judge every candidate that trials measured.
+    """Assess every candidate that the trials measured.
 
     Args:
         attempts: Repeats with their folders, as `Sources.read` returns them.
-        criterion: What must be kept.
+        criterion: The criterion.
     """
     tables: dict[tuple[Candidate, str, float], list[Repeats]] = {}
     for rows, stream, prefix, rmw in _measured(attempts):
@@ -100,17 +102,20 @@ def assess(attempts: Repeats, criterion: LinkCriterion) -> list[Assessment]:
             table = topic_columns(rows.where(index), prefix)
             tables.setdefault((_candidate(stream, rmw), f"{topology}, {distance}", stream.bytes), []).append(table)
     cells: dict[Candidate, list[LinkCell]] = {}
-    for (candidate, place, size_bytes), several in sorted(tables.items(), key=str):
-        cells.setdefault(candidate, []).append(link_cell(place, size_bytes, several))
-    wanted = {(cell.place, cell.size_bytes) for own in cells.values() for cell in own}
-    return [judged(candidate, own, wanted, criterion) for candidate, own in cells.items()]
+    for (candidate, place, size_bytes), cell_tables in sorted(tables.items(), key=str):
+        cells.setdefault(candidate, []).append(link_cell(place, size_bytes, cell_tables))
+    required = {(cell.place, cell.size_bytes) for candidate_cells in cells.values() for cell in candidate_cells}
+    return [
+        assess_candidate(candidate, candidate_cells, required, criterion)
+        for candidate, candidate_cells in cells.items()
+    ]
 
 
 def _measured(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOptions, str, str]]:
-    """Yield the attempts of each trial with each of its steps `topics`, the prefix of its columns, and its RMW."""
+    """Yield the attempts of each trial with each of its `topics` steps, its column prefix, and its RMW."""
     for folder in dict.fromkeys(attempts.texts[SOURCE]):
         if not folder or not Path(folder).is_dir():
-            continue  # a table alone does not say what was streamed
+            continue  # a CSV file without its trial does not contain the plan
         rows = attempts.where(attempts.texts[SOURCE] == folder)
         for placed in store.read_plan(Path(folder)).procedure.walk():
             if isinstance(placed.step, StreamOptions) and not placed.disturbed:
@@ -118,7 +123,7 @@ def _measured(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOptions, str, 
 
 
 def _rmw(folder: Path, step: StreamOptions) -> str:
-    """Return the RMW that the publishers of a trial reported; `unknown` if none, or several, did."""
+    """Return the RMW that the publishers of a trial reported; `unknown` unless exactly one was reported."""
     if step.over is not Over.ROS2 or not isinstance(step, Step):
         return ""
     logs = folder.glob(f"repeats/*/{step.own_name(f'{step.sender}-topic.log')}")
@@ -134,21 +139,21 @@ def _candidate(stream: StreamOptions, rmw: str) -> Candidate:
     return Candidate(stream.over.value, stream.transport, settings, " ".join(words))
 
 
-def judged(
-    candidate: Candidate, cells: Sequence[LinkCell], wanted: set[tuple[str, float]], criterion: LinkCriterion
+def assess_candidate(
+    candidate: Candidate, cells: Sequence[LinkCell], required: set[tuple[str, float]], criterion: LinkCriterion
 ) -> Assessment:
-    """Return whether a candidate kept a criterion.
+    """Return the assessment of a candidate.
 
     Args:
         candidate: The candidate.
-        cells: What was measured of it.
-        wanted: Places and sizes that any candidate has.
-        criterion: What must be kept.
+        cells: Its measured cells.
+        required: The places and sample sizes at which any candidate was measured.
+        criterion: The criterion.
     """
     failed: list[str] = []
     lacking: list[str] = []
-    for place, size_bytes in sorted(wanted - {(cell.place, cell.size_bytes) for cell in cells}):
-        lacking.append(f"{place}, {size_bytes:g} B: it was not measured; the others were")
+    for place, size_bytes in sorted(required - {(cell.place, cell.size_bytes) for cell in cells}):
+        lacking.append(f"{place}, {size_bytes:g} B: not measured, although other candidates were")
     for cell in cells:
         n = 0 if cell.loss is None else cell.loss.n
         if n < criterion.repeats:
@@ -160,7 +165,7 @@ def judged(
 
 
 def _reason(judgement: Judgement) -> str:
-    """Return why a judgement does not hold, with its figure."""
+    """Return the reason why a judgement does not hold, with the measured values."""
     unknown, demand = judgement.why or "not shown", judgement.expectation.text
     if judgement.found is None or judgement.met is None:
         return f"{demand}: {unknown}"
@@ -169,7 +174,7 @@ def _reason(judgement: Judgement) -> str:
 
 
 def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:
-    """Yield what was measured of a candidate, line by line, for the comment of its file."""
+    """Yield the lines of the comment that documents a candidate's measurements in its settings file."""
     yield "Written by fieldkit middleware recommend from measured trials."
     yield f"Measured: {assessment.candidate}."
     yield f"Criterion: {criterion}."

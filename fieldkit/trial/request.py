@@ -1,4 +1,4 @@
-"""The operator's request for a trial, and the plan that it is frozen into."""
+"""The operator's request for a trial, and the plan that is made of it."""
 
 import platform
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ from fieldkit.trial.procedure import Procedure
 
 @dataclass(frozen=True)
 class TrialRequest:
-    """Request of the operator; None takes the procedure's own value.
+    """Request of the operator; None means the procedure's value.
 
     Attributes:
         procedure: The procedure.
         distance: The distance.
         topology: Topology.
-        protocols: Protocols; empty takes the procedure's.
+        protocols: Protocols; empty for those of the procedure.
         repeats: Repeats per protocol.
         record_s: Duration of every recording, in seconds.
         seed: Seed.
@@ -44,7 +44,7 @@ class TrialRequest:
 
     @property
     def chosen_topology(self) -> Topology:
-        """The topology asked for, or the procedure's."""
+        """The requested topology, or that of the procedure."""
         return self.topology or self.procedure.topology
 
 
@@ -57,19 +57,19 @@ def make_plan(
     session: str | None = None,
     lab_bytes: int = 0,
 ) -> Plan:
-    """Freeze a request.
+    """Return the plan of a request.
 
     Args:
-        request: What the operator asked for.
+        request: The request.
         backend: Name of the backend.
-        cast: Who plays which role; robots in roles of other procedures' own take no part.
-        now: Start of the trial, part of its name.
-        session: The run of fieldkit that the trial is part of; None for the trial alone.
-        lab_bytes: How many bytes the lab itself adds to an attempt at most (`Backend.lab_bytes`).
+        cast: The robot in each role; robots in roles that the procedure does not use are left out.
+        now: Start of the trial; it becomes part of its name.
+        session: The run of fieldkit that the trial belongs to; None if it contains only this trial.
+        lab_bytes: Maximum number of bytes that the lab itself adds to an attempt (`Backend.lab_bytes`).
 
     Raises:
-        ConfigurationError: The procedure or the topology needs a role that nobody plays, or a ROS master that robots
-            share where each has its own.
+        ConfigurationError: No robot has a role that the procedure or the topology needs, or the procedure needs a
+            common ROS master and each robot has its own.
     """
     procedure, topology = request.procedure, request.chosen_topology
     _demand_roles(procedure, topology, cast)
@@ -93,8 +93,8 @@ def make_plan(
             },
         },
         code_sha256=code_hash(),
-        profiles_sha256=data_hash(_what_robots_are(cast)),
-        # What is demanded of figures changes none of them.
+        profiles_sha256=data_hash(_robot_data(cast)),
+        # Expectations are excluded, because they do not affect the measurement.
         procedure_sha256=data_hash(procedure.model_dump(mode="json", exclude={"expect"})),
         backend=backend,
         session=session or trial,
@@ -113,27 +113,27 @@ def make_plan(
     )
 
 
-def _what_robots_are(cast: Cast) -> dict[str, object]:
-    """Return what makes trials on other robots other trials."""
-    found: dict[str, object] = {role: robot.profile.model_dump(mode="json") for role, robot in cast.items()}
-    # By role: addresses are another lab's, and measure nothing else.
-    found |= {"ros_master": role for role, robot in cast.items() if robot.address == robot.ros_master}  # noqa: B035
-    return found
+def _robot_data(cast: Cast) -> dict[str, object]:
+    """Return the data that distinguishes the robots of this trial from those of other trials."""
+    data: dict[str, object] = {role: robot.profile.model_dump(mode="json") for role, robot in cast.items()}
+    # The role of the ROS master is used, because addresses differ between labs without effect on the measurement.
+    data |= {"ros_master": role for role, robot in cast.items() if robot.address == robot.ros_master}  # noqa: B035
+    return data
 
 
 def _demand_ros_master(procedure: Procedure, topology: Topology, cast: Cast) -> None:
     if procedure.needs_ros_master and not any(robot.ros_master for robot in cast.values()):
         raise ConfigurationError(
-            f"procedure {procedure.name} is about one ROS master of all robots; in {topology} each has its own",
-            remedy="write into the site file who runs it: ros_master: relay",
+            f"procedure {procedure.name} needs one ROS master for all robots; in {topology} each robot has its own",
+            remedy="set the robot that runs it in the site file: ros_master: relay",
         )
 
 
 def _demand_roles(procedure: Procedure, topology: Topology, cast: Cast) -> None:
-    """Refuse a cast that lacks a role of the procedure, or of who is placed."""
+    """Raise an error if the cast lacks a role of the procedure or of the topology."""
     placed = {Role.SENDER, Role.RECEIVER} | ({Role.RELAY} if topology is Topology.MASTER else set())
     if missing := (procedure.roles() | placed) - cast.keys():
         raise ConfigurationError(
-            f"nobody plays {', '.join(sorted(missing))} in topology {topology}",
+            f"no robot has the role {', '.join(sorted(missing))} in topology {topology}",
             remedy=f"name a robot under roles.{topology} in the site file",
         )

@@ -1,4 +1,4 @@
-"""Rows of trial.csv and summary.csv, the same whether a repeat has just ended or is read from disk years later."""
+"""Rows of trial.csv and summary.csv; they are the same for a repeat that just ended and for one read from disk."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import filterfalse
@@ -32,7 +32,7 @@ LOSSES: Final = frozenset(
         "mavlink_loss",
     )
 )
-"""Columns that are 1 where nothing arrived; of a transfer without any packet some are missing."""
+"""Columns that are 1 if nothing arrived; some are missing for a transfer without any packet."""
 
 
 def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
@@ -66,29 +66,31 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
 
 
 def in_words(plan: Plan, row: Row) -> str:
-    """Return the most important numbers of a row for people, losses first: `IP loss 3.2 %, RTT 12.1 ms`.
+    """Return the most important numbers of a row for display, losses first: `IP loss 3.2 %, RTT 12.1 ms`.
 
-    How long a fault took a robot away comes after what it did to others.
+    The steps that a fault disturbs come before the duration of the fault itself.
     """
     steps = sorted(
         (placed.step for placed in plan.procedure.walk()), key=lambda step: isinstance(step, Nest) and step.disturbs
     )
-    said = [(step.prefix, list(_of_step(step, row))) for step in steps]
-    losses = [text for name, parts in said for text in _named(name, filter(_is_loss, parts))]
-    others = [text for name, parts in said for text in _named(name, filterfalse(_is_loss, parts))]
+    parts_by_step = [(step.prefix, list(_of_step(step, row))) for step in steps]
+    losses = [text for name, parts in parts_by_step for text in _named(name, filter(_is_loss, parts))]
+    others = [text for name, parts in parts_by_step for text in _named(name, filterfalse(_is_loss, parts))]
     return ", ".join([*([NOTHING_ARRIVED] if _lost_all(row) else []), *losses, *others])
 
 
 def _of_step(step: Step, row: Row) -> Iterator[str]:
-    """Return the most important numbers of a step, whose columns have its name before theirs, if it has one."""
-    begin = prefixed(step.prefix, "")
+    """Return the most important numbers of a step, from the columns with its prefix."""
+    prefix = prefixed(step.prefix, "")
     return iter(
-        step.summary({column.removeprefix(begin): value for column, value in row.items() if column.startswith(begin)})
+        step.summary(
+            {column.removeprefix(prefix): value for column, value in row.items() if column.startswith(prefix)}
+        )
     )
 
 
 def _named(name: str, parts: Iterable[str]) -> Iterator[str]:
-    """Yield parts with the name of their step before the first."""
+    """Yield parts, the first preceded by the name of their step."""
     for index, part in enumerate(parts):
         yield f"{name}: {part}" if name and not index else part
 
@@ -98,13 +100,13 @@ def _is_loss(part: str) -> bool:
 
 
 def _lost_all(row: Row) -> bool:
-    """Return whether everything that a repeat sent was lost, as far as its steps count losses."""
+    """Return True if everything that a repeat sent was lost, as far as its steps count losses."""
     losses = [value for name, value in row.items() if columns.plain_name(name) in LOSSES]
     return bool(losses) and all(isinstance(loss, float | int) and loss >= 1 for loss in losses)
 
 
 def to_csv(rows: Iterable[Row], table: Sequence[Column]) -> str:
-    """Return rows as the text of a trial.csv of these columns, as `Plan.table` has them."""
+    """Return the text of a trial.csv with these rows and columns; `table` is that of `Plan.table`."""
     return head(table) + "".join(line(row, table) for row in rows)
 
 
@@ -114,7 +116,7 @@ def head(table: Sequence[Column]) -> str:
 
 
 def line(row: Row, table: Sequence[Column]) -> str:
-    """Return a row as its line of a trial.csv."""
+    """Return the line of a row in a trial.csv."""
     return columns.csv_line(row.get(column.name) for column in table)
 
 
@@ -124,16 +126,16 @@ def write_table(folder: Path, table: str) -> None:
 
 
 def summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
-    """Return the summary of a trial with this table.
+    """Return the summary of a trial's table.
 
     Raises:
-        EvidenceError: A value is not what its column is declared to hold.
+        EvidenceError: A value does not match the declaration of its column.
     """
     return aggregate(repeats.parse(table.encode(), plan.table, str(folder / store.TRIAL_CSV)))
 
 
 def write_summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
-    """Write summary.csv of a trial with this table and return what it holds; errors as `summary`."""
+    """Write summary.csv for a trial's table and return its cells; errors as for `summary`."""
     cells = summary(folder, plan, table)
     files.write(folder / store.SUMMARY_CSV, tables.to_csv(DEFAULT_BY, cells).encode())
     return cells

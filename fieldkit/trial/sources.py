@@ -1,4 +1,4 @@
-"""Find trials and CSV files at paths, as commands and the Python API take them, and read their repeats."""
+"""Find trials and CSV files at paths for commands and the Python API, and read their repeats."""
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
 
 Note = Callable[[str], None]
-"""Shows a sentence on something that is left out, or not as one would think."""
+"""Shows a sentence about data that is left out or treated in an unexpected way."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Sources:
 
     Attributes:
         where: The paths, for messages.
-        tables: Each once.
-        columns: What any of them has.
+        tables: The tables, without duplicates.
+        columns: The columns of all tables.
         rebuild: Whether raw evidence is measured again instead; nothing is written.
-        note: Where notes go.
+        note: Receives notes.
     """
 
     where: str
@@ -42,41 +42,41 @@ class Sources:
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
-        """What figures can be made of, by name and in order."""
+        """The quantities that can be estimated, by name and in order."""
         return {quantity.name: quantity for quantity in quantities(self.columns)}
 
     @cached_property
     def words(self) -> Mapping[str, Column]:
-        """Columns whose words are counted, by name and in order."""
+        """The columns whose words are counted, by name and in order."""
         return {column.name: column for column in worded(self.columns)}
 
     def condition(self, text: str, *, asked: str = "--by") -> tuple[str, ...]:
-        """Return the columns that tell one condition from another, each once.
+        """Return the columns that define a condition, without duplicates.
 
         Args:
-            text: Names with commas between them.
-            asked: The option or argument by which; for the message.
+            text: Comma-separated names.
+            asked: The option or argument that gave them; for the message.
 
         Raises:
             ConfigurationError: There is no such column.
         """
         names = tuple(name.strip() for name in text.split(","))
-        known = [*(column.name for column in self.columns), SOURCE]
+        names_allowed = [*(column.name for column in self.columns), SOURCE]
         for name in names:
-            if name not in known:
+            if name not in names_allowed:
                 raise ConfigurationError(
                     f"{asked}: there is no column {name!r}",
-                    remedy=nearest(name, known, "fieldkit columns lists them"),
+                    remedy=nearest(name, names_allowed, "fieldkit columns lists them"),
                 )
         return tuple(dict.fromkeys(names))
 
     def chosen(
         self, names: Collection[str], *, asked: str = "--quantity"
     ) -> tuple[list[Quantity] | None, list[Column] | None]:
-        """Return the quantities and the columns of words of some names, each None where no name is given: for all.
+        """Return the quantities and the word columns of some names; both are None, meaning all, if no name is given.
 
         Raises:
-            ConfigurationError: As `quantity`, which tells of `asked`.
+            ConfigurationError: As for `quantity`, with `asked` in the message.
         """
         if not names:
             return None, None
@@ -84,99 +84,102 @@ class Sources:
         return quantities, [self.words[name] for name in names if name in self.words]
 
     def quantity(self, name: str, *, asked: str = "--quantity") -> Quantity:
-        """Return the quantity of a name; `asked` as in `condition`.
+        """Return the quantity of a name; `asked` as for `condition`.
 
         Raises:
-            ConfigurationError: There is none.
+            ConfigurationError: There is no such quantity.
         """
         if name not in self.quantities:
             raise ConfigurationError(
-                f"{asked}: repeats are not put together over {name!r}",
+                f"{asked}: repeats are not aggregated over {name!r}",
                 remedy=nearest(name, self.quantities, f"it is one of: {', '.join(self.quantities)}"),
             )
         return self.quantities[name]
 
     def expectations(self) -> Mapping[str, Sequence[Expectation]]:
-        """Return what trials expect of their figures, by their source; of a table alone nothing is known.
+        """Return the expectations of trials by source folder; a CSV file without its trial has none.
 
         Raises:
             ConfigurationError: A plan cannot be read.
         """
-        found: dict[str, list[Expectation]] = {}
+        by_source: dict[str, list[Expectation]] = {}
         for folder in (table.parent for table in self.tables if table.name == store.TRIAL_CSV):
             if (folder / PLAN_FILE).is_file() and not files.foreign(folder / PLAN_FILE):
                 for text in frozen.expected(folder / PLAN_FILE):
                     try:
-                        one = expectations.parse(text, self.quantities.values())
-                    except ConfigurationError as error:  # of an earlier version, or edited
-                        self.note(f"{folder}: what it expects is left out: {error.what}")
+                        expectation = expectations.parse(text, self.quantities.values())
+                    except ConfigurationError as error:  # the plan is of an earlier version, or was edited
+                        self.note(f"{folder}: an expectation is left out: {error.what}")
                     else:
-                        found.setdefault(str(folder), []).append(one)
-        return found
+                        by_source.setdefault(str(folder), []).append(expectation)
+        return by_source
 
     def read(
         self, columns: Collection[str] | None = None, *, also: Collection[str] = (), undeclared: bool = False
     ) -> Repeats:
-        """Return the attempts in the tables, each once, as `repeats.read`.
+        """Return the attempts in the tables without duplicates, as `repeats.read`.
 
         Args:
-            columns: Columns that are needed, None for all that are declared.
-            also: Columns that are needed whether they are declared or not.
-            undeclared: Whether to keep all of those that are not; a note names them.
+            columns: Columns that are needed; None for all that are declared.
+            also: Columns that are needed even if they are not declared.
+            undeclared: Whether to keep all undeclared columns; a note lists them.
 
         Raises:
-            ConfigurationError: A file is none of ours, two contradict each other, or there is no evidence to rebuild
-                from.
+            ConfigurationError: A file is not a table of repeats, two tables contradict each other, or there is no
+                evidence to rebuild from.
             EvidenceError: A line or a journal is damaged, or no repeat has ended.
         """
         others = [column.name for column in self.columns if repeats.is_undeclared(column)]
         if others and undeclared:
-            self.note(f"kept as text, because no kind of step that is installed declares it: {', '.join(others)}")
+            self.note(f"kept as text, because no installed kind of step declares it: {', '.join(others)}")
         if columns is None:
             columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
         content = partial(_measured, note=self.note) if self.rebuild else Path.read_bytes
-        found, notes = deduplicated(repeats.read(self.tables, self.columns, columns, content))
+        attempts, notes = deduplicated(repeats.read(self.tables, self.columns, columns, content))
         for note in notes:
             self.note(note)
-        if not len(found):
-            begun = next((table.parent for table in self.tables if (table.parent / PLAN_FILE).is_file()), None)
+        if not len(attempts):
+            started = next((table.parent for table in self.tables if (table.parent / PLAN_FILE).is_file()), None)
             raise EvidenceError(
                 "no repeat has ended yet",
                 where=self.where,
-                remedy=typed("fieldkit", "resume", begun) if begun else "name a trial that ran",
+                remedy=typed("fieldkit", "resume", started) if started else "name a trial that ran",
             )
-        return found
+        return attempts
 
 
 def find(paths: Sequence[Path], note: Note, *, rebuild: bool = False) -> Sources:
-    """Return the tables of the trials and CSV files at or below `paths`, and what their columns are.
+    """Return the tables of the trials and CSV files at or below `paths`, with their columns.
 
     Args:
-        paths: Folders of trials, CSV files with the columns of trial.csv, or folders with trials below.
-        note: Where notes go.
+        paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
+        note: Receives notes.
         rebuild: Whether to measure raw evidence again.
 
     Raises:
-        ConfigurationError: A path does not exist or has no trial below, or as `tables.declared_in`.
+        ConfigurationError: A path does not exist or has no trial below, or as for `tables.declared_in`.
         EvidenceError: No trial has its table.
     """
     return find_each([paths], note, rebuild=rebuild)[0]
 
 
 def find_each(runs: Sequence[Sequence[Path]], note: Note, *, rebuild: bool = False) -> list[Sources]:
-    """Return what is at the paths of each run, as `find`; the columns are those of all runs."""
-    found = [_found(paths, note, rebuild=rebuild) for paths in runs]
-    every = [table for one in found for table in one]
-    columns = tables.planned(every) if rebuild else tables.declared_in(every)
-    return [Sources(_where(paths), one, columns, rebuild, note) for paths, one in zip(runs, found, strict=True)]
+    """Return the sources at the paths of each run, as `find`; all have the columns of all runs."""
+    tables_by_run = [_find_tables(paths, note, rebuild=rebuild) for paths in runs]
+    all_tables = [table for run_tables in tables_by_run for table in run_tables]
+    columns = tables.planned(all_tables) if rebuild else tables.declared_in(all_tables)
+    return [
+        Sources(_where(paths), run_tables, columns, rebuild, note)
+        for paths, run_tables in zip(runs, tables_by_run, strict=True)
+    ]
 
 
-def _found(paths: Sequence[Path], note: Note, *, rebuild: bool) -> list[Path]:
-    found = {_identity(table): table for path in paths for table in _tables(path, note, rebuild=rebuild)}
-    if not found:
+def _find_tables(paths: Sequence[Path], note: Note, *, rebuild: bool) -> list[Path]:
+    by_identity = {_identity(table): table for path in paths for table in _tables(path, note, rebuild=rebuild)}
+    if not by_identity:
         remedy = "add --rebuild, or make each as the notes above say"
         raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=_where(paths), remedy=remedy)
-    return list(found.values())
+    return list(by_identity.values())
 
 
 def _where(paths: Sequence[Path]) -> str:
@@ -198,17 +201,17 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
             remedy=f"name the folder that trials are in, or CSV files: {typed(path)}/*.csv",
         )
     for folder in folders:
-        if not rebuild and (what := files.foreign(folder / store.TRIAL_CSV)):
-            note(f"{folder / store.TRIAL_CSV}: {what}, and is left out")
+        if not rebuild and (reason := files.foreign(folder / store.TRIAL_CSV)):
+            note(f"{folder / store.TRIAL_CSV}: {reason}, and is left out")
         elif rebuild or (folder / store.TRIAL_CSV).is_file():
             yield folder / store.TRIAL_CSV
         else:
-            how = typed("fieldkit", "rebuild", folder)
-            note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {how}")
+            command = typed("fieldkit", "rebuild", folder)
+            note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {command}")
 
 
 def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
-    """Yield the folders of trials at or below one, sorted; links are followed, in a circle once."""
+    """Yield the folders of trials at or below a folder, sorted; links are followed, each folder is visited once."""
     status = folder.stat()
     if (status.st_dev, status.st_ino) in seen:
         return
@@ -224,14 +227,14 @@ def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
 
 
 def _identity(table: Path) -> object:
-    """Return what two paths to one table have in common."""
+    """Return the identity of a table, which is the same for two paths to it."""
     status = table.parent.stat() if table.name == store.TRIAL_CSV else table.stat()
     return status.st_dev, status.st_ino
 
 
 def _measured(table: Path, note: Note) -> bytes:
-    """Return a trial's table as its raw evidence gives it."""
-    from fieldkit.trial import rebuild  # noqa: PLC0415 (gates and all, which no table needs that is there)
+    """Return a trial's table, measured again from its raw evidence."""
+    from fieldkit.trial import rebuild  # noqa: PLC0415 (loads all measuring code, which existing tables do not need)
 
     folder = table.parent
     if table.name != store.TRIAL_CSV or not (folder / PLAN_FILE).is_file():
@@ -246,8 +249,8 @@ def _measured(table: Path, note: Note) -> bytes:
 
 
 def note_differences(folder: Path, note: Note) -> None:
-    """Note evidence that is measured again and is not what was measured first."""
+    """Show a note if evidence that is measured again differs from what was measured first."""
     from fieldkit.trial import manifest  # noqa: PLC0415 (as above)
 
-    if found := manifest.differences(folder):
-        note(f"{folder}: measured as it is now, which is not as it was kept: {manifest.few(found)}")
+    if differences := manifest.differences(folder):
+        note(f"{folder}: measured from changed evidence: {manifest.few(differences)}")

@@ -1,4 +1,4 @@
-"""Packages of step kinds that do not ship with fieldkit: their versions and code are part of a trial."""
+"""Packages of step kinds that do not ship with fieldkit; their versions and code hashes are part of a plan."""
 
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -40,18 +40,21 @@ def of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
 
 
 def changes(planned: Mapping[str, StepPackage]) -> Iterator[str]:
-    """Yield a sentence for each kind of step whose code is not that of the plan, although its version is."""
-    for kind, now in of_kinds(planned).items():
-        was = planned[kind]
-        if (was.package, was.version) == (now.package, now.version) and was.code_sha256 != now.code_sha256:
+    """Yield a sentence for each kind of step whose code differs from the plan's although its version does not."""
+    for kind, current in of_kinds(planned).items():
+        frozen = planned[kind]
+        if (frozen.package, frozen.version) == (
+            current.package,
+            current.version,
+        ) and frozen.code_sha256 != current.code_sha256:
             yield (
-                f"the code of the step {kind} ({now.package} {now.version}) has changed since the trial began: its "
-                "repeats are measured by two versions of it"
+                f"the code of the step {kind} ({current.package} {current.version}) has changed since the trial "
+                "started: its repeats are measured by two versions of it"
             )
 
 
 def missing(document: object) -> str | None:
-    """Return which kinds of step of a frozen plan are not installed; None if all are.
+    """Return a sentence that names the kinds of step of a frozen plan that are not installed; None if all are.
 
     Args:
         document: The plan as plain data, before it is validated.

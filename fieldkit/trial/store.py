@@ -1,4 +1,4 @@
-"""A trial's folder: its names, its plan, and the folders of its attempts, brought to disk before they are kept."""
+"""A trial's folder: file names, plan, and folders of attempts, which are synced before they are renamed."""
 
 import os
 import shutil
@@ -22,12 +22,12 @@ SUMMARY_CSV: Final = laptop_files.SUMMARY_CSV
 PREFLIGHT_FILE: Final = laptop_files.PREFLIGHT
 REPEATS: Final = "repeats"
 POSITIONS: Final = "positions-"
-"""What the names of files begin with that tell where robots were, given after the trial."""
+"""Prefix of the files with positions of robots that were added after the trial."""
 
 DEPTH: Final = 3
-"""How deep evidence lies below `repeats/` at most: in a folder of an attempt's folder."""
+"""Maximum depth of evidence below `repeats/`: in a subfolder of an attempt's folder."""
 
-_OWN: Final = frozenset(
+_TRIAL_FILES: Final = frozenset(
     {
         PLAN_FILE,
         JOURNAL_FILE,
@@ -40,26 +40,26 @@ _OWN: Final = frozenset(
         accounts.FILE,
     }
 )
-"""What fieldkit reads and writes in a trial's folder; what else lies there is its owner's business."""
+"""Files that fieldkit reads and writes in a trial's folder; other files in it are ignored."""
 
 
 def prepare(out: Path) -> None:
-    """Make the folder that trials go into, before anything is started for them.
+    """Create the folder for trials; called before any robot is used.
 
     Raises:
-        ConfigurationError: It cannot be made or written.
+        ConfigurationError: The folder cannot be created or written.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise ConfigurationError(
-            f"no trial can be kept there: {error.strerror}", where=str(out), remedy="choose another --out"
+            f"no trial can be stored there: {error.strerror}", where=str(out), remedy="choose another --out"
         ) from error
 
 
 def create(out: Path, plan: Plan) -> Path:
-    """Make the folder of a new trial with its plan in it.
+    """Create the folder of a new trial and write its plan.
 
     Raises:
         ConfigurationError: `out` cannot be written, or the trial exists.
@@ -71,17 +71,17 @@ def create(out: Path, plan: Plan) -> Path:
         files.sync_folder(out)
     except OSError as error:
         raise ConfigurationError(
-            f"cannot make the trial's folder: {error.strerror}", where=str(folder), remedy="choose another --out"
+            f"cannot create the trial's folder: {error.strerror}", where=str(folder), remedy="choose another --out"
         ) from error
     return folder
 
 
 def read_plan(folder: Path) -> Plan:
-    """Return the plan of a trial, in whose folder there are files and folders alone.
+    """Return the plan of a trial.
 
     Raises:
-        ConfigurationError: The folder holds none, or it was edited.
-        EvidenceError: As `demand_plain`.
+        ConfigurationError: The folder has no plan, or the plan was edited.
+        EvidenceError: As for `demand_plain`.
     """
     demand_plain(folder)
     if not (folder / PLAN_FILE).is_file():
@@ -99,51 +99,53 @@ def read_plan(folder: Path) -> Plan:
 
 
 def demand_plain(folder: Path) -> None:
-    """Refuse a trial from somebody else whose folder leads out of itself, or would keep who reads it waiting.
+    """Raise an error if a file of the trial is not a plain file or folder.
+
+    A trial may come from another person. Links could lead out of its folder, and reading a pipe could block.
 
     Raises:
-        EvidenceError: What fieldkit reads and writes there is no plain file or folder: a link, a pipe, a device.
+        EvidenceError: A file that fieldkit reads or writes there is a link, a pipe or a device.
     """
-    for path, what in foreign(folder):
+    for path, problem in unexpected_files(folder):
         name = path.relative_to(folder).parts[0]
-        if name in _OWN or name.startswith(POSITIONS):
+        if name in _TRIAL_FILES or name.startswith(POSITIONS):
             raise EvidenceError(
-                what,
+                problem,
                 where=str(path),
-                remedy="ask whoever made the trial for it; fieldkit reads plain files of the trial alone",
+                remedy="get a copy with plain files from the person who ran the trial; no others are read",
             )
 
 
-def foreign(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Yield what lies in a trial's folder and is neither a plain file nor a folder of it, and what it is instead."""
+def unexpected_files(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Yield each path in a trial's folder that is neither a plain file nor one of its folders, and its type."""
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if what := files.foreign(path):
-            yield path, what
+        if file_type := files.foreign(path):
+            yield path, file_type
         elif path.name == REPEATS and path.is_dir():
-            yield from _foreign_below(path, DEPTH)
+            yield from _unexpected_below(path, DEPTH)
 
 
-def _foreign_below(folder: Path, depth: int) -> Iterator[tuple[Path, str]]:
+def _unexpected_below(folder: Path, depth: int) -> Iterator[tuple[Path, str]]:
     with os.scandir(folder) as scan:
         entries = sorted(scan, key=lambda entry: entry.name)
     for entry in entries:
         path = folder / entry.name
         if entry.is_dir(follow_symlinks=False):
             if depth == 1:
-                yield path, "it is a folder, where evidence has none any more"
+                yield path, "it is a folder, deeper than evidence can be"
             else:
-                yield from _foreign_below(path, depth - 1)
+                yield from _unexpected_below(path, depth - 1)
         elif not entry.is_file(follow_symlinks=False):
             yield path, files.foreign(path)
 
 
 def attempt_folder(folder: Path, name: str) -> Path:
-    """Return the folder of an attempt's evidence, given that of its trial and its own name, `Attempt.folder`."""
+    """Return the evidence folder of an attempt; `folder` is the trial's folder, `name` is `Attempt.folder`."""
     return folder / REPEATS / name
 
 
 def open_attempt(folder: Path, repeat: RepeatId) -> Path:
-    """Return an empty folder for an attempt's evidence; what an interrupted attempt left there is removed."""
+    """Return an empty folder for an attempt's evidence; remains of an interrupted attempt are removed."""
     partial = _partial(folder, repeat)
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
@@ -151,13 +153,13 @@ def open_attempt(folder: Path, repeat: RepeatId) -> Path:
 
 
 def reopen_attempt(folder: Path, repeat: RepeatId) -> Path:
-    """Return the folder of an attempt whose evidence is to be fetched again, with what was half fetched in it."""
+    """Return the folder of an attempt whose evidence is fetched again; partially fetched files are kept in it."""
     partial = _partial(folder, repeat)
     partial.mkdir(exist_ok=True)
     for path in partial.iterdir():
         if path.is_dir():
             shutil.rmtree(path)
-        elif not is_half(path):
+        elif not is_partial(path):
             path.unlink()
     return partial
 
@@ -166,14 +168,14 @@ def _partial(folder: Path, repeat: RepeatId) -> Path:
     return attempt_folder(folder, f".{repeat}.partial")
 
 
-def is_half(path: Path) -> bool:
-    """Return whether a file of an attempt's folder was being fetched when something cut that."""
+def is_partial(path: Path) -> bool:
+    """Return True if a file of an attempt's folder was not fetched completely."""
     return path.name.startswith(".")
 
 
-def keep_attempt(partial: Path, name: str) -> Path:
-    """Bring an attempt's files to disk and give its folder the final name; what was half fetched is removed."""
-    for path in filter(is_half, list(partial.iterdir())):
+def commit_attempt(partial: Path, name: str) -> Path:
+    """Sync an attempt's files to disk and give its folder the final name; partially fetched files are removed."""
+    for path in filter(is_partial, list(partial.iterdir())):
         path.unlink()
     files.sync((partial, *partial.rglob("*")))
     final = partial.with_name(name)
@@ -182,18 +184,18 @@ def keep_attempt(partial: Path, name: str) -> Path:
     return final
 
 
-def kept_unentered(folder: Path, names: Iterable[str]) -> Path | None:
-    """Return the folder of an attempt that a kill kept from its entry in the journal, None where there is none.
+def unjournalled_attempt(folder: Path, names: Iterable[str]) -> Path | None:
+    """Return the committed folder of an attempt whose journal entry is missing after a kill, or None.
 
     Args:
         folder: The trial's folder.
-        names: What the attempt's folder may be called.
+        names: The possible names of the attempt's folder.
     """
     return next((path for name in names if (path := attempt_folder(folder, name)).is_dir()), None)
 
 
-def demand_room(folder: Path, needed_bytes: int) -> None:
-    """Stop before an attempt whose evidence this machine could not hold.
+def demand_space(folder: Path, needed_bytes: int) -> None:
+    """Raise an error if this machine has too little space for the evidence of an attempt.
 
     Raises:
         ConfigurationError: Less than `needed_bytes` is free.

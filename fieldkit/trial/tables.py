@@ -1,4 +1,4 @@
-"""Columns of tables in which trials of procedures that differ stand beside each other."""
+"""The combined columns of the tables of trials whose procedures differ."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -15,10 +15,10 @@ from fieldkit.trial.plan import PLAN_FILE
 
 
 def declared_in(tables: Sequence[Path]) -> tuple[Column, ...]:
-    """Return every column of tables: those of every trial first, then others in the order in which tables have them.
+    """Return every column of the tables: those of every trial first, then others in the order of the tables.
 
-    A column that is not in every trial is what the `trial.yaml` beside its table says, else what kinds of step that
-    are installed say of its name, or of its name without that of a step; else a text, `repeats.is_undeclared`.
+    A column that is not in every trial is declared by the `trial.yaml` next to the table; otherwise by an installed
+    kind of step, by its name with or without the name of the step; otherwise it is text (`repeats.is_undeclared`).
 
     Args:
         tables: CSV files with the columns of trial.csv.
@@ -28,46 +28,46 @@ def declared_in(tables: Sequence[Path]) -> tuple[Column, ...]:
     """
     everywhere = {column.name for column in trial_columns()} | {"", SOURCE}
     others = {table: names for table in tables if (names := _others(table, everywhere))}
-    said = united((table.parent / PLAN_FILE, _frozen(table)) for table in others)
-    known = {column.name: column for column in installed()}
-    found = dict.fromkeys(name for names in others.values() for name in names)
-    return trial_columns(said.get(name) or _by_name(name, known) for name in found)
+    planned_columns = merge_columns((table.parent / PLAN_FILE, _frozen(table)) for table in others)
+    installed_columns = {column.name: column for column in installed()}
+    other_names = dict.fromkeys(name for names in others.values() for name in names)
+    return trial_columns(planned_columns.get(name) or _by_name(name, installed_columns) for name in other_names)
 
 
 def planned(tables: Iterable[Path]) -> tuple[Column, ...]:
-    """Return every column that the plans beside tables have; errors as `declared_in`, or a plan cannot be read."""
+    """Return every column in the plans of tables; errors as for `declared_in`, or if a plan cannot be read."""
     plans = [table.parent / PLAN_FILE for table in tables if (table.parent / PLAN_FILE).is_file()]
     everywhere = set(trial_columns())
-    found = (
+    declared = (
         (plan, [column for column in store.read_plan(plan.parent).table if column not in everywhere])
         for plan in plans
     )
-    return trial_columns(united(found).values())
+    return trial_columns(merge_columns(declared).values())
 
 
-def united(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str, Column]:
-    """Return the columns of several plans by name; of two that say the same of a column the first is kept.
+def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str, Column]:
+    """Return the columns of several plans by name; of compatible columns of one name, the first is kept.
 
     Args:
-        declared: Plans, and the columns that each has.
+        declared: Plans with their columns.
 
     Raises:
-        ConfigurationError: Two plans mean different things by a name.
+        ConfigurationError: Two plans declare incompatible columns of one name.
     """
-    found: dict[str, tuple[Path, Column]] = {}
+    merged: dict[str, tuple[Path, Column]] = {}
     for path, columns in declared:
         for column in columns:
-            first, kept = found.setdefault(column.name, (path, column))
-            if _makes(kept) != _makes(column):
+            first, kept = merged.setdefault(column.name, (path, column))
+            if _type_of(kept) != _type_of(column):
                 raise ConfigurationError(
                     f"{column.name} is another column here ({_in_words(column)}) than in {first} ({_in_words(kept)})",
                     where=str(path),
-                    remedy="put together trials in which it is the same",
+                    remedy="combine only trials in which it is the same",
                 )
             if kept.bounds != column.bounds:
                 (low, high), (least, most) = kept.possible, column.possible
-                found[column.name] = first, replace(kept, bounds=(min(low, least), max(high, most)))
-    return {name: column for name, (_, column) in found.items()}
+                merged[column.name] = first, replace(kept, bounds=(min(low, least), max(high, most)))
+    return {name: column for name, (_, column) in merged.items()}
 
 
 def _others(table: Path, everywhere: Iterable[str]) -> list[str]:
@@ -75,20 +75,22 @@ def _others(table: Path, everywhere: Iterable[str]) -> list[str]:
 
 
 def _frozen(table: Path) -> tuple[Column, ...]:
-    """Return the columns that the plan beside a table has."""
+    """Return the columns in the plan in the folder of a table."""
     plan = table.parent / PLAN_FILE
     return frozen.read(plan) if plan.exists() and not files.foreign(plan) else ()
 
 
-def _by_name(name: str, known: Mapping[str, Column]) -> Column:
-    """Return what a column is that no plan knows."""
+def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
+    """Return the column of a name that no plan declares."""
     step, _, plain = name.rpartition(".")
-    column = known.get(name) or (known.get(plain_name(name)) and named(step, known[plain]))
+    column = installed_columns.get(name) or (
+        installed_columns.get(plain_name(name)) and named(step, installed_columns[plain])
+    )
     return column if column and not column.flaw() else repeats.undeclared(name)
 
 
-def _makes(column: Column) -> tuple[object, ...]:
-    """Return what must be the same for the values of two columns to be put together; texts always can be."""
+def _type_of(column: Column) -> tuple[object, ...]:
+    """Return the properties in which two columns must agree for their values to be combined; texts always can be."""
     figure = None if column.type is str else column.figure
     return column.unit, figure and (figure.kind, figure.arrived, figure.sent)
 

@@ -1,4 +1,4 @@
-"""The notebooks of the documentation run in Jupyter's kernel, in their folder, and are kept without outputs."""
+"""The notebooks of the documentation run in a Jupyter kernel in their folder, and are stored without outputs."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Trials in Python hold what their tables, their exports and their captures hold."""
+"""Trials in Python have the same content as their tables, exports and captures."""
 
 import csv
 import io
@@ -51,23 +51,23 @@ def as_csv(table: Table) -> str:
 
 
 @pytest.mark.parametrize("folder", STORED, ids=lambda path: path.name)
-def test_repeats_and_cells_are_those_of_the_trial_s_own_tables(folder: Path) -> None:
+def test_repeats_and_cells_equal_the_trial_tables(folder: Path) -> None:
     trials = fieldkit.load(folder)
     assert as_csv(trials.repeats) == (folder / store.TRIAL_CSV).read_text(encoding="utf-8")
     assert as_csv(trials.cells()) == (folder / store.SUMMARY_CSV).read_text(encoding="utf-8")
 
 
-def test_repeats_are_what_export_writes(named: Path, tmp_path: Path) -> None:
+def test_repeats_equal_the_export(named: Path, tmp_path: Path) -> None:
     for paths in ([TRIALS], [named], [TRIALS, named]):
         out = tmp_path / "out.parquet"
         assert main(["export", *map(str, paths), "--format", "parquet", "-o", str(out)]) == 0
         written = pyarrow.parquet.read_table(out)
-        found = fieldkit.load(*paths).repeats
-        assert found.equals(written, check_metadata=True)
+        repeats = fieldkit.load(*paths).repeats
+        assert repeats.equals(written, check_metadata=True)
         out.unlink()
 
 
-def test_cells_of_named_steps_are_what_aggregate_prints(named: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cells_of_named_steps_equal_aggregate(named: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["aggregate", str(named), "--by", "trial,protocol", "--format", "csv"]) == 0
     with pytest.warns(UserWarning, match="echo requests of different sizes"):
         cells = fieldkit.load(named).cells(by=["trial", "protocol"])
@@ -76,13 +76,13 @@ def test_cells_of_named_steps_are_what_aggregate_prints(named: Path, capsys: pyt
     assert (units["up.file_loss"], units["probe.level"]) == ("share", "dBm")
 
 
-def test_cells_are_of_the_quantities_that_are_asked_for() -> None:
+def test_cells_have_the_requested_quantities() -> None:
     rows = fieldkit.load(TRIALS).cells("protocol", "rtt_median_s").to_pylist()
     assert [(row["protocol"], row["quantity"]) for row in rows] == [("tcp", "rtt_median_s"), ("udp", "rtt_median_s")]
     assert all(row["low"] <= row["value"] <= row["high"] for row in rows)
 
 
-def test_cells_can_be_told_apart_by_source() -> None:
+def test_cells_can_be_grouped_by_source() -> None:
     with pytest.warns(UserWarning, match="echo requests of different sizes"):
         sources = {row["source"] for row in fieldkit.load(TRIALS).cells("source").to_pylist()}
     assert sources == {str(path) for path in STORED}
@@ -90,7 +90,7 @@ def test_cells_can_be_told_apart_by_source() -> None:
 
 @pytest.mark.parametrize("folder", STORED, ids=lambda path: path.name)
 def test_packets_count_as_the_trial_does(folder: Path) -> None:
-    """What was measured of all packets follows from each of them."""
+    """The measures of a trial follow from its packets."""
     trials = fieldkit.load(folder)
     valid = [row for row in trials.repeats.to_pylist() if row["status"] == "valid"]
     assert valid
@@ -105,7 +105,7 @@ def compare(row: dict[str, Any], packets: Table) -> None:
         assert columns["lost"].count(True) == row["ip_packets_sent"] - row["ip_packets_received"]
         assert [time is None for time in columns["received_ns"]] == columns["lost"]
     elif row["tcp_sent_bytes"] is None:
-        assert not packets.num_rows, "no connection came about"
+        assert not packets.num_rows, "no connection was established"
     else:
         assert columns["sent_again"].count(True) == row["tcp_retransmitted_segments"]
         assert (columns["lost"].count(True) > 0) is (row["tcp_byte_loss"] > 0)
@@ -127,10 +127,10 @@ def test_each_packet_has_the_times_at_which_it_was_captured(recorded_trial: Path
     assert [number for number, lost in enumerate(packets["lost"]) if lost] == list(LOST)
     assert set(packets["wire_bytes"]) == {1042}
     assert set(packets["payload_bytes"]) == {1008}
-    assert set(packets["delay_s"]) == {None}, "nothing went back, so that no offset of the clocks is known"
+    assert set(packets["delay_s"]) == {None}, "without packets in the other direction the clock offset is unknown"
 
 
-def test_packets_of_a_step_are_told_by_its_name(recorded_trial: Path) -> None:
+def test_packets_of_a_step_are_selected_by_its_name(recorded_trial: Path) -> None:
     path = recorded_trial / "trial.yaml"
     before, step, after = path.read_text(encoding="utf-8").partition("- transfer:\n")
     keys, ping, rest = after.partition("      - ping:\n")
@@ -145,7 +145,7 @@ def test_packets_of_a_step_are_told_by_its_name(recorded_trial: Path) -> None:
     assert caught.value.remedy == "its transfers: 'up', 'down'"
 
 
-def test_what_tells_cells_apart_is_null_where_it_is_missing() -> None:
+def test_a_missing_value_of_a_grouping_column_is_null() -> None:
     with pytest.warns(UserWarning, match="echo requests of different sizes"):
         cells = fieldkit.load(TRIALS).cells("reason", "rtt_loss")
     assert None in cells["reason"].to_pylist()
@@ -164,7 +164,7 @@ def test_tables_become_data_frames(recorded_trial: Path) -> None:
     assert trials.packets("udp-01").to_pandas()["lost"].sum() == len(LOST)
 
 
-def test_all_but_data_frames_goes_without_pandas(recorded_trial: Path) -> None:
+def test_only_data_frames_need_pandas(recorded_trial: Path) -> None:
     said = """
 import sys, fieldkit
 class WithoutPandas:
@@ -190,24 +190,24 @@ trials.repeats.to_pandas()
         ("udp-01.void1", EvidenceError, "there are no complete captures of both ends"),
     ],
 )
-def test_packets_that_nobody_can_tell_are_refused(
+def test_unknown_attempts_and_transfers_are_rejected(
     recorded_trial: Path, repeat: str, error: type[Exception], what: str
 ) -> None:
     with pytest.raises(error, match=what):
         fieldkit.load(recorded_trial).packets(repeat)
 
 
-def test_a_repeat_of_several_trials_is_to_be_named_with_its_trial() -> None:
+def test_a_repeat_of_several_trials_needs_its_trial() -> None:
     trials = fieldkit.load(TRIALS)
     with pytest.raises(ConfigurationError, match="2 trials have a repeat 'udp-01'") as caught:
         trials.packets("udp-01")
     assert f"{LOSSY.name}/udp-01" in caught.value.remedy
 
 
-def test_packets_without_evidence_as_it_was_kept_are_refused(tmp_path: Path) -> None:
+def test_packets_without_unchanged_evidence_are_rejected(tmp_path: Path) -> None:
     shutil.copytree(LOSSY, trial := tmp_path / LOSSY.name)
     alone = shutil.copy(trial / store.TRIAL_CSV, tmp_path / "alone.csv")
-    with pytest.raises(EvidenceError, match="evidence of udp-02 is not at hand"):
+    with pytest.raises(EvidenceError, match="evidence of udp-02 is not available"):
         fieldkit.load(alone).packets("udp-02")
     with (trial / store.REPEATS / "udp-02" / "receiver.pcap").open("ab") as capture:
         capture.write(b"more")
@@ -216,7 +216,7 @@ def test_packets_without_evidence_as_it_was_kept_are_refused(tmp_path: Path) -> 
     assert fieldkit.load(trial).packets("udp-01").num_rows
 
 
-def test_what_is_no_trial_is_refused_as_commands_refuse_it(tmp_path: Path) -> None:
+def test_paths_without_a_trial_are_rejected_as_by_commands(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="no path"):
         fieldkit.load()
     with pytest.raises(ConfigurationError, match="no such file or folder"):
@@ -229,7 +229,7 @@ def test_what_is_no_trial_is_refused_as_commands_refuse_it(tmp_path: Path) -> No
         fieldkit.load(other)
 
 
-def test_a_damaged_table_is_refused_with_its_line(tmp_path: Path) -> None:
+def test_a_damaged_table_is_rejected_with_its_line(tmp_path: Path) -> None:
     lines = (LOSSY / store.TRIAL_CSV).read_text(encoding="utf-8").splitlines(keepends=True)
     damaged = tmp_path / "damaged.csv"
     damaged.write_text("".join([*lines[:2], lines[2].replace("udp,", "udp,x", 1).replace("tcp,", "tcp,x", 1)]))
@@ -241,13 +241,13 @@ def test_a_damaged_table_is_refused_with_its_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("by", "quantities", "what"), [("protocl", None, "by: "), ("protocol", ["ip_los"], "quant")])
-def test_a_mistyped_column_is_refused(by: str, quantities: list[str] | None, what: str) -> None:
+def test_a_mistyped_column_is_rejected(by: str, quantities: list[str] | None, what: str) -> None:
     with pytest.raises(ConfigurationError, match=what) as caught:
         fieldkit.load(TRIALS).cells(by, quantities)
     assert caught.value.remedy.startswith("did you mean")
 
 
-def test_what_a_command_notes_is_a_warning(tmp_path: Path) -> None:
+def test_notes_of_commands_are_warnings(tmp_path: Path) -> None:
     shutil.copytree(LOSSY, tmp_path / "1")
     (tmp_path / "2").mkdir()
     (tmp_path / "2" / "trial.yaml").touch()
@@ -264,7 +264,7 @@ def test_rebuild_measures_the_evidence_again(recorded_trial: Path) -> None:
     assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(kept)
 
 
-def test_the_package_imports_what_reads_trials_when_it_is_asked_for() -> None:
+def test_the_package_imports_its_readers_lazily() -> None:
     said = "import sys; before = set(sys.modules); import fieldkit; print(*sorted(set(sys.modules) - before))"
     done = subprocess.run((sys.executable, "-c", said), capture_output=True, text=True, check=True)
     assert done.stdout == "fieldkit\n"
@@ -281,21 +281,21 @@ def test_a_cell_has_its_figures_by_name(named: Path) -> None:
         for row in trials.cells(quantities="file_loss").to_pylist()
         if (row["protocol"], row["quantity"]) == ("udp", "file_loss")
     )
-    found = cell.file_loss
-    assert (found.value, found.low, found.high, found.n) == (row["value"], row["low"], row["high"], row["n"])
-    assert (found.name, found.unit, cell.n_valid, cell.condition["protocol"]) == (
+    figure = cell.file_loss
+    assert (figure.value, figure.low, figure.high, figure.n) == (row["value"], row["low"], row["high"], row["n"])
+    assert (figure.name, figure.unit, cell.n_valid, cell.condition["protocol"]) == (
         "file_loss",
         "share",
         row["n"],
         "udp",
     )
-    assert found in list(cell)
+    assert figure in list(cell)
     with pytest.warns(UserWarning, match="echo requests of different sizes"):
         up = fieldkit.load(named).cell(trial="named-0", protocol="udp")["up.file_loss"]
     assert (up.n, up.unit) == (8, "share")
 
 
-def test_the_interval_of_a_single_repeat_shows_nothing(recorded_trial: Path) -> None:
+def test_the_interval_of_a_single_repeat_is_infinite(recorded_trial: Path) -> None:
     figure = fieldkit.load(recorded_trial).cell().ip_loss
     assert (figure.n, figure.low, figure.high) == (1, -np.inf, np.inf)
 
@@ -303,18 +303,22 @@ def test_the_interval_of_a_single_repeat_shows_nothing(recorded_trial: Path) -> 
 @pytest.mark.parametrize(
     ("condition", "what", "remedy"),
     [
-        ({}, "4 cells have any condition, and not one", "they differ in procedure: 'driveaway', 'los', 'selfheal'; "),
-        ({"protocol": "sctp"}, "no cells have protocol='sctp', and not one", "protocol: 'tcp', 'udp'"),
+        (
+            {},
+            "4 cells have any condition; exactly one must",
+            "they differ in procedure: 'driveaway', 'los', 'selfheal'; ",
+        ),
+        ({"protocol": "sctp"}, "no cells have protocol='sctp'; exactly one must", "protocol: 'tcp', 'udp'"),
         ({"protocl": "udp"}, "cell: there is no column 'protocl'", "did you mean 'protocol'?"),
     ],
 )
-def test_a_cell_that_is_not_the_only_one_is_refused(condition: dict[str, str], what: str, remedy: str) -> None:
+def test_an_ambiguous_cell_is_rejected(condition: dict[str, str], what: str, remedy: str) -> None:
     with pytest.raises(ConfigurationError, match=what) as caught:
         fieldkit.load(TRIALS).cell(**condition)
     assert remedy in caught.value.remedy
 
 
-def test_a_figure_that_no_repeat_has_is_refused() -> None:
+def test_a_figure_of_no_repeat_is_rejected() -> None:
     cell = fieldkit.load(LOSSY).cell(protocol="udp")
     with pytest.raises(ConfigurationError, match="valid repeats has a figure 'file_los'") as caught:
         cell.file_los  # noqa: B018

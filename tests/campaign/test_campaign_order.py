@@ -1,4 +1,4 @@
-"""The order of a campaign, against brute force: each trial once, in blocks, within the walk, and truly shuffled."""
+"""The order of a campaign compared with brute force: complete, in blocks, within the walk, and random."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -32,34 +32,38 @@ seeds = st.integers(min_value=0, max_value=2**40)
 
 
 @given(trials, seeds, st.floats(min_value=1.0, max_value=6.0))
-def test_every_trial_comes_once_in_blocks_within_the_walk(
+def test_every_trial_occurs_once_in_blocks_within_the_walk(
     planned: set[PlannedTrial], seed: int, factor: float
 ) -> None:
     limit_m = factor * order.walk_m(order.shortest(sorted(planned, key=str)))
-    found = order.shuffled(list(planned), seed=seed, limit_m=limit_m)
-    assert Counter(found) == Counter(planned)
-    assert order.walk_m(found) <= limit_m + 1e-5
+    shuffled = order.shuffled(list(planned), seed=seed, limit_m=limit_m)
+    assert Counter(shuffled) == Counter(planned)
+    assert order.walk_m(shuffled) <= limit_m + 1e-5
     for depth in (1, 2, 3):
-        blocks = [block for block, _ in groupby((one.topology, one.scenario, one.distance)[:depth] for one in found)]
-        assert len(blocks) == len(set(blocks)), "a block is left once"
+        blocks = [
+            block
+            for block, _ in groupby(
+                (planned_trial.topology, planned_trial.scenario, planned_trial.distance)[:depth]
+                for planned_trial in shuffled
+            )
+        ]
+        assert len(blocks) == len(set(blocks)), "each block is contiguous"
 
 
 @given(trials, seeds)
-def test_equal_seeds_give_equal_orders_whatever_order_they_were_given_in(
-    planned: set[PlannedTrial], seed: int
-) -> None:
+def test_equal_seeds_give_equal_orders_for_any_input_order(planned: set[PlannedTrial], seed: int) -> None:
     forwards = sorted(planned, key=str)
     orders = {order.shuffled(given, seed=seed, limit_m=1e9) for given in (forwards, tuple(reversed(forwards)))}
     assert len(orders) == 1
 
 
-def lone_blocks(found: tuple[PlannedTrial, ...]) -> bool:
-    runs = [[key for key, _ in groupby(map(name, found))] for name in (lambda t: t.topology, scenario_of)]
+def lone_blocks(planned_order: tuple[PlannedTrial, ...]) -> bool:
+    runs = [[key for key, _ in groupby(map(name, planned_order))] for name in (lambda t: t.topology, scenario_of)]
     return all(len(run) == len(set(run)) for run in runs)
 
 
-def scenario_of(one: PlannedTrial) -> tuple[Topology, Scenario]:
-    return one.topology, one.scenario
+def scenario_of(planned_trial: PlannedTrial) -> tuple[Topology, Scenario]:
+    return planned_trial.topology, planned_trial.scenario
 
 
 @settings(max_examples=40)
@@ -71,28 +75,30 @@ def scenario_of(one: PlannedTrial) -> tuple[Topology, Scenario]:
     )
 )
 def test_no_order_in_blocks_is_shorter_than_the_shortest(planned: set[PlannedTrial]) -> None:
-    every = (one for one in permutations(planned) if lone_blocks(one))
+    every = (planned_trial for planned_trial in permutations(planned) if lone_blocks(planned_trial))
     assert order.walk_m(order.shortest(list(planned))) == pytest.approx(min(map(order.walk_m, every)))
 
 
-def test_the_walk_is_that_of_everybody_who_walks() -> None:
+def test_the_walk_counts_every_carried_robot() -> None:
     los, master, masterless = Scenario.LOS, Topology.MASTER, Topology.MASTERLESS
     there_and_back = [trial(10, los, master), trial(30, los, master), trial(20, los, master)]
     assert order.walk_m(there_and_back) == pytest.approx(2 * (10 + 20 + 10) * 0.3048), "two stations"
     assert order.walk_m([trial(10, los, masterless), trial(30, los, masterless)]) == pytest.approx(30 * 0.3048)
     assert order.walk_m([trial(30, los, master), trial(30, los, masterless)]) == pytest.approx((60 + 30) * 0.3048)
-    assert order.walk_m([trial(9, los, master, one) for one in ("a", "b")]) == pytest.approx(18 * 0.3048), (
-        "once there"
-    )
+    assert order.walk_m([trial(9, los, master, procedure) for procedure in ("a", "b")]) == pytest.approx(
+        18 * 0.3048
+    ), "one way"
 
 
 def every_first(limit: float) -> Iterator[PlannedTrial]:
-    planned = [trial(feet, one, two) for feet in (10, 20, 30, 40) for one in Scenario for two in Topology]
+    planned = [
+        trial(feet, scenario, topology) for feet in (10, 20, 30, 40) for scenario in Scenario for topology in Topology
+    ]
     limit_m = limit * order.walk_m(order.shortest(planned))
     return (order.shuffled(planned, seed=seed, limit_m=limit_m)[0] for seed in range(320))
 
 
-def test_without_a_bound_each_of_16_trials_is_first_about_as_often() -> None:
+def test_without_a_limit_each_of_16_trials_is_first_equally_often() -> None:
     counts = Counter(every_first(100.0))
     assert len(counts) == 16
     # 20 are expected of each; a binomial count of 320 with p = 1/16 is outside 5..40 once in 10,000 times.
@@ -103,7 +109,7 @@ def test_within_three_times_the_shortest_walk_each_trial_is_first_sometimes() ->
     assert len(Counter(every_first(order.DEFAULT_WALK))) == 16
 
 
-def test_the_shortest_walk_leaves_sweeps_only() -> None:
+def test_the_shortest_walk_allows_only_sweeps() -> None:
     planned = [trial(feet, Scenario.LOS, Topology.MASTERLESS) for feet in (10, 20, 30, 40)]
-    found = order.shuffled(planned, seed=3, limit_m=order.walk_m(order.shortest(planned)))
-    assert found == order.shortest(planned)
+    shuffled = order.shuffled(planned, seed=3, limit_m=order.walk_m(order.shortest(planned)))
+    assert shuffled == order.shortest(planned)

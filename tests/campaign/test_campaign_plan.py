@@ -1,4 +1,4 @@
-"""The campaign file: what it means, and what is said of a wrong one."""
+"""The campaign file: its meaning, and its error messages."""
 
 from pathlib import Path
 
@@ -21,12 +21,12 @@ def names(tmp_path: Path, text: str) -> list[str]:
     path = tmp_path / "lawn.yaml"
     path.write_text(text, encoding="utf-8")
     campaign, document = load_campaign(path)
-    return [str(one) for one in trials_of(campaign, load_procedures(campaign, document), document)]
+    return [str(trial) for trial in trials_of(campaign, load_procedures(campaign, document), document)]
 
 
-def test_a_campaign_is_distances_by_procedures_by_topologies(tmp_path: Path) -> None:
-    found = names(tmp_path, LAWN)
-    assert sorted(found) == [
+def test_a_campaign_combines_distances_procedures_and_topologies(tmp_path: Path) -> None:
+    trial_names = names(tmp_path, LAWN)
+    assert sorted(trial_names) == [
         f"{procedure} {distance} {topology}"
         for procedure in ("los", "nlos")
         for distance in ("10ft", "20ft")
@@ -34,10 +34,10 @@ def test_a_campaign_is_distances_by_procedures_by_topologies(tmp_path: Path) -> 
     ]
 
 
-def test_what_is_left_out_matches_by_every_key_named(tmp_path: Path) -> None:
-    found = names(tmp_path, f"{LAWN}except: [{{topology: master, distance: 240 cm}}]\n".replace("20ft", "2.4m"))
-    assert len(found) == 6
-    assert not [one for one in found if one.endswith("2.4m master")]
+def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
+    trial_names = names(tmp_path, f"{LAWN}except: [{{topology: master, distance: 240 cm}}]\n".replace("20ft", "2.4m"))
+    assert len(trial_names) == 6
+    assert not [name for name in trial_names if name.endswith("2.4m master")]
     assert len(names(tmp_path, f"{LAWN}except: [{{procedure: nlos}}]\n")) == 4
 
 
@@ -50,11 +50,11 @@ def test_what_is_left_out_matches_by_every_key_named(tmp_path: Path) -> None:
         ("name: lawn", "name: ../lawn", 1, "in name"),
         ("20ft", "20", 3, "has no unit"),
         ("20ft", "20feet", 3, "unknown unit 'feet'"),
-        ("20ft", "3.048m", 3, "named twice"),
+        ("20ft", "3.048m", 3, "occurs twice"),
         ("20ft", "0m", 3, "not above zero"),
         ("[10ft, 20ft]", "[]", 3, "at least 1"),
         ("[los, nlos]", "[los, nslo]", 2, "did you mean 'nlos'?"),
-        ("[los, nlos]", "[los, los]", 2, "named twice"),
+        ("[los, nlos]", "[los, los]", 2, "occurs twice"),
         ("masterless]", "mesh]", 4, "'master' or 'masterless'"),
         ("seed: 7", "seed: 7\nrepeats: 0", 6, "greater than 0"),
         ("seed: 7", "seed: 7\nrecord: 0s", 6, "greater than 0"),
@@ -64,7 +64,7 @@ def test_what_is_left_out_matches_by_every_key_named(tmp_path: Path) -> None:
         ("seed: 7", "seed: 7\nexcept: [{}]", 6, "leaves out every trial"),
     ],
 )
-def test_a_wrong_file_is_told_with_its_line(tmp_path: Path, old: str, new: str, line: int, said: str) -> None:
+def test_a_wrong_file_is_reported_with_its_line(tmp_path: Path, old: str, new: str, line: int, said: str) -> None:
     assert old in LAWN
     with pytest.raises(ConfigurationError) as caught:
         names(tmp_path, LAWN.replace(old, new))
@@ -85,7 +85,7 @@ KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xY
 SHORTER = "turtlebot-2 moves 29.5 m away, at 0.22 m/s; 60 m away, at 2 m/s is beyond its limits"
 
 
-def test_what_robots_do_less_than_asked_is_said_once_before_the_first_trial(
+def test_reduced_values_are_reported_once_before_the_first_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

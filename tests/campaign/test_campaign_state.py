@@ -1,4 +1,4 @@
-"""What a campaign remembers: its frozen inputs, and what became of each trial, whatever tore the journal."""
+"""The stored state of a campaign: its frozen inputs, and the progress of each trial, also after a torn journal."""
 
 from pathlib import Path
 
@@ -51,15 +51,15 @@ def begin(lawn: Path) -> tuple[CampaignPlan, CampaignJournal]:
     return asked, CampaignJournal(lawn.parent / "campaign_lawn")
 
 
-def test_what_was_frozen_is_read_back_and_a_comment_changes_nothing(lawn: Path) -> None:
+def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) -> None:
     asked, journal = begin(lawn)
     with journal.kept(asked):
         lawn.write_text(f"# dry grass\n{LAWN}", encoding="utf-8")
     again, document = plan.make_plan(lawn, "field")
-    found = plan.begun(journal.folder, again, document)
-    assert found is not None
-    assert found.order == asked.order
-    assert found.trials() == asked.trials()
+    frozen = plan.begun(journal.folder, again, document)
+    assert frozen is not None
+    assert frozen.order == asked.order
+    assert frozen.trials() == asked.trials()
 
 
 @pytest.mark.parametrize(
@@ -72,21 +72,19 @@ def test_what_was_frozen_is_read_back_and_a_comment_changes_nothing(lawn: Path) 
         ("name: lawn", "name: lawn", 1, "backend"),
     ],
 )
-def test_a_file_that_changed_is_refused_and_the_key_named(
-    lawn: Path, old: str, new: str, line: int, named: str
-) -> None:
+def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str, line: int, named: str) -> None:
     asked, journal = begin(lawn)
     with journal.kept(asked):
         lawn.write_text(LAWN.replace(old, new), encoding="utf-8")
     again, document = plan.make_plan(lawn, "emulated" if named == "backend" else "field")
     with pytest.raises(ConfigurationError) as caught:
         plan.begun(journal.folder, again, document)
-    assert caught.value.what == f"changed since the campaign was begun: {named}"
+    assert caught.value.what == f"changed since the campaign started: {named}"
     assert caught.value.where == f"{lawn}:{line}"
     assert "campaign.yaml" in caught.value.remedy
 
 
-def test_a_procedure_that_changed_is_refused(lawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_changed_procedure_is_rejected(lawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(lawn.parent)
     asked, journal = begin(lawn)
     with journal.kept(asked):
@@ -98,9 +96,9 @@ def test_a_procedure_that_changed_is_refused(lawn: Path, monkeypatch: pytest.Mon
         plan.begun(journal.folder, *plan.make_plan(lawn, "field"))
 
 
-def test_a_walk_that_nobody_can_keep_is_refused_with_one_that_can(lawn: Path) -> None:
+def test_an_impossible_walk_is_rejected_with_the_minimum(lawn: Path) -> None:
     lawn.write_text(LAWN.replace("333ft", "5m"), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="the shortest way") as caught:
+    with pytest.raises(ConfigurationError, match="the shortest path") as caught:
         plan.make_plan(lawn, "field")
     assert caught.value.where == f"{lawn}:8"
     walk = caught.value.remedy.split("m ")[0].removeprefix("walk: ")
@@ -109,7 +107,7 @@ def test_a_walk_that_nobody_can_keep_is_refused_with_one_that_can(lawn: Path) ->
     assert walk_m(asked.trials()) <= float(walk)
 
 
-def test_trials_begin_are_placed_skipped_and_end(lawn: Path) -> None:
+def test_trials_start_are_placed_skipped_and_end(lawn: Path) -> None:
     asked, journal = begin(lawn)
     first, second, third, *_ = asked.trials()
     with journal.kept(asked):
@@ -131,7 +129,7 @@ def test_trials_begin_are_placed_skipped_and_end(lawn: Path) -> None:
 
 @settings(max_examples=30)
 @given(st.integers(min_value=0, max_value=2000))
-def test_a_journal_torn_anywhere_goes_on(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
+def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
     folder = tmp_path_factory.mktemp("lab")
     lawn = folder / "lawn.yaml"
     lawn.write_text(LAWN, encoding="utf-8")
@@ -151,7 +149,7 @@ def test_a_journal_torn_anywhere_goes_on(tmp_path_factory: pytest.TempPathFactor
     assert list(CampaignJournal(journal.folder).ended()) == [*map(str, trials[:complete]), str(trials[-1])]
 
 
-def test_a_damaged_journal_and_a_second_fieldkit_are_refused(lawn: Path) -> None:
+def test_a_damaged_journal_and_a_second_process_are_rejected(lawn: Path) -> None:
     asked, journal = begin(lawn)
     with (
         journal.kept(asked),
@@ -165,14 +163,14 @@ def test_a_damaged_journal_and_a_second_fieldkit_are_refused(lawn: Path) -> None
 
 
 def planned(asked: CampaignPlan, journal: CampaignJournal, backend: Backend) -> CampaignPlanned:
-    told: list[Event] = []
-    CampaignRun(asked, journal, backend, told.append).announce()
-    (event,) = told
+    events: list[Event] = []
+    CampaignRun(asked, journal, backend, events.append).announce()
+    (event,) = events
     assert isinstance(event, CampaignPlanned)
     return event
 
 
-def test_the_estimate_learns_how_long_people_take(lawn: Path) -> None:
+def test_the_estimate_uses_measured_placing_times(lawn: Path) -> None:
     asked, journal = begin(lawn)
     (lawn.parent / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     by_hand = load_backend("field", *load_site(lawn.parent / "fieldkit.yaml"))
@@ -191,18 +189,18 @@ def test_the_estimate_learns_how_long_people_take(lawn: Path) -> None:
     assert event.left_s == pytest.approx(work_s * 7 / 8 + 7 * 20.0)
 
 
-def test_a_disk_that_cannot_hold_the_evidence_is_noticed_before_anybody_walks(lawn: Path) -> None:
+def test_a_disk_too_small_for_the_evidence_is_reported_before_robots_are_placed(lawn: Path) -> None:
     lawn.write_text(LAWN.replace("repeats: 3", "repeats: 100000"), encoding="utf-8")
     asked, journal = begin(lawn)
-    told: list[Event] = []
-    campaign = CampaignRun(asked, journal, load_backend("emulated", None, None), told.append)
+    events: list[Event] = []
+    campaign = CampaignRun(asked, journal, load_backend("emulated", None, None), events.append)
     with pytest.raises(ConfigurationError, match="GB are free"):
         campaign.run(Nobody(), Stop())
-    assert [type(event) for event in told] == [CampaignEnded], "no robot was started"
-    assert journal.folder.is_dir(), "and the order is kept"
+    assert [type(event) for event in events] == [CampaignEnded], "no robot was started"
+    assert journal.folder.is_dir(), "the order is unchanged"
 
 
-def test_trials_with_failed_repeats_are_left_where_these_are_redone(lawn: Path) -> None:
+def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> None:
     asked, journal = begin(lawn)
     backend = load_backend("emulated", None, None)
     whole, failed, *_ = asked.trials()
@@ -211,10 +209,10 @@ def test_trials_with_failed_repeats_are_left_where_these_are_redone(lawn: Path) 
             journal.add(trial, TrialProgress.STARTED, trial=str(count))
             journal.add(trial, TrialProgress.ENDED, trial=str(count), failed=count)
     assert str(failed) not in planned(asked, journal, backend).trials
-    told: list[Event] = []
-    campaign = CampaignRun(asked, journal, backend, told.append, failed=True)
+    events: list[Event] = []
+    campaign = CampaignRun(asked, journal, backend, events.append, failed=True)
     campaign.announce()
-    (event,) = told
+    (event,) = events
     assert isinstance(event, CampaignPlanned)
     assert str(failed) in event.trials
     assert str(whole) not in event.trials

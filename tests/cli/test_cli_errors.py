@@ -39,7 +39,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("trial los 30ft --backend emulatd", "no backend 'emulatd'"),
         ("trial los 30ft --backend field", "needs a site file"),
         ("trial los 30ft --site nope.yaml", "No such file"),
-        ("trial los 30ft --out /proc/trials", "no trial can be kept there"),
+        ("trial los 30ft --out /proc/trials", "no trial can be stored there"),
         ("trial los 30ft --answers nope.txt", "the answers cannot be read"),
         ("robots show turtlebot", "did you mean 'turtlebot3_burger'?"),
         ("procedures show loss", "did you mean 'los'?"),
@@ -110,7 +110,7 @@ def test_verify_of_no_trial_is_exit_4(capsys: pytest.CaptureFixture[str]) -> Non
 def test_master_topology_without_a_relay_is_an_error(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (lab / "fieldkit.yaml").write_text(f"backend: emulated\n{SITE}", encoding="utf-8")
     assert main(["trial", "los", "30ft", "--dry-run"]) == 2
-    assert "nobody plays relay in topology master" in capsys.readouterr().err
+    assert "no robot has the role relay in topology master" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("backend", ["emulated", "field"])

@@ -105,7 +105,7 @@ def test_error_has_the_line_of_the_key(tmp_path: Path) -> None:
         ("        - transfer: {from: sender", "        - transfer: {form: sender", "did you mean 'from'?"),
         ("- transfer: {from: sender, to: receiver", "- transfer: {from: sender, to: sender", "cannot send to itself"),
         ("- ping: {from: sender, to: receiver", "- ping: {from: sender, to: sender", "cannot ping itself"),
-        ("robot: sender", "robot: boss", "there is no role boss; say where it stands"),
+        ("robot: sender", "robot: boss", "there is no role boss; give its place"),
         ("duration: 15s", "duration: 15", "has no unit"),
         ("duration: 15s", "duration: 0s", "greater than 0"),
         ("topics: [/scan]", "topics: []", "at least 1 item"),

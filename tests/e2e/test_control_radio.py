@@ -104,7 +104,7 @@ def test_a_trial_ends_valid_and_captures_nothing_of_ssh(tmp_path: Path, radio: s
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize(("control", "word"), [("separate", "comes to 127.0.0.1"), ("radio", "shares the radio")])
+@pytest.mark.parametrize(("control", "word"), [("separate", "arrives at 127.0.0.1"), ("radio", "shares the radio")])
 def test_check_sees_which_way_ssh_takes(tmp_path: Path, control: str, word: str) -> None:
     folder = make_lab(tmp_path / "lab", "{}")
     site = folder / "fieldkit.yaml"

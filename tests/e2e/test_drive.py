@@ -429,7 +429,7 @@ def test_stop_of_a_suspended_agent_lets_it_send_no_other_velocity(outside: Outsi
     assert motions(trial) == ["origin", "begun", "held"]
     again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
-    assert "nothing moves again before a person has confirmed it: rover-1" in again.err
+    assert "no robot moves before a person confirms: rover-1" in again.err
     assert standstill_s(outside, stands_ns) == 0.0
 
 

@@ -83,7 +83,7 @@ def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_holds_over_all_tria
         process.kill()
         wait_for_end({process.pid}, within_s=60.0)
     assert stopped.code == 130, stopped.err
-    assert "before rover-1 moves again, a person has to put it at its place and type confirm" in stopped.out
+    assert "before rover-1 moves again, a person must put it at its place and type confirm" in stopped.out
     assert motions(lab, out) == ["origin", "begun", "held"]
 
     since_ns = time.time_ns()
@@ -133,7 +133,7 @@ def test_with_yes_a_robot_does_not_start_at_a_place_where_no_person_put_it(lab: 
     since_ns = time.time_ns()
     several = fieldkit(lab.folder, "trial", "drive", "5m", "10m", "--out", out, *UNASKED)
     assert several.code == 2, several.err
-    assert "rover-1 moves by itself and must be at another place for 10m" in several.err
+    assert "rover-1 moves without a person and must be at another place for 10m" in several.err
     assert set(lab.track_m(since_ns)) <= {lab.place_m}
 
     first = campaign(lab, out, *UNASKED)

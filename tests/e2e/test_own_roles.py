@@ -71,5 +71,5 @@ def test_a_robot_that_nobody_plays_is_named_before_anything_starts(lab: Path) ->
     (lab / "fieldkit.yaml").write_text(SITE.replace("rival: turtlebot-2, ", ""), encoding="utf-8")
     done = fieldkit(lab, "trial", "rivals", "10m")
     assert done.code == 2
-    assert "nobody plays rival in topology masterless" in done.err
+    assert "no robot has the role rival in topology masterless" in done.err
     assert not (lab / "trials").exists()

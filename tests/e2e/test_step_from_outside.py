@@ -116,7 +116,7 @@ def test_the_package_of_a_step_is_part_of_the_trial(fieldkit: Fieldkit, tmp_path
     with (installed / "route_step.py").open("a", encoding="utf-8") as module:
         module.write("\nCHANGED = True\n")
     changed = fieldkit("resume", str(folder))
-    assert "the code of the step route (route-step 1.0) has changed since the trial began" in changed.stdout
+    assert "the code of the step route (route-step 1.0) has changed since the trial started" in changed.stdout
     installed.rename(tmp_path / "elsewhere")
     refused = fieldkit("rebuild", str(folder))
     assert (refused.returncode, "mend" in refused.stderr) == (2, False)

@@ -78,7 +78,7 @@ def test_the_second_ctrl_c_stops_the_repeat_at_once(tmp_path: Path, untouched: U
     stopped = finish(process)
     assert stopped.code == 130
     notes = [note["text"] for note in stopped.events("note")]
-    assert notes[-1] == "not begun: 6m, 7m"
+    assert notes[-1] == "not started: 6m, 7m"
     assert not any("stays" in note or "delete" in note for note in notes), "nothing stays on robots that have ended"
     wait_for_end(family, within_s=60.0)
     untouched()

@@ -1,4 +1,4 @@
-"""Every form of export with everything that can be wrong with a trial: an error with a remedy, or a whole file."""
+"""Every export format with damaged trials: an error with a remedy, or a complete file."""
 
 import os
 import shutil
@@ -43,7 +43,7 @@ def exported(path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> int:
     code = main(["export", str(path), "--format", form, "-o", str(out)])
     said = capsys.readouterr().err
     assert code in {0, 2, 4}
-    assert out.exists() is (code == 0), "a file that is not whole is not left behind"
+    assert out.exists() is (code == 0), "an incomplete file is removed"
     assert code == 0 or ("error: " in said and "remedy: " in said)
     return code
 
@@ -51,7 +51,7 @@ def exported(path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> int:
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("name", [PLAN_FILE, JOURNAL_FILE, store.TRIAL_CSV])
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_trial_is_an_error_with_a_remedy_or_a_whole_file(
+def test_a_damaged_trial_gives_an_error_with_a_remedy_or_a_complete_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, name: str, damage: str
 ) -> None:
     trial = tmp_path / LOSSY.name
@@ -64,7 +64,7 @@ def test_a_damaged_trial_is_an_error_with_a_remedy_or_a_whole_file(
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("missing", ["none", "folder"])
-def test_what_is_no_trial_is_an_error(
+def test_a_path_without_a_trial_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, missing: str
 ) -> None:
     (tmp_path / "folder").mkdir()

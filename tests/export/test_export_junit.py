@@ -1,4 +1,4 @@
-"""JUnit XML of trials: what a CI server would show of them."""
+"""JUnit XML of trials, as a CI server reads it."""
 
 import csv
 import shutil
@@ -24,12 +24,12 @@ def trial(tmp_path: Path) -> Path:
 
 
 def suite(*folders: Path) -> ET.Element:
-    (found,) = ET.fromstring(junit.text(folders))
-    return found
+    (element,) = ET.fromstring(junit.text(folders))
+    return element
 
 
-def cases(found: ET.Element, kind: str) -> list[str]:
-    return [str(case.get("name")) for case in found if case.find(kind) is not None]
+def cases(element: ET.Element, kind: str) -> list[str]:
+    return [str(case.get("name")) for case in element if case.find(kind) is not None]
 
 
 def edited(path: Path, edit: Callable[[str], str]) -> None:
@@ -40,12 +40,12 @@ def edited(path: Path, edit: Callable[[str], str]) -> None:
 
 
 def test_each_repeat_is_a_case_with_its_time(trial: Path) -> None:
-    found, plan = suite(trial), store.read_plan(trial)
-    assert [case.get("name") for case in found] == [str(repeat) for repeat in plan.order()]
-    assert found.get("tests") == str(len(found))
-    assert found.get("failures") == found.get("skipped") == "0"
-    assert {case.get("classname") for case in found} == {"fieldkit.los.30ft.master"}
-    assert all(0 < float(case.get("time", "")) < 1000 for case in found)
+    element, plan = suite(trial), store.read_plan(trial)
+    assert [case.get("name") for case in element] == [str(repeat) for repeat in plan.order()]
+    assert element.get("tests") == str(len(element))
+    assert element.get("failures") == element.get("skipped") == "0"
+    assert {case.get("classname") for case in element} == {"fieldkit.los.30ft.master"}
+    assert all(0 < float(case.get("time", "")) < 1000 for case in element)
 
 
 def test_a_repeat_that_failed_is_a_failure_with_its_reason(trial: Path) -> None:
@@ -56,13 +56,13 @@ def test_a_repeat_that_failed_is_a_failure_with_its_reason(trial: Path) -> None:
         )
 
     edited(trial / JOURNAL_FILE, fail)
-    found = suite(trial)
-    (name,) = cases(found, "failure")
-    assert found.get("failures") == "1"
+    element = suite(trial)
+    (name,) = cases(element, "failure")
+    assert element.get("failures") == "1"
     assert name == str(list(store.read_plan(trial).order())[-1])
 
 
-def test_a_repeat_that_is_not_over_is_skipped(trial: Path) -> None:
+def test_a_repeat_that_has_not_ended_is_skipped(trial: Path) -> None:
     edited(trial / JOURNAL_FILE, lambda text: "".join(text.splitlines(keepends=True)[:-1]))
     assert len(cases(suite(trial), "skipped")) == 1
 
@@ -70,11 +70,11 @@ def test_a_repeat_that_is_not_over_is_skipped(trial: Path) -> None:
 def test_an_expectation_is_a_case_that_fails_unless_it_holds(trial: Path) -> None:
     expect = "  expect: [rtt_median_s > 1 us, rtt_median_s < 1 us]\n"
     edited(trial / PLAN_FILE, lambda text: text.replace("  steps:\n", f"{expect}  steps:\n", 1))
-    found = suite(trial)
-    failed = cases(found, "failure")
-    protocols = [str(one).upper() for one in store.read_plan(trial).protocols]
+    element = suite(trial)
+    failed = cases(element, "failure")
+    protocols = [str(protocol).upper() for protocol in store.read_plan(trial).protocols]
     assert failed == [f"rtt_median_s < 1 us ({protocol})" for protocol in protocols]
-    assert found.get("tests") == str(len(found))
+    assert element.get("tests") == str(len(element))
 
 
 def expecting(trial: Path, *expect: str) -> None:
@@ -83,7 +83,7 @@ def expecting(trial: Path, *expect: str) -> None:
 
 
 def with_column(trial: Path, name: str, values: Callable[[int], str]) -> None:
-    """Give the trial's table a column, or other values in one that it has."""
+    """Add a column to the trial's table, or replace its values."""
     path = trial / store.TRIAL_CSV
     with path.open(encoding="utf-8", newline="") as file:
         rows = [row | {name: values(number)} for number, row in enumerate(csv.DictReader(file))]
@@ -110,20 +110,20 @@ def test_a_trial_without_its_table_passes_no_expectation(trial: Path, capsys: py
     (trial / store.TRIAL_CSV).unlink()
     out = trial.parent / "results.xml"
     assert main(["export", str(trial.parent), "--format", "junit", "-o", str(out)]) == 0
-    (found,) = ET.parse(out).getroot()
-    assert cases(found, "failure") == ["rtt_loss < 100 %"]
+    (element,) = ET.parse(out).getroot()
+    assert cases(element, "failure") == ["rtt_loss < 100 %"]
     assert "no repeat has ended" in capsys.readouterr().err + out.read_text(encoding="utf-8")
 
 
-def test_the_command_writes_what_a_parser_reads(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_valid_xml(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = trial.parent / "results.xml"
     assert main(["export", str(trial.parent), "--format", "junit", "-o", str(out)]) == 0
     assert "wrote" in capsys.readouterr().out
-    (found,) = ET.parse(out).getroot()
-    assert found.get("name") == trial.name
+    (element,) = ET.parse(out).getroot()
+    assert element.get("name") == trial.name
 
 
-def test_nothing_that_a_robot_says_breaks_the_file(trial: Path) -> None:
+def test_no_text_from_a_robot_breaks_the_file(trial: Path) -> None:
     reason = "\\u0000\\u001b[31m]]>&<\\ud800\\uffff"
     edited(trial / JOURNAL_FILE, lambda text: text.replace('"reason": ""', f'"reason": "{reason}"', 3))
     assert len(suite(trial)) > 0

@@ -1,4 +1,4 @@
-"""The time line of a trial, read back by the MCAP library: indexed and as a stream, each message by its schema."""
+"""The timeline of a trial, read back by the MCAP library: indexed and as a stream, each message by its schema."""
 
 import io
 import json
@@ -25,7 +25,7 @@ BEGIN_NS = START_NS + 10 * SECOND_NS
 
 @dataclass(frozen=True)
 class Read:
-    """A message as its reader sees it."""
+    """A message as read back."""
 
     topic: str
     time_ns: int
@@ -41,12 +41,12 @@ def exported(trial: Path, name: str = "out.mcap") -> bytes:
 
 
 def messages(content: bytes) -> list[Read]:
-    found = []
+    read_messages = []
     for schema, channel, message in make_reader(io.BytesIO(content), validate_crcs=True).iter_messages():
         assert schema
         said, form = json.loads(message.data), json.loads(schema.data)
-        found.append(Read(channel.topic, message.log_time, said, form, channel.metadata["clock"]))
-    return found
+        read_messages.append(Read(channel.topic, message.log_time, said, form, channel.metadata["clock"]))
+    return read_messages
 
 
 @pytest.fixture
@@ -55,20 +55,20 @@ def trial(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def found(trial: Path) -> list[Read]:
+def read_messages(trial: Path) -> list[Read]:
     return messages(exported(trial))
 
 
-def of(found: list[Read], topic: str) -> list[Read]:
-    return [one for one in found if one.topic == topic]
+def of(read_messages: list[Read], topic: str) -> list[Read]:
+    return [message for message in read_messages if message.topic == topic]
 
 
-def test_every_message_conforms_to_its_schema_and_has_its_own_time(found: list[Read]) -> None:
-    for one in found:
-        jsonschema.validate(one.said, one.schema)
-        stamp = one.said["transforms"][0]["timestamp"] if one.topic == "/tf" else one.said["timestamp"]
-        assert stamp["sec"] * SECOND_NS + stamp["nsec"] == one.time_ns
-        assert one.said.keys() <= one.schema["properties"].keys(), "a field that the schema does not tell of"
+def test_every_message_conforms_to_its_schema_and_has_its_own_time(read_messages: list[Read]) -> None:
+    for message in read_messages:
+        jsonschema.validate(message.said, message.schema)
+        stamp = message.said["transforms"][0]["timestamp"] if message.topic == "/tf" else message.said["timestamp"]
+        assert stamp["sec"] * SECOND_NS + stamp["nsec"] == message.time_ns
+        assert message.said.keys() <= message.schema["properties"].keys(), "a field that is not in the schema"
 
 
 def test_the_index_the_statistics_and_the_stream_agree(trial: Path) -> None:
@@ -78,15 +78,18 @@ def test_the_index_the_statistics_and_the_stream_agree(trial: Path) -> None:
     assert summary
     assert summary.statistics
     indexed, streamed = (
-        [(channel.topic, message.log_time) for _, channel, message in one.iter_messages()]
-        for one in (reader, NonSeekingReader(io.BytesIO(content)))
+        [(channel.topic, message.log_time) for _, channel, message in each_reader.iter_messages()]
+        for each_reader in (reader, NonSeekingReader(io.BytesIO(content)))
     )
     assert sorted(indexed) == sorted(streamed)
     times = [time_ns for _, time_ns in indexed]
     assert times == sorted(times)
     assert summary.statistics.message_count == len(indexed)
     assert (summary.statistics.message_start_time, summary.statistics.message_end_time) == (times[0], times[-1])
-    counts = {summary.channels[one].topic: count for one, count in summary.statistics.channel_message_counts.items()}
+    counts = {
+        summary.channels[channel_id].topic: count
+        for channel_id, count in summary.statistics.channel_message_counts.items()
+    }
     assert counts == Counter(topic for topic, _ in indexed)
     assert {schema.encoding for schema in summary.schemas.values()} == {"jsonschema"}
     assert {channel.message_encoding for channel in summary.channels.values()} == {"json"}
@@ -94,27 +97,30 @@ def test_the_index_the_statistics_and_the_stream_agree(trial: Path) -> None:
     assert about.metadata["trial"] == trial.name
 
 
-def test_the_log_is_the_journal(found: list[Read], trial: Path) -> None:
+def test_the_log_is_the_journal(read_messages: list[Read], trial: Path) -> None:
     lines = (trial / journal.JOURNAL_FILE).read_text(encoding="utf-8").splitlines()
-    said = [(one.said["level"], one.said["name"], one.said["message"]) for one in of(found, "/trial/log")]
+    said = [
+        (message.said["level"], message.said["name"], message.said["message"])
+        for message in of(read_messages, "/trial/log")
+    ]
     assert said == [
         (2, "udp-01", "attempt 1 running"),
         (3, "udp-01", "attempt 1 void: ping.txt is missing"),
         (2, "udp-01", "attempt 2 running"),
         (2, "udp-01", "attempt 2 valid"),
     ]
-    for one in of(found, "/trial/log"):
-        entry = json.loads(lines[one.said["line"] - 1])
-        assert (one.said["file"], one.time_ns) == (journal.JOURNAL_FILE, entry["utc_ns"])
+    for message in of(read_messages, "/trial/log"):
+        entry = json.loads(lines[message.said["line"] - 1])
+        assert (message.said["file"], message.time_ns) == (journal.JOURNAL_FILE, entry["utc_ns"])
 
 
-def test_each_packet_has_its_robots_time_and_its_fate(found: list[Read]) -> None:
-    sent, came = of(found, "/sender/packets"), of(found, "/receiver/packets")
+def test_each_packet_has_its_robots_time_and_its_fate(read_messages: list[Read]) -> None:
+    sent, came = of(read_messages, "/sender/packets"), of(read_messages, "/receiver/packets")
     first_ns = BEGIN_NS + 2 * SECOND_NS
-    assert [one.time_ns for one in sent] == [first_ns + 1_000_000 * index for index in range(PACKETS)]
+    assert [message.time_ns for message in sent] == [first_ns + 1_000_000 * index for index in range(PACKETS)]
     assert came[0].time_ns == first_ns + AHEAD_NS
-    assert [index for index, one in enumerate(sent) if one.said["lost"]] == list(LOST)
-    assert [one.said["copy"] for one in came] == [False] * (PACKETS - len(LOST)) + [True]
+    assert [index for index, message in enumerate(sent) if message.said["lost"]] == list(LOST)
+    assert [message.said["copy"] for message in came] == [False] * (PACKETS - len(LOST)) + [True]
     assert sent[REPEATED].said == {
         "timestamp": {"sec": first_ns // SECOND_NS, "nsec": 1_000_000 * REPEATED},
         "repeat": "udp-01",
@@ -130,8 +136,8 @@ def test_each_packet_has_its_robots_time_and_its_fate(found: list[Read]) -> None
     }
 
 
-def test_every_topic_says_whose_clock_its_times_are_of(found: list[Read]) -> None:
-    assert {one.topic: one.clock for one in found} == {
+def test_every_topic_names_its_clock(read_messages: list[Read]) -> None:
+    assert {message.topic: message.clock for message in read_messages} == {
         "/tf": "laptop",
         "/trial/log": "laptop",
         "/repeat/udp": "laptop",
@@ -144,30 +150,36 @@ def test_every_topic_says_whose_clock_its_times_are_of(found: list[Read]) -> Non
     }
 
 
-def test_replies_and_phases_are_those_of_the_evidence(found: list[Read]) -> None:
-    replies = of(found, "/sender/rtt")
-    assert [one.said["rtt_s"] for one in replies] == [one / 1e3 for one in RTT_MS]
-    assert [one.time_ns for one in replies] == [BEGIN_NS + 3 * SECOND_NS + 200_000_000 * index for index in range(3)]
-    assert [one.said["message"] for one in of(found, "/sender/log")] == [
+def test_replies_and_phases_are_those_of_the_evidence(read_messages: list[Read]) -> None:
+    replies = of(read_messages, "/sender/rtt")
+    assert [message.said["rtt_s"] for message in replies] == [rtt_ms / 1e3 for rtt_ms in RTT_MS]
+    assert [message.time_ns for message in replies] == [
+        BEGIN_NS + 3 * SECOND_NS + 200_000_000 * index for index in range(3)
+    ]
+    assert [message.said["message"] for message in of(read_messages, "/sender/log")] == [
         f"icmp_seq=4: {recorded.SENDER} says Destination Host Unreachable"
     ]
-    assert [one.said["phase"] for one in of(found, "/receiver/phase")] == ["transfer", "idle"]
-    # The bag's own stamps are of the trial's start.
-    begun = {one.said["phase"]: one.time_ns for one in of(found, "/sender/phase") if one.said["phase"] != "idle"}
-    assert begun == {"record": START_NS, "transfer": BEGIN_NS + 2 * SECOND_NS, "ping": BEGIN_NS + 3 * SECOND_NS}
+    assert [message.said["phase"] for message in of(read_messages, "/receiver/phase")] == ["transfer", "idle"]
+    # The time stamps of the bag are those of the trial's start.
+    starts_ns = {
+        message.said["phase"]: message.time_ns
+        for message in of(read_messages, "/sender/phase")
+        if message.said["phase"] != "idle"
+    }
+    assert starts_ns == {"record": START_NS, "transfer": BEGIN_NS + 2 * SECOND_NS, "ping": BEGIN_NS + 3 * SECOND_NS}
 
 
-def test_the_robots_stand_where_the_plan_has_them(found: list[Read]) -> None:
-    transforms = [one for read in of(found, "/tf")[:3] for one in read.said["transforms"]]
-    assert {one["child_frame_id"]: one["translation"] for one in transforms} == {
+def test_the_robots_are_at_their_planned_places(read_messages: list[Read]) -> None:
+    transforms = [transform for read in of(read_messages, "/tf")[:3] for transform in read.said["transforms"]]
+    assert {transform["child_frame_id"]: transform["translation"] for transform in transforms} == {
         "duckiedrone-1": {"x": 0, "y": 0, "z": 0},
         "turtlebot-1": {"x": pytest.approx(-9.144), "y": 0, "z": 0},
         "turtlebot-2": {"x": pytest.approx(9.144), "y": 0, "z": 0},
     }
 
 
-def test_the_numbers_of_each_attempt_leave_out_what_is_missing(found: list[Read]) -> None:
-    void, valid = (one.said for one in of(found, "/repeat/udp"))
+def test_the_numbers_of_each_attempt_leave_out_what_is_missing(read_messages: list[Read]) -> None:
+    void, valid = (message.said for message in of(read_messages, "/repeat/udp"))
     assert (void["repeat"], void["status"], void["reason"]) == ("udp-01.void1", "void", "ping.txt is missing")
     assert "ip_loss" not in void
     assert valid["ip_loss"] == pytest.approx(len(LOST) / PACKETS)
@@ -184,25 +196,27 @@ def test_many_packets_go_into_several_compressed_chunks(tmp_path: Path) -> None:
     summary = make_reader(io.BytesIO(content)).get_summary()
     assert summary
     assert len(summary.chunk_indexes) > 2
-    assert {one.compression for one in summary.chunk_indexes} == {"zstd"}
-    lost = [one.said["lost"] for one in messages(content) if one.topic == "/sender/packets"]
+    assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
+    lost = [message.said["lost"] for message in messages(content) if message.topic == "/sender/packets"]
     assert (len(lost), sum(lost)) == (10_000, 1_000)
 
 
 def test_a_damaged_capture_gives_what_is_before_the_damage_and_no_fates(trial: Path) -> None:
     path = trial / "repeats" / "udp-01" / "receiver.pcap"
     path.write_bytes(path.read_bytes()[:-1])
-    found = messages(exported(trial))
-    assert len(of(found, "/receiver/packets")) == PACKETS - len(LOST)
-    assert not any("lost" in one.said or "copy" in one.said for one in found)
-    (warning,) = (one.said for one in of(found, "/trial/log") if one.said["file"].endswith("receiver.pcap"))
+    read_messages = messages(exported(trial))
+    assert len(of(read_messages, "/receiver/packets")) == PACKETS - len(LOST)
+    assert not any("lost" in message.said or "copy" in message.said for message in read_messages)
+    (warning,) = (
+        message.said for message in of(read_messages, "/trial/log") if message.said["file"].endswith("receiver.pcap")
+    )
     assert warning["message"].startswith("ends inside the packet at byte")
     assert warning["level"] == 3
 
 
-@pytest.mark.parametrize(("payload_bytes", "told"), [(1440, True), (2880, False)])
-def test_what_became_of_frames_of_offload_is_not_told(trial: Path, payload_bytes: int, told: bool) -> None:
-    """Of TCP with offload, frames of one end are not those of the other."""
+@pytest.mark.parametrize(("payload_bytes", "has_fates"), [(1440, True), (2880, False)])
+def test_frames_of_offload_have_no_fates(trial: Path, payload_bytes: int, has_fates: bool) -> None:
+    """With TCP offload, the frames of the two ends differ."""
     plan = (trial / "trial.yaml").read_text(encoding="utf-8")
     (trial / "trial.yaml").write_text(plan.replace("protocols:\n- udp", "protocols:\n- tcp"), encoding="utf-8")
     path = trial / journal.JOURNAL_FILE
@@ -211,36 +225,39 @@ def test_what_became_of_frames_of_offload_is_not_told(trial: Path, payload_bytes
     sent = [recorded.segment(number, payload_bytes) for number in range(10)]
     (folder / "sender.pcap").write_bytes(file_bytes(timed(sent)))
     (folder / "receiver.pcap").write_bytes(file_bytes(timed(sent[1:])))
-    lost = [one.said.get("lost") for one in of(messages(exported(trial)), "/sender/packets")]
-    assert lost == ([True] + [False] * 9 if told else [None] * 10)
+    lost = [message.said.get("lost") for message in of(messages(exported(trial)), "/sender/packets")]
+    assert lost == ([True] + [False] * 9 if has_fates else [None] * 10)
 
 
 @pytest.mark.parametrize(("ip_id", "target"), [(0, recorded.RECEIVER), (1, "10.42.0.9")])
-def test_what_became_of_packets_that_do_not_compare_is_not_told(trial: Path, ip_id: int, target: str) -> None:
-    """All alike, but for their times; or with another address at the receiver."""
+def test_packets_that_cannot_be_matched_have_no_fates(trial: Path, ip_id: int, target: str) -> None:
+    """The packets are equal except for their times, or the receiver has another address."""
     folder = trial / "repeats" / "udp-01"
     sent = timed([recorded.packet(number * ip_id) for number in range(10)])
-    received = [replace(one, data=one.data[:16] + IPv4Address(target).packed + one.data[20:]) for one in sent[1:]]
+    received = [
+        replace(message, data=message.data[:16] + IPv4Address(target).packed + message.data[20:])
+        for message in sent[1:]
+    ]
     (folder / "sender.pcap").write_bytes(file_bytes(sent))
     (folder / "receiver.pcap").write_bytes(file_bytes(received))
-    found = messages(exported(trial))
-    assert (len(of(found, "/sender/packets")), len(of(found, "/receiver/packets"))) == (10, 9)
-    assert not any("lost" in one.said or "copy" in one.said for one in found)
+    read_messages = messages(exported(trial))
+    assert (len(of(read_messages, "/sender/packets")), len(of(read_messages, "/receiver/packets"))) == (10, 9)
+    assert not any("lost" in message.said or "copy" in message.said for message in read_messages)
 
 
-def test_replies_without_a_time_stamp_are_left_out_and_told_of(trial: Path) -> None:
+def test_replies_without_a_time_stamp_are_left_out_and_reported(trial: Path) -> None:
     path = trial / "repeats" / "udp-01" / "ping.txt"
     text = path.read_text(encoding="utf-8")
     path.write_text("\n".join(line.partition("] ")[2] or line for line in text.split("\n")), encoding="utf-8")
-    found = messages(exported(trial))
-    assert not of(found, "/sender/rtt")
-    (warning,) = (one.said for one in of(found, "/trial/log") if one.said["file"].endswith("ping.txt"))
+    read_messages = messages(exported(trial))
+    assert not of(read_messages, "/sender/rtt")
+    (warning,) = (
+        message.said for message in of(read_messages, "/trial/log") if message.said["file"].endswith("ping.txt")
+    )
     assert warning["message"] == "3 replies have no time stamp and are left out"
 
 
-def test_a_trial_without_an_ended_repeat_has_nothing_to_tell(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_trial_without_an_ended_repeat_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     trial = recorded.make(tmp_path)
     path = trial / journal.JOURNAL_FILE
     path.write_text(path.read_text(encoding="utf-8").splitlines(keepends=True)[0], encoding="utf-8")
@@ -249,27 +266,29 @@ def test_a_trial_without_an_ended_repeat_has_nothing_to_tell(
     assert list(tmp_path.iterdir()) == [trial]
 
 
-def test_a_track_takes_the_place_of_the_plan(trial: Path) -> None:
+def test_a_track_replaces_the_planned_places(trial: Path) -> None:
     before = of(messages(exported(trial)), "/tf")
     folder = next(path for path in (trial / "repeats").iterdir() if path.name == "udp-01")
-    began_ns = min(one.time_ns for one in before)
+    began_ns = min(message.time_ns for message in before)
     went = [
         Whereabouts(began_ns - SECOND_NS, Role.SENDER, (1.0, 2.0, 0.2)),
         Whereabouts(began_ns + 10**6, Role.SENDER, (1.5, 2.0, 0.2), (2.0, 0.0, 0.0)),
         Whereabouts(began_ns + 2 * 10**6, Role.SENDER, None),
     ]
     (folder / "track.csv").write_text(track.text(went), encoding="ascii")
-    found = messages(exported(trial, "tracked.mcap"))
-    places = [one.said["transforms"][0]["translation"] for one in of(found, "/tf")]
+    read_messages = messages(exported(trial, "tracked.mcap"))
+    places = [message.said["transforms"][0]["translation"] for message in of(read_messages, "/tf")]
     assert places == [{"x": 1.0, "y": 2.0, "z": 0.2}, {"x": 1.5, "y": 2.0, "z": 0.2}]
-    assert all(one.said["transforms"][0]["child_frame_id"] == "turtlebot-1" for one in of(found, "/tf"))
-    times_ns = [one.time_ns for one in of(found, "/tf")]
+    assert all(
+        message.said["transforms"][0]["child_frame_id"] == "turtlebot-1" for message in of(read_messages, "/tf")
+    )
+    times_ns = [message.time_ns for message in of(read_messages, "/tf")]
     assert times_ns == sorted(times_ns)
-    assert times_ns[0] >= began_ns, "what held when the attempt began is told then"
+    assert times_ns[0] >= began_ns, "an earlier position is reported at the start of the attempt"
 
 
-def test_what_was_told_of_robots_takes_the_place_of_the_testbeds_track(trial: Path) -> None:
-    began_ns = min(one.time_ns for one in of(messages(exported(trial)), "/tf"))
+def test_added_positions_replace_the_testbeds_track(trial: Path) -> None:
+    began_ns = min(message.time_ns for message in of(messages(exported(trial)), "/tf"))
     folder = trial / "repeats" / "udp-01"
     (folder / "track.csv").write_text(
         track.text([Whereabouts(began_ns, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER)])
@@ -278,22 +297,26 @@ def test_what_was_told_of_robots_takes_the_place_of_the_testbeds_track(trial: Pa
     lines = "".join(f"{at_s:.6f},48.1,{11 + number},\n" for number, at_s in enumerate(times_s))
     (trial.parent / "walk.csv").write_text(f"t_s,lat,lon,note\n{lines}")
     assert main(["positions", str(trial), f"receiver={trial.parent / 'walk.csv'}", "sender=1m,2m"]) == 0
-    found = messages(exported(trial, "told.mcap"))
-    for one in found:
-        jsonschema.validate(one.said, one.schema)
-    transforms = [one.said["transforms"][0] for one in of(found, "/tf")]
-    assert {(one["parent_frame_id"], one["child_frame_id"]) for one in transforms} == {("metres", "turtlebot-1")}
-    fixes = of(found, "/receiver/location")
-    assert all("altitude" not in one.said for one in fixes)
-    assert {one.said["longitude"] for one in fixes} == {12, 13}, "what held when an attempt began, and no other day"
+    read_messages = messages(exported(trial, "told.mcap"))
+    for message in read_messages:
+        jsonschema.validate(message.said, message.schema)
+    transforms = [message.said["transforms"][0] for message in of(read_messages, "/tf")]
+    assert {(transform["parent_frame_id"], transform["child_frame_id"]) for transform in transforms} == {
+        ("metres", "turtlebot-1")
+    }
+    fixes = of(read_messages, "/receiver/location")
+    assert all("altitude" not in message.said for message in fixes)
+    assert {message.said["longitude"] for message in fixes} == {12, 13}, (
+        "the position at the start of an attempt, not of another day"
+    )
     assert fixes[0].time_ns == began_ns
 
 
-def test_what_radios_told_of_their_links_is_a_channel_of_each(trial: Path) -> None:
+def test_link_samples_have_a_channel_per_robot(trial: Path) -> None:
     folder = trial / "repeats" / "udp-01"
     known = StationSample("turtlebot-2", -51.25, 65_000_000, None, 7, 5, 1, 0)
-    told = [LinkSample(BEGIN_NS, (known,), noise_dbm=-95.0, active_ns=2 * SECOND_NS, busy_ns=SECOND_NS)]
-    (folder / link_samples.FILE).write_text(link_samples.text({Role.SENDER: told}), encoding="ascii")
+    samples = [LinkSample(BEGIN_NS, (known,), noise_dbm=-95.0, active_ns=2 * SECOND_NS, busy_ns=SECOND_NS)]
+    (folder / link_samples.FILE).write_text(link_samples.text({Role.SENDER: samples}), encoding="ascii")
     (sample,) = of(messages(exported(trial)), "/sender/link")
     jsonschema.validate(sample.said, sample.schema)
     assert (sample.time_ns, sample.clock) == (BEGIN_NS, "sender turtlebot-1")

@@ -1,4 +1,4 @@
-"""The rows of trials as one table: CSV as they stand on disk, Parquet with types, units and meanings."""
+"""The rows of trials as one table: CSV as stored on disk, Parquet with types, units and meanings."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def exported(*paths: Path, kind: str, name: str = "out") -> Path:
     return out
 
 
-def test_the_csv_of_a_trial_is_its_own_byte_for_byte(trial: Path) -> None:
+def test_the_exported_csv_equals_the_trial_csv(trial: Path) -> None:
     assert exported(trial, kind="csv").read_bytes() == (trial / store.TRIAL_CSV).read_bytes()
 
 
@@ -39,21 +39,19 @@ def test_raw_evidence_measured_again_gives_the_same_bytes(trial: Path, tmp_path:
     assert out.read_bytes() == kept
 
 
-def test_tables_of_which_one_lacks_a_column_are_one_table(trial: Path, tmp_path: Path) -> None:
+def test_tables_with_different_columns_are_combined(trial: Path, tmp_path: Path) -> None:
     old = tmp_path / "old.csv"
     lines = (trial / store.TRIAL_CSV).read_text(encoding="utf-8").splitlines()
     last = lines[0].rpartition(",")[2]
     text = "".join(line.rpartition(",")[0] + "\n" for line in lines)
     old.write_text(text.replace(trial.name, "older"), encoding="utf-8")
     exported(trial, old, kind="csv")
-    found = rows(tmp_path, "out.csv")
-    assert [row["trial"] for row in found] == [trial.name, trial.name, "older", "older"]
-    assert [row[last] for row in found] == [*(line.rpartition(",")[2] for line in lines[1:]), "", ""]
+    exported_rows = rows(tmp_path, "out.csv")
+    assert [row["trial"] for row in exported_rows] == [trial.name, trial.name, "older", "older"]
+    assert [row[last] for row in exported_rows] == [*(line.rpartition(",")[2] for line in lines[1:]), "", ""]
 
 
-def test_columns_that_nobody_here_declares_are_kept_as_they_stand(
-    trial: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_undeclared_columns_are_kept_as_text(trial: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, more = trial / store.TRIAL_CSV, ("soil_moisture,,note", "0.300,,wet", ",,")
     lines = path.read_text(encoding="utf-8").splitlines()
     path.write_text("".join(f"{line},{end}\n" for line, end in zip(lines, more, strict=True)), encoding="utf-8")
@@ -76,7 +74,7 @@ def test_parquet_has_units_meanings_and_versions(trial: Path) -> None:
     assert int(schema.metadata[b"schema_version"]) == SCHEMA_VERSION
 
 
-def test_parquet_has_types_and_nothing_where_something_is_missing(trial: Path) -> None:
+def test_parquet_has_types_and_nulls(trial: Path) -> None:
     table = pa.parquet.read_table(exported(trial, kind="parquet"))
     assert {name: str(table.schema.field(name).type) for name in ("repeat", "hash_match", "ip_loss", "status")} == {
         "repeat": "int64",
@@ -91,7 +89,7 @@ def test_parquet_has_types_and_nothing_where_something_is_missing(trial: Path) -
     assert table["ip_loss"].to_pylist() == [None, pytest.approx(len(LOST) / PACKETS)]
 
 
-def test_times_keep_digits_that_a_float_has_no_room_for(trial: Path) -> None:
+def test_times_keep_all_digits(trial: Path) -> None:
     path = trial / store.TRIAL_CSV
     path.write_text(path.read_text(encoding="utf-8").replace(str(START_NS), str(START_NS + 1)), encoding="utf-8")
     table = pa.parquet.read_table(exported(trial, kind="parquet"))
@@ -103,7 +101,7 @@ def test_the_same_rows_give_the_same_bytes(trial: Path) -> None:
     assert exported(trial, kind="parquet", name="again").read_bytes() == first
 
 
-def test_a_table_without_rows_is_no_export(trial: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_table_without_rows_is_an_error(trial: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = trial / store.TRIAL_CSV
     path.write_text(path.read_text(encoding="utf-8").splitlines(keepends=True)[0], encoding="utf-8")
     assert main(["export", str(trial), "--format", "parquet", "-o", str(tmp_path / "out.parquet")]) == 4

@@ -1,4 +1,4 @@
-"""Evidence folders of tests: made late, removed unless kept, never one over another."""
+"""Evidence folders of tests: created on first use, removed unless kept, never overwritten."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from fieldkit.pytest.evidence import LOG, EvidenceFolder, EvidenceKeeper
 from fieldkit.pytest.options import Keep
 
 
-def test_a_folder_is_made_when_something_is_put_there(tmp_path: Path) -> None:
+def test_a_folder_is_created_on_first_use(tmp_path: Path) -> None:
     folder = EvidenceFolder(tmp_path / "run" / "test_a")
     assert (folder.is_there, list(tmp_path.iterdir())) == (False, [])
     folder.add("heard")
@@ -27,7 +27,7 @@ def test_a_folder_is_made_when_something_is_put_there(tmp_path: Path) -> None:
         (Keep.NONE, True, False),
     ],
 )
-def test_it_stays_where_it_is_to_be_kept(tmp_path: Path, *, keep: Keep, failed: bool, stays: bool) -> None:
+def test_a_folder_remains_if_it_must_be_kept(tmp_path: Path, *, keep: Keep, failed: bool, stays: bool) -> None:
     folder = EvidenceFolder(tmp_path / "run" / "test_a")
     folder.add("heard")
     folder.has_failed = failed
@@ -35,38 +35,38 @@ def test_it_stays_where_it_is_to_be_kept(tmp_path: Path, *, keep: Keep, failed: 
     assert (folder.is_there, (tmp_path / "run").exists()) == (stays, stays)
 
 
-def test_another_try_of_a_test_has_a_folder_of_its_own(tmp_path: Path) -> None:
+def test_a_rerun_of_a_test_has_a_separate_folder(tmp_path: Path) -> None:
     tries = [EvidenceFolder(tmp_path / "test_a") for _ in range(3)]
-    assert [one.path.name for one in tries] == ["test_a", "test_a-2", "test_a-3"]
+    assert [folder.path.name for folder in tries] == ["test_a", "test_a-2", "test_a-3"]
 
 
-def test_a_folder_that_cannot_be_made_is_told_with_the_option(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_created_is_reported_with_the_option(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigurationError, match="no folder for evidence") as caught:
+    with pytest.raises(ConfigurationError, match="cannot create the folder for evidence") as caught:
         EvidenceFolder(tmp_path / "file" / "run" / "test_a").add("heard")
     assert "--fieldkit-output" in caught.value.remedy
 
 
-def test_a_run_that_kept_nothing_leaves_no_folder(tmp_path: Path) -> None:
+def test_a_run_without_kept_evidence_leaves_no_folder(tmp_path: Path) -> None:
     keeper = EvidenceKeeper(tmp_path / "results" / "run", Keep.FAILED)
-    keeper.told(Note("robots are up"))
+    keeper.add_event(Note("robots are up"))
     assert list(tmp_path.rglob(LOG))
     keeper.end()
     assert not list(tmp_path.iterdir())
 
 
-def test_what_others_left_in_the_folder_stays(tmp_path: Path) -> None:
+def test_other_files_in_the_folder_remain(tmp_path: Path) -> None:
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "notes.txt").touch()
     keeper = EvidenceKeeper(tmp_path / "results" / "run", Keep.FAILED)
-    keeper.told(Note("robots are up"))
+    keeper.add_event(Note("robots are up"))
     keeper.end()
     assert [path.name for path in tmp_path.rglob("*")] == ["results", "notes.txt"]
 
 
-def test_events_are_told_in_words_and_progress_is_not(tmp_path: Path) -> None:
+def test_events_are_logged_as_text_except_progress(tmp_path: Path) -> None:
     keeper = EvidenceKeeper(tmp_path / "run", Keep.ALL)
     for event in (Note("up"), PhaseStarted("record", "udp-01"), TrialStarted("folder", 0, 1)):
-        keeper.told(event)
+        keeper.add_event(event)
     lines = (keeper.folder.path / LOG).read_text(encoding="utf-8").splitlines()
     assert [line.split(" ", 1)[1] for line in lines] == ["up", "udp-01 record"]

@@ -1,4 +1,4 @@
-"""The fixtures `lab`, `robots` and `trial` in tests as people write them, on emulated robots."""
+"""The fixtures `lab`, `robots` and `trial` in realistic tests, on emulated robots."""
 
 import re
 import signal
@@ -32,7 +32,7 @@ def test_robots_have_names_roles_and_addresses(robots):
     assert len(robots) == 2
 
 
-def test_they_stand_where_they_are_put(lab, robots):
+def test_robots_are_at_their_places(lab, robots):
     assert "3 received" in ping(robots).stdout
     lab.place("350m")
     assert ping(robots).exit_code == 1
@@ -40,7 +40,7 @@ def test_they_stand_where_they_are_put(lab, robots):
     assert "3 received" in ping(robots).stdout
 
 
-def test_a_link_goes_down_for_a_while(lab, robots):
+def test_a_link_is_down_temporarily(lab, robots):
     with robots.sender.running(["ping", "-i", "0.1", robots.receiver.address]) as program:
         lab.fault("link-down", "base", lasts="1s")
         ping(robots)
@@ -61,7 +61,7 @@ def test_a_robot_moves_and_comes_back(lab, robots):
     assert ping(robots).exit_code == 0
 
 
-def test_files_go_there_and_back(robots, tmp_path):
+def test_files_are_copied_in_both_directions(robots, tmp_path):
     (tmp_path / "tool").write_bytes(bytes(range(256)) * 1000)
     (tmp_path / "tool").chmod(0o755)
     robots.sender.put(tmp_path / "tool", "new/folder/tool")
@@ -70,7 +70,7 @@ def test_files_go_there_and_back(robots, tmp_path):
     assert robots.sender.run(["cat"], stdin="quoted; $HOME").stdout == "quoted; $HOME"
 
 
-def test_its_radio_tells_of_its_link(robots):
+def test_the_state_of_a_link_is_read(robots):
     ping(robots)
     (station,) = robots.sender.link().stations
     assert station.station == "base"
@@ -78,7 +78,7 @@ def test_its_radio_tells_of_its_link(robots):
     assert station.tx_packets > 0
 
 
-def test_ros_is_at_hand(robots):
+def test_ros_is_available(robots):
     assert robots.sender.run(["rosbag", "record", "--help"], ros=True).exit_code == 0
 
 
@@ -93,40 +93,40 @@ def test_a_trial_has_its_figures(short):
     assert short.repeats["sent_bytes"].to_pylist() == [20_000]
 
 
-def test_another_reads_the_same_trial(short):
+def test_two_tests_share_a_trial(short):
     assert not any(short.packets("tcp-01")["lost"].to_pylist())
 
 
-def test_fails_by_its_figure(short):
+def test_fails_because_of_a_figure(short):
     assert short.cell().file_loss.high < 0.5
 
 
-def test_fails_by_a_program(robots):
+def test_fails_because_of_a_program(robots):
     robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])
 
 
-def test_fails_by_time(robots):
+def test_fails_because_of_a_timeout(robots):
     robots.sender.run(["sleep", "60"], timeout=0.5)
 
 
-def test_fails_by_what_its_procedure_expects(trial):
+def test_fails_because_of_an_expectation(trial):
     trial("slow", "10m", repeats=2)
 
 
-def test_asks_for_who_is_not_there(robots):
+def test_uses_an_unknown_robot(robots):
     robots.sendr.run(["true"])
 
 
-def test_asks_for_robots_that_the_site_has_not(trial):
+def test_uses_robots_missing_in_the_site(trial):
     trial("los", "10m", repeats=1)
 
 
-def test_gives_one_word(robots):
+def test_passes_a_string_as_arguments(robots):
     robots.sender.run("ping -c 1 base")
 
 
 @pytest.mark.parametrize(("kind", "more"), [("link-down", {}), ("reboot", {"lasts": "1s"}), ("ufo", {})])
-def test_asks_for_no_fault(lab, kind, more):
+def test_uses_an_unknown_fault(lab, kind, more):
     lab.fault(kind, "sender", **more)
 """
 SHORT = """\
@@ -156,10 +156,10 @@ expect:
   - rtt_median_s < 1 us
 """
 FAIL = {
-    "test_fails_by_its_figure",
-    "test_fails_by_a_program",
-    "test_fails_by_time",
-    "test_fails_by_what_its_procedure_expects",
+    "test_fails_because_of_a_figure",
+    "test_fails_because_of_a_program",
+    "test_fails_because_of_a_timeout",
+    "test_fails_because_of_an_expectation",
 }
 LONG = """
 def test_long(robots):
@@ -194,13 +194,13 @@ def ran(folder: Path) -> SuiteRun:
 
 
 def part(said: str, title: str) -> str:
-    """Return what pytest printed of one test that did not pass."""
-    found = re.search(rf"^_+ {title} _+$(.*?)(?=^_{{3,}} \S|^={{3,}} |\Z)", said, re.MULTILINE | re.DOTALL)
-    assert found, said
-    return found[1]
+    """Return the output of pytest for one test that did not pass."""
+    match = re.search(rf"^_+ {title} _+$(.*?)(?=^_{{3,}} \S|^={{3,}} |\Z)", said, re.MULTILINE | re.DOTALL)
+    assert match, said
+    return match[1]
 
 
-def test_tests_pass_fail_and_meet_errors_of_the_lab(ran: SuiteRun) -> None:
+def test_tests_pass_fail_and_have_errors_of_the_lab(ran: SuiteRun) -> None:
     assert ran.code == 1
     failed = {name for name, how in ran.ended.items() if how == "failure"}
     errors = {name.partition("[")[0] for name, how in ran.ended.items() if how == "error"}
@@ -209,47 +209,53 @@ def test_tests_pass_fail_and_meet_errors_of_the_lab(ran: SuiteRun) -> None:
     assert len(ran.ended) == len(FAIL) + len([how for how in ran.ended.values() if how == "error"]) + 10, ran.said
 
 
-def test_a_failure_is_told_by_the_line_of_the_test(ran: SuiteRun) -> None:
-    said = part(ran.said, "test_fails_by_a_program")
+def test_a_failure_is_reported_with_the_line_of_the_test(ran: SuiteRun) -> None:
+    said = part(ran.said, "test_fails_because_of_a_program")
     assert '>       robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])' in said
-    assert "rover: `sh -c 'echo broken >&2; exit 3'` ended with exit code 3: broken" in said
-    assert "/fieldkit/" not in said, "nothing of fieldkit's own is shown"
-    assert "rover: `sleep 60` did not end in time" in part(ran.said, "test_fails_by_time")
-    assert "where inf = CellFigure(name='file_loss', unit='share', n=1" in part(ran.said, "test_fails_by_its_figure")
-    assert "rtt_median_s < 1 us TCP" in part(ran.said, "test_fails_by_what_its_procedure_expects")
+    assert "rover: `sh -c 'echo broken >&2; exit 3'` exited with code 3: broken" in said
+    assert "/fieldkit/" not in said, "no internals of fieldkit are shown"
+    assert "rover: `sleep 60` did not end in time" in part(ran.said, "test_fails_because_of_a_timeout")
+    assert "where inf = CellFigure(name='file_loss', unit='share', n=1" in part(
+        ran.said, "test_fails_because_of_a_figure"
+    )
+    assert "rtt_median_s < 1 us TCP" in part(ran.said, "test_fails_because_of_an_expectation")
 
 
-def test_an_error_of_the_lab_is_told_by_what_and_remedy(ran: SuiteRun) -> None:
-    said = part(ran.said, "ERROR at setup of test_asks_for_who_is_not_there")
+def test_an_error_of_the_lab_is_reported_with_its_remedy(ran: SuiteRun) -> None:
+    said = part(ran.said, "ERROR at setup of test_uses_an_unknown_robot")
     assert "there is no robot 'sendr' in this lab\n  remedy: did you mean 'sender'?" in said
-    assert "asked for at test_robots.py:" in said
+    assert "requested at test_robots.py:" in said
     assert "the site file gives no roles for topology master" in part(
-        ran.said, "ERROR at setup of test_asks_for_robots_that_the_site_has_not"
+        ran.said, "ERROR at setup of test_uses_robots_missing_in_the_site"
     )
     assert "remedy: write ['ping', '-c', '1', 'base']" in ran.said
 
 
-def test_evidence_is_kept_of_what_failed_alone(ran: SuiteRun, folder: Path) -> None:
+def test_only_evidence_of_failures_is_kept(ran: SuiteRun, folder: Path) -> None:
     (kept,) = (folder / "fieldkit-results").iterdir()
     own = {path.name for path in (kept / "test_robots.py").iterdir()}
-    assert own - {"set-up"} >= FAIL - {"test_fails_by_its_figure"}, "what that one is about was set up for several"
+    assert own - {"set-up"} >= FAIL - {"test_fails_because_of_a_figure"}, (
+        "what that one is about was set up for several"
+    )
     assert not any(name.startswith(("test_a", "test_r", "test_t")) for name in own if "asks" not in name)
-    log = (kept / "test_robots.py" / "test_fails_by_a_program" / "lab.log").read_text(encoding="utf-8")
+    log = (kept / "test_robots.py" / "test_fails_because_of_a_program" / "lab.log").read_text(encoding="utf-8")
     assert log.endswith("rover $ sh -c 'echo broken >&2; exit 3'\nbroken\nexit code 3\n")
-    for name, trials in (("set-up", 1), ("test_fails_by_what_its_procedure_expects", 1)):
-        found = list((kept / "test_robots.py" / name / "trials").glob("*/trial.csv"))
-        assert len(found) == trials
+    for name, trials in (("set-up", 1), ("test_fails_because_of_an_expectation", 1)):
+        tables = list((kept / "test_robots.py" / name / "trials").glob("*/trial.csv"))
+        assert len(tables) == trials
 
 
 def test_a_failed_test_names_its_evidence(ran: SuiteRun, folder: Path) -> None:
     (kept,) = (folder / "fieldkit-results").iterdir()
-    own = kept / "test_robots.py" / "test_fails_by_a_program"
-    assert f"fieldkit evidence -------------------------------\n{own}\n" in part(ran.said, "test_fails_by_a_program")
-    assert ("fieldkit_evidence", str(own)) in ran.properties["test_fails_by_a_program"]
-    assert not ran.properties["test_files_go_there_and_back"]
+    own = kept / "test_robots.py" / "test_fails_because_of_a_program"
+    assert f"fieldkit evidence -------------------------------\n{own}\n" in part(
+        ran.said, "test_fails_because_of_a_program"
+    )
+    assert ("fieldkit_evidence", str(own)) in ran.properties["test_fails_because_of_a_program"]
+    assert not ran.properties["test_files_are_copied_in_both_directions"]
 
 
-def test_workers_have_a_lab_each_and_one_folder(tmp_path: Path) -> None:
+def test_each_worker_has_a_lab_and_all_share_one_folder(tmp_path: Path) -> None:
     files = {f"test_{name}": PASSES.format(name=name) for name in ("a", "b")}
     suites.write(tmp_path, **files)
     done = suites.run(tmp_path, "-n", "2", "--dist", "loadfile", "--fieldkit-keep", "all")
@@ -259,7 +265,7 @@ def test_workers_have_a_lab_each_and_one_folder(tmp_path: Path) -> None:
     assert logs == [f"test_{one}.py/{test}/lab.log" for one in "ab" for test in ("set-up", f"test_{one}", "test_one")]
 
 
-def test_nothing_is_left_after_ctrl_c(tmp_path: Path) -> None:
+def test_nothing_remains_after_ctrl_c(tmp_path: Path) -> None:
     """In the middle of a program on a robot."""
     test = (
         'def test_long(robots):\n    open("up", "w").close()\n    robots.sender.run(["sleep", "600"], timeout=600)\n'
@@ -270,7 +276,7 @@ def test_nothing_is_left_after_ctrl_c(tmp_path: Path) -> None:
     )
     wait_until(lambda: (tmp_path / "up").exists() or process.poll() is not None, Deadline.after(120))
     started = descendants(process.pid)
-    assert len(started) > 3, "two robots and what carries their packets"
+    assert len(started) > 3, "two robots and the radio model"
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=120)
     assert (process.returncode, "KeyboardInterrupt" in said) == (2, True), said

@@ -1,4 +1,4 @@
-"""Options and configuration of the plugin, what is wrong with them, and tests that do not use it."""
+"""Options and configuration of the plugin, their errors, and tests that do not use it."""
 
 import os
 from pathlib import Path
@@ -67,7 +67,7 @@ from fieldkit.pytest.options import LabOptions
 
 def test_operator(pytestconfig):
     person = operator_of(pytestconfig, LabOptions(), print)
-    with pytest.raises(ConfigurationError, match="somebody must carry it, and there is no terminal") as caught:
+    with pytest.raises(ConfigurationError, match="a person must carry it, but there is no terminal") as caught:
         person.ask("carry it")
     assert "--fieldkit-yes" in caught.value.remedy
     assert operator_of(pytestconfig, LabOptions(yes=True), print) is NOBODY
@@ -75,12 +75,12 @@ def test_operator(pytestconfig):
 
 
 def run(pytester: pytest.Pytester, *words: str) -> pytest.RunResult:
-    """Run the tests of the current folder in this process, which has imported fieldkit already."""
+    """Run the tests of the current folder in this process, which has already imported fieldkit."""
     return pytester.runpytest_inprocess("-p", "no:cacheprovider", *words)
 
 
 def field(folder: Path) -> str:
-    """Return a site file with two robots that are off."""
+    """Return a site file with two robots that are switched off."""
     host_key = " ".join(make_key(folder / "host_key").split()[:2])
     make_key(folder / "key")
     access = f"port: {free_port()}, user: pi, key: {folder / 'key'}, host_key: {host_key}"
@@ -92,15 +92,15 @@ def field(folder: Path) -> str:
     return "\n".join(["backend: field", "patience: 1s", "robots:", *lines, roles, ""])
 
 
-def test_tests_without_its_fixtures_import_nothing_of_fieldkit(tmp_path: Path) -> None:
-    """Fixtures of their own that have the same names are theirs."""
+def test_tests_without_its_fixtures_import_no_other_module(tmp_path: Path) -> None:
+    """Other fixtures with the same names are not affected."""
     suites.write(tmp_path, site="robots: [", test_others=OTHERS, conftest=OWN)
     done = suites.run(tmp_path)
     assert (done.code, set(done.ended.values())) == (0, {"passed"}), done.said
     assert not (tmp_path / "fieldkit-results").exists()
 
 
-def test_the_configuration_says_what_the_command_line_does_not(pytester: pytest.Pytester) -> None:
+def test_the_configuration_is_used_without_command_line_options(pytester: pytest.Pytester) -> None:
     pytester.makeini(
         "[pytest]\nfieldkit_site = ours.yaml\nfieldkit_topology = masterless\nfieldkit_output = out\n"
         "fieldkit_keep = all\nfieldkit_backend = emulated\n"
@@ -123,7 +123,7 @@ def test_the_configuration_says_what_the_command_line_does_not(pytester: pytest.
         (("--fieldkit-topology", "master"), "the site file gives no roles for topology master", "add roles.master"),
     ],
 )
-def test_a_lab_that_cannot_be_is_an_error_of_set_up(
+def test_an_invalid_lab_is_an_error_of_set_up(
     pytester: pytest.Pytester, words: tuple[str, ...], what: str, remedy: str
 ) -> None:
     suites.write(pytester.path, test_asks=ASKS)
@@ -133,10 +133,10 @@ def test_a_lab_that_cannot_be_is_an_error_of_set_up(
     assert "ERROR at setup of test_asks" in said
     assert what in said
     assert remedy in said
-    assert "/fieldkit/" not in said, "nothing of fieldkit's own is shown"
+    assert "/fieldkit/" not in said, "no internals of fieldkit are shown"
 
 
-def test_all_of_an_error_is_shown_where_it_is_asked_for(pytester: pytest.Pytester) -> None:
+def test_a_full_traceback_is_shown_on_request(pytester: pytest.Pytester) -> None:
     suites.write(pytester.path, test_asks=ASKS)
     said = run(pytester, "--fieldkit-backend", "emulatd", "--tb=long").stdout.str()
     assert "fieldkit/backends/registry.py" in said
@@ -145,19 +145,19 @@ def test_all_of_an_error_is_shown_where_it_is_asked_for(pytester: pytest.Pyteste
 @pytest.mark.parametrize(
     "words", [("--fieldkit-keep", "som"), ("--fieldkit-topology", "mesh"), ("-o", "fieldkit_keep=som")]
 )
-def test_a_word_that_is_none_is_refused_before_any_test(pytester: pytest.Pytester, words: tuple[str, ...]) -> None:
+def test_an_invalid_value_is_rejected_before_any_test(pytester: pytest.Pytester, words: tuple[str, ...]) -> None:
     suites.write(pytester.path, test_asks=ASKS)
     done = run(pytester, *words)
     assert done.ret == pytest.ExitCode.USAGE_ERROR
     assert "choose from" in done.stderr.str()
 
 
-def test_a_file_of_tests_chooses_its_lab(pytester: pytest.Pytester) -> None:
+def test_a_test_module_chooses_its_lab(pytester: pytest.Pytester) -> None:
     suites.write(pytester.path, test_asks=CHOOSES + ASKS)
     assert "there is no backend 'mars'" in run(pytester).stdout.str()
 
 
-def test_a_robot_that_is_off_is_an_error_with_what_to_do(tmp_path: Path) -> None:
+def test_an_unreachable_robot_is_an_error_with_a_remedy(tmp_path: Path) -> None:
     suites.write(tmp_path, site=field(tmp_path), test_asks=ASKS)
     done = suites.run(tmp_path)
     assert (done.code, done.ended) == (1, {"test_asks": "error"}), done.said
@@ -168,7 +168,7 @@ def test_a_robot_that_is_off_is_an_error_with_what_to_do(tmp_path: Path) -> None
     assert "open field, masterless" in Path(folder, LOG).read_text(encoding="utf-8")
 
 
-def test_where_nobody_can_be_asked_the_option_is_named(pytester: pytest.Pytester) -> None:
+def test_without_a_terminal_the_option_is_named(pytester: pytest.Pytester) -> None:
     suites.write(pytester.path, test_operator=OPERATOR)
     run(pytester).assert_outcomes(passed=1)
 

@@ -150,7 +150,7 @@ def plan_of(cast: Cast, procedure: str = "los") -> Plan:
 
 
 def test_masterloss_requires_a_shared_master() -> None:
-    with pytest.raises(ConfigurationError, match="procedure masterloss is about one ROS master") as caught:
+    with pytest.raises(ConfigurationError, match="procedure masterloss needs one ROS master") as caught:
         plan_of(CAST, "masterloss")
     assert "ros_master: relay" in caught.value.remedy
     plan = plan_of(SHARED, "masterloss")

@@ -1,4 +1,4 @@
-"""Whatever a procedure may say is measured rightly, or refused when it is loaded: random ones, imagined robots."""
+"""Random procedures on simulated evidence: each is measured correctly, or rejected when it is loaded."""
 
 import json
 import random
@@ -37,7 +37,7 @@ NAMES = st.sampled_from(["up", "down", "recv", "n{n}", "n{n}"])
 
 
 def _given(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
-    """A mapping of which each key may be left out."""
+    """Return a strategy for mappings from which each key may be missing."""
     return st.fixed_dictionaries({}, optional=keys)
 
 
@@ -118,14 +118,14 @@ def _for(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
     return st.builds(lambda each, steps: {"for": {"each": {"n": each}, "during": steps}}, values, during)
 
 
-# Anything, most of which is refused; and what people write, with some of it changed.
+# Arbitrary procedures, most of which are rejected; and usual ones with random changes.
 ANYTHING = st.lists(
     st.recursive(st.one_of(TRANSFER, PING, RECORD, IPERF3), _nests, max_leaves=4), min_size=1, max_size=3
 )
 
 
 def usual(seed: int) -> list[Any]:
-    """Return what people write, with some of it changed."""
+    """Return a usual procedure with random changes."""
     draw = random.Random(seed)
     source, target = draw.choice([("sender", "receiver")] * 4 + [("receiver", "sender"), ("sender", "relay")])
     name = draw.choice(["scan", "scan", "lidar"])
@@ -156,7 +156,7 @@ def usual(seed: int) -> list[Any]:
 
 
 def _more(draw: random.Random, inside: list[Any], source: str, target: str) -> list[Any]:
-    """Return steps with others of the same kinds beside them, or at the same time, or once for each value."""
+    """Return the steps with further steps of the same kinds: in sequence, in parallel, or once for each value."""
     if draw.random() < 0.3:
         ping: dict[str, Any] = {"from": source, "to": target, "count": 3, "payload_bytes": "{bytes}"}
         ping |= draw.choice([{"name": "p{bytes}"}] * 4 + [{"name": "p"}, {"name": "p{byte}"}])
@@ -187,7 +187,7 @@ SEEN: Counter[str] = Counter()
 
 
 def loaded(steps: list[Any]) -> Procedure | ConfigurationError:
-    """Return the procedure, or why it is refused."""
+    """Return the procedure, or the error with which it is rejected."""
     text = f"{HEAD}steps: {json.dumps(steps, indent=1)}\n"
     try:
         return schema.validate(schema.parse(text, source="any.yaml"), Procedure)
@@ -198,7 +198,7 @@ def loaded(steps: list[Any]) -> Procedure | ConfigurationError:
 @pytest.mark.emulated  # needs tcpdump, which filters the captures
 @settings(max_examples=100)
 @given(steps=ANYTHING, **OTHERS)
-def test_anything_is_measured_rightly_or_refused(
+def test_any_procedure_is_measured_correctly_or_rejected(
     steps: list[Any], protocol: Protocol, loss: float, seed: int
 ) -> None:
     judge(steps, protocol, loss, seed)
@@ -206,14 +206,14 @@ def test_anything_is_measured_rightly_or_refused(
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("block", range(4))
-def test_what_people_write_is_measured_rightly_or_refused(block: int) -> None:
+def test_usual_procedures_are_measured_correctly_or_rejected(block: int) -> None:
     for seed in range(100 * block, 100 * block + 100):
         draw = random.Random(seed)
         judge(usual(seed), draw.choice(list(Protocol)), draw.choice([0.0, 0.2]), seed)
 
 
 def judge(steps: list[Any], protocol: Protocol, loss: float, seed: int) -> None:
-    """Load a procedure; where that works, play it, measure it, and compare with what really happened."""
+    """Load a procedure; if it is valid, simulate it, measure it, and compare the result with the truth."""
     procedure = loaded(steps)
     if isinstance(procedure, ConfigurationError):
         SEEN["refused when loaded"] += 1
@@ -242,7 +242,9 @@ def _compare(
     missing: Mapping[str, str],
 ) -> None:
     declared = [
-        prefixed(placed.step.prefix, one.name) for placed in procedure.walk() for one in placed.step.output_columns()
+        prefixed(placed.step.prefix, column.name)
+        for placed in procedure.walk()
+        for column in placed.step.output_columns()
     ]
     assert len(set(declared)) == len(declared)
     assert set(declared) <= values.keys() | missing.keys()
@@ -297,7 +299,7 @@ def _compare_transfer(
 
 
 @pytest.mark.emulated
-def test_enough_of_each_kind_was_tried(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
+def test_enough_procedures_of_each_kind_were_tried(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
     if not SEEN:
         pytest.fail("this runs behind the test above, in one process")
     record_property("said", f"random procedures: {dict(sorted(SEEN.items()))}")

@@ -1,4 +1,4 @@
-"""One source of a stored attempt changed: the repeat is void, or no column that depends on it moves.
+"""One evidence file of a stored attempt is changed: the repeat is void, or no dependent column changes.
 
 The attempts are valid ones of a transfer, pings and iperf3 in both directions, with and without captures, recorded on
 emulated robots with 5 % loss (`tests/data/README.md`).
@@ -65,7 +65,7 @@ def of_json(edit: Callable[[Any], object]) -> Change:
 
 
 def everywhere(key: str, factor: float) -> Change:
-    """Multiply every number of a key, in intervals, streams and totals alike."""
+    """Multiply every number of a key in intervals, streams and totals."""
 
     def multiply(value: Any) -> None:  # noqa: ANN401 (of JSON)
         for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
@@ -109,7 +109,7 @@ SENT = "sender-iperf3.json"
         (Protocol.UDP, "bare.receiver-iperf3.json", everywhere("bytes", 10), "bit/s by its bytes"),
     ],
 )
-def test_iperf3_results_that_other_evidence_contradicts(
+def test_iperf3_results_contradicted_by_other_evidence(
     protocol: Protocol, name: str, change: Change, reason: str, tmp_path: Path
 ) -> None:
     demand(protocol, name, change, tmp_path, reason)
@@ -121,7 +121,7 @@ def test_iperf3_results_that_other_evidence_contradicts(
 def test_bytes_that_are_consistent_in_their_file_are_compared_with_captures(
     protocol: Protocol, factor: float, test: str, tmp_path: Path
 ) -> None:
-    """Even if both ends agree: the program itself counted wrongly."""
+    """Even if both ends agree, because the program itself counted wrongly."""
     stored_one = attempt(protocol)
     for path in stored_one.folder.iterdir():
         (tmp_path / path.name).symlink_to(path)
@@ -150,7 +150,7 @@ def replies(change: Callable[[float], float], pattern: str = r"(time=)([0-9.]+)"
 
 
 def fewer(content: bytes) -> bytes:
-    """One reply less, and a summary that agrees."""
+    """Remove one reply and adapt the summary."""
     text = content.decode()
     without = re.sub(r"^\[.*icmp_seq=\d+ .*\n", "", text, count=1, flags=re.MULTILINE)
     return re.sub(r"(\d+) received", lambda match: f"{int(match[1]) - 1} received", without).encode()
@@ -181,8 +181,8 @@ def test_pings_that_captures_contradict(protocol: Protocol, change: Change, reas
     demand(protocol, "ping.txt", change, tmp_path, reason)
 
 
-def test_a_ping_of_other_times_that_its_own_summary_confirms(tmp_path: Path) -> None:
-    """Every time of the file 5 ms longer: only the capture tells."""
+def test_changed_ping_times_with_a_consistent_summary(tmp_path: Path) -> None:
+    """Every time in the file is 5 ms longer: only the capture shows it."""
 
     def longer(content: bytes) -> bytes:
         text = replies(lambda ms: ms + 5, form="{:.3f}")(content).decode()
@@ -204,13 +204,13 @@ def test_a_ping_of_other_times_that_its_own_summary_confirms(tmp_path: Path) -> 
         (lambda _: b"", "the kernel of the receiver dropped 0"),
     ],
 )
-def test_a_udp_file_that_is_not_what_arrived(change: Change, reason: str, tmp_path: Path) -> None:
+def test_a_udp_file_that_differs_from_the_received_data(change: Change, reason: str, tmp_path: Path) -> None:
     assert len((attempt(Protocol.UDP).folder / "recv.bag").read_bytes()) > 8192
     demand(Protocol.UDP, "recv.bag", change, tmp_path, reason)
 
 
-def test_datagrams_that_the_kernel_refused_are_a_loss_of_the_receiver(tmp_path: Path) -> None:
-    """A socket buffer overflow is legitimate: the kernel counts it (RcvbufErrors)."""
+def test_datagrams_dropped_by_the_kernel_are_a_loss_of_the_receiver(tmp_path: Path) -> None:
+    """An overflow of the socket buffer is legitimate: the kernel counts it (RcvbufErrors)."""
     stored_one = attempt(Protocol.UDP)
     for path in stored_one.folder.iterdir():
         (tmp_path / path.name).symlink_to(path)
@@ -224,7 +224,7 @@ def test_datagrams_that_the_kernel_refused_are_a_loss_of_the_receiver(tmp_path: 
 
 
 def _refusing(path: Path, count: int) -> bytes:
-    """The state of a host whose kernel refused so many datagrams more."""
+    """Return the state of a host whose kernel dropped this number of further datagrams."""
     text = path.read_text(encoding="utf-8")
     names, values = re.findall(r"^Udp: (.*)$", text, re.MULTILINE)
     table = dict(zip(names.split(), map(int, values.split()), strict=True))

@@ -1,4 +1,4 @@
-"""Estimates of time: what a good link and a dead one take at first, then what repeats really took."""
+"""Estimates of durations: from a good and a dead link at first, then from finished repeats."""
 
 import pytest
 from hypothesis import given
@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from fieldkit.core.model import Protocol, Status, Topology
 from fieldkit.core.units import TimeEstimate, parse_distance
 from fieldkit.trial import estimates
-from fieldkit.trial.estimates import Taken, of_repeats, of_trial
+from fieldkit.trial.estimates import FinishedRepeat, of_repeats, of_trial
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from tests.helpers.casts import los_plan
@@ -32,17 +32,22 @@ def test_at_first_a_good_link_is_assumed_and_a_dead_one_stated() -> None:
     assert ", up to 4" in str(lasts)
 
 
-def test_repeats_of_the_same_trial_say_it_best() -> None:
+def test_finished_repeats_of_the_same_trial_are_preferred() -> None:
     here, elsewhere = at("30ft"), at("10ft")
-    known = [Taken(here, TCP, 130.0), Taken(here, TCP, 150.0), Taken(elsewhere, TCP, 9.0), Taken(here, UDP, 8.0)]
+    known = [
+        FinishedRepeat(here, TCP, 130.0),
+        FinishedRepeat(here, TCP, 150.0),
+        FinishedRepeat(elsewhere, TCP, 9.0),
+        FinishedRepeat(here, UDP, 8.0),
+    ]
     assert of_repeats(here, TCP, 3, known) == TimeEstimate(3 * 140.0, 3 * 150.0)
     assert of_repeats(here, UDP, 3, known) == TimeEstimate(24.0, 24.0), "each protocol by its own repeats"
 
 
-def test_a_place_farther_than_any_before_may_have_a_dead_link() -> None:
-    known = [Taken(at("10m"), TCP, 9.0), Taken(at("20m"), TCP, 12.0)]
+def test_a_larger_distance_than_any_before_may_have_a_dead_link() -> None:
+    known = [FinishedRepeat(at("10m"), TCP, 9.0), FinishedRepeat(at("20m"), TCP, 12.0)]
     farther = of_repeats(at("30m"), TCP, 1, known)
-    assert farther.likely_s == 12.0, "as the farthest place so far"
+    assert farther.likely_s == 12.0, "as at the farthest place so far"
     assert farther.most_s == estimates.dead_link_s(LOS.procedure, TCP)
     assert of_repeats(at("15m"), TCP, 1, known) == TimeEstimate(10.5, 12.0), (
         "between two places, no longer than they took"
@@ -50,20 +55,22 @@ def test_a_place_farther_than_any_before_may_have_a_dead_link() -> None:
     assert of_repeats(at("5m"), TCP, 1, known) == TimeEstimate(9.0, 12.0)
 
 
-def test_another_topology_says_something_where_the_same_says_nothing() -> None:
+def test_another_topology_is_used_if_the_same_has_no_repeats() -> None:
     other = next(topology for topology in Topology if topology is not LOS.topology)
-    known = [Taken(at("10m", other), TCP, 50.0)]
+    known = [FinishedRepeat(at("10m", other), TCP, 50.0)]
     assert of_repeats(at("10m"), TCP, 2, known) == TimeEstimate(100.0, 100.0)
-    assert of_repeats(at("10m"), TCP, 2, [*known, Taken(at("10m"), TCP, 7.0)]) == TimeEstimate(14.0, 14.0)
+    assert of_repeats(at("10m"), TCP, 2, [*known, FinishedRepeat(at("10m"), TCP, 7.0)]) == TimeEstimate(14.0, 14.0)
 
 
-def test_a_dead_link_campaign_is_announced_as_what_it_took() -> None:
-    """A campaign said 4 min and took 19: after its first trial with dead links the rest is known."""
+def test_finished_repeats_with_a_dead_link_are_used() -> None:
+    """A campaign estimated 4 min and took 19: after its first trial with dead links, the rest can be estimated."""
     near, far = at("10m"), at("90m")
-    before = of_trial(far, [Taken(near, protocol, 8.0) for protocol in LOS.protocols])
+    before = of_trial(far, [FinishedRepeat(near, protocol, 8.0) for protocol in LOS.protocols])
     dead_s = sum(estimates.dead_link_s(LOS.procedure, protocol) for protocol in LOS.protocols) * LOS.repeats
     assert before.most_s == pytest.approx(dead_s)
-    after = of_trial(at("80m"), [Taken(near, TCP, 8.0), Taken(far, TCP, 128.0), Taken(near, UDP, 8.0)])
+    after = of_trial(
+        at("80m"), [FinishedRepeat(near, TCP, 8.0), FinishedRepeat(far, TCP, 128.0), FinishedRepeat(near, UDP, 8.0)]
+    )
     assert after.likely_s >= LOS.repeats * (8.0 + 128.0) / 2
 
 
@@ -86,7 +93,10 @@ def test_a_repeat_takes_as_long_as_all_of_its_attempts() -> None:
         entry(90_030, 3, 1, Status.RUNNING),
     ]
     plan = ping_plan()
-    assert estimates.taken(plan, entries) == [Taken(plan, TCP, 35.0), Taken(plan, TCP, 10.0)]
+    assert estimates.finished_repeats(plan, entries) == [
+        FinishedRepeat(plan, TCP, 35.0),
+        FinishedRepeat(plan, TCP, 10.0),
+    ]
 
 
 TIMES = st.lists(
@@ -99,5 +109,7 @@ TIMES = st.lists(
 def test_an_upper_end_is_never_below_what_is_expected(
     known: list[tuple[str, Protocol, float]], distance: str, count: int
 ) -> None:
-    lasts = of_repeats(at(distance), TCP, count, [Taken(at(where), what, took_s) for where, what, took_s in known])
+    lasts = of_repeats(
+        at(distance), TCP, count, [FinishedRepeat(at(where), what, took_s) for where, what, took_s in known]
+    )
     assert 0 <= lasts.likely_s <= lasts.most_s * (1 + 1e-9)

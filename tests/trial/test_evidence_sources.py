@@ -1,4 +1,4 @@
-"""The table of sources: every column of a step has a row, every check names a source, and the page has the table."""
+"""The table of sources: every column of a step has a row, every check names a source, and the page is up to date."""
 
 import os
 from pathlib import Path
@@ -26,10 +26,10 @@ def placed() -> list[PlacedStep]:
 
 def test_every_column_of_a_step_has_a_row() -> None:
     bare = {
-        (one.kind, column.name)
-        for one in placed()
-        for column in one.step.output_columns()
-        if not evidence_sources.covers(one.kind, column.name)
+        (step.kind, column.name)
+        for step in placed()
+        for column in step.step.output_columns()
+        if not evidence_sources.covers(step.kind, column.name)
     }
     bare |= {
         (kind, column.name)
@@ -40,17 +40,17 @@ def test_every_column_of_a_step_has_a_row() -> None:
     assert bare == set()
 
 
-def test_a_check_without_a_second_source_is_called_unchecked() -> None:
+def test_a_check_without_a_second_source_is_unchecked() -> None:
     for kind, check in evidence_sources.rows():
         assert (check.outcome is CheckOutcome.UNCHECKED) == (not check.against), (kind, check.quantity)
         assert check.tolerance, (kind, check.quantity)
 
 
-def test_no_row_names_a_column_that_no_step_has() -> None:
-    columns = {column.name for one in placed() for column in one.step.output_columns()}
+def test_no_row_names_an_unknown_column() -> None:
+    columns = {column.name for step in placed() for column in step.step.output_columns()}
     columns |= {column.name for step in base.step_types().values() for column in step.columns}
-    columns |= {column.name for column in (*drive_log.COLUMNS, *fly_log.COLUMNS)}  # of robots that move by themselves
-    # Only a procedure with such a flow, or with one across such a fault, declares these.
+    columns |= {column.name for column in (*drive_log.COLUMNS, *fly_log.COLUMNS)}  # of self-moving robots
+    # Only a procedure with such a flow, or with a flow across such a fault, declares these.
     columns |= {column.name for flow in recoveries.FLOWS for column in stalls.declared(flow, flow, 120)}
     across = (recoveries.declared(flow, fault) for flow in recoveries.FLOWS for fault in FaultKind)
     columns |= {column.name for declared in across for column in declared}
@@ -61,7 +61,7 @@ def test_no_row_names_a_column_that_no_step_has() -> None:
 
 
 def test_the_page_has_the_table() -> None:
-    """To write it anew: `FIELDKIT_WRITE_DOCS=1`."""
+    """To update it: `FIELDKIT_WRITE_DOCS=1`."""
     text = PAGE.read_text(encoding="utf-8")
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)

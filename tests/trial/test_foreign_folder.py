@@ -1,4 +1,4 @@
-"""A folder from a colleague: nothing in it leads out of it, keeps a command waiting, or has a second word to say."""
+"""A trial's folder from another person: links do not lead out of it, pipes do not block, errors are brief."""
 
 import json
 import os
@@ -46,7 +46,7 @@ def pipe(path: Path) -> None:
 
 def unix_socket(path: Path) -> None:
     here = Path.cwd()
-    os.chdir(path.parent)  # its path has a limit of 108 characters
+    os.chdir(path.parent)  # a socket path is limited to 108 characters
     try:
         with socket.socket(socket.AF_UNIX) as one:
             one.bind(path.name)
@@ -73,7 +73,7 @@ COMMANDS = [
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
-def test_a_link_to_a_file_of_ours_is_refused_in_one_sentence(
+def test_a_link_to_a_local_file_is_rejected_in_one_sentence(
     trial: Path, ours: Path, place: str, command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     (trial / place).unlink(missing_ok=True)
@@ -82,13 +82,13 @@ def test_a_link_to_a_file_of_ours_is_refused_in_one_sentence(
     assert main([command[0], str(trial), *out]) == EvidenceError.exit_code
     said = capsys.readouterr().err
     assert f"{place}: it is a symbolic link, not a regular file" in " ".join(said.split())
-    assert "remedy: ask whoever made the trial" in " ".join(said.split())
+    assert "remedy: get a copy with plain files from" in " ".join(said.split())
     assert ours.read_text(encoding="utf-8") == OURS
 
 
 @pytest.mark.parametrize("make", [pipe, unix_socket, lambda path: path.symlink_to("/dev/zero")])
 @pytest.mark.parametrize("place", ["trial.yaml", "journal.jsonl", "trial.csv", "repeats/udp-01/sender.pcap"])
-def test_what_could_keep_a_reader_waiting_is_refused(trial: Path, place: str, make: Callable[[Path], None]) -> None:
+def test_files_that_could_block_a_reader_are_rejected(trial: Path, place: str, make: Callable[[Path], None]) -> None:
     (trial / place).unlink()
     make(trial / place)
     with pytest.raises(EvidenceError, match="not a regular file") as caught:
@@ -97,7 +97,7 @@ def test_what_could_keep_a_reader_waiting_is_refused(trial: Path, place: str, ma
     assert any(line.startswith(f"{place}: it is a ") for line in manifest.verify(trial))
 
 
-def test_a_pipe_as_a_table_keeps_nobody_waiting(
+def test_a_pipe_as_a_table_does_not_block(
     trial: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (trial / "trial.csv").unlink()
@@ -107,21 +107,21 @@ def test_a_pipe_as_a_table_keeps_nobody_waiting(
 
 
 @pytest.mark.parametrize("name", ["repeats", "repeats/udp-01"])
-def test_a_folder_elsewhere_is_no_folder_of_the_trial(trial: Path, tmp_path: Path, name: str) -> None:
+def test_a_link_to_another_folder_is_not_a_folder_of_the_trial(trial: Path, tmp_path: Path, name: str) -> None:
     (trial / name).rename(tmp_path / "elsewhere")
     (trial / name).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(EvidenceError, match="it is a symbolic link"):
         store.read_plan(trial)
 
 
-def test_evidence_deeper_than_evidence_lies_is_refused(trial: Path) -> None:
+def test_evidence_in_too_deep_folders_is_rejected(trial: Path) -> None:
     (trial / "repeats/udp-01/a/b").mkdir(parents=True)
-    with pytest.raises(EvidenceError, match="a folder, where evidence has none any more"):
+    with pytest.raises(EvidenceError, match="a folder, deeper than evidence can be"):
         store.read_plan(trial)
 
 
 def test_a_journal_with_a_second_name_is_not_written(trial: Path, ours: Path) -> None:
-    """A hard link into a backup, or to a file of ours: what is written here would change it there."""
+    """A hard link to a backup or another local file: writing here would change it there."""
     (trial / "journal.jsonl").unlink()
     (trial / "journal.jsonl").hardlink_to(ours)
     with (
@@ -151,14 +151,14 @@ def test_a_file_that_is_replaced_is_never_what_a_link_leads_to(tmp_path: Path, o
     assert (tmp_path / "out.csv").read_bytes() == b"new"
 
 
-def test_names_that_are_no_text_stand_in_the_manifest_as_sha256sum_writes_them(trial: Path) -> None:
+def test_names_that_are_not_text_are_written_as_by_sha256sum(trial: Path) -> None:
     strange = ["a\nb.txt", "back\\slash", "re\rturn"]
     for name in strange:
         (trial / "repeats/udp-01" / name).write_text("x", encoding="utf-8")
     Path(os.fsdecode(os.fsencode(trial / "repeats/udp-01") + b"/\xff.txt")).write_text("x", encoding="utf-8")
-    told = manifest.verify(trial)
-    assert len(told) == len(strange) + 1
-    assert all(line.isprintable() and line.endswith(": not in the manifest") for line in told)
+    lines = manifest.verify(trial)
+    assert len(lines) == len(strange) + 1
+    assert all(line.isprintable() and line.endswith(": not in the manifest") for line in lines)
     (trial / store.MANIFEST_FILE).unlink()
     ledger = Ledger(store.read_plan(trial), trial, Stop())
     ledger.summarize()
@@ -176,21 +176,21 @@ RUNNING, VALID, VOID, MEASURED = Status.RUNNING, Status.VALID, Status.VOID, Stat
 @pytest.mark.parametrize(
     ("entries", "why"),
     [
-        ([(1, 2, RUNNING)], "attempt 2 at udp-01 begins, though it or its repeat was over"),
-        ([(1, 3, RUNNING)], "attempt 3 at udp-01 begins, though it or its repeat was over"),
-        ([(1, 2, VALID)], "attempt 2 at udp-01 is valid, though it does not run"),
-        ([(1, 7, VOID)], "attempt 7 at udp-01 is void, though it does not run"),
-        ([(1, 7, MEASURED)], "attempt 7 at udp-01 is measured, though it does not run"),
+        ([(1, 2, RUNNING)], "attempt 2 at udp-01 starts, although it or its repeat has ended"),
+        ([(1, 3, RUNNING)], "attempt 3 at udp-01 starts, although it or its repeat has ended"),
+        ([(1, 2, VALID)], "attempt 2 at udp-01 is valid, although it is not running"),
+        ([(1, 7, VOID)], "attempt 7 at udp-01 is void, although it is not running"),
+        ([(1, 7, MEASURED)], "attempt 7 at udp-01 is measured, although it is not running"),
         ([(2, 1, RUNNING)], "the plan has no repeat udp-02"),
         ([(1_000_000_000, 1, RUNNING)], "the plan has no repeat udp-1000000000"),
     ],
 )
-def test_a_journal_that_contradicts_itself_or_the_plan_is_told_with_its_line(
+def test_a_contradictory_journal_is_reported_with_its_line(
     trial: Path, entries: list[tuple[int, int, Status]], why: str
 ) -> None:
     lie(trial, *(JournalEntry(1, Protocol.UDP, number, attempt, status) for number, attempt, status in entries))
     for read in (rebuild, lambda folder: Ledger(store.read_plan(folder), folder, Stop())):
-        with pytest.raises(EvidenceError, match=f"this cannot have happened: {why}") as caught:
+        with pytest.raises(EvidenceError, match=f"impossible entry: {why}") as caught:
             read(trial)
         assert caught.value.where == f"{trial / journal.JOURNAL_FILE}:6"
 
@@ -212,7 +212,7 @@ def test_a_journal_that_contradicts_itself_or_the_plan_is_told_with_its_line(
     ],
     ids=str,
 )
-def test_a_line_that_is_no_entry_is_one_error_with_its_line(trial: Path, line: str) -> None:
+def test_an_invalid_line_is_one_error_with_its_line(trial: Path, line: str) -> None:
     with (trial / journal.JOURNAL_FILE).open("a", encoding="utf-8") as file:
         file.write(f"{line}\n")
     with pytest.raises(EvidenceError, match="not a journal entry") as caught:
@@ -220,8 +220,8 @@ def test_a_line_that_is_no_entry_is_one_error_with_its_line(trial: Path, line: s
     assert caught.value.where == f"{trial / journal.JOURNAL_FILE}:6"
 
 
-def test_a_reason_with_half_a_surrogate_pair_is_kept_with_a_mark(tmp_path: Path) -> None:
-    """Names of files that are no UTF-8 have such halves, and errors name files."""
+def test_a_reason_with_half_a_surrogate_pair_is_stored_with_a_mark(tmp_path: Path) -> None:
+    """Names of files that are not UTF-8 contain such halves, and errors contain names of files."""
     plan = los_plan(repeats=1, protocols=(Protocol.UDP,))
     folder = store.create(tmp_path, plan)
     with journal.claimed(folder):

@@ -1,4 +1,4 @@
-"""The journal of motions, and the fence over random attempts, faults and resumes of a robot whose base brakes."""
+"""The journal of motions, and the fence over random attempts, faults and resumes of a robot that brakes slowly."""
 
 import math
 from dataclasses import replace
@@ -25,7 +25,7 @@ TICK_S = 0.05
 BRAKES_M_S2 = 1.0
 SPEED_M_S = 1.0
 MARGIN_M = SPEED_M_S * 2 * TICK_S + SPEED_M_S**2 / (2 * BRAKES_M_S2)
-"""Beyond the fence: the way of two turns of the loop, and the braking distance v^2 / (2 a)."""
+"""Distance beyond the fence: two cycles of the control loop, and the braking distance v^2 / (2 a)."""
 TASK = DriveTask(
     legs=[(4.0, 0.0)],
     speed_m_s=SPEED_M_S,
@@ -39,11 +39,11 @@ TASK = DriveTask(
 
 
 def kept(folder: Path, placement: Placement = NEAR, *, may_return: bool = False) -> KeptOrigins:
-    """Return the origins of a trial as another run of fieldkit reads them."""
+    """Return the origins of a trial as read by another run of fieldkit."""
     return KeptOrigins(MotionJournal(folder / MOTION_FILE), folder, ROBOTS, placement, may_return=may_return)
 
 
-def test_an_origin_holds_over_runs_and_placements_that_leave_the_robot_where_it_is(tmp_path: Path) -> None:
+def test_an_origin_is_valid_over_runs_that_leave_the_robot_at_its_place(tmp_path: Path) -> None:
     kept(tmp_path).record(Role.RECEIVER, ORIGIN)
     kept(tmp_path).record(Role.SENDER, replace(ORIGIN, x_m=9.0))
     assert kept(tmp_path).get(Role.RECEIVER) == ORIGIN
@@ -61,7 +61,7 @@ def test_a_place_is_new_if_the_last_origin_is_of_another_one(tmp_path: Path) -> 
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.CONFIRMED, "rover-2")
     assert kept(tmp_path, FAR).is_new_place(Role.SENDER), "confirmed at the former place"
     kept(tmp_path, FAR).record(Role.SENDER, ORIGIN)
-    assert kept(tmp_path, NEAR).is_new_place(Role.SENDER), "back at the first one, and nobody put it there"
+    assert kept(tmp_path, NEAR).is_new_place(Role.SENDER), "back at the first place without a person"
 
 
 @pytest.mark.parametrize("at_place", [True, False])
@@ -82,7 +82,7 @@ def test_only_a_confirmation_lets_robots_move_after_a_fault(tmp_path: Path, at_p
     assert again.get(Role.RECEIVER) == (None if at_place else ORIGIN)
 
 
-def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign_with_that_reason(tmp_path: Path) -> None:
+def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -> None:
     (tmp_path / laptop_files.CAMPAIGN).write_text("{}", encoding="utf-8")
     trials = tmp_path / "first", tmp_path / "second"
     first = KeptOrigins(MotionJournal(journal_of(trials[0])), trials[0], ROBOTS, NEAR)
@@ -95,9 +95,9 @@ def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign_with_that_reason(
     assert "fieldkit campaign, as before" in held.value.remedy
 
 
-def test_a_fieldkit_that_was_killed_in_a_motion_holds_robots(tmp_path: Path) -> None:
+def test_a_kill_during_a_motion_holds_the_robots(tmp_path: Path) -> None:
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.BEGUN, "rover-1")
-    with pytest.raises(MotionHeldError, match="fieldkit ended while it moved"):
+    with pytest.raises(MotionHeldError, match="fieldkit stopped while it moved"):
         kept(tmp_path).demand()
 
 
@@ -116,12 +116,12 @@ def test_the_trials_of_a_campaign_have_one_journal(tmp_path: Path) -> None:
     assert journal_of(trial) == tmp_path / MOTION_FILE
 
 
-def test_a_log_may_begin_as_far_from_the_origin_as_a_robot_may_start() -> None:
+def test_a_log_may_start_as_far_from_the_origin_as_a_robot_may() -> None:
     assert drive_checks._START_M == START_M
 
 
 class BrakingBase:
-    """A base that slows down by `BRAKES_M_S2`, not at once, and whose odometry is right."""
+    """A base that decelerates with `BRAKES_M_S2` instead of immediately, with exact odometry."""
 
     def __init__(self) -> None:
         self.pose = OdometryPose(0.0, 0.0, 0.0)
@@ -142,7 +142,7 @@ ATTEMPTS = st.lists(st.tuples(st.integers(0, 400), st.sampled_from(["lease", "su
 @settings(max_examples=30, deadline=None)
 @given(ATTEMPTS)
 def test_no_sequence_of_attempts_leaves_the_fence_of_the_trial(attempts: list[tuple[int, str]]) -> None:
-    """Each attempt is a new run, with the option that lets the robot move from where a fault stopped it."""
+    """Each attempt is a new run, with the option that allows motion from the position after a fault."""
     base, now_s = BrakingBase(), 0.0
     farthest_m = 0.0
     with TemporaryDirectory() as text:

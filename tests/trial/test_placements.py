@@ -1,4 +1,4 @@
-"""Recorded positions against the placement that was planned: what an operator's tape allows, and what it does not."""
+"""Recorded positions compared with the planned placement: accepted and rejected differences."""
 
 import math
 from dataclasses import replace
@@ -19,12 +19,12 @@ from fieldkit.trial import placements
 from tests.helpers.casts import los_plan
 
 DEGREE_M = 110_574.28
-"""A degree north, on the equator."""
+"""Metres per degree of latitude at the equator."""
 
 
 def stood(folder: Path, receiver: Account, sender: Account) -> AttemptEvidence:
-    told = Accounts({Role.SENDER: sender, Role.RECEIVER: receiver})
-    (folder / accounts.FILE).write_text(accounts.text(told), encoding="utf-8")
+    stored = Accounts({Role.SENDER: sender, Role.RECEIVER: receiver})
+    (folder / accounts.FILE).write_text(accounts.text(stored), encoding="utf-8")
     return AttemptEvidence(folder)
 
 
@@ -41,29 +41,31 @@ def on_earth(folder: Path, apart_m: float) -> AttemptEvidence:
 PLAN = los_plan()
 SCENE = PLAN.scene(next(iter(PLAN.order())), "")
 PLANNED_M = math.dist(SCENE.places_m[Role.SENDER], SCENE.places_m[Role.RECEIVER])
-"""30 ft from the relay to each."""
+"""30 ft from the relay to each of the stations."""
 
 
 @pytest.mark.parametrize(
     ("apart_m", "agrees"), [(18.288, True), (18.897, True), (17.0, True), (24.0, False), (200.0, False)]
 )
-def test_a_place_in_metres_is_within_two_metres(apart_m: float, agrees: bool, tmp_path: Path) -> None:
-    """31 ft instead of 30 ft are 18.897 m from one to the other."""
+def test_positions_in_metres_have_a_tolerance_of_two_metres(apart_m: float, agrees: bool, tmp_path: Path) -> None:
+    """31 ft instead of 30 ft is a distance of 18.897 m between the stations."""
     why = placements.contradiction(SCENE, in_metres(tmp_path, apart_m))
     assert (why is None) is agrees
     if why:
-        assert why.startswith("the sender and the receiver were placed 18.3 m apart, and by the record")
+        assert why.startswith("the sender and the receiver were placed 18.3 m apart, but by their recorded")
 
 
 @given(off_m=st.floats(-18, 300))
-def test_a_place_by_satellites_is_within_their_error(off_m: float, tmp_path_factory: pytest.TempPathFactory) -> None:
-    found = placements.contradiction(SCENE, on_earth(tmp_path_factory.getbasetemp(), PLANNED_M + off_m))
+def test_satellite_positions_have_the_tolerance_of_their_error(
+    off_m: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    contradiction = placements.contradiction(SCENE, on_earth(tmp_path_factory.getbasetemp(), PLANNED_M + off_m))
     least_m = placements.SATELLITE_M + placements.SHARE * PLANNED_M
     if not math.isclose(abs(off_m), least_m, abs_tol=0.2):
-        assert (found is None) is (abs(off_m) < least_m)
+        assert (contradiction is None) is (abs(off_m) < least_m)
 
 
-def test_nobody_who_tells_of_positions_contradicts_nothing(tmp_path: Path) -> None:
+def test_missing_positions_contradict_nothing(tmp_path: Path) -> None:
     assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
     lone = Accounts({Role.RECEIVER: Account(place=(300.0, 0.0, 0.0), frame=LOCAL)})
     (tmp_path / accounts.FILE).write_text(accounts.text(lone), encoding="utf-8")
@@ -74,12 +76,14 @@ def test_nobody_who_tells_of_positions_contradicts_nothing(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("off_m", "why"), [(0.0, None), (200.0, "has the receiver 200.0 m from where it was placed")]
 )
-def test_a_place_that_the_laptop_wrote_is_the_planned_one(off_m: float, why: str | None, tmp_path: Path) -> None:
+def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
+    off_m: float, why: str | None, tmp_path: Path
+) -> None:
     places_m = SCENE.places_m
     x, y, z = places_m[Role.RECEIVER]
     evidence = stood(tmp_path, Account(place=(x + off_m, y, z)), Account(place=places_m[Role.SENDER]))
-    found = list(follow.problems(View(SCENE, evidence), ()))
-    assert (found == []) if why is None else [why in reason for reason in found] == [True]
+    problems = list(follow.problems(View(SCENE, evidence), ()))
+    assert (problems == []) if why is None else [why in reason for reason in problems] == [True]
 
 
 @pytest.mark.parametrize(

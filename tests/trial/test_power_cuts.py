@@ -1,4 +1,4 @@
-"""The power of the laptop is cut at every moment of a trial: nothing is lost of what the user was told is done.
+"""Power cuts of the laptop at every moment of a trial: nothing that was reported as done is lost.
 
 On file systems that lose what was not synced, see `tests/helpers/disks.py`. `python -m tests.e2e.power_cuts` cuts as
 often as one likes.
@@ -32,25 +32,25 @@ from tests.helpers.sshd import wait_until
 pytestmark = pytest.mark.emulated  # mounts need root
 
 BROUGHT_ALONG = {"store.create: files.sync_folder(out)"}
-"""Sync of a folder that holds a new folder with a new file: the file systems here may bring its name to disk with
+"""Sync of a folder that contains a new folder with a new file: the file systems here may write its name to disk with
 the file, which POSIX does not promise; see fsync(2)."""
 
-every_file_system = pytest.mark.parametrize("file_system", FILE_SYSTEMS, ids=lambda one: one.name)
+every_file_system = pytest.mark.parametrize("file_system", FILE_SYSTEMS, ids=lambda file_system: file_system.name)
 strictest_in_ci = pytest.mark.parametrize(
-    "file_system", others_at_night(FILE_SYSTEMS, in_ci=[STRICTEST]), ids=lambda one: one.name
+    "file_system", others_at_night(FILE_SYSTEMS, in_ci=[STRICTEST]), ids=lambda file_system: file_system.name
 )
 
 
 @pytest.fixture
 def place(tmp_path: Path, untouched: Untouched) -> Iterator[Path]:
-    """A folder in memory, in mounts of the test's own."""
+    """A folder in memory, in separate mounts of the test."""
     with workplace(tmp_path) as folder, robots_with_much_evidence():
         yield folder
 
 
 @every_file_system
 def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -> None:
-    """The other tests here would pass on disks that lose nothing."""
+    """Checks the method: the other tests here would also pass on disks that lose nothing."""
     disk = Disk.make(file_system, place / "disk.img")
     with disk.mounted(place / "disk") as mounted:
         (mounted / "changed").write_bytes(b"before")
@@ -75,9 +75,9 @@ def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -
 
 
 @strictest_in_ci
-def test_a_cut_at_any_write_loses_nothing_told(place: Path, file_system: FileSystem) -> None:
+def test_a_power_cut_at_any_write_loses_nothing_that_was_reported(place: Path, file_system: FileSystem) -> None:
     cuts, witness, _ = cuts_at_every_sync(Disk.make(file_system, place / "disk.img"), place)
-    assert len(cuts) > 30, "hardly a write was met"
+    assert len(cuts) > 30, "too few writes were interrupted"
     assert any(cut.told for cut in cuts)
     resumed = []
     for cut in cuts:
@@ -91,7 +91,7 @@ def test_a_cut_at_any_write_loses_nothing_told(place: Path, file_system: FileSys
                 demand_resumable(mounted / OUT)
 
 
-def test_each_sync_is_missed_when_it_is_taken_out(place: Path) -> None:
+def test_removing_any_sync_is_detected(place: Path) -> None:
     def lost(without: str) -> tuple[bool, set[str]]:
         file = place / "disk.img"
         cuts, witness, places = cuts_at_every_sync(Disk.make(STRICTEST, file), place, without=without)
@@ -100,7 +100,7 @@ def test_each_sync_is_missed_when_it_is_taken_out(place: Path) -> None:
 
     _, places = lost("")
     assert len(places) > 5
-    assert {one for one in places if not lost(one)[0]} <= BROUGHT_ALONG
+    assert {sync for sync in places if not lost(sync)[0]} <= BROUGHT_ALONG
 
 
 @strictest_in_ci
@@ -114,8 +114,8 @@ def _lost(place: Path, cut: Cut, witness: Witness) -> list[str]:
         return cut.lost(mounted / OUT, witness)
 
 
-def test_nothing_of_it_stays_when_it_is_killed(tmp_path: Path) -> None:
-    """Mounts and loop devices are the machine's, so they must not need anybody to put them away."""
+def test_a_killed_test_leaves_no_mounts(tmp_path: Path) -> None:
+    """Mounts and loop devices belong to the machine, so they must not need manual clean-up."""
     with subprocess.Popen(
         (sys.executable, "-m", "tests.e2e.power_cuts"),
         cwd=ROOT,
@@ -132,9 +132,9 @@ def test_nothing_of_it_stays_when_it_is_killed(tmp_path: Path) -> None:
 
 
 def _attached(folder: str) -> bool:
-    """Return whether a loop device of this machine stands for a file in a folder."""
+    """Return True if a loop device of this machine uses a file in a folder."""
     for file in Path("/sys/block").glob("loop*/loop/backing_file"):
-        with suppress(OSError):  # it goes meanwhile
+        with suppress(OSError):  # it may disappear meanwhile
             if file.read_text(encoding="utf-8").startswith(folder):
                 return True
     return False

@@ -1,4 +1,4 @@
-"""The rule of `fieldkit middleware recommend`, on repeats of which the answer is known."""
+"""The rule of `fieldkit middleware recommend`, on repeats with known results."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,7 +28,7 @@ def cell(
     status: Sequence[str] = (),
     size_bytes: float = SIZE,
 ) -> LinkCell:
-    """Return repeats that lost so many of 100 samples handed over."""
+    """Return repeats that lost the given numbers of 100 samples."""
     n = len(lost)
     delay = np.array([*delay_s] or [0.01] * n)
     numbers = {
@@ -48,7 +48,7 @@ def cell(
 
 
 def judge(*cells: LinkCell, criterion: LinkCriterion = ONE_PERCENT) -> Assessment:
-    return recommendation.judged(DDS, cells, {(own.place, own.size_bytes) for own in cells}, criterion)
+    return recommendation.assess_candidate(DDS, cells, {(own.place, own.size_bytes) for own in cells}, criterion)
 
 
 def test_a_repeat_at_the_bound_passes_and_one_above_fails() -> None:
@@ -58,14 +58,14 @@ def test_a_repeat_at_the_bound_passes_and_one_above_fails() -> None:
     assert assessment.failed == (f"{PLACE}, 1000 B: loss <= 0.01 in 4 of 5 repeats, up to 0.02",)
 
 
-def test_a_bound_is_what_a_user_wrote() -> None:
-    # In binary, 2.9 times 0.01 is less than 29/1000.
+def test_a_bound_is_compared_as_a_decimal() -> None:
+    # In binary floating point, 2.9 times 0.01 is less than 29/1000.
     bound = parse_amount("2.9%", "share", "bound")
     assert judge(cell(5 * [29], sent=1000), criterion=LinkCriterion(bound)).passed
     assert judge(cell(5 * [30], sent=1000), criterion=LinkCriterion(bound)).failed
 
 
-def test_one_bad_repeat_of_many_fails_though_the_mean_is_low() -> None:
+def test_one_bad_repeat_fails_although_the_mean_is_low() -> None:
     # Bimodal: 1 of 200 repeats loses everything, 0.5 % on average.
     assert judge(cell([100] + 199 * [0])).failed
 
@@ -85,7 +85,7 @@ def test_void_and_failed_repeats_do_not_count() -> None:
     own = cell(6 * [0], status=["valid", "void", "valid", "failed", "valid", "valid"])
     assert own.attempts == 6
     assert judge(own).lacking == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
-    # What a void repeat lost proves nothing either.
+    # The loss of a void repeat proves nothing either.
     assert judge(cell([0, 0, 0, 0, 0, 90], status=[*5 * ["valid"], "void"])).passed
 
 
@@ -106,7 +106,7 @@ def test_no_valid_repeat_at_all_is_undecided() -> None:
 
 
 @pytest.mark.parametrize(("largest_s", "passed"), [(0.2, True), (0.201, False)])
-def test_a_delay_is_kept_in_every_repeat(largest_s: float, passed: bool) -> None:
+def test_a_delay_limit_applies_to_every_repeat(largest_s: float, passed: bool) -> None:
     own = cell(5 * [0], delay_s=[0.01, 0.02, largest_s, 0.01, 0.01])
     assessment = judge(own, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
     assert assessment.passed == passed
@@ -119,17 +119,17 @@ def test_a_missing_delay_never_passes() -> None:
     assessment = judge(own, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
     assert not assessment.failed
     assert "1 of 5 repeats have no value" in assessment.lacking[0]
-    assert judge(own).passed  # without a limit of the delay it is not needed
+    assert judge(own).passed  # without a delay limit it is not needed
 
 
-def test_a_delay_that_is_only_known_of_what_arrived_never_passes() -> None:
+def test_a_censored_delay_never_passes() -> None:
     # More than 5 % were lost, so that the delay of 95 % of those sent is censored.
     lenient = LinkCriterion(0.5, 0.2)
     own = cell(5 * [10], delay_sent_s=[0.01, UNKNOWN, 0.01, 0.01, 0.01])
     assessment = judge(own, criterion=lenient)
     assert not assessment.failed
     assert "in 1 of 5 repeats too much was lost for a value over all sent items" in assessment.lacking[0]
-    # What arrived was late already: then it fails whatever the lost ones would have been.
+    # The received samples were already late, so it fails whatever the lost ones would have been.
     late = cell(5 * [10], delay_s=5 * [0.3], delay_sent_s=5 * [UNKNOWN])
     assert judge(late, criterion=lenient).failed
 
@@ -151,12 +151,12 @@ def test_a_share_of_repeats_needs_confidence(lost: list[float], passed: bool, fa
     assert bool(assessment.failed) == failed
 
 
-def test_every_cell_must_pass_and_none_may_lack() -> None:
+def test_every_cell_must_pass_and_none_may_be_missing() -> None:
     good, bad = cell(5 * [0]), cell(5 * [9], size_bytes=1e6)
     assert judge(good, bad).failed == (f"{PLACE}, 1e+06 B: loss <= 0.01 in 0 of 5 repeats, up to 0.09",)
     wanted = {(PLACE, SIZE), (PLACE, 1e6)}
-    assessment = recommendation.judged(DDS, [good], wanted, ONE_PERCENT)
-    assert assessment.lacking == (f"{PLACE}, 1e+06 B: it was not measured; the others were",)
+    assessment = recommendation.assess_candidate(DDS, [good], wanted, ONE_PERCENT)
+    assert assessment.lacking == (f"{PLACE}, 1e+06 B: not measured, although other candidates were",)
 
 
 def test_the_rank_is_the_loss_of_the_worst_cell_and_then_the_delay() -> None:
@@ -165,12 +165,12 @@ def test_the_rank_is_the_loss_of_the_worst_cell_and_then_the_delay() -> None:
     empty = cell([0, 0], status=["void", "void"])
     assert judge(fast).rank == (0, 0.01)
     assert judge(slow).rank == judge(fast, slow).rank == (0, 0.3)
-    assert judge(unknown).rank == (0, float("inf"))  # a delay that is unknown is not short
+    assert judge(unknown).rank == (0, float("inf"))  # an unknown delay is not short
     assert judge(lossy).rank == judge(fast, lossy).rank == (3 / 500, 0.01)
     assert judge(fast, empty).rank == (float("inf"), float("inf"))
 
 
-def test_the_evidence_holds_every_repeat() -> None:
+def test_the_evidence_contains_every_repeat() -> None:
     own = cell([0, 1, 0, 0, 1], delay_s=[0.01, 0.02, 0.03, UNKNOWN, 0.01])
     text = "\n".join(recommendation.evidence(judge(own), ONE_PERCENT))
     assert "loss <= 0.01 in 5 of 5 repeats: at least 55 % of all repeats do, with 95 % confidence" in text

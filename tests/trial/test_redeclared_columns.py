@@ -1,4 +1,4 @@
-"""A trial whose own columns are declared as what their values are not: errors with a remedy, no traceback."""
+"""A trial whose column declarations do not match its values: errors with a remedy, no traceback."""
 
 import re
 import shutil
@@ -51,7 +51,7 @@ def fetching(text: str) -> Callable[..., list[str]]:
 
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A trial for each unit, with a value of it."""
+    """A trial for each unit, with a value in it."""
     made = {}
     with pytest.MonkeyPatch.context() as patch:
         robots_with_evidence(patch)
@@ -69,7 +69,7 @@ def trials(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("now", UNITS)
 @pytest.mark.parametrize("was", VALUES)
-def test_every_command_ends_with_a_table_or_an_error(
+def test_every_command_prints_a_table_or_an_error(
     trials: dict[str, Path],
     tmp_path: Path,
     was: str,
@@ -80,7 +80,7 @@ def test_every_command_ends_with_a_table_or_an_error(
     shutil.copytree(trials[was], folder)
     plan = folder / PLAN_FILE
     written = plan.read_text(encoding="utf-8")
-    head, table, columns = written.partition("\ncolumns:\n")  # what the procedure says is as it was
+    head, table, columns = written.partition("\ncolumns:\n")  # the procedure is unchanged
     changed, count = re.subn(rf"(name: own\n\s*unit: ){was}\b", rf"\g<1>{now}", columns)
     assert count == 1, written
     plan.write_text(head + table + changed, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The columns of a trial: of every trial, of its steps, as its plan has them and as its table is read by others."""
+"""The columns of a trial: common columns, those of its steps, in its plan, and as read from its table."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -31,7 +31,7 @@ EVERYWHERE = [column.name for column in trial_columns()]
 
 @st.composite
 def declared_columns(draw: st.DrawFn) -> Column:
-    """A column as anybody may declare it."""
+    """Any valid column."""
     name, unit, meaning = draw(NAMES), draw(UNITS), draw(WORDS)
     plain = Column(name, unit, meaning)
     if plain.type is str:
@@ -45,14 +45,14 @@ def declared_columns(draw: st.DrawFn) -> Column:
 
 @st.composite
 def tables_of_columns(draw: st.DrawFn) -> tuple[list[Column], dict[str, Value]]:
-    """Columns of one trial, and a value of each."""
-    found = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
-    kept = [column for column in found if column.name not in EVERYWHERE]
+    """Columns of one trial, and a value for each."""
+    drawn = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
+    kept = [column for column in drawn if column.name not in EVERYWHERE]
     return kept, {column.name: draw(values(column)) for column in kept}
 
 
 def values(column: Column) -> st.SearchStrategy[Value]:
-    """Values that a column can have, as a CSV has them."""
+    """Return a strategy for the values of a column, as in a CSV file."""
     low, high = column.possible
     if column.type is str:
         return WORDS
@@ -65,7 +65,7 @@ def values(column: Column) -> st.SearchStrategy[Value]:
 
 @settings(max_examples=15)
 @given(tables_of_columns())
-def test_any_column_that_can_be_declared_is_read_again_from_plan_and_table(
+def test_any_valid_column_is_read_back_from_plan_and_table(
     tmp_path_factory: pytest.TempPathFactory, found: tuple[list[Column], dict[str, Value]]
 ) -> None:
     columns, row = found
@@ -76,12 +76,12 @@ def test_any_column_that_can_be_declared_is_read_again_from_plan_and_table(
     assert [*frozen.read(folder / "trial.yaml")] == columns
     assert store.read_plan(folder).table == plan.table == (*trial_columns(), *columns)
     read = repeats.parse(rows.to_csv([row], plan.table).encode(), plan.table)
-    # A cell has nine digits of a number, and a bound may have more.
+    # A cell has nine digits of a number; a bound may have more.
     kept = [float(f"{value:.9g}") if isinstance(value, float) else value for value in row.values()]
     assert [read.column(name)[0] for name in row] == kept
 
 
-def test_columns_of_every_trial_come_first_whatever_their_rank() -> None:
+def test_common_columns_come_first_whatever_their_rank() -> None:
     beyond = [Column("probe.level", "dBm", "x", rank=1), Column("status", "count", "not this one")]
     assert trial_columns(beyond) == (*trial_columns(), beyond[0])
     assert trial_columns()[: len(IDENTITY)] == IDENTITY
@@ -94,7 +94,7 @@ def test_the_paper_s_procedure_freezes_nothing() -> None:
     assert "columns:" not in schema.dump(los_plan())
 
 
-def test_a_named_column_takes_its_figure_and_its_counts_along() -> None:
+def test_a_named_column_has_named_figures_and_counts() -> None:
     (loss,) = (column for column in trial_columns() if column.name == "ip_loss")
     up = named("up", loss)
     assert up.name == "up.ip_loss"
@@ -132,10 +132,10 @@ def test_a_named_column_takes_its_figure_and_its_counts_along() -> None:
         ),
     ],
 )
-def test_a_column_that_nobody_could_read_or_show_is_refused(column: Column, flaw: str) -> None:
-    found = column.flaw()
-    assert found is not None
-    assert flaw in found
+def test_a_column_that_cannot_be_read_or_shown_is_rejected(column: Column, flaw: str) -> None:
+    problem = column.flaw()
+    assert problem is not None
+    assert flaw in problem
 
 
 # Steps.
@@ -146,11 +146,11 @@ def meters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An installed package with `meter`."""
     write_package(tmp_path / "installed", "meters", f"[{plugins.STEPS}]\nmeter = {meter.TARGET}\n")
     monkeypatch.syspath_prepend(tmp_path / "installed")
-    for one in (step_types, installed):
-        one.cache_clear()
+    for cached in (step_types, installed):
+        cached.cache_clear()
     yield
-    for one in (step_types, installed):
-        one.cache_clear()
+    for cached in (step_types, installed):
+        cached.cache_clear()
 
 
 def procedure(*steps: str) -> Procedure:
@@ -173,28 +173,28 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
     assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled)
     assert not {"ip_loss", "file_loss"} & set(filled)
     plan = los_plan().model_copy(update={"procedure": made})
-    assert plan.table == (*trial_columns(), *own), "a plan of an earlier version, which has none of them"
+    assert plan.table == (*trial_columns(), *own), "a plan of an earlier version, without columns"
 
 
 @pytest.mark.parametrize(
     ("steps", "what"),
     [
-        (("meter: {measures: [rtt_sent]}",), "'rtt_sent' is fieldkit's own already"),
-        (("meter: {measures: [status]}",), "'status' is fieldkit's own already"),
-        (("meter: {}", "meter: {}"), "'meter_level' comes twice"),
-        (("meter: {called: a, measures: [x, x]}",), "'a.x' comes twice"),
+        (("meter: {measures: [rtt_sent]}",), "'rtt_sent' is one of fieldkit's"),
+        (("meter: {measures: [status]}",), "'status' is one of fieldkit's"),
+        (("meter: {}", "meter: {}"), "'meter_level' is filled by two steps"),
+        (("meter: {called: a, measures: [x, x]}",), "'a.x' is filled by two steps"),
         (("meter: {measures: [Level]}",), "its name is not made of lower-case letters"),
     ],
 )
 @pytest.mark.usefixtures("meters")
-def test_names_that_clash_are_refused_with_the_line_of_their_step(steps: Sequence[str], what: str) -> None:
+def test_clashing_names_are_rejected_with_the_line_of_their_step(steps: Sequence[str], what: str) -> None:
     with pytest.raises(ConfigurationError, match=what) as refused:
         procedure(*steps)
     assert refused.value.where == f"x.yaml:{7 + len(steps)}"
 
 
 @pytest.mark.usefixtures("meters")
-def test_what_other_packages_declare_is_known_but_not_in_trials_that_do_not_use_it() -> None:
+def test_columns_of_other_packages_are_only_in_trials_that_use_them() -> None:
     assert "meter_level" in names(installed())
     assert "meter_level" not in names(trial_columns())
 
@@ -209,19 +209,19 @@ def written(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bo
     return varied.write(folder, plan, varied.measured(plan, repeats=2), with_plan=with_plan) / "trial.csv"
 
 
-def test_a_table_is_read_as_its_plan_says_without_the_package_that_declared_it(tmp_path: Path) -> None:
+def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Path) -> None:
     found = tables.declared_in([written(tmp_path, "one", varied.VENDOR)])
-    assert found == (*trial_columns(), *(Column(**{**vars(one), "rank": 100}) for one in varied.VENDOR))
+    assert found == (*trial_columns(), *(Column(**{**vars(column), "rank": 100}) for column in varied.VENDOR))
 
 
-def test_trials_that_measure_other_things_share_what_they_share(tmp_path: Path) -> None:
+def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:
     paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", varied.NAMED)]
     read = repeats.read(paths, tables.declared_in(paths))
     assert [value is None for value in read.column("probe.level")] == [False] * 4 + [True] * 4
     assert [value is None for value in read.column("up.transfer_s")] == [True] * 4 + [False] * 4
 
 
-def test_without_a_plan_a_name_behind_that_of_a_step_is_known_and_others_are_texts(tmp_path: Path) -> None:
+def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path: Path) -> None:
     alone = written(tmp_path, "one", (*varied.NAMED, *varied.VENDOR), with_plan=False)
     found = {column.name: column for column in tables.declared_in([alone])}
     for column in varied.NAMED:
@@ -230,7 +230,7 @@ def test_without_a_plan_a_name_behind_that_of_a_step_is_known_and_others_are_tex
         assert found[column.name] == repeats.undeclared(column.name)
 
 
-def test_a_table_without_a_plan_is_read_as_another_trial_s_plan_says(tmp_path: Path) -> None:
+def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: Path) -> None:
     paths = [written(tmp_path / "a", "one", OF_TRIAL, with_plan=False), written(tmp_path / "b", "two", OF_TRIAL)]
     (level,) = (column for column in tables.declared_in(paths) if column.name == "probe.level")
     assert level.unit == "dBm"
@@ -245,14 +245,14 @@ def test_a_table_without_a_plan_is_read_as_another_trial_s_plan_says(tmp_path: P
         Column("probe.level", "text", "x"),
     ],
 )
-def test_two_plans_that_mean_different_things_by_a_name_are_refused(tmp_path: Path, other: Column) -> None:
+def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path, other: Column) -> None:
     paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", [other])]
     with pytest.raises(ConfigurationError, match=r"probe\.level is another column here") as refused:
         tables.declared_in(paths)
     assert refused.value.where == str(paths[1].with_name("trial.yaml"))
 
 
-def test_two_plans_may_word_a_column_otherwise_and_bound_it_otherwise(tmp_path: Path) -> None:
+def test_plans_may_differ_in_meaning_and_bounds_of_a_column(tmp_path: Path) -> None:
     other = Column("probe.level", "dBm", "Level.", bounds=(-90, 0), figure=Figure("signal", Kind.MEDIAN))
     same = Column("probe.level", "dBm", "What it says.", bounds=(-120, -10), figure=Figure("level", Kind.MEDIAN))
     paths = [written(tmp_path, "one", [other]), written(tmp_path, "two", [same])]
@@ -278,7 +278,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("columns", HOSTILE.values(), ids=HOSTILE)
-def test_columns_that_another_hand_wrote_are_refused_with_their_place(tmp_path: Path, columns: str) -> None:
+def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns: str) -> None:
     table = written(tmp_path, "one", OF_TRIAL)
     path = table.with_name("trial.yaml")
     head, _, _ = path.read_text(encoding="utf-8").partition("columns:\n")
@@ -291,7 +291,7 @@ def test_columns_that_another_hand_wrote_are_refused_with_their_place(tmp_path: 
         assert len(str(refused.value)) < 1000
 
 
-def test_a_plan_may_not_say_what_a_column_of_every_trial_is(tmp_path: Path) -> None:
+def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:
     table = written(tmp_path, "one", [Column("probe.level", "dBm", "x")])
     path = table.with_name("trial.yaml")
     spoiled = path.read_text(encoding="utf-8").replace("name: probe.level", "name: status", 1)
@@ -301,7 +301,7 @@ def test_a_plan_may_not_say_what_a_column_of_every_trial_is(tmp_path: Path) -> N
     assert found[1] == repeats.undeclared("probe.level")
 
 
-def test_a_plan_that_is_a_link_elsewhere_is_not_read(tmp_path: Path) -> None:
+def test_a_plan_that_is_a_link_is_not_read(tmp_path: Path) -> None:
     table = written(tmp_path, "one", [Column("probe.level", "dBm", "x")])
     plan = table.with_name("trial.yaml")
     plan.rename(tmp_path / "elsewhere.yaml")

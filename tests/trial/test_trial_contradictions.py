@@ -1,4 +1,4 @@
-"""Evidence of stored attempts that is whole passes; one piece of it changed contradicts the others, and voids."""
+"""Complete evidence of stored attempts passes; one changed file contradicts the others and voids the attempt."""
 
 import re
 import shutil
@@ -36,15 +36,15 @@ tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes
 """
 
 HEADS = 8
-"""Bytes of a record's lengths, behind which its IP packet begins."""
+"""Offset of a record's lengths, after which its IP packet starts."""
 ICMP = 1
 Packet = tuple[int, bytes]
-"""Time in microseconds since 1970, and the rest of the record from its lengths on."""
+"""Time in microseconds since 1970, and the rest of the record from its lengths."""
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A copy of a stored attempt, with notes of its robots as today's job script writes them."""
+    """A copy of a stored attempt, with the state of its robots in the format of the present job script."""
 
     folder: Path
     protocol: Protocol
@@ -63,15 +63,15 @@ class Attempt:
         path.write_bytes(change(path.read_bytes()))
 
     def packets(self, name: str) -> list[Packet]:
-        data, at, found = (self.folder / name).read_bytes(), 24, list[Packet]()
+        data, at, packets = (self.folder / name).read_bytes(), 24, list[Packet]()
         while at < len(data):
             seconds, micros, kept = struct.unpack_from("<3I", data, at)
-            found.append((seconds * 10**6 + micros, data[at + 8 : at + 16 + kept]))
+            packets.append((seconds * 10**6 + micros, data[at + 8 : at + 16 + kept]))
             at += 16 + kept
-        return found
+        return packets
 
     def capture(self, role: str, change: Callable[[list[Packet]], Sequence[Packet]]) -> None:
-        """Change the packets of a capture, and what tcpdump counted with them."""
+        """Change the packets of a capture, and adapt the counts of tcpdump."""
         name = f"{role}.pcap"
         packets = self.packets(name)
         changed = change(packets)
@@ -112,18 +112,18 @@ def of(protocol: Protocol, folder: Path, trial: Path = LOSSLESS) -> Attempt:
 
 @pytest.mark.parametrize("trial", [LOSSLESS, LOSSY], ids=["lossless", "lossy"])
 @pytest.mark.parametrize("protocol", Protocol)
-def test_whole_evidence_contradicts_nothing(protocol: Protocol, trial: Path, tmp_path: Path) -> None:
+def test_complete_evidence_has_no_contradictions(protocol: Protocol, trial: Path, tmp_path: Path) -> None:
     assert of(protocol, tmp_path, trial).problems(store.read_plan(trial)) == ()
 
 
 def demand(attempt: Attempt, *reasons: str) -> None:
-    found = attempt.problems()
-    assert all(any(reason in one for one in found) for reason in reasons), found
+    problems = attempt.problems()
+    assert all(any(reason in problem for problem in problems) for reason in reasons), problems
 
 
 @pytest.mark.parametrize(("role", "held"), [("sender", "sender"), ("receiver", "receiver")])
 def test_a_capture_that_ended_in_the_middle(attempt: Attempt, role: str, held: str) -> None:
-    """It looks whole: exit code 0, counters that agree."""
+    """It looks complete: exit code 0, consistent counters."""
     attempt.capture(role, lambda packets: packets[: len(packets) // 3])
     demand(attempt, f"the {held}'s capture")
 
@@ -141,14 +141,14 @@ def test_a_capture_without_its_beginning(attempt: Attempt, role: str) -> None:
         ("receiver", "a connection whose SYN is not in the receiver's capture"),
     ],
 )
-def test_a_handshake_that_one_capture_lacks(tcp: Attempt, role: str, reason: str) -> None:
+def test_a_handshake_missing_in_one_capture(tcp: Attempt, role: str, reason: str) -> None:
     tcp.capture(role, lambda packets: packets[3:])
     demand(tcp, reason)
 
 
 @pytest.mark.parametrize(("calls", "is_told"), [(1, True), (2, False)])
 def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_told: bool) -> None:
-    """At once, nobody listened; after calls that the link lost, perhaps since the listener was at its limit."""
+    """An immediate refusal: no listener; a refusal after lost calls: perhaps the listener was at its time limit."""
 
     def refused(packets: list[Packet]) -> list[Packet]:
         (at, call), (answered, answer) = packets[:2]
@@ -158,8 +158,8 @@ def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_told: boo
     for role in ("sender", "receiver"):
         tcp.capture(role, refused)
     tcp.file("recv.bag", lambda _: b"")
-    told = "the receiver refused the connection: no program listened when the sender started"
-    assert (told in " ".join(tcp.problems())) == is_told
+    message = "the receiver refused the connection: no program listened when the sender started"
+    assert (message in " ".join(tcp.problems())) == is_told
 
 
 def test_a_bag_that_is_missing_contradicts_nothing(attempt: Attempt) -> None:
@@ -167,10 +167,10 @@ def test_a_bag_that_is_missing_contradicts_nothing(attempt: Attempt) -> None:
     assert attempt.problems() == ("scan.bag: there is no bag",)
 
 
-def test_a_link_that_brought_nothing_contradicts_nothing(udp: Attempt) -> None:
+def test_a_link_that_lost_everything_contradicts_nothing(udp: Attempt) -> None:
     sender = udp.packets("sender.pcap")[0][1][8 + 12 : 8 + 16]
     udp.capture("receiver", lambda _: [])
-    udp.capture("sender", lambda packets: [one for one in packets if one[1][8 + 12 : 8 + 16] == sender])
+    udp.capture("sender", lambda packets: [packet for packet in packets if packet[1][8 + 12 : 8 + 16] == sender])
     (udp.folder / "recv.bag").write_bytes(b"")
     sent = "10 packets transmitted, 0 received, 100% packet loss, time 1800ms\n"
     (udp.folder / "ping.txt").write_text(f"PING 10.42.0.2 (10.42.0.2) 8192(8220) bytes of data.\n\n{sent}")
@@ -181,8 +181,8 @@ SECTIONS = ["boot", "clock", "date"]
 
 
 @pytest.mark.parametrize("section", SECTIONS)
-def test_robots_that_provide_no_such_section_contradict_nothing(attempt: Attempt, section: str) -> None:
-    """Neither before nor after: their tools cannot."""
+def test_sections_that_a_robot_never_provides_contradict_nothing(attempt: Attempt, section: str) -> None:
+    """The section is missing before and after, because the robot lacks the tool."""
     for role in ("sender", "receiver"):
         for moment in ("before", "after"):
             note = attempt.folder / f"{role}-{moment}.txt"
@@ -193,15 +193,15 @@ def test_robots_that_provide_no_such_section_contradict_nothing(attempt: Attempt
 @pytest.mark.parametrize("moment", ["before", "after"])
 @pytest.mark.parametrize("section", SECTIONS)
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_a_section_that_is_there_at_one_moment_alone(attempt: Attempt, role: str, moment: str, section: str) -> None:
+def test_a_section_that_is_present_only_once(attempt: Attempt, role: str, moment: str, section: str) -> None:
     attempt.text(f"{role}-{moment}.txt", f"==> {section} <==", "==> other <==")
-    demand(attempt, f"that after it do not both have the section {section}")
+    demand(attempt, f"the section {section} is missing in its state")
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_jobs_of_which_nothing_is_noted(attempt: Attempt, role: str) -> None:
+def test_jobs_without_any_record(attempt: Attempt, role: str) -> None:
     attempt.text(f"{role}-after.txt", "==> jobs <==", "==> other <==")
-    demand(attempt, "do not both have the section jobs")
+    demand(attempt, "the section jobs is missing in its state")
 
 
 @pytest.mark.parametrize("moment", ["before", "after"])
@@ -212,20 +212,22 @@ def test_a_state_that_is_missing(attempt: Attempt, role: str, moment: str) -> No
 
 
 @pytest.mark.parametrize("job", ["capture asked 0 100000 1090.00\n", "listen itself 0 100000 1060.00\n"])
-def test_a_job_that_ran_without_a_note_of_its_end(attempt: Attempt, job: str) -> None:
+def test_a_job_without_a_record_of_its_end(attempt: Attempt, job: str) -> None:
     attempt.text("receiver-after.txt", job, "")
-    demand(attempt, f"its job {job.partition(' ')[0]} ran, and nothing says how it ended")
+    demand(attempt, f"its job {job.partition(' ')[0]} ran, but its exit was not recorded")
 
 
 def test_a_robot_that_a_step_reboots_may_reboot(tcp: Attempt) -> None:
     procedure, scene = load_procedure("selfheal"), PLAN.scene(RepeatId(Protocol.TCP, 1), "")
     for role in ("sender", "receiver"):
         tcp.text(f"{role}-after.txt", BOOT, BOOT.replace("a", "b"))
-    found = hosts.problems(procedure, scene, AttemptEvidence(tcp.folder))
-    assert list(found) == ["turtlebot-1: the robot rebooted during the repeat"], "which only loses its link"
+    problems = hosts.problems(procedure, scene, AttemptEvidence(tcp.folder))
+    assert list(problems) == ["turtlebot-1: the robot rebooted during the repeat"], (
+        "of the robot that only loses its link"
+    )
 
 
-def test_a_file_that_tcp_cannot_have_brought(tcp: Attempt) -> None:
+def test_a_file_that_tcp_cannot_have_delivered(tcp: Attempt) -> None:
     tcp.file("recv.bag", lambda data: data[:100] + bytes([data[100] ^ 1]) + data[101:])
     demand(tcp, "recv.bag is not a prefix of scan.bag")
 
@@ -235,7 +237,7 @@ def test_a_file_with_more_than_arrived(attempt: Attempt) -> None:
     demand(attempt, "capture contains")
 
 
-def test_a_file_with_less_than_tcp_delivered_to_the_end(tcp: Attempt) -> None:
+def test_a_file_with_less_than_tcp_delivered(tcp: Attempt) -> None:
     tcp.file("recv.bag", lambda data: data[:-1])
     demand(tcp, "although its listener ended normally")
 
@@ -252,7 +254,7 @@ def test_more_bytes_than_the_file_has_left_the_sender(attempt: Attempt) -> None:
     demand(attempt, "bytes left the sender, but scan.bag has")
 
 
-def test_a_whole_file_beside_lost_packets_that_copies_make_up_for(udp: Attempt) -> None:
+def test_a_complete_file_with_lost_packets_replaced_by_copies(udp: Attempt) -> None:
     udp.file("recv.bag", lambda _: (udp.folder / "scan.bag").read_bytes())
     packets = udp.packets("sender.pcap")
 
@@ -264,19 +266,19 @@ def test_a_whole_file_beside_lost_packets_that_copies_make_up_for(udp: Attempt) 
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_answers_that_are_in_no_capture(attempt: Attempt, role: str) -> None:
+def test_replies_that_are_in_no_capture(attempt: Attempt, role: str) -> None:
     attempt.capture(role, lambda packets: packets[:-30])
     demand(attempt, f"but the {role}'s capture ")
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_answers_that_only_another_pings_packets_could_make_up_for(attempt: Attempt, role: str) -> None:
-    """Of one that runs beside, with another identifier: half of each one's packets are as many as one's."""
+def test_replies_that_match_only_packets_of_another_ping(attempt: Attempt, role: str) -> None:
+    """Of a parallel ping with another identifier: half of the packets of each are as many as those of one."""
 
     def shared(packets: list[Packet]) -> list[Packet]:
         echoes = [at for at, (_, rest) in enumerate(packets) if rest[HEADS + 9] == ICMP and not _is_later(rest)]
         assert len(echoes) > 4
-        # Requests and answers take turns: of every other exchange both.
+        # Requests and replies alternate: keep both of every other exchange.
         every_other = [at for number, at in enumerate(echoes) if number // 2 % 2]
         others = {at: packets[at][1][: HEADS + 24] + b"??" + packets[at][1][HEADS + 26 :] for at in every_other}
         return [(time_us, others.get(at, rest)) for at, (time_us, rest) in enumerate(packets)]
@@ -296,14 +298,14 @@ def test_a_ping_whose_counters_contradict_its_lines(attempt: Attempt) -> None:
     demand(attempt, f"ping counted {answers - 1} answers and printed {answers}")
 
 
-def test_an_answer_that_took_no_time(udp: Attempt) -> None:
-    """As iputils prints it, beside "time of day goes back" in its log."""
+def test_a_reply_with_a_round_trip_time_of_zero(udp: Attempt) -> None:
+    """The output of iputils if its log has "time of day goes back"."""
     lines = (udp.folder / "ping.txt").read_text(encoding="utf-8")
-    told = re.search(r"time=[0-9.]+ ms", lines)
-    assert told
-    udp.text("ping.txt", told[0], "time=0.000 ms")
+    match = re.search(r"time=[0-9.]+ ms", lines)
+    assert match
+    udp.text("ping.txt", match[0], "time=0.000 ms")
     reason = "ping.txt has a round-trip time of 0: the clock was set back while ping waited"
-    assert reason in udp.problems(), "beside others"
+    assert reason in udp.problems(), "among other reasons"
 
 
 @pytest.mark.parametrize(
@@ -327,8 +329,8 @@ def test_a_clock_that_was_set_back_within_a_capture_and_ahead_again(attempt: Att
 def test_a_clock_that_was_set(attempt: Attempt, role: str) -> None:
     name, robot = f"{role}-after.txt", {"sender": "turtlebot-1", "receiver": "turtlebot-2"}[role]
     first_ns = 1_000 * attempt.packets(f"{role}.pcap")[0][0]
-    true, told = (note(first_ns + 50 * 10**9 + step_ns, AFTER_S) for step_ns in (0, 200_000_000))
-    attempt.text(name, true, told)
+    true, changed = (note(first_ns + 50 * 10**9 + step_ns, AFTER_S) for step_ns in (0, 200_000_000))
+    attempt.text(name, true, changed)
     assert attempt.problems() == (
         f"{robot}: its clock was set ahead by 0.200 s (uncertainty 0.010 s) during the repeat",
     )
@@ -357,10 +359,12 @@ def test_a_robot_that_rebooted(attempt: Attempt) -> None:
         ("sender", "ping itself 0", "ping asked 0", "its job ping was stopped by fieldkit before it had finished"),
     ],
 )
-def test_a_job_that_somebody_else_ended(attempt: Attempt, name: str, old: str, new: str, reason: str) -> None:
+def test_a_job_that_was_ended_by_another_program(
+    attempt: Attempt, name: str, old: str, new: str, reason: str
+) -> None:
     attempt.text(f"{name}-after.txt", old, new)
-    (found,) = attempt.problems()
-    assert reason in found
+    (problem,) = attempt.problems()
+    assert reason in problem
 
 
 def test_a_traditional_netcat_that_caught_a_signal(attempt: Attempt) -> None:
@@ -381,7 +385,7 @@ def test_a_traditional_netcat_that_caught_a_signal(attempt: Attempt) -> None:
         (2, "Ncat: Idle timeout expired (2000 ms). QUITTING.\n", False),
     ],
 )
-def test_a_listener_that_was_ended_or_could_not_write(attempt: Attempt, code: int, log: str, *, cut: bool) -> None:
+def test_a_listener_that_was_stopped_or_could_not_write(attempt: Attempt, code: int, log: str, *, cut: bool) -> None:
     attempt.text("receiver-after.txt", "listen itself 0", f"listen itself {code}")
     (attempt.folder / "receiver-listen.log").write_text(log, encoding="ascii")
     reason = "receiver-listen.log: netcat was terminated by a signal, or could not write recv.bag"

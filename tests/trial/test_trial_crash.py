@@ -1,4 +1,4 @@
-"""Fieldkit dies at every moment in which it writes, and is resumed: each planned repeat is valid exactly once."""
+"""Fieldkit is killed at each of its writes and resumed: each planned repeat is valid exactly once."""
 
 import os
 import shutil
@@ -37,7 +37,7 @@ CODE_HASH = code_hash()
 WRITE = os.write
 FSYNC = os.fsync
 VOID_FIRST = "tcp-01-1"
-"""The one attempt whose evidence is not whole."""
+"""The only attempt with incomplete evidence."""
 
 PROCEDURE = """\
 name: small
@@ -54,12 +54,12 @@ PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
 1 packets transmitted, 1 received, 0% packet loss, time 0ms
 """
 
-# What brings something to disk, or takes it away.
+# Calls that write something to disk or remove it.
 WRITES = ("fsync", "write", "rename", "mkdir", "unlink", "truncate")
 
 
 def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let robots have measured, without robots: everything after it is the real thing."""
+    """Replace the measurement on robots; everything after it is real."""
 
     def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
         (into / "ping.txt").write_text("" if remote.endswith(VOID_FIRST) else PING, encoding="utf-8")
@@ -69,18 +69,18 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing(*_words: object, **_more: object) -> dict[str, object]:
         return {}
 
-    for verb in ("begin", "measure", "demand_held", "end_jobs", "end_left", "hang_up", "discard"):
+    for verb in ("begin", "measure", "demand_held", "end_jobs", "end_left", "hang_up", "delete_remote"):
         monkeypatch.setattr(Robots, verb, nothing)
     monkeypatch.setattr(Robots, "fetch", fetch)
     monkeypatch.setattr(preflight, "preflight", nothing)
-    # Most of a short trial is reading of the same YAML and the same code.
+    # A short trial spends most of its time reading the same YAML and the same code.
     monkeypatch.setattr(schema, "load", once(schema.load))
     for module in ("request", "running.resumption"):
         monkeypatch.setattr(f"fieldkit.trial.{module}.code_hash", lambda: CODE_HASH)
 
 
 def once(load: Callable[[Path, type[Plan]], Plan]) -> Callable[[Path, type[Plan]], Plan]:
-    """Read files of equal content once."""
+    """Read files with equal content only once."""
     known: dict[bytes, Plan] = {}
 
     def loaded(path: Path, kind: type[Plan]) -> Plan:
@@ -93,7 +93,7 @@ def once(load: Callable[[Path, type[Plan]], Plan]) -> Callable[[Path, type[Plan]
 
 
 def die(call: Callable[..., object], *words: object) -> None:
-    """End this process as kill -9 would, with half of what it writes in the journal on disk."""
+    """Exit like after kill -9, with half of the data of a journal entry on disk."""
     if call is WRITE:
         descriptor, data = words
         assert isinstance(descriptor, int)
@@ -103,12 +103,12 @@ def die(call: Callable[..., object], *words: object) -> None:
 
 
 def be_told(_call: Callable[..., object], *_words: object) -> None:
-    """Be told to stop at once, as by a second Ctrl-C."""
+    """Receive a request to stop immediately, as from a second Ctrl-C."""
     signal.raise_signal(signal.SIGTERM)
 
 
 def at_write(moment: int, befalls: Callable[..., None]) -> None:
-    """Let something befall this process, for the rest of its life, at its `moment`-th write."""
+    """Let an event happen to this process at its `moment`-th write, for the rest of its life."""
     count = 0
 
     def watched(call: Callable[..., object]) -> Callable[..., object]:
@@ -117,7 +117,7 @@ def at_write(moment: int, befalls: Callable[..., None]) -> None:
             count += 1
             if count == moment:
                 befalls(call, *words)
-            return None if call is FSYNC else call(*words, **more)  # a process that dies takes no disk with it
+            return None if call is FSYNC else call(*words, **more)  # a kill of a process does not affect the disk
 
         return counted
 
@@ -126,7 +126,7 @@ def at_write(moment: int, befalls: Callable[..., None]) -> None:
 
 
 def run(out: Path, moment: int = 0, befalls: Callable[..., None] = die) -> bool:
-    """Begin the trial in `out`, or go on with it, in a process of its own; return whether it ended by itself."""
+    """Start or resume the trial in `out` in a separate process; return True if it ended normally."""
     pid = os.fork()
     if pid == 0:
         code = 1
@@ -159,7 +159,7 @@ def trial_of(out: Path) -> Path:
 
 
 def demand_agreement(folder: Path) -> None:
-    """Demand that a trial's files agree with each other."""
+    """Check that a trial's files are consistent."""
     assert manifest.verify(folder) == []
     before = {name: (folder / name).read_bytes() for name in ("trial.csv", "summary.csv")}
     rebuild(folder)
@@ -167,22 +167,24 @@ def demand_agreement(folder: Path) -> None:
 
 
 def demand_whole(out: Path) -> None:
-    """Demand what every trial must be in the end."""
+    """Check the properties of every finished trial."""
     folder = trial_of(out)
     ended = journal.ended(journal.read(folder))
-    valid = Counter((one.repeat.protocol, one.repeat.number) for one in ended if one.status == "valid")
+    valid = Counter(
+        (attempt.repeat.protocol, attempt.repeat.number) for attempt in ended if attempt.status == "valid"
+    )
     assert valid == {(Protocol.TCP, number + 1): 1 for number in range(REPEATS)}
-    assert all(one.reason for one in ended if one.status != "valid")
-    assert sorted(path.name for path in (folder / "repeats").iterdir()) == sorted(one.folder for one in ended)
+    assert all(attempt.reason for attempt in ended if attempt.status != "valid")
+    assert sorted(path.name for path in (folder / "repeats").iterdir()) == sorted(attempt.folder for attempt in ended)
     demand_agreement(folder)
     assert all(
-        problems(plan(), one.repeat.protocol, folder / "repeats" / one.folder) == ()
-        for one in ended
-        if one.status == "valid"
+        problems(plan(), attempt.repeat.protocol, folder / "repeats" / attempt.folder) == ()
+        for attempt in ended
+        if attempt.status == "valid"
     )
 
 
-def test_it_may_die_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robots_with_evidence(monkeypatch)
     out = tmp_path / "trials"
     moments = 0
@@ -191,10 +193,10 @@ def test_it_may_die_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         demand_whole(out)
         shutil.rmtree(out)
     demand_whole(out)
-    assert moments > 40, "hardly a write was met"
+    assert moments > 40, "too few writes were interrupted"
 
 
-def test_it_may_be_told_to_stop_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robots_with_evidence(monkeypatch)
     out = tmp_path / "trials"
     moments = 0
@@ -204,12 +206,12 @@ def test_it_may_be_told_to_stop_at_any_write(tmp_path: Path, monkeypatch: pytest
         assert run(out)
         demand_whole(out)
         shutil.rmtree(out)
-    assert moments > 40, "hardly a write was met"
+    assert moments > 40, "too few writes were interrupted"
 
 
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(moments=st.lists(st.integers(1, 60), max_size=6))
-def test_it_may_die_again_while_it_resumes(
+def test_a_kill_during_recovery_is_recovered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moments: list[int]
 ) -> None:
     robots_with_evidence(monkeypatch)

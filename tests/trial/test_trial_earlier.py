@@ -1,4 +1,4 @@
-"""Packets of an earlier attempt that arrive in this one make it void; what honestly stands at the edges does not."""
+"""Packets of an earlier attempt that arrive in this one make it void; legitimate packets at the edges do not."""
 
 import random
 import tempfile
@@ -17,7 +17,7 @@ from tests.trial.test_trial_contradictions import LOSSLESS, Attempt, Packet, of
 
 EARLIER = "packets of an earlier attempt were still on the way"
 HEADS = 8
-"""Bytes of a record's lengths, behind which its IP packet begins: the captures are of link type RAW."""
+"""Offset of a record's lengths, after which its IP packet starts: the captures have link type RAW."""
 KEPT = sorted(TRIALS.glob("*/repeats/*-0[0-9]"))
 
 Chosen = Callable[[bytes], bool]
@@ -40,7 +40,7 @@ def _is_later_echo(packet: bytes) -> bool:
 
 
 def _is_load(packet: bytes) -> bool:
-    """Whether it is of the transfer: a first fragment of UDP, or a frame of TCP with payload."""
+    """Return True for a packet of the transfer: a first fragment of UDP, or a TCP frame with payload."""
     return not _is_icmp(packet) and not _is_later(packet) and int.from_bytes(packet[2:4], "big") > 60
 
 
@@ -55,7 +55,7 @@ def _left(packets: list[Packet], role: str, chosen: Chosen) -> list[Packet]:
 
 
 def _waiting(attempt: Attempt, role: str, chosen: Chosen) -> list[Packet]:
-    """Return what left a robot in the other repeat, as if it was on the way until this one began."""
+    """Return packets sent in the other repeat, as if they were delayed until the start of this one."""
     other = Attempt(LOSSLESS / "repeats" / f"{attempt.protocol}-02", attempt.protocol)
     began_us, _ = attempt.packets("receiver.pcap")[0]
     found = [(began_us, rest) for _, rest in _left(other.packets(f"{role}.pcap"), role, chosen)]
@@ -73,7 +73,7 @@ def _told(attempt: Attempt) -> list[str]:
 
 
 @pytest.mark.parametrize("path", KEPT, ids=lambda path: f"{path.parents[1].name[:16]} {path.name}")
-def test_kept_repeats_stay_valid(path: Path) -> None:
+def test_stored_repeats_stay_valid(path: Path) -> None:
     assert problems(store.read_plan(path.parents[1]), Protocol(path.name.split("-")[0]), path) == ()
 
 
@@ -84,7 +84,9 @@ def test_kept_repeats_stay_valid(path: Path) -> None:
     [("sender", _is_echo), ("receiver", _is_echo), ("sender", _is_load)],
     ids=["requests", "replies", "transfer"],
 )
-def test_they_void(tmp_path: Path, protocol: Protocol, role: str, chosen: Chosen, count: int) -> None:
+def test_packets_of_an_earlier_attempt_make_an_attempt_void(
+    tmp_path: Path, protocol: Protocol, role: str, chosen: Chosen, count: int
+) -> None:
     attempt = of(protocol, tmp_path)
     waiting = _waiting(attempt, role, chosen)[:count]
     to = "receiver" if role == "sender" else "sender"
@@ -94,8 +96,8 @@ def test_they_void(tmp_path: Path, protocol: Protocol, role: str, chosen: Chosen
 
 
 @pytest.mark.parametrize("protocol", Protocol)
-def test_they_void_where_they_waited_on_the_sender_and_left_in_this_one(tmp_path: Path, protocol: Protocol) -> None:
-    """As many datagrams of this one never left, so that the sums agree; of TCP a SYN waited."""
+def test_earlier_packets_queued_at_the_sender_make_an_attempt_void(tmp_path: Path, protocol: Protocol) -> None:
+    """The same number of datagrams of this attempt never left, so the sums agree; for TCP a SYN was queued."""
     attempt = of(protocol, tmp_path)
     chosen = _is_load if protocol is Protocol.UDP else lambda packet: packet[9] == 6 and packet[33] == 2
     waiting = _waiting(attempt, "sender", chosen)[:1]
@@ -105,7 +107,7 @@ def test_they_void_where_they_waited_on_the_sender_and_left_in_this_one(tmp_path
     assert reason == f"{EARLIER}: 1 packet left for the transfer's port before its sender started"
 
 
-def test_fragments_of_which_the_first_came_before_the_capture_void(tmp_path: Path) -> None:
+def test_fragments_without_their_first_one_make_an_attempt_void(tmp_path: Path) -> None:
     attempt = of(Protocol.UDP, tmp_path)
     waiting = _waiting(attempt, "sender", _is_later_echo)
     attempt.capture("receiver", lambda packets: [*waiting[:3], *packets])
@@ -114,7 +116,7 @@ def test_fragments_of_which_the_first_came_before_the_capture_void(tmp_path: Pat
 
 
 @pytest.mark.parametrize("chosen", [_is_load, _is_icmp], ids=["transfer", "pings"])
-def test_all_of_this_one_was_lost_behind_them(tmp_path: Path, chosen: Chosen) -> None:
+def test_only_earlier_packets_arrived(tmp_path: Path, chosen: Chosen) -> None:
     attempt = of(Protocol.UDP, tmp_path)
     waiting = _waiting(attempt, "sender", chosen)
     attempt.capture("receiver", lambda _: (waiting * 5)[:9])
@@ -127,10 +129,8 @@ def test_all_of_this_one_was_lost_behind_them(tmp_path: Path, chosen: Chosen) ->
 
 @given(st.sampled_from(Protocol), st.integers(0, 2**32), st.sampled_from((0.0, 0.1, 0.6, 1.0)))
 @settings(max_examples=20)
-def test_what_a_link_loses_and_captures_miss_at_their_edges_is_of_this_one(
-    protocol: Protocol, seed: int, lost: float
-) -> None:
-    """The ends of two captures differ by what is on the way; a user's ping or stray acknowledgments run beside."""
+def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Protocol, seed: int, lost: float) -> None:
+    """Two captures differ at their ends by packets in flight; a user's ping or stray ACKs run in parallel."""
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory() as place:
         attempt = of(protocol, Path(place))
@@ -155,7 +155,7 @@ def test_what_a_link_loses_and_captures_miss_at_their_edges_is_of_this_one(
         assert _told(attempt) == []
 
 
-def test_a_router_that_gives_other_ids_is_no_earlier_attempt(tmp_path: Path) -> None:
+def test_rewritten_ip_ids_are_not_an_earlier_attempt(tmp_path: Path) -> None:
     attempt = of(Protocol.UDP, tmp_path)
     attempt.capture(
         "receiver",

@@ -1,4 +1,4 @@
-"""Evidence that is whole passes every gate; damaged in one place, it gives the one reason for it."""
+"""Complete evidence passes every check; damaged in one place, it gives exactly one reason."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +19,7 @@ from tests.helpers.plans import problems, write_states
 from tests.measure.evidence.test_measure_bag import write_bag
 
 PLAN = los_plan(record_s=2.0, protocols=(Protocol.UDP,))
-FRAMES = timed([one for number in range(4) for one in datagram(number, 8192)])
+FRAMES = timed([frame for number in range(4) for frame in datagram(number, 8192)])
 
 LOG = """\
 tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes
@@ -52,22 +52,22 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_whole_evidence_passes_and_lost_packets_are_no_reason(folder: Path) -> None:
+def test_complete_evidence_passes_even_with_lost_packets(folder: Path) -> None:
     assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
-def test_strangers_that_came_before_the_filter_are_no_reason(folder: Path) -> None:
+def test_packets_captured_before_the_filter_are_ignored(folder: Path) -> None:
     (folder / "sender-capture.log").write_text(log(matched=len(FRAMES) + 1), encoding="utf-8")
     assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
-def test_a_tcpdump_that_does_not_say_what_matched_is_no_reason(folder: Path) -> None:
+def test_a_tcpdump_without_a_match_count_is_accepted(folder: Path) -> None:
     said = [line for line in log().splitlines(keepends=True) if "received by filter" not in line]
     (folder / "sender-capture.log").write_text("".join(said), encoding="utf-8")
     assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
-def test_a_lab_that_kept_its_model_and_one_that_has_none_are_no_reason(folder: Path) -> None:
+def test_labs_with_an_intact_or_no_radio_model_are_accepted(folder: Path) -> None:
     (folder / "lateness.txt").write_text("bound 5000000\nlate 5000000 7\n", encoding="ascii")
     (folder / "track.csv").write_text(track.text([]), encoding="ascii")
     assert problems(PLAN, Protocol.UDP, folder) == ()
@@ -135,36 +135,38 @@ def fewer_frames(folder: Path) -> None:
         (text("ping.txt", PING.format(sent=7)), "ping.txt: ping sent 7 of 10 requests"),
     ],
 )
-def test_one_damage_is_one_reason(folder: Path, damage: Callable[[Path], object], reason: str) -> None:
+def test_one_damaged_file_gives_one_reason(folder: Path, damage: Callable[[Path], object], reason: str) -> None:
     plan = los_plan(record_s=4.0) if damage is short_bag else PLAN
     damage(folder)
-    found = problems(plan, Protocol.UDP, folder)
-    assert any(reason in one for one in found), found
-    assert len(found) <= 2, "one cause, at most its sign in two places"
-    assert not [one for one in found if "cannot be measured" in one], "it was foreseen"
+    reasons = problems(plan, Protocol.UDP, folder)
+    assert any(reason in other for other in reasons), reasons
+    assert len(reasons) <= 2, "one cause has at most two symptoms"
+    assert not [other for other in reasons if "cannot be measured" in other], "the damage is handled"
 
 
-def test_a_step_that_cannot_measure_what_it_left_voids_the_attempt_and_raises_nothing(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_exception_while_measuring_makes_the_attempt_void(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def measure(step: PingStep, view: View) -> Measured:
         raise OverflowError("int too large to convert to float")
 
     monkeypatch.setattr(PingStep, "measure", measure)
     (said,) = problems(PLAN, Protocol.UDP, folder)
-    assert said == "what the step ping left cannot be measured: OverflowError: int too large to convert to float"
+    assert (
+        said == "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
+    )
     judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
     assert judged.measured.missing["rtt_loss"] == said
     assert judged.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size
 
 
-def test_a_figure_that_cannot_be_voids_and_is_missing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A row that holds it would be in a table that nothing reads again."""
+def test_an_impossible_value_makes_the_attempt_void_and_is_missing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A table with such a row could not be read again."""
     measured = PingStep.measure
 
     def impossible(self: PingStep, view: View) -> Measured:
-        found = measured(self, view)
-        return Measured({**found.values, "rtt_loss": -38460.0, "rtt_min_s": float("nan")}, found.missing)
+        result = measured(self, view)
+        return Measured({**result.values, "rtt_loss": -38460.0, "rtt_min_s": float("nan")}, result.missing)
 
     monkeypatch.setattr(PingStep, "measure", impossible)
     judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
@@ -175,22 +177,22 @@ def test_a_figure_that_cannot_be_voids_and_is_missing(folder: Path, monkeypatch:
     assert not {"rtt_loss", "rtt_min_s"} & judged.measured.values.keys()
 
 
-def test_a_figure_that_is_neither_there_nor_missing_for_a_reason_voids(
+def test_a_value_missing_without_a_reason_makes_the_attempt_void(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     measured = PingStep.measure
 
     def forgetful(self: PingStep, view: View) -> Measured:
-        found = measured(self, view)
-        return Measured({name: value for name, value in found.values.items() if name != "rtt_loss"}, found.missing)
+        result = measured(self, view)
+        return Measured({name: value for name, value in result.values.items() if name != "rtt_loss"}, result.missing)
 
     monkeypatch.setattr(PingStep, "measure", forgetful)
-    assert problems(PLAN, Protocol.UDP, folder) == ("the step ping does not say why it has no rtt_loss",)
+    assert problems(PLAN, Protocol.UDP, folder) == ("the step ping gives neither a value nor a reason for rtt_loss",)
 
 
-def test_what_a_fault_disturbed_need_not_be_whole(tmp_path: Path) -> None:
-    """Its own evidence must be; the ping inside left nothing."""
+def test_evidence_disturbed_by_a_fault_may_be_incomplete(tmp_path: Path) -> None:
+    """The evidence of the fault must be complete; the ping inside left none."""
     plan = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
     write_states(tmp_path)
-    found = problems(plan, Protocol.TCP, tmp_path)
-    assert [one.partition(":")[0] for one in found] == ["fault-link-down.txt", "fault-reboot.txt"]
+    reasons = problems(plan, Protocol.TCP, tmp_path)
+    assert [reason.partition(":")[0] for reason in reasons] == ["fault-link-down.txt", "fault-reboot.txt"]

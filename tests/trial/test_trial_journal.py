@@ -23,7 +23,7 @@ entries = st.builds(
 
 
 @given(st.lists(entries, max_size=8), st.integers(min_value=0, max_value=200))
-def test_a_journal_torn_anywhere_gives_every_whole_entry_before(
+def test_a_torn_journal_gives_every_complete_entry(
     tmp_path_factory: pytest.TempPathFactory, written: list[JournalEntry], cut: int
 ) -> None:
     folder = tmp_path_factory.mktemp("trial")
@@ -34,7 +34,7 @@ def test_a_journal_torn_anywhere_gives_every_whole_entry_before(
     path.write_bytes(kept)
     complete = kept.count(b"\n")
     read = journal.read(folder)
-    # A last line that lost only its end of line is whole all the same.
+    # A last line that lost only its line end is still complete.
     assert read in (written[:complete], written[: complete + 1])
 
 
@@ -72,7 +72,7 @@ def test_ended_pairs_start_and_end(tmp_path: Path) -> None:
 
 
 @given(st.lists(entries, max_size=6), st.integers(min_value=0, max_value=200), entries)
-def test_what_is_appended_to_a_mended_journal_is_read_again(
+def test_entries_after_a_repair_are_read_back(
     tmp_path_factory: pytest.TempPathFactory, written: list[JournalEntry], cut: int, next_entry: JournalEntry
 ) -> None:
     folder = tmp_path_factory.mktemp("trial")
@@ -86,7 +86,7 @@ def test_what_is_appended_to_a_mended_journal_is_read_again(
     assert journal.read(folder) == [*before, next_entry]
 
 
-def test_an_attempt_without_an_end_was_cut_short(tmp_path: Path) -> None:
+def test_an_attempt_without_an_end_was_interrupted(tmp_path: Path) -> None:
     journal.append(
         tmp_path,
         JournalEntry(10, Protocol.UDP, 1, 1, Status.RUNNING),

@@ -1,4 +1,4 @@
-"""Positions given after a trial, by the command as its user types it: kept, summed, refused, forgotten."""
+"""Positions added after a trial with the command: stored, summed, rejected, removed."""
 
 import shutil
 from pathlib import Path
@@ -18,7 +18,7 @@ from tests.helpers.stored_trials import TRIALS
 
 @pytest.fixture
 def trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a copy of a stored trial, in the folder that one is in."""
+    """Return a copy of a stored trial; its parent is the current folder."""
     (stored,) = TRIALS.glob("*_driveaway_*")
     shutil.copytree(stored, tmp_path / "trial")
     monkeypatch.chdir(tmp_path)
@@ -31,43 +31,43 @@ def replies_ns(trial: Path) -> list[int]:
 
 
 def walk(trial: Path, name: str = "walk.csv", *, late_ns: int = 0) -> list[int]:
-    """Write how somebody walked at 1 m/s from 5 m on while all of the trial went on; return the times of replies."""
+    """Write a walk at 1 m/s starting at 5 m during the whole trial; return the times of the replies."""
     at_ns = replies_ns(trial)
     first_ns, last_ns = min(at_ns) - 60 * 10**9, max(at_ns) + 60 * 10**9
     lines = (f"{first_ns - late_ns},5,0", f"{last_ns - late_ns},{5 + (last_ns - first_ns) / 1e9},0")
     Path(name).write_text("\n".join(("t_ns,x_m,y_m", *lines, "")), encoding="ascii")
-    return [one - first_ns for one in at_ns]
+    return [time_ns - first_ns for time_ns in at_ns]
 
 
 def said(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
     code = main(["positions", "trial", *words])
-    told = capsys.readouterr()
-    return code, told.out + told.err
+    output = capsys.readouterr()
+    return code, output.out + output.err
 
 
 def means_m(trial: Path) -> list[str]:
     return [row["rtt_distance_mean_m"] for row in rows(trial) if row["status"] == "valid"]
 
 
-def test_what_is_given_fills_the_columns_is_summed_and_can_be_forgotten(
+def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
     trial: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()}
     elapsed_ns = walk(trial)
-    code, told = said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")
-    assert code == 0, told
-    assert told.startswith("changed: trial.csv")
-    found = [float(metres) for metres in means_m(trial)]
-    assert all(65 <= metres <= 5 + max(elapsed_ns) / 1e9 for metres in found)
+    code, output = said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")
+    assert code == 0, output
+    assert output.startswith("changed: trial.csv")
+    means = [float(metres) for metres in means_m(trial)]
+    assert all(65 <= metres <= 5 + max(elapsed_ns) / 1e9 for metres in means)
     assert manifest.verify(trial) == []
     assert {path.name for path in trial.glob("positions*")} == {"positions.json", "positions-receiver.csv"}
-    assert said(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(found)
+    assert said(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(means)
 
     walk(trial, "again.CSV", late_ns=2 * 10**9)
     said(capsys, "receiver=again.CSV", "sender=0m,0m", "--gap", "1000min", "--offset", "-1s")
-    assert [float(metres) for metres in means_m(trial)] == pytest.approx([one + 3 for one in found])
+    assert [float(metres) for metres in means_m(trial)] == pytest.approx([metres + 3 for metres in means])
     said(capsys, "receiver=again.CSV", "sender=0m,0m")
-    assert means_m(trial) == [""] * len(found)
+    assert means_m(trial) == [""] * len(means)
     assert "have a gap of" in said(capsys)[1]
 
     assert said(capsys, "--clear")[0] == 0
@@ -77,9 +77,9 @@ def test_what_is_given_fills_the_columns_is_summed_and_can_be_forgotten(
 @pytest.mark.parametrize(
     ("words", "code", "complaint"),
     [
-        (["walk.csv"], 2, "'walk.csv' is no ROLE=FILE"),
-        (["Receiver=walk.csv"], 2, "is no ROLE=FILE"),
-        (["receiver="], 2, "is no ROLE=FILE"),
+        (["walk.csv"], 2, "'walk.csv' is not ROLE=FILE"),
+        (["Receiver=walk.csv"], 2, "is not ROLE=FILE"),
+        (["receiver="], 2, "is not ROLE=FILE"),
         (["reciever=walk.csv"], 2, "did you mean 'receiver'"),
         (["receiver=nowhere.csv"], 2, "there is no such file"),
         (["receiver=91,0"], 2, "there is no such file"),
@@ -92,7 +92,7 @@ def test_what_is_given_fills_the_columns_is_summed_and_can_be_forgotten(
         (["receiver=walk.csv", "--clear"], 2, "--clear forgets"),
     ],
 )
-def test_what_cannot_be_is_refused_and_changes_nothing(
+def test_invalid_positions_are_rejected_and_change_nothing(
     trial: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, complaint: str
 ) -> None:
     walk(trial)
@@ -101,28 +101,24 @@ def test_what_cannot_be_is_refused_and_changes_nothing(
     with Path("huge.gpx").open("wb") as huge:
         huge.truncate(positions.MOST_BYTES + 1)
     before = {path: path.read_bytes() for path in trial.iterdir() if path.is_file()}
-    found, told = said(capsys, *words)
-    assert (found, complaint in told) == (code, True), told
+    exit_code, output = said(capsys, *words)
+    assert (exit_code, complaint in output) == (code, True), output
     assert {path: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
 
 
-def test_a_trial_whose_evidence_changed_or_that_runs_takes_nothing(
-    trial: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
     walk(trial)
     with journal.claimed(trial):
         assert said(capsys, "receiver=walk.csv")[0] == 2
     file = next(trial.glob("repeats/*/ping.txt"))
     file.write_bytes(file.read_bytes() + b"\n")
-    code, told = said(capsys, "receiver=walk.csv")
-    assert (code, "the evidence is not what was measured" in told) == (4, True)
+    code, output = said(capsys, "receiver=walk.csv")
+    assert (code, "the evidence is not what was measured" in output) == (4, True)
     assert not list(trial.glob("positions*"))
 
 
 @pytest.mark.parametrize("how", ["changed", "gone", "unsummed"])
-def test_given_files_that_differ_from_their_sums_make_no_table(
-    trial: Path, capsys: pytest.CaptureFixture[str], how: str
-) -> None:
+def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.CaptureFixture[str], how: str) -> None:
     walk(trial)
     assert said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")[0] == 0
     kept = trial / "positions-receiver.csv"
@@ -152,10 +148,10 @@ def test_given_files_that_differ_from_their_sums_make_no_table(
         ("sender=a=b.gpx", Path("a=b.gpx")),
     ],
 )
-def test_a_place_is_told_from_a_file(text: str, found: object) -> None:
+def test_a_place_is_distinguished_from_a_file(text: str, found: object) -> None:
     assert positions.told(text) == (Role.SENDER, found)
 
 
-def test_what_is_no_pair_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="no ROLE=FILE"):
+def test_an_invalid_pair_is_rejected() -> None:
+    with pytest.raises(ConfigurationError, match="not ROLE=FILE"):
         positions.told("=walk.gpx")

@@ -9,7 +9,7 @@ from tests.helpers.recorded import make
 from tests.helpers.runs import rows
 
 
-def test_a_rebuilt_row_has_the_schema_of_who_measured_it(tmp_path: Path) -> None:
+def test_a_rebuilt_row_has_the_schema_version_of_its_measurement(tmp_path: Path) -> None:
     folder = make(tmp_path)
     plan = folder / PLAN_FILE
     current = f"schema_version: {SCHEMA_VERSION}\n"

@@ -1,4 +1,4 @@
-"""The estimate of a trial's evidence against what trials left."""
+"""The estimated size of a trial's evidence compared with real sizes."""
 
 from fieldkit.core.model import FIXED_ROLES, Protocol, Role
 from fieldkit.trial import size
@@ -20,13 +20,13 @@ def test_a_longer_recording_leaves_more_on_both_ends_and_nothing_on_the_relay() 
     assert size.evidence_bytes(long, Role.RELAY) == 0
 
 
-def test_the_laptop_gets_every_attempt() -> None:
+def test_the_laptop_stores_every_attempt() -> None:
     plan = los_plan(repeats=7)
     per_attempt = sum(size.evidence_bytes(plan, role) for role in FIXED_ROLES)
     assert size.trial_bytes(plan) == 7 * 2 * per_attempt
 
 
-def test_what_the_lab_writes_itself_is_on_the_laptop_alone() -> None:
+def test_files_of_the_lab_are_only_on_the_laptop() -> None:
     plan, recorded = los_plan(repeats=7), los_plan(repeats=7).model_copy(update={"lab_bytes": 1000})
     assert size.attempt_bytes(recorded) == size.attempt_bytes(plan) + 1000
     assert size.trial_bytes(recorded) == size.trial_bytes(plan) + 7 * 2 * 1000

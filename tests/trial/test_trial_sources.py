@@ -1,4 +1,4 @@
-"""Which tables paths name, for aggregate and its like."""
+"""The tables found at paths, for `aggregate` and other commands."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,31 +23,31 @@ def trial(folder: Path, name: str) -> Path:
     return write(folder / name, repeats(replace(ROW, trial=name), 2)).parent
 
 
-def test_trials_below_a_folder_come_sorted_and_what_is_hidden_is_left_out(tmp_path: Path) -> None:
+def test_trials_below_a_folder_are_sorted_without_hidden_ones(tmp_path: Path) -> None:
     wanted = [trial(tmp_path / "campaign_lawn", "3"), trial(tmp_path, "ones/1"), trial(tmp_path, "ones/2")]
     trial(tmp_path, ".trash")
     trial(tmp_path, "copy.partial")
     trial(tmp_path, "ones/1/repeats/udp-01")
     write(tmp_path, [ROW], "notes.csv")
-    assert read_from(tmp_path) == [str(one) for one in wanted]
+    assert read_from(tmp_path) == [str(table) for table in wanted]
 
 
-def test_a_table_is_counted_once_whatever_it_is_called(tmp_path: Path) -> None:
-    one = trial(tmp_path, "1")
-    (tmp_path / "again").symlink_to(one, target_is_directory=True)
-    (one / "circle").symlink_to(tmp_path, target_is_directory=True)
+def test_a_table_with_several_paths_counts_once(tmp_path: Path) -> None:
+    table = trial(tmp_path, "1")
+    (tmp_path / "again").symlink_to(table, target_is_directory=True)
+    (table / "circle").symlink_to(tmp_path, target_is_directory=True)
     (tmp_path / "circle").symlink_to(tmp_path, target_is_directory=True)
     notes: list[str] = []
-    assert len(load([tmp_path, one, one / "trial.csv"], notes)) == 2
+    assert len(load([tmp_path, table, table / "trial.csv"], notes)) == 2
     assert not notes
 
 
 def test_a_copy_counts_once_with_a_note(tmp_path: Path) -> None:
-    one = trial(tmp_path, "1")
+    table = trial(tmp_path, "1")
     copy = write(tmp_path, repeats(replace(ROW, trial="1"), 2), "copy.csv")
     notes: list[str] = []
-    assert len(load([one, copy], notes)) == 2
-    assert notes == [f"{copy}: 2 rows of {one} again, counted once"]
+    assert len(load([table, copy], notes)) == 2
+    assert notes == [f"{copy}: 2 rows of {table} again, counted once"]
 
 
 def test_a_trial_without_a_table_is_named(tmp_path: Path) -> None:
@@ -60,25 +60,25 @@ def test_a_trial_without_a_table_is_named(tmp_path: Path) -> None:
     assert [note for note in notes if f"to make it: fieldkit rebuild {begun}" in note]
 
 
-def test_a_table_alone_cannot_be_rebuilt(tmp_path: Path) -> None:
+def test_a_table_without_its_trial_cannot_be_rebuilt(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="no raw evidence"):
         sources.find([trial(tmp_path, "1")], print, rebuild=True).read()
 
 
 @pytest.mark.parametrize(("name", "what"), [("gone", "no such file"), (".", "no trial is there")])
-def test_a_path_without_a_trial_is_refused(tmp_path: Path, name: str, what: str) -> None:
+def test_a_path_without_a_trial_is_rejected(tmp_path: Path, name: str, what: str) -> None:
     with pytest.raises(ConfigurationError, match=what):
         load([tmp_path / name])
 
 
-def test_tables_in_a_folder_are_named_as_a_shell_takes_them(tmp_path: Path) -> None:
+def test_the_remedy_for_tables_in_a_folder_is_valid_in_a_shell(tmp_path: Path) -> None:
     write(tmp_path / "from Ann", [ROW], "lawn.csv")
     with pytest.raises(ConfigurationError, match="no trial is there or below") as caught:
         load([tmp_path / "from Ann"])
     assert caught.value.remedy.endswith(f"CSV files: '{tmp_path / 'from Ann'}'/*.csv")
 
 
-def test_trials_without_an_attempt_are_refused(tmp_path: Path) -> None:
+def test_trials_without_an_attempt_are_rejected(tmp_path: Path) -> None:
     write(tmp_path, [])
     with pytest.raises(EvidenceError, match="no repeat has ended"):
         load([tmp_path])

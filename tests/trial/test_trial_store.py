@@ -21,17 +21,17 @@ def folder(tmp_path: Path) -> Path:
     (partial / "scan").mkdir()
     (partial / "scan" / "scan_0.db3").write_bytes(b"SQLite format 3\0" * 9)
     sums = manifest.Manifest(made)
-    sums.add(store.keep_attempt(partial, "udp-01"))
+    sums.add(store.commit_attempt(partial, "udp-01"))
     sums.write()
     return made
 
 
-def test_a_plan_survives_being_written_and_read_again(folder: Path) -> None:
+def test_a_plan_is_written_and_read_back(folder: Path) -> None:
     assert store.read_plan(folder) == los_plan()
     assert schema.dump(store.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
 
 
-def test_a_plan_keeps_what_the_numbers_depend_on() -> None:
+def test_a_plan_contains_the_inputs_of_the_numbers() -> None:
     plan = los_plan(record_s=2.0)
     text = schema.dump(plan)
     assert "duration: 2s" in text
@@ -41,8 +41,8 @@ def test_a_plan_keeps_what_the_numbers_depend_on() -> None:
 
 
 @pytest.mark.parametrize("name", ["../..", ".", "a/b", "", "-rf"])
-def test_a_plan_whose_trial_is_no_name_of_a_folder_is_refused(folder: Path, name: str) -> None:
-    """Robots are told to remove the folder of that name."""
+def test_a_plan_with_an_invalid_folder_name_is_rejected(folder: Path, name: str) -> None:
+    """The folder of that name is removed on robots."""
     path = folder / "trial.yaml"
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(f"trial: {los_plan().trial}", f"trial: '{name}'"), encoding="utf-8")
@@ -64,7 +64,7 @@ def test_one_flipped_byte_is_found(folder: Path, name: str) -> None:
     assert manifest.verify(folder) == [f"{name}: changed"]
 
 
-def test_a_missing_and_a_foreign_file_are_found(folder: Path) -> None:
+def test_missing_and_additional_files_are_found(folder: Path) -> None:
     (folder / "repeats/udp-01/ping.txt").unlink()
     (folder / "repeats/udp-01/notes.txt").write_text("x", encoding="utf-8")
     assert manifest.verify(folder) == [
@@ -73,27 +73,27 @@ def test_a_missing_and_a_foreign_file_are_found(folder: Path) -> None:
     ]
 
 
-def test_what_an_interrupted_attempt_left_is_neither_listed_nor_kept(folder: Path) -> None:
+def test_files_of_an_interrupted_attempt_are_not_in_the_manifest(folder: Path) -> None:
     partial = store.open_attempt(folder, RepeatId(Protocol.TCP, 1))
     (partial / "half.pcap").write_bytes(b"x")
     assert manifest.verify(folder) == []
     assert list(store.open_attempt(folder, RepeatId(Protocol.TCP, 1)).iterdir()) == []
 
 
-def test_a_folder_that_is_no_trial_says_so(tmp_path: Path) -> None:
+def test_a_folder_without_a_trial_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"there is no trial\.yaml"):
         store.read_plan(tmp_path)
     with pytest.raises(EvidenceError, match="no readable manifest"):
         manifest.verify(tmp_path)
 
 
-def test_an_out_folder_that_cannot_be_made_says_so(tmp_path: Path) -> None:
+def test_an_out_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="cannot make"):
+    with pytest.raises(ConfigurationError, match="cannot create"):
         store.create(tmp_path / "file", los_plan())
 
 
-def test_what_was_half_fetched_is_kept_for_the_next_fetch_and_never_as_evidence(folder: Path) -> None:
+def test_partially_fetched_files_are_kept_only_for_the_next_fetch(folder: Path) -> None:
     repeat = RepeatId(Protocol.TCP, 1)
     partial = store.open_attempt(folder, repeat)
     (partial / "scan").mkdir()
@@ -101,6 +101,6 @@ def test_what_was_half_fetched_is_kept_for_the_next_fetch_and_never_as_evidence(
         (partial / name).write_bytes(b"x")
     assert store.reopen_attempt(folder, repeat) == partial
     assert [path.name for path in partial.iterdir()] == [".sender.camera.bag.part"]
-    kept = store.keep_attempt(partial, "tcp-01.void1")
+    kept = store.commit_attempt(partial, "tcp-01.void1")
     assert list(kept.iterdir()) == []
     assert list(store.reopen_attempt(folder, repeat).iterdir()) == []

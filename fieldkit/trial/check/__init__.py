@@ -1,1 +1,1 @@
-"""Checks of `fieldkit check`: a shell script asks each robot once, pure functions judge what it said."""
+"""Checks of `fieldkit check`: a shell script reads the state of each robot once, and pure functions judge it."""

@@ -1,4 +1,4 @@
-"""Reach a robot and read its clock."""
+"""Log in on a robot and read its clock."""
 
 from typing import Final
 
@@ -11,11 +11,11 @@ from fieldkit.trial.check.report import Report
 CONTACT_S: Final = 15.0
 WARN_S: Final = 1.0
 HOUR_S: Final = 1800.0
-"""From half an hour on a clock is not late but wrong: a time zone, a board without a battery."""
+"""From half an hour on, a clock is wrong rather than late: wrong time zone, or a board without a battery."""
 
 
-def greet(shell: Shell) -> None:
-    """Log in.
+def log_in(shell: Shell) -> None:
+    """Log in on a robot.
 
     Raises:
         FieldkitError: It cannot be reached, has another host key, or refuses the login.
@@ -24,34 +24,34 @@ def greet(shell: Shell) -> None:
 
 
 def judge(shell: Shell, report: Report) -> Offset | None:
-    """Add that the robot answers, and return its clock's offset, if it tells the time; errors as `greet`."""
-    greet(shell)
+    """Report that the robot answers; return its clock's offset, or None without a time; errors as for `log_in`."""
+    log_in(shell)
     exchanges = clocks.exchanges(shell, CONTACT_S)
     fastest_s = min((exchange.answered_ns - exchange.asked_ns for exchange in exchanges), default=0) / 1e9
     report.ok("connection", f"host key and login right, answers in {1e3 * fastest_s:.0f} ms")
     return offset(exchanges) if exchanges else None
 
 
-def judge_clock(found: Offset | None, by_hand: str, report: Report) -> None:
+def judge_clock(clock_offset: Offset | None, by_hand: str, report: Report) -> None:
     """Add the offset of a robot's clock.
 
     Args:
-        found: The offset; None where it tells no time.
-        by_hand: How a person gets there (`Shell.by_hand`).
-        report: Gets the finding.
+        clock_offset: The offset; None if the robot reported no time.
+        by_hand: Login command for a person (`Shell.by_hand`).
+        report: Receives the finding.
     """
-    if found is None:
-        report.warn("clock", "date tells no time", "date -u +%s.%N")
+    if clock_offset is None:
+        report.warn("clock", "date prints no time", "date -u +%s.%N")
         return
-    away_s = abs(found.offset_s)
-    detail = f"{found.offset_s:+.3f} s against the laptop, \N{PLUS-MINUS SIGN} {found.error_s:.3f} s"
-    if away_s - found.error_s <= WARN_S:
+    magnitude_s = abs(clock_offset.offset_s)
+    detail = f"{clock_offset.offset_s:+.3f} s against the laptop, \N{PLUS-MINUS SIGN} {clock_offset.error_s:.3f} s"
+    if magnitude_s - clock_offset.error_s <= WARN_S:
         report.ok("clock", detail)
         return
-    if away_s >= HOUR_S:
-        ahead = "ahead" if found.offset_s > 0 else "behind"
-        detail = f"{away_s / 3600:.1f} hours {ahead}: {detail}"
+    if magnitude_s >= HOUR_S:
+        ahead = "ahead" if clock_offset.offset_s > 0 else "behind"
+        detail = f"{magnitude_s / 3600:.1f} hours {ahead}: {detail}"
     command = "date -u -s @$(date +%s)"
-    has_sudo = report.means is None or report.means.root or "sudo" in report.means.programs
+    has_sudo = report.user_tools is None or report.user_tools.root or "sudo" in report.user_tools.programs
     on_robot = f"sudo {command}" if has_sudo else f"\"su -c '{command}'\""
     report.warn("clock", detail, f"ssh -t {by_hand} {on_robot}   # on the laptop")

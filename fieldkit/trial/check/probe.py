@@ -1,4 +1,4 @@
-"""Ask a robot everything that can be read from it in one round trip."""
+"""Run one script that reads the state of a robot in a single round trip."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,7 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Said
 from fieldkit.trial.check import tools
 
-# Beside the tools' own time: a command that hangs, as df does on a dead network drive, hangs the probe.
+# In addition to the time of the tools; a command can hang, such as df on a dead network drive.
 PROBE_S: Final = 20.0 + tools.PROBE_S
 
 _SCRIPT: Final = resources.files("fieldkit.trial.check").joinpath("probe.sh").read_text(encoding="ascii")
@@ -20,10 +20,10 @@ _HEAD: Final = re.compile(r"^==> (.+): ([0-9]{1,3}) <==$", re.MULTILINE)
 Sections = Mapping[str, Said]
 
 NOTHING: Final = Said(text="", code=Said.MISSING)
-"""What a section that the robot did not send says."""
+"""Result of a section that the robot did not send."""
 
 
-def ask(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]]) -> Sections:
+def run_probe(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]]) -> Sections:
     """Run the probe on a robot.
 
     Args:
@@ -33,7 +33,7 @@ def ask(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]]) -> 
 
     Raises:
         LinkError: The robot did not answer, or not in `PROBE_S`.
-        RobotError: It sent more than a probe can be.
+        RobotError: Its output exceeds the limit of a probe.
     """
     done = shell.run(
         ("sh", "-s", interface),
@@ -50,9 +50,9 @@ def script(commands: Mapping[str, Sequence[str]]) -> str:
 
 
 def parse(text: str) -> Sections:
-    """Return the sections in what the probe said, the first of each name."""
-    found: dict[str, Said] = {}
+    """Return the sections of a probe's output; of sections with the same name the first is used."""
+    sections: dict[str, Said] = {}
     parts = _HEAD.split(text)[1:]
-    for name, code, said in zip(parts[::3], parts[1::3], parts[2::3], strict=True):
-        found.setdefault(name, Said(said.strip("\n"), int(code)))
-    return found
+    for name, code, section_text in zip(parts[::3], parts[1::3], parts[2::3], strict=True):
+        sections.setdefault(name, Said(section_text.strip("\n"), int(code)))
+    return sections

@@ -1,5 +1,5 @@
-# What a robot is like, asked in one round trip. Read by `sh -s INTERFACE`, with more calls of `section` appended for
-# what a plan needs. It only reads. A tool that is missing is a section with code 127.
+# State of a robot, read in one round trip. Run by `sh -s INTERFACE`, with further calls of `section` appended for
+# the needs of a plan. It only reads. The section of a missing tool has code 127.
 interface=$1
 export LC_ALL=C
 
@@ -20,13 +20,13 @@ system() (
     uname -srm
 )
 
-have() { # those of some programs that are there
+have() { # prints those of the given programs that exist
     for program in "$@"; do
         admin command -v "$program" >/dev/null && echo "$program"
     done
 }
 
-batteries() { # of the robot itself: a mouse's has the scope Device
+batteries() { # of the robot itself; the battery of a mouse has the scope Device
     for supply in /sys/class/power_supply/*; do
         read -r scope 2>/dev/null <"$supply/scope" || scope=System
         [ "$scope" != Device ] && read -r percent 2>/dev/null <"$supply/capacity" && echo "${supply##*/} $percent"

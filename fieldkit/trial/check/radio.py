@@ -1,4 +1,4 @@
-"""Judge a robot's radio interface by the probe: address, SSH, offloads, access point, signal, power save."""
+"""Checks of a robot's radio interface by the probe: address, SSH, offloads, access point, signal, power save."""
 
 import re
 from collections.abc import Mapping
@@ -12,10 +12,10 @@ from fieldkit.trial.check.probe import NOTHING, Sections
 from fieldkit.trial.check.report import Report
 
 MARGIN_DB: Final = 10
-"""A signal closer than this to the profile's sensitivity is called weak."""
+"""Margin above the profile's sensitivity below which a signal is reported as weak."""
 
 _FLAGS: Final = re.compile(r"^[0-9]+: \S+ <(?P<flags>[A-Z0-9_,-]*)>", re.MULTILINE)
-# Of a line each, never `\s`: that goes on through empty lines, and again from the next one.
+# `[ \t]` instead of `\s`, which also matches line breaks and would backtrack over empty lines.
 _ADDRESS: Final = re.compile(r"^[ \t]+inet (?P<address>[0-9.]{7,15}/[0-9]{1,2})\b", re.MULTILINE)
 _OFFLOADS: Final = {
     "GSO": "generic-segmentation-offload",
@@ -35,7 +35,7 @@ _POWER_SAVE: Final = re.compile(r"^Power save: (on|off)$", re.MULTILINE)
 
 
 def judge(robot: Robot, sections: Sections, report: Report) -> None:
-    """Add what was found of the interface under test."""
+    """Report the findings on the interface under test."""
     interface = robot.profile.radio.interface
     _judge_interface(robot, sections, report)
     _judge_control(robot, sections, report)
@@ -43,49 +43,49 @@ def judge(robot: Robot, sections: Sections, report: Report) -> None:
     if sections.get("wifi-info", NOTHING).ok:
         _judge_wifi(robot, sections, report)
     elif sections.get("wireless", NOTHING).ok and "link/ether" in sections.get("interface", NOTHING).text:
-        said = sections.get("wifi-info", NOTHING)
-        if said.code == Said.MISSING:
+        section = sections.get("wifi-info", NOTHING)
+        if section.code == Said.MISSING:
             report.warn("Wi-Fi", "signal and power save cannot be read without iw", "sudo apt-get install iw")
         else:
-            report.warn("Wi-Fi", said.text, f"sudo iw dev {interface} info")
+            report.warn("Wi-Fi", section.text, f"sudo iw dev {interface} info")
 
 
 def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
     name = robot.profile.radio.interface
-    check, said = f"interface {name}", sections.get("interface", NOTHING)
-    flags = _FLAGS.search(said.text)
-    addresses = _ADDRESS.findall(said.text)
-    if said.code == Said.MISSING:
+    check, section = f"interface {name}", sections.get("interface", NOTHING)
+    flags = _FLAGS.search(section.text)
+    addresses = _ADDRESS.findall(section.text)
+    if section.code == Said.MISSING:
         report.fail(check, "ip is not installed", "sudo apt-get install iproute2")
     elif flags is None or is_missing(sections):
         report.fail(
-            check, said.text, f"ip link   # then correct radio.interface: {locations.own_copy(robot.profile.name)}"
+            check, section.text, f"ip link   # then correct radio.interface: {locations.own_copy(robot.profile.name)}"
         )
     elif "UP" not in flags["flags"].split(","):
         report.fail(check, "down", f"sudo ip link set {name} up")
     elif "NO-CARRIER" in flags["flags"]:
         report.fail(check, "up, but joined to nothing: no carrier", f"iw dev {name} link   # then join the network")
     elif robot.address not in {address.partition("/")[0] for address in addresses}:
-        found = f"has {', '.join(addresses)}" if addresses else "has no IPv4 address"
+        actual = f"has {', '.join(addresses)}" if addresses else "has no IPv4 address"
         remedy = f"ip addr   # then correct address of {robot.name} in the site file, or join its network"
-        report.fail(check, f"{found}, not {robot.address}", remedy)
+        report.fail(check, f"{actual}, not {robot.address}", remedy)
     else:
         report.ok(check, f"up, {', '.join(addresses)}")
 
 
 def is_missing(sections: Sections) -> bool:
-    """Return whether the robot has no interface of the profile's name."""
-    said = sections.get("interface", NOTHING)
-    return said.code != Said.MISSING and _FLAGS.search(said.text) is None
+    """Return True if the robot has no interface of the profile's name."""
+    section = sections.get("interface", NOTHING)
+    return section.code != Said.MISSING and _FLAGS.search(section.text) is None
 
 
 def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
-    # The client's address and port, and then the robot's own, as its server saw the connection come (sshd, ssh(1)).
+    # The client's address and port, then the robot's address and port, as the SSH server sees the connection.
     words = sections.get("control", NOTHING).text.split()
     if len(words) != 4:
-        report.ok("control", "the SSH server does not say which way SSH takes")
+        report.ok("control", "the SSH server does not report the addresses of the connection")
     elif words[2] != robot.address:
-        report.ok("control", f"SSH does not cross the radio under test: it comes to {words[2]}")
+        report.ok("control", f"SSH does not use the radio under test: it arrives at {words[2]}")
     elif robot.control is Control.RADIO:
         report.ok("control", "SSH shares the radio under test, as the site file says")
     else:
@@ -97,35 +97,35 @@ def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
 
 
 def _judge_offloads(sections: Sections, report: Report) -> None:
-    said = sections.get("offloads", NOTHING)
-    states = {name: re.search(rf"^{long}: (on|off)", said.text, re.MULTILINE) for name, long in _OFFLOADS.items()}
-    known = [f"{name} {state[1]}" for name, state in states.items() if state]
-    report.ok("offloads", ", ".join(known) or "not known: ethtool is not installed")
+    section = sections.get("offloads", NOTHING)
+    states = {name: re.search(rf"^{long}: (on|off)", section.text, re.MULTILINE) for name, long in _OFFLOADS.items()}
+    offloads = [f"{name} {state[1]}" for name, state in states.items() if state]
+    report.ok("offloads", ", ".join(offloads) or "not known: ethtool is not installed")
 
 
 def facts(sections: Sections) -> Mapping[str, str]:
-    """Return what `iw info` and `iw link` say, by the names in `_FACTS`; what they do not say is missing."""
+    """Return the values printed by `iw info` and `iw link`, by the names in `_FACTS`; others are missing."""
     text = "\n".join(sections.get(name, NOTHING).text for name in ("wifi-info", "wifi-link"))
-    found = {name: re.search(pattern, text, re.MULTILINE) for name, pattern in _FACTS.items()}
-    return {name: match[1] for name, match in found.items() if match}
+    matches = {name: re.search(pattern, text, re.MULTILINE) for name, pattern in _FACTS.items()}
+    return {name: match[1] for name, match in matches.items() if match}
 
 
 def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
-    known = facts(sections)
+    wifi_facts = facts(sections)
     interface = robot.profile.radio.interface
-    is_access_point = known.get("type") == "AP"
-    if "joined" not in known and known.get("type") == "managed":
+    is_access_point = wifi_facts.get("type") == "AP"
+    if "joined" not in wifi_facts and wifi_facts.get("type") == "managed":
         report.fail("Wi-Fi", "joined to no network", f"sudo wpa_cli -i {interface} reconnect")
         return
-    stations = "wifi-stations" if is_access_point or "joined" not in known else "wifi-link"
+    stations = "wifi-stations" if is_access_point or "joined" not in wifi_facts else "wifi-link"
     signals = [int(signal) for signal in _SIGNAL.findall(sections.get(stations, NOTHING).text)]
     words = [
-        f"{known.get('type', 'unknown mode')} {known.get('ssid', '')!r}",
-        *([f"at {known['joined']}"] if "joined" in known else []),
-        *([f"channel {known['channel']}"] if "channel" in known else []),
+        f"{wifi_facts.get('type', 'unknown mode')} {wifi_facts.get('ssid', '')!r}",
+        *([f"at {wifi_facts['joined']}"] if "joined" in wifi_facts else []),
+        *([f"channel {wifi_facts['channel']}"] if "channel" in wifi_facts else []),
         *([f"{len(signals)} stations"] if is_access_point else []),
         *([f"{min(signals)} dBm"] if signals else []),
-        *([known["rate"]] if "rate" in known else []),
+        *([wifi_facts["rate"]] if "rate" in wifi_facts else []),
     ]
     weak_dbm = robot.profile.radio.sensitivity_dbm + MARGIN_DB
     if signals and min(signals) < weak_dbm:
@@ -139,10 +139,10 @@ def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
 
 
 def _judge_power_save(interface: str, sections: Sections, report: Report) -> None:
-    said = sections.get("wifi-power-save", NOTHING)
-    state = _POWER_SAVE.search(said.text)
+    section = sections.get("wifi-power-save", NOTHING)
+    state = _POWER_SAVE.search(section.text)
     if state is None:
-        report.ok("power save", f"not known: {said.text}")
+        report.ok("power save", f"not known: {section.text}")
     elif state[1] == "on":
         report.warn("power save", "on: delays become long and vary", f"sudo iw dev {interface} set power_save off")
     else:

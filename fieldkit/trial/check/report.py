@@ -1,4 +1,4 @@
-"""Findings of one robot as they are made; what a robot said enters them here and nowhere else."""
+"""Findings of one robot; all text from a robot is made printable here."""
 
 import re
 from dataclasses import dataclass
@@ -9,16 +9,16 @@ from fieldkit.core.model import Verdict
 from fieldkit.remote.command import printable
 
 LAPTOP: Final = "laptop"
-"""Whose findings are those of the machine that fieldkit runs on."""
+"""Name under which findings on the machine that runs fieldkit are reported."""
 
 
 @dataclass(frozen=True)
-class Means:
-    """Means of a robot's user to mend it.
+class UserTools:
+    """Permissions and programs with which a robot's user can fix problems.
 
     Attributes:
         root: Whether the user is root.
-        programs: Those of the programs that remedies name and that it has.
+        programs: Available programs among those used in remedies.
     """
 
     root: bool
@@ -32,42 +32,42 @@ class Report:
         robot: Its name.
 
     Attributes:
-        means: What remedies can be typed there; None while that is not known, and for the laptop.
+        user_tools: Tools of the robot's user; None while unknown, and for the laptop.
     """
 
     def __init__(self, robot: str) -> None:
         self.robot = robot
         self.findings: list[Finding] = []
-        self.means: Means | None = None
+        self.user_tools: UserTools | None = None
 
     def ok(self, check: str, detail: str) -> None:
-        """Add a check that passed, or something for the record."""
+        """Add a passed check, or a value for the record."""
         self.add(check, Verdict.OK, detail, "")
 
     def warn(self, check: str, detail: str, remedy: str) -> None:
-        """Add what makes a trial worse, but not wrong."""
+        """Add a problem that degrades a trial but does not invalidate it."""
         self.add(check, Verdict.WARN, detail, remedy)
 
     def fail(self, check: str, detail: str, remedy: str) -> None:
-        """Add what no trial can begin with."""
+        """Add a problem with which no trial can start."""
         self.add(check, Verdict.FAIL, detail, remedy)
 
     def add(self, check: str, status: Verdict, detail: str, remedy: str) -> None:
-        """Add a check with its verdict; the remedy is empty where it passed."""
+        """Add a check with its verdict; the remedy is empty if it passed."""
         check, detail, remedy = (printable(text.encode()) for text in (check, detail, self._typable(remedy)))
         self.findings.append(Finding(self.robot, check, status, detail or "no answer", remedy))
 
     def _typable(self, remedy: str) -> str:
-        """Return a remedy as this robot's user can type it: steps word it for Debian and a user who has sudo."""
-        if self.means is None:
+        """Adapt a remedy to this robot's user; steps write remedies for Debian and a user with sudo."""
+        if self.user_tools is None:
             return remedy
-        if "apt-get" not in self.means.programs:
-            remedy = _INSTALL.sub(r"install \g<package> (so called in Debian)", remedy)
-        if "setcap" not in self.means.programs and _SETCAP.search(remedy):
-            remedy += "   # setcap is of Debian's libcap2-bin"
-        if self.means.root:
+        if "apt-get" not in self.user_tools.programs:
+            remedy = _INSTALL.sub(r"install \g<package> (package name in Debian)", remedy)
+        if "setcap" not in self.user_tools.programs and _SETCAP.search(remedy):
+            remedy += "   # setcap is in Debian's libcap2-bin"
+        if self.user_tools.root:
             return _SUDO.sub("", remedy)
-        if "sudo" not in self.means.programs and _SUDO.search(remedy):
+        if "sudo" not in self.user_tools.programs and _SUDO.search(remedy):
             return f"as root: {_SUDO.sub('', remedy)}"
         return remedy
 

@@ -1,4 +1,4 @@
-"""Check a robot's programs by the probe: those that steps start, and what else steps need."""
+"""Checks of a robot's programs by the probe: those that steps start, and other requirements of steps."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ from fieldkit.trial.plan import Plan
 
 BASE_PROGRAMS: Final = ("setsid", "mkfifo", "timeout", "awk", "tar", "sha256sum")
 
-# Of Debian.
+# Package names in Debian.
 _PACKAGES: Final = {
     "setsid": "util-linux",
     "mkfifo": "coreutils",
@@ -47,35 +47,35 @@ _BRIDGE: Final = "on the robot: python3 -m pip install 'fieldkit[ros2]', or corr
 
 
 def commands(plan: Plan, role: Role) -> dict[str, Sequence[str]]:
-    """Return what the probe is to run on the robot in `role`, by the name of its section."""
+    """Return the commands that the probe must run on the robot in `role`, by section name."""
     profile = plan.cast[role].profile
-    asked: dict[str, Sequence[str]] = {}
+    by_section: dict[str, Sequence[str]] = {}
     for program, setup in _programs(plan, role):
-        asked[_at(program)] = with_environment(("sh", "-c", 'command -v "$1"', "sh", program), setup=setup)
+        by_section[_section(program)] = with_environment(("sh", "-c", 'command -v "$1"', "sh", program), setup=setup)
     for need in _needs(plan, role):
-        asked[need.name] = need.argv
-    asked[_TOOLS] = tools.probe(profile, _tools(plan, role))
-    return asked
+        by_section[need.name] = need.argv
+    by_section[_TOOLS] = tools.probe(profile, _tools(plan, role))
+    return by_section
 
 
 def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variants:
-    """Add what was found of the programs.
+    """Report the findings on the programs.
 
     Returns:
-        Which variants of the tools the robot has; the expected ones where that is among what failed.
+        The variants of the robot's tools; the expected ones if that check failed.
     """
     profile = plan.cast[role].profile
     programs = dict.fromkeys(program for program, _ in _programs(plan, role))
     remedies = {planned.program: planned.remedy for planned in _planned(plan, role)}
     if profile.ros is not None and profile.ros.bridge is not None:
         remedies[profile.ros.bridge.program] = f"{_BRIDGE}: {locations.own_copy(profile.name)}"
-    found = [program for program in programs if sections.get(_at(program), NOTHING).ok]
-    report.ok("programs", ", ".join(found) or "none found")
+    present = [program for program in programs if sections.get(_section(program), NOTHING).ok]
+    report.ok("programs", ", ".join(present) or "none found")
     needs = _needs(plan, role)
-    # A recorder that its setup file hides is told with that file.
+    # A recorder that its setup file hides is explained by the finding on that file.
     explained = {need.explains for need in needs if not sections.get(need.name, NOTHING).ok}
     for program in programs:
-        if program not in found and program not in explained:
+        if program not in present and program not in explained:
             package = _PACKAGES.get(Path(program).name)
             correct = remedies.get(program) or (
                 f"correct its name in profile {profile.name}: {locations.own_copy(profile.name)}"
@@ -83,30 +83,30 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
             report.fail(program, "not found", f"sudo apt-get install {package}" if package else correct)
     interface = profile.radio.interface if radio.is_missing(sections) else None
     for need in needs:
-        # Who asks for an interface that is not there learns nothing else; that it is not there is told by itself.
-        if (not need.of or need.of in found) and interface not in need.argv:
+        # A need that uses a missing interface is skipped: the missing interface is reported separately.
+        if (not need.of or need.of in present) and interface not in need.argv:
             report.add(need.name, *need.judge(sections.get(need.name, NOTHING)))
-    if len(found) < len(programs):
+    if len(present) < len(programs):
         return variants.expected(profile)
     return _judge_tools(profile, sections.get(_TOOLS, NOTHING), report)
 
 
 def ask_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
-    """Add what the agent finds on the robot of what steps need, where its Python is there; put it there first.
+    """Report the agent's findings on requirements of steps; the agent is installed if its Python interpreter exists.
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: The agent cannot be put there.
+        RobotError: The agent cannot be installed.
     """
     for need in _needs(plan, role, by_agent=True):
-        if sections.get(_at(need.of), NOTHING).ok:
+        if sections.get(_section(need.of), NOTHING).ok:
             agent.install(shell)
             done = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
             text = (done.stdout + done.stderr).decode("utf-8", "replace")
             report.add(need.name, *need.judge(Said(text, done.exit_code)))
 
 
-def _at(program: str) -> str:
+def _section(program: str) -> str:
     return f"program {program}"
 
 
@@ -116,29 +116,31 @@ def _tools(plan: Plan, role: Role) -> set[Tool]:
 
 def _judge_tools(profile: RobotProfile, said: Said, report: Report) -> Variants:
     try:
-        found = tools.parse(said.text.encode(), profile)
+        detected = tools.parse(said.text.encode(), profile)
     except RobotError as error:
         report.fail(_TOOLS, error.what, error.remedy)
         return variants.expected(profile)
-    # A netcat names itself in too many ways, or not at all.
-    words = [f"{found.netcat} netcat" if tool is Tool.NETCAT else said for tool, said in found.versions.items()]
+    # The versions that netcats print are too different to be shown, or missing.
+    words = [
+        f"{detected.netcat} netcat" if tool is Tool.NETCAT else version for tool, version in detected.versions.items()
+    ]
     if words:
         report.ok(_TOOLS, ", ".join(words))
-    return found
+    return detected
 
 
 def can_record(plan: Plan, role: Role, sections: Sections) -> bool:
-    """Return whether nothing is known to be missing for a recording on the robot."""
+    """Return True if nothing that a recording needs is known to be missing on the robot."""
     ros = plan.cast[role].profile.ros
     if ros is None or not any(placed.step.live_topics(role) for placed in plan.procedure.walk()):
         return True
     program = ros.command.record[0]
-    needed = (_at(program), *(need.name for need in _needs(plan, role) if need.explains == program))
+    needed = (_section(program), *(need.name for need in _needs(plan, role) if need.explains == program))
     return all(sections.get(name, NOTHING).ok for name in needed)
 
 
 def _programs(plan: Plan, role: Role) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield each program that a step starts, or fieldkit itself, with the files to source before looking for it."""
+    """Yield each program that a step or fieldkit starts, with the files to source before looking for it."""
     yield from ((program, ()) for program in BASE_PROGRAMS)
     yield from dict.fromkeys((planned.program, planned.setup) for planned in _planned(plan, role))
     ros = plan.cast[role].profile.ros
@@ -152,7 +154,7 @@ def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
 
 
 def _needs(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:
-    """Return what steps need of the robot, what several need once: what the probe asks for, or the agent."""
+    """Return the needs of steps on the robot without duplicates: those checked by the probe, or by the agent."""
     scene = plan.scenes()[0]
     needs = (need for placed in plan.procedure.walk() for need in placed.step.needs(scene) if need.role is role)
     return tuple({need.name: need for need in needs if need.agent == by_agent}.values())

@@ -1,4 +1,4 @@
-"""Judge a robot's system by the probe: kernel, disk, ports, battery."""
+"""Checks of a robot's system by the probe: kernel, disk, ports, battery."""
 
 import re
 from pathlib import Path
@@ -10,25 +10,25 @@ from fieldkit.core.units import format_bytes, format_duration
 from fieldkit.remote.command import quote
 from fieldkit.trial import size
 from fieldkit.trial.check.probe import NOTHING, Sections
-from fieldkit.trial.check.report import Means, Report
+from fieldkit.trial.check.report import Report, UserTools
 from fieldkit.trial.plan import Plan
 
 MIN_BATTERY_PERCENT: Final = 20
 LONG_FETCH_S: Final = 60.0
 
-# File system, blocks of 1024 bytes, used, available (POSIX, df -P); the last line, as a long name breaks none.
+# File system, blocks of 1024 bytes, used, available (POSIX, df -P); long names do not wrap lines with -P.
 _DF: Final = re.compile(r"^\S.*\s[0-9]+\s+[0-9]+\s+(?P<free_kib>[0-9]{1,15})\s+[0-9]+%\s", re.MULTILINE)
 _BATTERY: Final = re.compile(r"^(?P<name>\S{1,60}) (?P<percent>[0-9]{1,3})$", re.MULTILINE)
 
 
-def means(sections: Sections) -> Means:
-    """Return what a robot's user can type to mend it."""
+def user_tools(sections: Sections) -> UserTools:
+    """Return the permissions and programs of a robot's user."""
     programs = sections.get("means", NOTHING).text.split()
-    return Means(sections.get("user", NOTHING).text.strip() == "0", frozenset(programs))
+    return UserTools(sections.get("user", NOTHING).text.strip() == "0", frozenset(programs))
 
 
 def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
-    """Add what was found of kernel, disk, ports and battery."""
+    """Report the findings on kernel, disk, ports and battery."""
     report.ok("system", sections.get("system", NOTHING).text)
     _judge_disk(plan, role, sections, report)
     scene = plan.scenes()[0]
@@ -40,26 +40,26 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
 
 
 def judge_laptop(plan: Plan, out: Path, report: Report) -> None:
-    """Add whether the disk that `out` is on has room for the trial, and whether its evidence takes long to come."""
+    """Report whether the disk of `out` has space for the trial, and whether fetching its evidence takes long."""
     judge_room(plan, files.free_bytes(out), files.existing(out), report)
     if (fetch_s := size.fetch_s(plan)) > LONG_FETCH_S:
         rate = size.FETCHED_BYTES_PER_S
-        left, takes = format_bytes(rate * fetch_s), format_duration(fetch_s)
+        evidence, duration = format_bytes(rate * fetch_s), format_duration(fetch_s)
         report.warn(
             "fetch",
-            f"an attempt leaves about {left}: at {format_bytes(rate)}/s {takes} to fetch",
+            f"an attempt leaves about {evidence}: {duration} to fetch at {format_bytes(rate)}/s",
             "record less (--record, fewer topics), or fetch over a cable: control: separate",
         )
 
 
 def judge_room(plan: Plan, free: int, folder: Path, report: Report) -> None:
-    """Add whether the laptop has room: for an attempt it must, for the whole trial it should.
+    """Report whether the laptop has space: a failure without space for one attempt, a warning for the whole trial.
 
     Args:
         plan: The trial.
         free: Bytes free in `folder`.
-        folder: Where the trial goes.
-        report: Gets the finding.
+        folder: Folder of the trial.
+        report: Receives the finding.
     """
     attempt, whole = size.attempt_bytes(plan), size.trial_bytes(plan)
     detail = f"{format_bytes(free)} free, the trial needs {format_bytes(whole)} at most"
@@ -89,20 +89,20 @@ def _judge_disk(plan: Plan, role: Role, sections: Sections, report: Report) -> N
 
 
 def _judge_port(port: int, sections: Sections, report: Report) -> None:
-    """Add whether nobody listens on `port`; the second column of /proc/net/tcp is `ADDRESS:PORT` in hex."""
+    """Report whether a program listens on `port`; the second column of /proc/net/tcp is `ADDRESS:PORT` in hex."""
     columns = map(str.split, sections.get("listeners", NOTHING).text.splitlines())
     if any(len(words) > 1 and words[1].endswith(f":{port:04X}") for words in columns):
-        tool = "netstat" if report.means and "ss" not in report.means.programs else "ss"
+        tool = "netstat" if report.user_tools and "ss" not in report.user_tools.programs else "ss"
         report.fail(
-            f"port {port}", "a program listens on it", f"sudo {tool} -lntup | grep :{port}   # names it; end it"
+            f"port {port}", "a program listens on it", f"sudo {tool} -lntup | grep :{port}   # shows it; stop it"
         )
     else:
         report.ok(f"port {port}", "free")
 
 
 def judge_battery(name: str, percent: float, report: Report) -> None:
-    """Add how full a battery is."""
+    """Report the charge of a battery."""
     if percent < MIN_BATTERY_PERCENT:
-        report.warn("battery", f"{name} at {percent:.0f} %", "charge it, or change it for a full one")
+        report.warn("battery", f"{name} at {percent:.0f} %", "charge or replace it")
     else:
         report.ok("battery", f"{name} at {percent:.0f} %")

@@ -1,4 +1,4 @@
-"""Asking the tools of a robot which variants they are: what is typed, and what their answers mean."""
+"""Detection of the variants of a robot's tools: the commands of the probe, and the parser of its output."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -13,10 +13,10 @@ from fieldkit.remote.command import printable, quote, with_environment
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool, Variants, expected
 
 PROBE_S: Final = 40.0
-"""How long `probe` may take: each tool has 6 s, and Python on a small computer needs 3 s to start ros2."""
+"""Maximum duration of `probe`: each tool has 6 s, and Python on a small computer needs 3 s to start ros2."""
 
-# POSIX sh: dash, bash, busybox ash. What waits for input finds none; what does not end is killed.
-_LOOK: Final = r"""look() {
+# POSIX sh: dash, bash, busybox ash. Standard input is empty, and a tool that does not exit is killed.
+_PROBE_FUNCTION: Final = r"""look() {
     printf '==> %s <==\n' "$1"
     shift
     "$@" </dev/null 2>&1 &
@@ -52,7 +52,7 @@ _STORAGES: Final = re.compile(r"-s \{(?P<ids>[a-z0-9_,\s]+)\}")
 
 
 def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...]:
-    """Return a command that changes nothing and prints what each of `tools` says of itself, for `parse`."""
+    """Return a read-only command that prints the output of each of `tools` for `parse`."""
     names = profile.tools
     ros = profile.ros
     ask: dict[Tool, tuple[tuple[str, tuple[str, ...]], ...]] = {
@@ -66,55 +66,55 @@ def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...
     if ros is not None:
         help_of = with_environment((*_verb(profile), "--help"), setup=ros.command.setup)
         ask[Tool.RECORDER] = ((Tool.RECORDER, help_of),)
-    known = [tool for tool in ask if tool in set(tools) and (tool is not Tool.RECORDER or _verb(profile))]
-    looks = [(_USER, ("id", "-u")), *(look for tool in known for look in ask[tool])]
-    return ("sh", "-c", _LOOK + "".join(f"look {name} {quote(argv)}\n" for name, argv in looks))
+    asked_tools = [tool for tool in ask if tool in set(tools) and (tool is not Tool.RECORDER or _verb(profile))]
+    looks = [(_USER, ("id", "-u")), *(look for tool in asked_tools for look in ask[tool])]
+    return ("sh", "-c", _PROBE_FUNCTION + "".join(f"look {name} {quote(argv)}\n" for name, argv in looks))
 
 
 def parse(output: bytes, profile: RobotProfile) -> Variants:
-    """Return what the output of `probe` says; tools that were not asked are taken for the expected ones.
+    """Return the variants in the output of `probe`; tools that were not probed get the expected variant.
 
     Raises:
-        RobotError: A tool is missing, is of an unknown kind, or may not do what it is for.
+        RobotError: A tool is missing, is of an unknown kind, or lacks a permission that it needs.
     """
-    said = dict(_sections(output))
-    if _USER not in said:
+    outputs = dict(_sections(output))
+    if _USER not in outputs:
         raise RobotError(
-            f"cannot tell its tools apart: {printable(output) or 'no answer'}",
-            remedy="log in and look whether its login shell is a POSIX one: echo $SHELL",
+            f"its tools cannot be identified: {printable(output) or 'no answer'}",
+            remedy="log in and check that its login shell is a POSIX shell: echo $SHELL",
         )
-    variants = replace(expected(profile), root=said[_USER][0].strip() == "0")
+    variants = replace(expected(profile), root=outputs[_USER][0].strip() == "0")
     versions: dict[Tool, str] = {}
-    if Tool.NETCAT in said:
-        kind, versions[Tool.NETCAT] = _netcat(*said[Tool.NETCAT], profile.tools.netcat)
+    if Tool.NETCAT in outputs:
+        kind, versions[Tool.NETCAT] = _netcat(*outputs[Tool.NETCAT], profile.tools.netcat)
         variants = replace(variants, netcat=kind)
-    if Tool.PING in said:
-        ping, versions[Tool.PING] = _ping(*said[Tool.PING], profile.tools.ping)
+    if Tool.PING in outputs:
+        ping, versions[Tool.PING] = _ping(*outputs[Tool.PING], profile.tools.ping)
         variants = replace(variants, ping=ping)
-    if _ECHO in said:
-        _may_ping(said[_ECHO][0], profile.tools.ping, variants.ping)
-    if Tool.CAPTURE in said:
-        immediate, versions[Tool.CAPTURE] = _capture(*said[Tool.CAPTURE], profile.tools.capture)
+    if _ECHO in outputs:
+        _demand_ping(outputs[_ECHO][0], profile.tools.ping, variants.ping)
+    if Tool.CAPTURE in outputs:
+        immediate, versions[Tool.CAPTURE] = _capture(*outputs[Tool.CAPTURE], profile.tools.capture)
         variants = replace(variants, immediate_mode=immediate)
-    if Tool.RECORDER in said:
-        variants = replace(variants, recorder=_recorder(*said[Tool.RECORDER], profile))
+    if Tool.RECORDER in outputs:
+        variants = replace(variants, recorder=_recorder(*outputs[Tool.RECORDER], profile))
     return replace(variants, versions=MappingProxyType(versions))
 
 
 def _sections(output: bytes) -> Iterator[tuple[str, tuple[str, int]]]:
-    """Yield what each look found: its name, what the tool said, and its exit code."""
-    begun = None
+    """Yield the result of each tool: its name, its output, and its exit code."""
+    start = None
     for mark in _MARK.finditer(output):
-        if begun is None:
-            begun = mark if mark["name"] else None
+        if start is None:
+            start = mark if mark["name"] else None
         elif mark["code"]:
-            said = output[begun.end() + 1 : mark.start() - 1].decode("utf-8", "replace")
-            yield begun["name"].decode(), (said, int(mark["code"]))
-            begun = None
+            text = output[start.end() + 1 : mark.start() - 1].decode("utf-8", "replace")
+            yield start["name"].decode(), (text, int(mark["code"]))
+            start = None
 
 
 def _verb(profile: RobotProfile) -> tuple[str, ...]:
-    """Return the record command without its options; nothing for a program that may not know `--help`."""
+    """Return the record command without its options; empty for a program that may not support `--help`."""
     words = profile.ros.command.record if profile.ros else ("",)
     verbs = {"rosbag": ("record",), "ros2": ("bag", "record")}
     verb = verbs.get(PurePosixPath(words[0]).name)
@@ -137,7 +137,7 @@ def _ping(text: str, code: int, program: str) -> tuple[PingTool, str]:
     raise _unknown(text, code, program, "sudo apt-get install iputils-ping, and ping: ping in")
 
 
-def _may_ping(text: str, program: str, kind: PingTool) -> None:
+def _demand_ping(text: str, program: str, kind: PingTool) -> None:
     if "bytes from 127.0.0.1" not in text:
         raise RobotError(
             f"{program} cannot ping 127.0.0.1 (-i 0.2): {printable(text.encode()) or 'no answer'}",
@@ -167,7 +167,7 @@ def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
     named = [words[at + 1] for at, word in enumerate(words[:-1]) if word in {"-s", "--storage"}]
     default = _STORAGE.search(text)
     storage = named[-1] if named else default["id"] if default else Recorder.SQLITE3.removeprefix("ros2-")
-    offered = _STORAGES.search(text)  # Foxy and older do not name them
+    offered = _STORAGES.search(text)  # Foxy and older do not list them
     kinds = {"sqlite3": Recorder.SQLITE3, "mcap": Recorder.MCAP}
     if offered and storage not in re.split(r"[,\s]+", offered["ids"]):
         return Recorder.NONE
@@ -176,13 +176,13 @@ def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
 
 def _silent(command: str) -> RobotError:
     return RobotError(
-        f"{command} did not end in time", remedy=f"is the robot busy? try again; on it: uptime; time {command}"
+        f"{command} did not exit in time", remedy=f"is the robot busy? try again; on it: uptime; time {command}"
     )
 
 
 def _unknown(text: str, code: int, program: str, remedy: str) -> RobotError:
     if code == _KILLED:
         return _silent(program)
-    what = f"there is no {program}" if code in _MISSING else f"{program} is none that is known"
-    said = printable(text.encode(), limit=100)
-    return RobotError(f"{what}: {said}" if said else what, remedy=f"{remedy} its profile")
+    what = f"there is no {program}" if code in _MISSING else f"{program} is of an unknown kind"
+    excerpt = printable(text.encode(), limit=100)
+    return RobotError(f"{what}: {excerpt}" if excerpt else what, remedy=f"{remedy} its profile")

@@ -1,4 +1,4 @@
-"""Check that each recorded topic is alive at its rate: a short recording by the robot's own recorder."""
+"""Check the rate of each recorded topic with a short recording by the robot's recorder."""
 
 import tempfile
 from collections.abc import Sequence
@@ -25,20 +25,20 @@ from fieldkit.trial.plan import Plan
 RECORD_S: Final = 2.0
 LONGEST_S: Final = 20.0
 MESSAGES: Final = 2
-"""A slow topic is recorded until so many messages are due, for `LONGEST_S` at most."""
+"""Number of messages that the recording waits for on a slow topic, for `LONGEST_S` at most."""
 TOLERANCE: Final = 0.5
-"""Share of its rate by which a topic may be off."""
+"""Allowed deviation of a topic's rate, as a share of it."""
 
-# One that is ended from outside spends its time on its start too: on a small computer ros2 takes 3 s to load.
+# A recorder that is stopped from outside also needs time to start: ros2 takes 3 s to load on a small computer.
 _START_S: Final = 4.0
-# A recorder waits for a master that is not there; where only the battery is asked for, no longer than this.
+# A recorder waits for a missing ROS master; if only the battery is needed, it waits no longer than this.
 _PATIENCE_S: Final = 6.0
 _END_BYTES: Final = 4096
 _BATTERY: Final = "sensor_msgs/BatteryState"
 
 
-def look(plan: Plan, role: Role, shell: Shell, variants: Variants, report: Report) -> None:
-    """Record for a moment; add whether each topic that the procedure records is alive, and how full the battery is.
+def check_topics(plan: Plan, role: Role, shell: Shell, variants: Variants, report: Report) -> None:
+    """Record for a short time; report whether each recorded topic is published, and the charge of the battery.
 
     Raises:
         LinkError: The robot did not answer.
@@ -53,17 +53,17 @@ def look(plan: Plan, role: Role, shell: Shell, variants: Variants, report: Repor
     scene = plan.scene(RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: variants})
     with tempfile.TemporaryDirectory() as into:
         try:
-            path, found = _record(scene, step, shell, Path(into), patient=bool(wanted))
+            path, recorded_bag = _record(scene, step, shell, Path(into), patient=bool(wanted))
         except EvidenceError as error:
             judge(robot, wanted, None, report, why=error.what)
             return
         finally:
             evidence.discard(shell, plan.trial)
-        judge(robot, wanted, found, report)
-        _look_at_battery(path, battery, report)
+        judge(robot, wanted, recorded_bag, report)
+        _check_battery(path, battery, report)
 
 
-def _look_at_battery(path: Path, topic: str, report: Report) -> None:
+def _check_battery(path: Path, topic: str, report: Report) -> None:
     try:
         share = bag.battery_share(path, topic)
     except EvidenceError as error:
@@ -74,7 +74,7 @@ def _look_at_battery(path: Path, topic: str, report: Report) -> None:
 
 
 def recorded(plan: Plan, role: Role) -> tuple[str, ...]:
-    """Return the topics that the procedure wants alive on the robot in `role`."""
+    """Return the topics that the procedure requires to be published on the robot in `role`."""
     topics = (topic for placed in plan.procedure.walk() for topic in placed.step.live_topics(role))
     return tuple(dict.fromkeys(topics))
 
@@ -84,26 +84,26 @@ def _topics(robot: Robot) -> tuple[PublishedTopic, ...]:
 
 
 def battery_of(robot: Robot) -> str:
-    """Return the topic on which the robot tells its battery; empty if its profile has none."""
+    """Return the topic of the robot's battery state; empty if its profile has none."""
     return next((topic.name for topic in _topics(robot) if topic.type == _BATTERY), "")
 
 
 def has_shared_battery(plan: Plan, role: Role) -> bool:
-    """Return whether nobody knows whose battery a robot's topic tells of: another on its ROS master has the same."""
+    """Return True if a battery topic is ambiguous: another robot on the same ROS master has the same topic."""
     robot = plan.cast[role]
-    others = (other for one, other in plan.cast.items() if one is not role and other.ros_master)
+    others = (other for other_role, other in plan.cast.items() if other_role is not role and other.ros_master)
     return any(
         other.ros_master == robot.ros_master and battery_of(other) == battery_of(robot) != "" for other in others
     )
 
 
 def rate_of(robot: Robot, topic: str) -> float | None:
-    """Return the rate in Hz that the robot's profile gives for a topic, None if it names no such topic."""
-    return next((one.rate for one in _topics(robot) if one.name == topic), None)
+    """Return the rate in Hz that the robot's profile gives for a topic, or None if it has no such topic."""
+    return next((entry.rate for entry in _topics(robot) if entry.name == topic), None)
 
 
 def recording(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
-    """Return a recording that is just long enough for every topic."""
+    """Return the shortest recording step that covers every topic."""
     slowest_s = max((1 / rate_hz for topic in topics if (rate_hz := rate_of(robot, topic))), default=0.0)
     duration_s = max(RECORD_S, min(MESSAGES * slowest_s, LONGEST_S))
     if robot.profile.ros and robot.profile.ros.command.ends == "sigint":
@@ -112,10 +112,10 @@ def recording(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
 
 
 def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient: bool) -> tuple[Path, Bag]:
-    """Carry out a recording; return the bag that was fetched, and what it holds.
+    """Run a recording; return the path and the content of the fetched bag.
 
     Raises:
-        EvidenceError: There is no bag, or no message in it; says how the recorder's log ends.
+        EvidenceError: There is no bag, or no message in it; the error includes the end of the recorder's log.
     """
     robot = scene.robot(step.robot)
     where = (scene.folder, step.robot, robot.profile.radio.interface)
@@ -128,11 +128,11 @@ def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient
     try:
         return path, bag.read(path)
     except EvidenceError as error:
-        raise EvidenceError(f"{error.what}; the recorder: {_end(log) or 'said nothing'}") from error
+        raise EvidenceError(f"{error.what}; the recorder: {_end(log) or 'printed nothing'}") from error
 
 
 def _end(log: Path) -> str:
-    """Return how a log ends."""
+    """Return the end of a log."""
     if not log.is_file():
         return ""
     with log.open("rb") as file:
@@ -140,12 +140,12 @@ def _end(log: Path) -> str:
         return printable(file.read(), limit=120)
 
 
-def judge(robot: Robot, topics: Sequence[str], found: Bag | None, report: Report, *, why: str = "") -> None:
-    """Add whether each of `topics` is alive, and at its rate, by a recording or by `why` there is none."""
+def judge(robot: Robot, topics: Sequence[str], content: Bag | None, report: Report, *, why: str = "") -> None:
+    """Report whether each topic is published at its rate, from a recording or the reason why there is none."""
     for topic in topics:
         check, rate_hz = f"topic {topic}", rate_of(robot, topic)
-        count = 0 if found is None else found.messages_by_topic.get(topic, 0)
-        if found is None or not count:
+        count = 0 if content is None else content.messages_by_topic.get(topic, 0)
+        if content is None or not count:
             tool = "rostopic hz" if robot.profile.ros and robot.profile.ros.variant == "ros1" else "ros2 topic hz"
             report.fail(
                 check,
@@ -153,13 +153,13 @@ def judge(robot: Robot, topics: Sequence[str], found: Bag | None, report: Report
                 f"{tool} {topic}   # start what publishes it, or correct the procedure",
             )
         elif rate_hz is None:
-            report.ok(check, f"{count} messages in {found.duration_s:.1f} s; the profile gives no rate")
+            report.ok(check, f"{count} messages in {content.duration_s:.1f} s; the profile gives no rate")
         else:
-            _judge_rate(check, count, found.duration_s, rate_hz, report)
+            _judge_rate(check, count, content.duration_s, rate_hz, report)
 
 
 def _judge_rate(check: str, count: int, span_s: float, rate_hz: float, report: Report) -> None:
-    # A message more or less may fall into the span, which is from the first message of any topic to the last.
+    # The span is from the first message of any topic to the last, so the count may be off by one.
     low, high = ((count + sign) / max(span_s, 1e-9) for sign in (-1, 1))
     detail = f"{count} messages in {span_s:.1f} s, of {rate_hz:g} Hz"
     if high < (1 - TOLERANCE) * rate_hz or (count > 1 and low > (1 + TOLERANCE) * rate_hz):

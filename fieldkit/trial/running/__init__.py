@@ -1,1 +1,1 @@
-"""Carry a trial out on robots: open them, hold them, check them, make every attempt, go on where one stopped."""
+"""Run a trial on robots: open and lock them, run preflight and every attempt, resume an interrupted trial."""

@@ -1,4 +1,4 @@
-"""One attempt at a repeat: its steps run, its evidence fetched, judged and kept, whatever cuts it short."""
+"""One attempt at a repeat: run its steps, fetch and judge its evidence, and store it, even if it is interrupted."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -35,11 +35,11 @@ class Attempts:
         plan: The trial.
         folder: Its folder.
         robots: Its robots.
-        ledger: Told what becomes of each attempt.
+        ledger: Records the result of each attempt.
         variants: The tools of each robot.
-        sink: Told of each phase.
-        motions: The robots that move by themselves.
-        origins: Origins of the robots that move by themselves.
+        sink: Receives the start of each phase.
+        motions: The robots that move without a person.
+        origins: Origins of these robots.
     """
 
     def __init__(
@@ -66,65 +66,68 @@ class Attempts:
         self._reached: Status | None = None
 
     def make(self, repeat: RepeatId) -> str:
-        """Make another attempt at a repeat and keep it, whatever it came to; return what to do where a step failed.
+        """Make another attempt at a repeat and store it, whatever its result.
+
+        Returns:
+            The remedy of a failed step; empty if none failed.
 
         Raises:
-            ConfigurationError: This machine has no room for its evidence.
-            FieldkitError: The trial cannot go on; the attempt is kept as one that does not count.
-            KeyboardInterrupt: Likewise; one whose steps are done is left to `recover`.
-            OSError: The disk is full or gone.
+            ConfigurationError: This machine has no space for its evidence.
+            FieldkitError: The trial cannot continue; the attempt is stored as one that does not count.
+            KeyboardInterrupt: As for `FieldkitError`, but an attempt whose steps are done is left to `recover`.
+            OSError: The disk is full or was removed.
         """
         self._robots.demand_up()
-        store.demand_room(self._folder, size.attempt_bytes(self._plan))
-        begun = self._ledger.begin(repeat)
+        store.demand_space(self._folder, size.attempt_bytes(self._plan))
+        started = self._ledger.begin(repeat)
         partial = store.open_attempt(self._folder, repeat)
-        remote = begun.remote(self._plan.trial)
+        remote = started.remote(self._plan.trial)
         self._reached = None
-        with self._cut_short(begun, partial):
+        with self._storing_interrupted(started, partial):
             self._robots.begin(remote, old=self._last_remote or None)
-            failure = self._measure(begun, remote, partial)
+            failure = self._measure(started, remote, partial)
             reasons = [failure.located] if failure else []
             if reasons:
-                self._robots.demand_up()  # nobody waits for robots that have ended
+                self._robots.demand_up()  # fails immediately if an emulated robot has exited
             else:
-                self._ledger.measured(begun)
+                self._ledger.measured(started)
                 self._reached = Status.MEASURED
             self._sink(PhaseStarted("collect evidence", str(repeat)))
             reasons += self._robots.fetch(remote, partial, clean=not reasons)
-            judged = self._judged(begun, partial)
-            reasons = reasons or list(judged.problems)
+            verdict = self._judge(started, partial)
+            reasons = reasons or list(verdict.problems)
             self._last_remote = remote
             if reasons:
                 self._robots.demand_up()
-                self._robots.demand_held()  # whose jobs somebody else ended, it counts for none of those allowed
-        bad = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
+                self._robots.demand_held()  # an attempt aborted by another user is not counted
+        invalid = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
         why = "; ".join(hosts.without_effects(reasons))
         self._ledger.keep(
-            partial, replace(begun, status=bad if reasons else Status.VALID, reason=why), judged.measured
+            partial, replace(started, status=invalid if reasons else Status.VALID, reason=why), verdict.measured
         )
         return failure.remedy if failure else ""
 
     def recover(self, cut: Attempt) -> None:
-        """Settle an attempt that fieldkit was killed in; errors as `make`."""
+        """Complete an attempt during which fieldkit was killed; errors as for `make`."""
         self._sink(PhaseStarted("recover", str(cut.repeat)))
         remote, was_measured = cut.remote(self._plan.trial), cut.status is Status.MEASURED
-        found = store.kept_unentered(self._folder, cut.folders)
-        evidence_folder = found or store.reopen_attempt(self._folder, cut.repeat)
-        # Of an attempt that was cut in its midst what there is, is evidence as that of any void one.
-        missing = [] if found else self._robots.fetch(remote, evidence_folder, clean=was_measured)
-        judged = self._judged(cut, evidence_folder)
+        committed = store.unjournalled_attempt(self._folder, cut.folders)
+        evidence_folder = committed or store.reopen_attempt(self._folder, cut.repeat)
+        # Partial evidence of an interrupted attempt is stored like that of any void attempt.
+        missing = [] if committed else self._robots.fetch(remote, evidence_folder, clean=was_measured)
+        verdict = self._judge(cut, evidence_folder)
         if was_measured and missing:
-            reasons = ["fieldkit was killed before it had the evidence, which was not to be had later", *missing]
+            reasons = ["fieldkit was killed before it had the evidence, which could not be fetched later", *missing]
         else:
-            reasons = list(judged.problems) if was_measured else ["fieldkit was killed during it"]
+            reasons = list(verdict.problems) if was_measured else ["fieldkit was killed during it"]
         status = Status.VOID if reasons else Status.VALID
         ended = replace(cut, status=status, reason="; ".join(reasons), excused=bool(reasons))
-        self._ledger.keep(evidence_folder, ended, judged.measured)
+        self._ledger.keep(evidence_folder, ended, verdict.measured)
         self._last_remote = remote
 
-    def _measure(self, begun: Attempt, remote: str, here: Path) -> FieldkitError | None:
-        """Run the steps of an attempt; return why it is not whole."""
-        repeat = begun.repeat
+    def _measure(self, started: Attempt, remote: str, here: Path) -> FieldkitError | None:
+        """Run the steps of an attempt; return the error that makes it void, or None."""
+        repeat = started.repeat
         self._reached = Status.RUNNING
         planned = self._plan.scene(repeat, remote, self._variants)
         scene = replace(planned, here=here, motions=self._motions, origins=self._origins)
@@ -134,7 +137,7 @@ class Attempts:
 
         try:
             self._robots.measure(scene, announce)
-            self._motions.ahead = ()  # what is left to do may be finished
+            self._motions.ahead = ()  # the remaining work may be completed after a request to stop
         except (RobotError, LinkError, EvidenceError) as error:
             if error.ends_trial:
                 raise
@@ -142,34 +145,34 @@ class Attempts:
         return None
 
     @contextmanager
-    def _cut_short(self, begun: Attempt, partial: Path) -> Iterator[None]:
-        """Whatever cuts the body short, end its jobs and keep the attempt as one that does not count.
+    def _storing_interrupted(self, started: Attempt, partial: Path) -> Iterator[None]:
+        """If the body is interrupted, end its jobs and store the attempt as one that does not count.
 
-        What it measured stays on the robots, and is told: nobody waits for it who wants to stop now.
+        Its measurements stay on the robots, and the attempt says so: after a request to stop, nothing is fetched.
         """
         try:
             yield
         except BaseException as error:
             if not isinstance(error, Exception) or isinstance(error, TestbedLostError):
-                self._robots.hang_up()  # ends what other threads still wait for
-            with suppress(FieldkitError):  # a robot that cannot be reached ends its jobs at their own limits
-                self._robots.end_jobs(begun.remote(self._plan.trial))
+                self._robots.hang_up()  # unblocks threads that wait for an answer
+            with suppress(FieldkitError):  # a robot that cannot be reached ends its jobs at their time limits
+                self._robots.end_jobs(started.remote(self._plan.trial))
             if isinstance(error, OSError):
-                raise  # nothing more can be written; the journal says that it began, and resume goes on from there
+                raise  # nothing more can be written; resume continues from the started attempt
             is_fetched_later = self._reached is Status.MEASURED and not self._robots.transient
             if is_fetched_later and isinstance(error, KeyboardInterrupt):
-                raise  # nothing is wrong with it: resume fetches it, and what has come of it stays
+                raise  # the attempt is intact: resume fetches the rest of it
             reason = STOPPED if self._motions.called else _why_cut(error)
             if self._reached:
-                self._robots.leave(begun.remote(self._plan.trial), partial, reason)
-            ended = replace(begun, status=Status.VOID, reason=reason, excused=True)
-            self._ledger.keep(partial, ended, self._judged(begun, partial).measured)
+                self._robots.mark_unfetched(started.remote(self._plan.trial), partial, reason)
+            ended = replace(started, status=Status.VOID, reason=reason, excused=True)
+            self._ledger.keep(partial, ended, self._judge(started, partial).measured)
             if isinstance(error, LockLostError) and self._last_remote:
-                with suppress(FieldkitError):  # nobody may come back to a trial that was aborted
-                    self._robots.discard(self._last_remote)
+                with suppress(FieldkitError):  # an aborted trial may never be resumed
+                    self._robots.delete_remote(self._last_remote)
             raise
 
-    def _judged(self, attempt: Attempt, folder: Path) -> Judged:
+    def _judge(self, attempt: Attempt, folder: Path) -> Judged:
         try:
             return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
         except MemoryError:
@@ -177,11 +180,11 @@ class Attempts:
 
 
 def _why_cut(error: BaseException) -> str:
-    """Return in words what cut an attempt short."""
+    """Return the reason why an attempt was interrupted."""
     match error:
         case FieldkitError():
             return error.located
-        case Exception():  # of a kind of step, most likely, that is another package's
+        case Exception():  # most likely raised by a step kind of another package
             return f"{type(error).__name__}: {error}"
         case _:
             return "interrupted"

@@ -1,7 +1,7 @@
-"""Bridges of a session: `fieldkit bridge` on each robot whose profile asks for it (`ros: bridge:`).
+"""Bridges of a session: `fieldkit bridge` on each robot whose profile requests it (`ros: bridge:`).
 
-A bridge is up before the first check and ends with the session, so that preflight, people and every trial of it find
-the robot as it will be. It is a job like any other: `fieldkit abort` ends it, and who resumes joins it.
+A bridge runs from before the first check until the end of the session, so preflight, people and every trial of the
+session use the robot in the same state. It is a normal job: `fieldkit abort` ends it, and a resumed session joins it.
 """
 
 from collections.abc import Iterator
@@ -22,34 +22,35 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 
 LIMIT_S: Final = 12 * 3600.0
-"""How long a bridge goes on by itself, if nobody ends it."""
+"""Maximum duration of a bridge that is not stopped."""
 
 _MASTER_S: Final = 5
 _READY_S: Final = 40
-"""A small computer takes seconds to load Python, rospy and a middleware."""
+"""A small computer needs seconds to load Python, rospy and a middleware."""
 _INSTALLS_S: Final = 30.0
 _GRACE_S: Final = 5
 _LOG: Final = "bridge.log"
 
 
 def folder_of(session: str) -> str:
-    """Return the folder in fieldkit's own on a robot in which a session's bridge runs."""
+    """Return the name of the folder of a session's bridge, below fieldkit's folder on a robot."""
     return f"bridge-{session}"
 
 
 def jobs_of(cast: Cast, session: str) -> dict[Role, Job]:
-    """Return the bridge of each robot whose profile asks for one.
+    """Return the bridge job of each robot whose profile requests one.
 
-    Of robots that share a ROS master, the first carries what all of them publish to it: a second would say it twice.
+    Of robots with a common ROS master only the first gets a bridge, which forwards the messages of all of them; a
+    second one would publish each message twice.
     """
-    found: dict[Role, Job] = {}
+    bridges: dict[Role, Job] = {}
     masters: set[str] = set()
     for role, robot in cast.items():
         ros = robot.profile.ros
         if ros is not None and ros.bridge is not None and robot.ros_master not in masters:
             masters.update({robot.ros_master} - {""})
-            found[role] = _job(robot, ros, ros.bridge, session)
-    return found
+            bridges[role] = _job(robot, ros, ros.bridge, session)
+    return bridges
 
 
 def _job(robot: Robot, ros: Ros, bridge: RobotBridge, session: str) -> Job:
@@ -67,34 +68,36 @@ def _job(robot: Robot, ros: Ros, bridge: RobotBridge, session: str) -> Job:
 
 @contextmanager
 def running(cast: Cast, shells: Shells, session: str, *, sink: Sink) -> Iterator[None]:
-    """Let the bridges run while the body does.
+    """Run the bridges while the body runs.
 
     Args:
-        cast: Who plays which role.
+        cast: The robot in each role.
         shells: The robots.
-        session: Names the run of fieldkit.
-        sink: Told when they start, and of one that did not end well.
+        session: Identifies the run of fieldkit.
+        sink: Receives the start of the bridges, and a note if one did not exit successfully.
 
     Raises:
         LinkError: A robot did not answer.
-        RobotError: A bridge did not come up; the message has the end of its log.
+        RobotError: A bridge did not start; the message has the end of its log.
     """
-    wanted = jobs_of(cast, session)
-    if not wanted:
+    bridge_jobs = jobs_of(cast, session)
+    if not bridge_jobs:
         yield
         return
     sink(PhaseStarted("start bridges"))
-    up: list[Role] = []
+    running_roles: list[Role] = []
 
     def start(role: Role) -> None:
-        _start(cast[role], shells[role], role, wanted[role])
-        up.append(role)
+        _start(cast[role], shells[role], role, bridge_jobs[role])
+        running_roles.append(role)
 
     try:
-        together(start, wanted)
+        together(start, bridge_jobs)
         yield
     finally:
-        for role, error in zip(up, together(lambda role: _end(shells[role], wanted[role]), up), strict=True):
+        for role, error in zip(
+            running_roles, together(lambda role: _end(shells[role], bridge_jobs[role]), running_roles), strict=True
+        ):
             if error:
                 sink(Note(f"the bridge on {cast[role].name} {error}"))
 
@@ -108,19 +111,19 @@ def _start(robot: Robot, shell: Shell, role: Role, job: Job) -> None:
         raise RobotError(
             f"its bridge does not start: {error.what}",
             where=robot.name,
-            remedy="see what it needs there: fieldkit docs bridge; or leave ros.bridge out of a copy of the profile",
+            remedy="see its requirements: fieldkit docs bridge; or leave ros.bridge out of a copy of the profile",
         ) from error
 
 
 def _end(shell: Shell, job: Job) -> str:
-    """End a bridge; return what went wrong, empty if nothing did."""
+    """Stop a bridge; return a description of what went wrong, empty if nothing did."""
     try:
         runs = any(f"{job.folder}/" in line for line in jobs.left(shell, Deadline.after(jobs.REPLY_S)))
         code = jobs.stop(shell, job, grace_s=_GRACE_S)
         evidence.discard(shell, job.folder.split("/")[-2])
     except TestbedLostError:
-        return ""  # it ended with its robot
+        return ""  # it exited with its robot
     except FieldkitError as error:
-        return f"was not ended: {error.what}"
-    early = "" if runs else "before its time, "
-    return f"ended {early}with exit code {code}" if code or early else ""
+        return f"was not stopped: {error.what}"
+    early = "" if runs else "early, "
+    return f"exited {early}with exit code {code}" if code or early else ""

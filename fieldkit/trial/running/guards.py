@@ -1,9 +1,9 @@
-"""Guards of drones that other programs fly: each brings its drone down where the attempt is cut short (`on_abort`).
+"""Guards of drones that other programs fly: each lands its drone if the attempt is aborted (`on_abort`).
 
-A guard runs on the drone's own computer for as long as the steps do. It ends by itself, and leaves the drone as it
-is, when the steps are done. It brings the drone down where the attempt's jobs are ended (Ctrl-C, an error, `fieldkit
-abort`), and where the laptop has not been heard for `piloting.LEASE_S`; not while a person or a failsafe has the
-drone (`fieldkit.agent.flying.guard`). A step `fly` has a guard of its own.
+A guard runs on the drone's computer while the steps run, and exits without an action when they are done. It lands the
+drone or lets it return if the attempt's jobs are ended (Ctrl-C, an error, `fieldkit abort`), or if the laptop was not
+heard for `piloting.LEASE_S`; but not while a person or a failsafe controls the drone (`fieldkit.agent.flying.guard`).
+A step `fly` has a separate guard.
 """
 
 from collections.abc import Iterator
@@ -17,11 +17,11 @@ from fieldkit.trial.plan import Plan
 
 @contextmanager
 def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
-    """Have every drone of `on_abort` guarded that no step flies, while the body runs.
+    """Guard every drone of `on_abort` that no step flies while the body runs.
 
     Raises:
         LinkError: A robot did not answer.
-        RobotError: A guard did not come up: the autopilot is silent, for example.
+        RobotError: A guard did not start, for example because the autopilot does not answer.
     """
     with ExitStack() as stack:
         for role in in_order(set(plan.procedure.on_abort) - plan.procedure.moved()):

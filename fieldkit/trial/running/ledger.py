@@ -1,4 +1,4 @@
-"""The ledger of a trial: what became of each attempt, in journal, folders, rows and manifest, on disk at once."""
+"""The ledger of a trial: it stores the result of each attempt in journal, folders, table and manifest immediately."""
 
 import time
 from collections import Counter
@@ -22,22 +22,22 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.running.stop import Stop
 
 TABLE_SHARE: Final = 0.01
-"""Table and manifest are written anew, whole, when so large a share of the attempts is not in them: after each in a
-trial of up to 100 attempts, and in a larger one so that all that is written grows as the trial, not as its square."""
+"""Table and manifest are rewritten when this share of the attempts is missing in them: after each one in a trial of
+up to 100 attempts. So the total amount written grows linearly with the trial, not with its square."""
 
 
 class Ledger:
-    """Begins and ends attempts; opened on a folder with a past, it knows that too.
+    """Starts and commits attempts; the state of an earlier run of the trial is read first.
 
-    What is in the table is not measured again, and what was summed not summed again.
+    Attempts in the table are not measured again, and files with a checksum are not read again.
 
     Args:
         plan: The trial.
         folder: Its folder.
-        stop: Waits until what is being written is whole.
+        stop: Delays a stop while files are being written.
 
     Raises:
-        EvidenceError: The journal is damaged, or evidence that would have to be measured again is not as it was.
+        EvidenceError: The journal is damaged, or evidence that must be measured again has changed.
     """
 
     def __init__(self, plan: Plan, folder: Path, stop: Stop) -> None:
@@ -64,35 +64,35 @@ class Ledger:
         for attempt in ended:
             self._rename(attempt)
         self.differences = dict(self._differing(ended))
-        """What is not as it was when it was summed, by file."""
-        known = self._known_lines(len(ended))
-        remade = [attempt for index, attempt in enumerate(ended) if index >= len(known) or attempt.reopened]
+        """Differences from the manifest, by file."""
+        unchanged = self._unchanged_lines(len(ended))
+        remade = [attempt for index, attempt in enumerate(ended) if index >= len(unchanged) or attempt.reopened]
         if remade and self.differences:
             self._demand_evidence(remade)
         for number, attempt in enumerate(ended):
             evidence = store.attempt_folder(folder, attempt.folder)
-            is_known = number < len(known) and not attempt.reopened  # its row said that it failed
+            is_known = number < len(unchanged) and not attempt.reopened  # a reopened attempt changes its row
             row = {} if is_known else rebuild.row(plan, attempt, AttemptEvidence(evidence))
-            self._enter(attempt, known[number] if is_known else rows.line(row, self._plan.table))
+            self._enter(attempt, unchanged[number] if is_known else rows.line(row, self._plan.table))
             if attempt.folder not in self._manifest:
                 self._manifest.add(evidence)
         self.ended = tuple(ended)
-        """The attempts that had ended before, in the order in which they did."""
+        """The attempts that ended in earlier runs, in order."""
         self.cut_short = tuple(journal.cut_short(past))
-        """Attempts that fieldkit was killed in; each is to be kept before anything else."""
+        """Attempts during which fieldkit was killed; they must be completed first."""
 
     @property
     def last(self) -> tuple[Attempt, Row]:
-        """The attempt kept last, and its row."""
+        """The attempt committed last, and its row."""
         assert self._last is not None
         return self._last
 
     def counts(self, status: Status) -> int:
-        """Return how many attempts ended so."""
+        """Return the number of attempts with a final status."""
         return self._counts[status]
 
     def is_over(self, repeat: RepeatId) -> bool:
-        """Return whether a repeat is valid, or failed for good."""
+        """Return True if a repeat is valid, or failed after its last attempt."""
         return repeat in self._over
 
     @property
@@ -101,38 +101,38 @@ class Ledger:
         return len(self._over)
 
     def is_last(self, repeat: RepeatId) -> bool:
-        """Return whether the procedure allows one more attempt at a repeat only."""
+        """Return True if the procedure allows only one more attempt at a repeat."""
         return self._spent[repeat] + 1 >= self._plan.procedure.attempts
 
     def begin(self, repeat: RepeatId) -> Attempt:
-        """Enter a new attempt as running; returns once that is on disk.
+        """Record the start of a new attempt; returns when it is on disk.
 
         Raises:
-            OSError: The disk is full or gone.
+            OSError: The disk is full or was removed.
         """
-        begun = Attempt(repeat, 1 + self._numbers.get(repeat, 0), time.time_ns(), Status.RUNNING)
-        self._append(begun, begun.started_utc_ns)
+        started = Attempt(repeat, 1 + self._numbers.get(repeat, 0), time.time_ns(), Status.RUNNING)
+        self._append(started, started.started_utc_ns)
         if self._is_due(len(self._lines) - 1):
             self._manifest.write()
-        return begun
+        return started
 
     def measured(self, attempt: Attempt) -> None:
-        """Enter that the steps of an attempt are done and its evidence waits on the robots; errors as `begin`."""
+        """Record that the steps of an attempt are done and its evidence is on the robots; errors as for `begin`."""
         self._append(attempt, time.time_ns(), Status.MEASURED)
 
     def keep(self, evidence: Path, attempt: Attempt, measured: Measured) -> None:
-        """Bring an attempt that ended to disk: its evidence, then the journal's word on it, then what is derived.
+        """Commit an attempt that ended to disk: its evidence, then its journal entry, then the derived files.
 
         Args:
             evidence: Folder of its files, which gets its final name.
-            attempt: What became of it.
-            measured: What its evidence says.
+            attempt: The attempt with its final status.
+            measured: Its measured values.
 
         Raises:
-            OSError: As `begin`.
+            OSError: As for `begin`.
         """
         with self._stop.whole():
-            final = store.keep_attempt(evidence, attempt.folder)
+            final = store.commit_attempt(evidence, attempt.folder)
             ended = replace(attempt, reason=encodable(attempt.reason))
             row = rows.build(self._plan, ended, measured)
             self._append(ended, time.time_ns())
@@ -143,14 +143,14 @@ class Ledger:
                 self._write()
 
     def summarize(self) -> tuple[Cell, ...]:
-        """Write rows and summary of the attempts kept so far and return the summary; errors as `begin`."""
+        """Write the table and the summary of all committed attempts and return the summary; errors as for `begin`."""
         with self._stop.whole():
             cells = rows.write_summary(self._folder, self._plan, self._table())
             self._write()
         return cells
 
     def _rename(self, attempt: Attempt) -> None:
-        """Give the folder of an attempt that failed before its repeat was reopened the name of a void one."""
+        """Rename the folder of an attempt that failed before its repeat was reopened to that of a void attempt."""
         if not attempt.reopened:
             return
         before = attempt.repeat.folder(Status.FAILED, attempt.number)
@@ -173,25 +173,25 @@ class Ledger:
 
     def _differing(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
         if ended and not (self._folder / store.MANIFEST_FILE).exists():
-            yield store.MANIFEST_FILE, "missing, so nothing says whether evidence is as it was"
-        if self._manifest.whole_lines(store.TRIAL_CSV) is None:
+            yield store.MANIFEST_FILE, "missing, so changes of the evidence cannot be detected"
+        if self._manifest.unchanged_lines(store.TRIAL_CSV) is None:
             yield store.TRIAL_CSV, "changed"
         yield from manifest.differences(self._folder).items()
 
-    def _known_lines(self, ended: int) -> list[str]:
-        """Return the lines of the table that are as they were summed, for so many attempts at most."""
-        whole = self._manifest.whole_lines(store.TRIAL_CSV)
-        if not whole:
+    def _unchanged_lines(self, ended: int) -> list[str]:
+        """Return the unchanged lines of the table, if they are not more than the attempts that ended."""
+        line_count = self._manifest.unchanged_lines(store.TRIAL_CSV)
+        if not line_count:
             return []
         text = files.read(self._folder / store.TRIAL_CSV).decode()
-        head, *lines = text.splitlines(keepends=True)[:whole]
+        head, *lines = text.splitlines(keepends=True)[:line_count]
         return lines if head == rows.head(self._plan.table) and len(lines) <= ended else []
 
     def _demand_evidence(self, attempts: list[Attempt]) -> None:
-        """Refuse to measure again what is not as it was summed."""
+        """Raise an error if evidence that must be measured again has changed."""
         if differing := manifest.differences(self._folder, [attempt.folder for attempt in attempts]):
             raise EvidenceError(
-                f"{store.TRIAL_CSV} has to be made again, and evidence is not what was measured: "
+                f"{store.TRIAL_CSV} must be rebuilt, but the evidence is not what was measured: "
                 f"{manifest.few(differing)}",
                 where=str(self._folder),
                 remedy="restore both from a copy, or start a new trial",

@@ -1,4 +1,4 @@
-"""Locks on robots: one trial at a time, told to everyone else, given back at its end or by their expiry."""
+"""Locks on robots: one trial at a time; a lock names its holder, and ends with the trial or when it expires."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,19 +19,19 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
-"""How long a lock lasts that nobody renews; `evidence.begin` does at half of it. Longer than any attempt or walk."""
+"""Lifetime of a lock that is not renewed; `evidence.begin` renews it after half. Longer than any attempt or walk."""
 
 _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (?P<what>\S+)\n")
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Holder of robots, and its purpose; letters, digits and `._@-` of each are kept, at most 80.
+    """Holder of robots, and the purpose; of each text the letters, digits and `._@-` are used, at most 80.
 
     Attributes:
-        token: Tells this trial from any other; the same token takes its own lock again.
+        token: Identifies the trial; a holder with the same token can lock its robots again.
         who: `user@laptop`, see `runtime.me`.
-        what: The trial.
+        what: The purpose, for example the trial.
     """
 
     token: str
@@ -41,20 +41,20 @@ class Holder:
 
 @contextmanager
 def held(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
-    """Hold every robot, or none, while the body runs, as the only fieldkit of this machine with the holder's token.
+    """Lock all robots while the body runs, as the only process of this machine with the holder's token.
 
     Raises:
-        ConfigurationError: Another one has the token: it would take the robots for its own, and so give them back.
-        FieldkitError: As `taken`.
+        ConfigurationError: Another process has the token; it would use the same locks and release them.
+        FieldkitError: As for `taken`.
     """
     with ExitStack() as stack:
         try:
             stack.enter_context(runtime.held(f"trial-{word(holder.token)}"))
         except NameHeldError as error:
             raise ConfigurationError(
-                "another fieldkit runs this trial, or one that was begun with it",
+                "another fieldkit runs this trial, or another trial of its session",
                 where=holder.what,
-                remedy="wait until it has ended, or end it",
+                remedy="wait until it has ended, or stop it",
             ) from error
         stack.enter_context(taken(shells, holder, sink=sink))
         yield
@@ -62,27 +62,27 @@ def held(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
 
 @contextmanager
 def taken(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
-    """Take every robot, or none, and give them back after the body.
+    """Lock all robots, or none, and unlock them after the body.
 
-    Robots are reached side by side, and taken in the order of their names, so that of two trials which want the same
-    one gets them. After Ctrl-C no link that was lost is awaited any more.
+    Robots are contacted in parallel, but locked in the order of their names: of two trials that need the same robots,
+    one gets all of them. After Ctrl-C the program does not wait for lost links.
 
     Args:
         shells: The robots.
-        holder: Who takes them.
-        sink: Told of a robot that could not be given back; its lock expires by itself.
-        ttl_s: Seconds until a lock expires that is not renewed.
+        holder: The holder of the locks.
+        sink: Receives a note for a robot that could not be unlocked; its lock expires.
+        ttl_s: Lifetime of a lock that is not renewed, in seconds.
 
     Raises:
         LinkError: A robot did not answer.
-        RobotError: Somebody else holds one; says who, since when, until when, and what to do.
+        RobotError: Another holder has a robot; the message says who, since when, until when, and what to do.
     """
     touched: list[Shell] = []
-    in_order = sorted(shells.values(), key=lambda one: one.robot)
+    in_order = sorted(shells.values(), key=lambda shell: shell.robot)
     together(lambda shell: jobs.install(shell, Deadline.after(REPLY_S)), in_order, hang_up=lambda: _hang_up(in_order))
     try:
         for shell in in_order:
-            touched.append(shell)  # before it answers: the answer may be lost where the lock was taken
+            touched.append(shell)  # added before it answers, because the answer of a successful lock may be lost
             words = (word(holder.token), str(ttl_s), word(holder.who), word(holder.what))
             call(shell, "lock", *words, deadline=Deadline.after(REPLY_S))
         yield
@@ -92,15 +92,15 @@ def taken(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> 
         raise
     finally:
         if touched:
-            together(lambda shell: _give_back(shell, holder, sink), touched)
+            together(lambda shell: _unlock(shell, holder, sink), touched)
 
 
 @dataclass(frozen=True)
 class Held:
-    """A lock that holds.
+    """A valid lock.
 
     Attributes:
-        holder: Who has the robot.
+        holder: Its holder.
         left_s: Seconds until the lock expires.
     """
 
@@ -109,26 +109,26 @@ class Held:
 
 
 def holder(shell: Shell) -> Held | None:
-    """Return who holds a robot that has the job script, None if nobody does.
+    """Return the lock of a robot that has the job script, or None if it is not locked.
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: The robot could not tell.
+        RobotError: The robot could not read its lock.
     """
-    said = _HELD.match(call(shell, "holder", deadline=Deadline.after(REPLY_S)))
-    if said is None:
+    match = _HELD.match(call(shell, "holder", deadline=Deadline.after(REPLY_S)))
+    if match is None:
         return None
-    token, who, what = (word(said[name].decode(errors="replace")) for name in ("token", "who", "what"))
-    return Held(Holder(token, who, what), float(said["left"]))
+    token, who, what = (word(match[name].decode(errors="replace")) for name in ("token", "who", "what"))
+    return Held(Holder(token, who, what), float(match["left"]))
 
 
 def demand(shell: Shell, token: str) -> None:
-    """Go on only if a robot that has the job script is still held by us.
+    """Check that a robot with the job script is still locked by this trial.
 
     Raises:
         LinkError: The robot did not answer.
-        LockLostError: Somebody aborted the trial, or took the robot when its lock had expired.
-        RobotError: The robot could not tell.
+        LockLostError: The trial was aborted, or the lock expired and another holder locked the robot.
+        RobotError: The robot could not read its lock.
     """
     call(shell, "renew", word(token), "0", deadline=Deadline.after(REPLY_S))
 
@@ -138,7 +138,7 @@ def _hang_up(shells: Iterable[Shell]) -> None:
         shell.close()
 
 
-def _give_back(shell: Shell, holder: Holder, sink: Sink) -> None:
+def _unlock(shell: Shell, holder: Holder, sink: Sink) -> None:
     try:
         call(shell, "unlock", word(holder.token), deadline=Deadline.after(REPLY_S))
     except FieldkitError as error:
@@ -146,11 +146,11 @@ def _give_back(shell: Shell, holder: Holder, sink: Sink) -> None:
 
 
 def abort(robots: Mapping[str, Shell | FieldkitError], who: str) -> Mapping[str, Aborted]:
-    """Break the lock of every robot and end every job on it, of any trial; return what became of each.
+    """Break the lock of every robot and end all of its jobs, of any trial; return the result for each robot.
 
     Args:
         robots: From `Backend.standing`.
-        who: Told to those whose trial ends, see `runtime.me`.
+        who: Name that is shown to the users whose trials end, see `runtime.me`.
     """
     return dict(zip(robots, together(lambda name: _abort(robots[name], who), robots), strict=True))
 

@@ -1,4 +1,4 @@
-"""What a person must confirm before robots move: their places, and that they may move again after a fault."""
+"""Confirmations by a person before robots move: that they are at their places, and may move again after a fault."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,10 +21,10 @@ _STOP: Final = "stop"
 
 
 def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
-    """Return if robots that move by themselves stay at one place in all trials, or a person puts them there.
+    """Check that self-moving robots stay at one place in all trials, or that a person moves them.
 
     Raises:
-        ConfigurationError: A robot has to be at another place in a later trial, and `--yes` answers for the operator.
+        ConfigurationError: A robot must be at another place in a later trial, and with `--yes` no person moves it.
     """
     if not backend.by_hand or not isinstance(operator, Nobody):
         return
@@ -32,9 +32,9 @@ def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator
         for role in _self_moving(later):
             if motion.place_of(role, earlier.placement) != motion.place_of(role, later.placement):
                 raise ConfigurationError(
-                    f"{later.cast[role].name} moves by itself and must be at another place for {later.distance}, and "
-                    "with --yes no person puts it there",
-                    remedy="without --yes; or one distance per command",
+                    f"{later.cast[role].name} moves without a person and must be at another place for "
+                    f"{later.distance}, and with --yes no person moves it there",
+                    remedy="run it without --yes, or one distance per command",
                 )
 
 
@@ -43,16 +43,16 @@ def _self_moving(plan: Plan) -> tuple[Role, ...]:
     return tuple(role for role, robot in plan.cast.items() if role in moved and (robot.drives or robot.flies))
 
 
-class MotionLeave:
-    """Lets the robots of a trial move, or ends the trial.
+class MotionPermission:
+    """Permission of the robots of a trial to move.
 
     Args:
         plan: The trial.
-        testbed: Its robots. Those of a testbed that ends with this run are at their places again after each motion.
+        testbed: Its robots. In a transient testbed they are back at their places after each motion.
         folder: Its folder.
 
     Attributes:
-        origins: Origins of its robots, for its steps.
+        origins: Origins of its robots, for the steps.
 
     Raises:
         EvidenceError: The journal of motions is damaged.
@@ -72,12 +72,12 @@ class MotionLeave:
         self.origins = self._kept = KeptOrigins(self._journal, folder, robots, plan.placement, may_return=allowed)
 
     def demand(self) -> None:
-        """Return if robots may move in the next attempt. After a fault a person is asked, and must type `confirm`.
+        """Check that robots may move in the next attempt. After a fault, a person must type `confirm`.
 
         Raises:
-            ConfigurationError: As `Operator.enter`.
+            ConfigurationError: As for `Operator.enter`.
             MotionHeldError: No person has confirmed.
-            OSError: The disk is full or gone.
+            OSError: The disk is full or was removed.
         """
         if self._kept is None or not self._moving:
             return
@@ -92,20 +92,20 @@ class MotionLeave:
             yield
         except KeyboardInterrupt:
             for hold in self._journal.holds if self._kept is not None else ():
-                place = f"before {hold.robot} moves again, a person has to put it at its place and type {CONFIRM}"
+                place = f"before {hold.robot} moves again, a person must put it at its place and type {CONFIRM}"
                 sink(Note(f"{hold.reason}: {place}"))
             raise
 
     def _demand_placed(self, kept: KeptOrigins) -> None:
-        """With `--yes` no person puts a robot at a new place, so its origin there would be wherever it is."""
+        """Raise an error if a robot must be at a new place but no person was asked: its origin would be wrong."""
         testbed = self._testbed
         if isinstance(testbed, Attended) and not isinstance(testbed.operator, Nobody):
-            return  # a person was asked to put it there
+            return  # a person was asked to move it there
         for role, name in self._moving.items():
             if kept.is_new_place(role):
                 raise MotionHeldError(
                     f"{name} must be at another place than before, and --yes does not confirm that it is there",
-                    remedy="put it at its place for this trial, its way free, then the same command without --yes",
+                    remedy="put it at its place for this trial, clear its path, then repeat this without --yes",
                 )
 
     def _demand_confirmed(self, kept: KeptOrigins) -> None:
@@ -117,7 +117,7 @@ class MotionLeave:
             stopped = "; ".join(f"{hold.robot}: {hold.reason}" for hold in self._journal.holds)
             names = " and ".join(hold.robot for hold in self._journal.holds)
             text = (
-                f"a fault stopped a robot ({stopped}); put {names} at its place, facing as in the beginning, its way "
+                f"a fault stopped a robot ({stopped}); put {names} at its place, with the initial heading, its path "
                 f"free; type {CONFIRM} to let robots move again"
             )
             if testbed.operator.enter(Question(text, choices=(CONFIRM, _STOP), usual=_STOP)) == CONFIRM:

@@ -1,6 +1,6 @@
-"""Open the robots of a trial: open the testbed, log in everywhere, hold the locks, run.
+"""Open the robots of a trial: open the testbed, log in on all robots, lock them, run.
 
-The only place where that is done: `trial`, `resume`, `campaign` and tests go through it.
+`trial`, `resume`, `campaign` and the pytest plugin all use this module.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,26 +24,26 @@ from fieldkit.trial.running.stop import Stop
 def opened(
     backend: Backend, cast: Cast, *, session: str, what: str, seed: int, sink: Sink, operator: Operator
 ) -> Iterator[Testbed]:
-    """Yield the testbed of a cast, every robot logged in and held by us, the bridges up that their profiles ask for.
+    """Yield the testbed of a cast, with every robot logged in and locked, and the bridges running.
 
     Args:
-        backend: Where the robots come from.
-        cast: Who plays which role.
-        session: Names the run of fieldkit on the robots' locks.
-        what: What the robots are held for, told to everyone else.
-        seed: Seed of everything random in the testbed.
-        sink: Told what happens.
-        operator: Does what the backend cannot do by itself.
+        backend: The backend.
+        cast: The robot in each role.
+        session: Identifies the run of fieldkit in the robots' locks.
+        what: Purpose of the locks, shown to other users.
+        seed: Seed of all random numbers in the testbed.
+        sink: Receives events.
+        operator: The person who does what the backend cannot do.
 
     Raises:
-        ConfigurationError: A right or a program is missing on this machine, there is nothing to log in with, or
-            another fieldkit runs the session.
+        ConfigurationError: A permission or a program is missing on this machine, there are no credentials, or another
+            fieldkit runs the session.
         LinkError: A robot did not answer.
-        RobotError: A robot cannot be reached, has another host key, refuses the login, or is held by somebody else.
+        RobotError: A robot cannot be reached, has another host key, refuses the login, or is locked by another user.
     """
     with backend.open(cast, seed=seed, sink=sink, operator=operator) as testbed:
         preflight.meet(cast, testbed.shells, sink)
-        # A lock that could not be given back is of no matter where its robot ends now.
+        # Failure to unlock an emulated robot does not matter, because the robot exits now.
         on_lost_lock = (lambda _: None) if isinstance(testbed, Transient) else sink
         with (
             locks.held(testbed.shells, Holder(session, runtime.me(), what), sink=on_lost_lock),
@@ -55,23 +55,23 @@ def opened(
 def run(
     plans: Sequence[Plan], backend: Backend, cast: Cast, out: Path, *, sink: Sink, operator: Operator, stop: Stop
 ) -> list[Outcome | None]:
-    """Run planned trials of one session one after the other, on robots that are opened once.
+    """Run planned trials of one session one after the other; their robots are opened once.
 
     Args:
         plans: The trials, at least one.
-        backend: Where the robots come from.
-        cast: Who plays which role.
-        out: Folder that the trials' own folders are made in.
-        sink: Told what happens.
-        operator: Does what the backend cannot do by itself.
-        stop: Tells the trial that runs to stop.
+        backend: The backend.
+        cast: The robot in each role.
+        out: Folder in which the trials' folders are created.
+        sink: Receives events.
+        operator: The person who does what the backend cannot do.
+        stop: Request to stop the running trial.
 
     Returns:
-        What each came to; None for one that the operator left for later.
+        The outcome of each trial; None for a trial that the operator skipped.
 
     Raises:
-        ConfigurationError: As `motion_leave.demand_one_place`.
-        FieldkitError: As `opened` and `runner.run_trial`; trials that were not begun are told.
+        ConfigurationError: As for `motion_leave.demand_one_place`.
+        FieldkitError: As for `opened` and `runner.run_trial`; a note lists the trials that were not started.
     """
     motion_leave.demand_one_place(plans, backend, operator)
     store.prepare(out)
@@ -82,11 +82,11 @@ def run(
     ) as testbed:
         try:
             for plan in plans:
-                ended.append(runner.run_trial(plan, testbed, out, sink, stop))  # noqa: PERF401 (needed where one stops)
+                ended.append(runner.run_trial(plan, testbed, out, sink, stop))  # noqa: PERF401 (needed if one stops)
         except BaseException:
-            # Whoever resumes that one alone would miss them.
+            # A person who resumes the interrupted trial alone would overlook the later ones.
             if later := plans[len(ended) + 1 :]:
-                sink(Note(f"not begun: {', '.join(str(plan.distance) for plan in later)}"))
+                sink(Note(f"not started: {', '.join(str(plan.distance) for plan in later)}"))
             raise
     return ended
 
@@ -94,22 +94,22 @@ def run(
 def resume(
     folder: Path, name: str, backend: Backend, *, failed: bool, sink: Sink, operator: Operator, stop: Stop
 ) -> Outcome | None:
-    """Go on with a trial that stopped.
+    """Resume an interrupted trial.
 
     Args:
         folder: The trial's folder.
         name: Name of the backend.
-        backend: Where its robots come from.
-        failed: Whether failed repeats are redone too.
-        sink: Told what happens.
-        operator: Does what the backend cannot do by itself.
-        stop: Tells the trial to stop.
+        backend: The backend.
+        failed: Whether failed repeats are repeated too.
+        sink: Receives events.
+        operator: The person who does what the backend cannot do.
+        stop: Request to stop the trial.
 
     Returns:
-        What it came to; None when the operator left it for later.
+        The outcome; None if the operator skipped the trial.
 
     Raises:
-        FieldkitError: It is no trial of this fieldkit, of this backend or of these robots; or as `opened` and
+        FieldkitError: The trial is not of this fieldkit, of this backend or of these robots; or as for `opened` and
             `runner.resume_trial`.
     """
     plan = resumable(folder)

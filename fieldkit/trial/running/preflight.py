@@ -1,4 +1,4 @@
-"""Preflight: everything that a trial needs of its robots, before repeat 1 and as a whole by `fieldkit check`."""
+"""Preflight: the checks of robots and laptop before a trial's first repeat; `fieldkit check` runs all of them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,23 +31,23 @@ _CONNECTION: Final = "connection"
 
 
 def meet(cast: Cast, shells: Shells, sink: Sink) -> None:
-    """Log in on every robot, before anybody walks.
+    """Log in on every robot, before a person carries any.
 
     Raises:
-        ConfigurationError: Nothing to log in with.
-        RobotError: Names every robot that cannot be reached, has another host key or refuses the login.
+        ConfigurationError: There are no credentials.
+        RobotError: The message names every robot that cannot be reached, has another host key or refuses the login.
     """
     sink(PhaseStarted("connect"))
 
-    def greet(role: Role) -> Report:
+    def log_in(role: Role) -> Report:
         report = Report(cast[role].name)
         try:
-            contact.greet(shells[role])
+            contact.log_in(shells[role])
         except (LinkError, RobotError) as error:
             report.fail(_CONNECTION, error.what, error.remedy)
         return report
 
-    demand(_joined(together(greet, cast)))
+    demand(_joined(together(log_in, cast)))
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Checked:
     """Result of a check.
 
     Attributes:
-        findings: All findings, robot by robot; a robot that cannot be reached is a failure among them.
+        findings: All findings by robot; a robot that cannot be reached is one of the failures.
         variants: The tools of each robot that was reached.
     """
 
@@ -64,40 +64,41 @@ class Checked:
 
 
 def check(plan: Plan, shells: Shells, out: Path, *, whole: bool) -> Checked:
-    """Check every robot of the cast and this machine, and put the job script on each robot.
+    """Check every robot of the cast and this machine, and install the job script on each robot.
 
     Args:
         plan: The trial.
         shells: The robots.
-        out: Folder that the trial goes into.
-        whole: Record for a moment, too, to see whether topics are alive.
+        out: Folder of the trial.
+        whole: Whether to also check locks, and to make a short recording that checks the topics.
     """
     reports = {role: Report(robot.name) for role, robot in plan.cast.items()}
-    found: dict[Role, Variants] = {}
+    variants_by_role: dict[Role, Variants] = {}
 
-    def look(role: Role) -> None:
-        _check(plan, role, shells[role], found, reports[role], whole=whole)
+    def check_robot(role: Role) -> None:
+        _check(plan, role, shells[role], variants_by_role, reports[role], whole=whole)
 
-    together(look, plan.cast)
-    for refusal in plan.refusals(found):
+    together(check_robot, plan.cast)
+    for refusal in plan.refusals(variants_by_role):
         reports[refusal.role].fail("tools", refusal.what, refusal.remedy)
     laptop = Report(LAPTOP)
     system.judge_laptop(plan, out, laptop)
-    return Checked(_joined([*reports.values(), laptop]), found)
+    return Checked(_joined([*reports.values(), laptop]), variants_by_role)
 
 
 def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
-    """Check what a trial needs before repeat 1, keep the findings in its folder and tell those that are not ok.
+    """Run the preflight of a trial, store the findings in its folder and report those that are not ok.
 
     Returns:
         The tools of each robot.
 
     Raises:
-        RobotError: A check failed; names each with its remedy.
+        RobotError: A check failed; the message lists each with its remedy.
     """
     checked = check(plan, shells, folder.parent, whole=False)
     findings = checked.findings
-    lines = ("\t".join((one.robot, one.check, one.status, one.detail, one.remedy)) for one in findings)
+    fields = ((each.robot, each.check, each.status, each.detail, each.remedy) for each in findings)
+    lines = map("\t".join, fields)
     files.write(folder / store.PREFLIGHT_FILE, "".join(f"{line}\n" for line in lines).encode())
     for finding in findings:
         if finding.status is not Verdict.OK:
@@ -107,10 +108,10 @@ def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[R
 
 
 def demand(findings: Sequence[Finding]) -> None:
-    """Go on only if no check failed.
+    """Raise an error if a check failed.
 
     Raises:
-        RobotError: Names every failed check with its remedy.
+        RobotError: A check failed; the message lists each with its remedy.
     """
     failed = [finding for finding in findings if finding.status is Verdict.FAIL]
     if failed:
@@ -118,24 +119,27 @@ def demand(findings: Sequence[Finding]) -> None:
             f"\n  {finding.robot}: {finding.check}: {finding.detail}\n    {finding.remedy}" for finding in failed
         )
         raise RobotError(
-            f"preflight found {format_count(len(failed), 'problem')}:{lines}", remedy="mend these, then try again"
+            f"preflight found {format_count(len(failed), 'problem')}:{lines}",
+            remedy="fix these, then try again",
         )
 
 
-def _check(plan: Plan, role: Role, shell: Shell, found: dict[Role, Variants], report: Report, *, whole: bool) -> None:
+def _check(
+    plan: Plan, role: Role, shell: Shell, variants_by_role: dict[Role, Variants], report: Report, *, whole: bool
+) -> None:
     stage, robot = _CONNECTION, plan.cast[role]
     try:
         offset = contact.judge(shell, report)
         stage = "probe"
-        sections = probe.ask(shell, robot.profile.radio.interface, software.commands(plan, role))
-        report.means = system.means(sections)
+        sections = probe.run_probe(shell, robot.profile.radio.interface, software.commands(plan, role))
+        report.user_tools = system.user_tools(sections)
         contact.judge_clock(offset, shell.by_hand, report)
         system.judge(plan, role, sections, report)
-        found[role] = software.judge(plan, role, sections, report)
+        variants_by_role[role] = software.judge(plan, role, sections, report)
         radio.judge(robot, sections, report)
         stage = "jobs"
         jobs.install(shell, Deadline.after(JOBS_S))
-        # A trial holds its robots already. Somebody else's jobs are no leftovers, and a recording would disturb them.
+        # A trial has locked its robots already. A recording would disturb jobs of another user.
         if whole and not _judge_lock(locks.holder(shell), report):
             return
         _judge_jobs(plan, jobs.left(shell, Deadline.after(JOBS_S)), report)
@@ -145,7 +149,7 @@ def _check(plan: Plan, role: Role, shell: Shell, found: dict[Role, Variants], re
             return
         stage = "topics"
         if software.can_record(plan, role, sections):
-            topics.look(plan, role, shell, found[role], report)
+            topics.check_topics(plan, role, shell, variants_by_role[role], report)
     except FieldkitError as error:
         report.fail(stage, error.what, error.remedy)
 
@@ -160,12 +164,12 @@ def _judge_jobs(plan: Plan, left: Sequence[str], report: Report) -> None:
 
 
 def _judge_lock(held: Held | None, report: Report) -> bool:
-    """Return whether nobody holds the robot."""
+    """Report the lock of a robot; return True if it is not locked."""
     if held is None:
-        report.ok("lock", "nobody holds the robot")
+        report.ok("lock", "the robot is not locked")
         return True
-    who, left = held.holder, format_duration(held.left_s)
-    report.fail("lock", f"{who.who} holds the robot for {who.what}, at most {left} more", HELD_REMEDY)
+    holder, left = held.holder, format_duration(held.left_s)
+    report.fail("lock", f"{holder.who} holds the robot for {holder.what}, at most {left} more", HELD_REMEDY)
     return False
 
 

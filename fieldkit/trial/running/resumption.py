@@ -1,4 +1,4 @@
-"""Refuse to go on with a trial that stopped: by another fieldkit, backend or robots than it began with."""
+"""Checks before a trial is resumed: code, backend and robots must be those with which it started."""
 
 from pathlib import Path
 
@@ -11,24 +11,24 @@ from fieldkit.trial.plan import Plan
 
 
 def resumable(folder: Path) -> Plan:
-    """Return the plan of a trial that this fieldkit can go on with.
+    """Return the plan of a trial that this fieldkit can resume.
 
     Raises:
-        ConfigurationError: `folder` is no trial, or other code began it: its rows would mix two ways to measure. Or a
-            program of the lab that it copies to robots has changed, or is missing.
+        ConfigurationError: `folder` is not a trial; or other code started it, so that its rows would be measured in
+            two ways; or a program of the lab that it copies to robots has changed or is missing.
     """
     plan = store.read_plan(folder)
-    was = plan.versions
-    # Packages that add steps or a backend have no hash here, and fieldkit's own says more than its version.
+    versions = plan.versions
+    # Packages that add steps or a backend have no hash here; fieldkit's hash is more precise than its version.
     added = {name: now for name, now in plugins.versions().items() if name != "fieldkit"}
-    others = [f"{name} {was[name]}" for name, now in added.items() if was.get(name, now) != now]
+    changed = [f"{name} {versions[name]}" for name, now in added.items() if versions.get(name, now) != now]
     if plan.code_sha256 != code_hash():
-        others = [f"fieldkit {was.get('fieldkit', 'of no version')}, {plan.code_sha256}"]
-    if others:
+        changed = [f"fieldkit {versions.get('fieldkit', 'of no version')}, {plan.code_sha256}"]
+    if changed:
         raise ConfigurationError(
-            f"it was begun by other code ({', '.join(others)})",
+            f"it was started by other code ({', '.join(changed)})",
             where=str(folder),
-            remedy="go on with that version, or start a new trial; what had ended is complete: "
+            remedy="resume it with that version, or start a new trial; the repeats that ended are complete: "
             + typed("fieldkit", "rebuild", folder),
         )
     for put in plan.puts():
@@ -37,43 +37,43 @@ def resumable(folder: Path) -> Plan:
 
 
 def demand_backend(plan: Plan, name: str, folder: Path) -> None:
-    """Stop before robots of another backend go on with a trial.
+    """Raise an error if a trial would be resumed on another backend.
 
     Args:
         plan: The trial.
-        name: Name of the backend that would go on with it.
+        name: Name of the backend on which it would be resumed.
         folder: The trial's folder.
 
     Raises:
-        ConfigurationError: It was begun on another backend.
+        ConfigurationError: It was started on another backend.
     """
     if name != plan.backend:
         raise ConfigurationError(
-            f"it was begun on backend {plan.backend}, not {name}",
+            f"it was started on backend {plan.backend}, not {name}",
             where=str(folder),
             remedy=typed("fieldkit", "resume", folder, "--backend", plan.backend),
         )
 
 
 def demand_cast(plan: Plan, cast: Cast) -> None:
-    """Stop before robots go on with a trial that others began.
+    """Raise an error if a trial would be resumed with other robots.
 
     Raises:
-        ConfigurationError: A role is not played by the robot that the plan names.
+        ConfigurationError: A role has another robot than in the plan.
     """
     for role, robot in plan.cast.items():
-        found = cast.get(role)
-        moved = role in plan.procedure.moved()
-        if found and moved and (robot.drives > found.drives or robot.flies > found.flies):
+        current = cast.get(role)
+        is_moved = role in plan.procedure.moved()
+        if current and is_moved and (robot.drives > current.drives or robot.flies > current.flies):
             raise ConfigurationError(
-                f"{robot.name} moved by itself in this trial, and may not now",
+                f"{robot.name} moved without a person in this trial, and may not now",
                 where=plan.trial,
-                remedy="give --allow-motion again, or start a new trial in which somebody moves it",
+                remedy="give --allow-motion again, or start a new trial in which a person moves it",
             )
-        # What the lab would let it do is no matter to a trial in which nothing moves it.
-        if found is None or found.model_copy(update={"drives": robot.drives, "flies": robot.flies}) != robot:
+        # Permission to move does not matter in a trial that does not move the robot.
+        if current is None or current.model_copy(update={"drives": robot.drives, "flies": robot.flies}) != robot:
             raise ConfigurationError(
-                f"{role} was {robot.name} ({robot.address}, {robot.profile.name}); the site file now says otherwise",
+                f"{role} was {robot.name} ({robot.address}, {robot.profile.name}); the site file now differs",
                 where=plan.trial,
-                remedy="let site file and profile say again what trial.yaml says, or start a new trial",
+                remedy="restore the site file and profile to the values in trial.yaml, or start a new trial",
             )

@@ -1,4 +1,4 @@
-"""The robots of a trial during one attempt: make the folders, run the steps, fetch the evidence, clean up."""
+"""The robots of a trial during one attempt: create folders, run the steps, fetch the evidence, clean up."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,17 +39,17 @@ _WATCH_S: Final = 0.5
 
 
 def unfetched_file(role: Role) -> str:
-    """Return the name of the file that says that evidence stays on the robot in `role`, and why."""
+    """Return the name of the file that records why evidence was left on the robot in `role`."""
     return f"{role}-{laptop_files.UNFETCHED}"
 
 
 class Robots:
-    """The robots that take part in a trial, all served at once.
+    """The robots that take part in a trial; each operation runs on all of them in parallel.
 
     Args:
         plan: The trial.
-        testbed: Where they are.
-        sink: Told how far the fetching of large evidence is.
+        testbed: The testbed.
+        sink: Receives the progress of fetching large evidence.
     """
 
     def __init__(self, plan: Plan, testbed: Testbed, sink: Sink = lambda _: None) -> None:
@@ -57,7 +57,7 @@ class Robots:
         self._testbed = testbed
         self._sink = sink
         self.transient = isinstance(testbed, Transient)
-        """Whether the robots, and all files on them, end with this run of fieldkit."""
+        """Whether the robots and their files are removed at the end of this run of fieldkit."""
         self._roles = sorted(plan.procedure.roles())
         protocol = plan.procedure.protocols[0]
         self._owners = FileOwners.of(plan.procedure, plan.scene(RepeatId(protocol, 1), ""))
@@ -71,12 +71,12 @@ class Robots:
         return self._testbed.shells
 
     def begin(self, remote: str, *, old: str | None) -> None:
-        """Make an attempt's folder `remote` on each robot, and remove the folder `old` where it was fetched.
+        """Create an attempt's folder `remote` on each robot, and remove the folder `old` unless it was not fetched.
 
-        Programs of the lab are copied here, before the first step, so that nothing of them crosses the radio later.
+        Programs of the lab are copied now, before the first step, so that the copies do not load the radio later.
 
         Raises:
-            FieldkitError: As `evidence.begin` and `programs.place`; or a program of the lab has changed.
+            FieldkitError: As for `evidence.begin` and `programs.place`; or a program of the lab has changed.
         """
         plan = self._plan
         puts = [(put, put.program.content()) for put in plan.puts()]
@@ -99,7 +99,7 @@ class Robots:
         self._everywhere(make)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
-        """Run every step, and write down what the oracle knows of it, where there is one; errors as `Step.run`."""
+        """Run every step, and store the measurements of the testbed's oracle, if any; errors as for `Step.run`."""
         oracle = self._testbed.oracle
         if oracle is None:
             self._run_steps(scene, announce)
@@ -125,7 +125,7 @@ class Robots:
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
-        """End what the body waits for when a process that the robots need has ended: no answer comes any more."""
+        """Unblock the body if a process that emulates robots has exited, because no answer can arrive any more."""
         ended = Event()
 
         def watch() -> None:
@@ -146,32 +146,32 @@ class Robots:
                 watching.join()
 
     def fetch(self, remote: str, into: Path, *, clean: bool) -> list[str]:
-        """Collect an attempt's evidence, after ending its jobs where it did not end cleanly.
+        """Fetch an attempt's evidence; if it did not end normally, its jobs are ended first.
 
-        What a robot did not give stays on it, and `ROLE-unfetched.txt` says so.
+        Evidence that was not fetched stays on its robot, and `ROLE-unfetched.txt` records it.
 
         Args:
             remote: The attempt's folder on each robot.
-            into: The folder that it comes to.
-            clean: Whether the attempt ended cleanly.
+            into: The local folder.
+            clean: Whether the attempt ended normally.
 
         Returns:
-            What went wrong, in sentences.
+            The problems, one sentence each.
         """
         self._hung_up = False
-        found_by_role = self._everywhere(lambda role: self._collect(role, remote, into, clean=clean))
-        failed = [(role, *found) for role, found in zip(self._roles, found_by_role, strict=True) if found]
+        problems = self._everywhere(lambda role: self._collect(role, remote, into, clean=clean))
+        failed = [(role, *problem) for role, problem in zip(self._roles, problems, strict=True) if problem]
         for role, reason, is_there in failed:
             if is_there:
-                self._leave(role, remote, into, reason)
+                self._mark_unfetched(role, remote, into, reason)
         return [reason for _, reason, _ in failed]
 
     def _collect(self, role: Role, remote: str, into: Path, *, clean: bool) -> tuple[str, bool] | None:
-        """Collect the evidence of one robot; return what went wrong, and whether the robot has the evidence still."""
+        """Fetch the evidence of one robot; return the problem and whether the robot still has it, or None."""
         shell, attempt = self.shells[role], remote.rpartition("/")[2]
 
-        def announce(said: str, left_s: float) -> None:
-            name = f"collect evidence, {said} of {self._plan.cast[role].name}"
+        def announce(progress_text: str, left_s: float) -> None:
+            name = f"collect evidence, {progress_text} of {self._plan.cast[role].name}"
             self._sink(PhaseStarted(name, attempt.rpartition("-")[0], left_s))
 
         progress = FetchProgress(announce, lambda: self._hung_up)
@@ -196,13 +196,12 @@ class Robots:
         rebooted = None if clean else self._rebooted(role)
         return (rebooted, False) if rebooted else None
 
-    def leave(self, remote: str, into: Path, reason: str) -> None:
-        """Leave an attempt's folder on every robot, and write into its folder here that it is there, and why."""
+    def mark_unfetched(self, remote: str, into: Path, reason: str) -> None:
+        """Leave an attempt's folder on every robot, and record its path and the reason in its local folder."""
         for role in self._roles:
-            self._leave(role, remote, into, reason)
+            self._mark_unfetched(role, remote, into, reason)
 
-    def _leave(self, role: Role, remote: str, into: Path, reason: str) -> None:
-        """Leave an attempt's folder on a robot, and write down that it is there."""
+    def _mark_unfetched(self, role: Role, remote: str, into: Path, reason: str) -> None:
         if remote not in self._unfetched[role]:
             self._unfetched[role].append(remote)
         verb = "had" if self.transient else "has"
@@ -210,21 +209,21 @@ class Robots:
         text = f"{reason}\n{self._plan.cast[role].name} {verb} it in ~/{remote}{end}\n"
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 
-    def remember(self, ended: Attempt, kept: Path) -> None:
-        """Know again what of an earlier attempt, kept in a folder, was not fetched."""
+    def restore_unfetched(self, ended: Attempt, kept: Path) -> None:
+        """Mark the evidence of an attempt in an earlier run as unfetched, if its stored folder says so."""
         if ended.status is not Status.VALID and not self.transient:
             for role in self._roles:
                 if (kept / unfetched_file(role)).is_file():
                     self._unfetched[role].append(ended.remote(self._plan.trial))
 
-    def left(self) -> Mapping[str, Sequence[str]]:
-        """Return the folders whose evidence was not fetched and stays on its robot, by the robot's name."""
+    def unfetched(self) -> Mapping[str, Sequence[str]]:
+        """Return the remote folders with evidence that was not fetched, by the robot's name."""
         if self.transient:
             return {}
         return {self._plan.cast[role].name: folders for role, folders in self._unfetched.items() if folders}
 
     def _rebooted(self, role: Role) -> str | None:
-        """Return that a robot rebooted during the attempt; None where a step made it, or nobody knows."""
+        """Return a message if a robot rebooted unexpectedly during the attempt; None if it did not, or is unknown."""
         booted = self._boots.get(role) if role not in hosts.restarted(self._plan.procedure) else None
         with suppress(FieldkitError):
             if booted and hosts.rebooted(booted, evidence.boot(self.shells[role])):
@@ -232,33 +231,33 @@ class Robots:
         return None
 
     def demand_up(self) -> None:
-        """Return if every process runs that the robots need; errors as `Transient.demand_up`."""
+        """Raise an error if a process that emulates robots has exited; errors as for `Transient.demand_up`."""
         if isinstance(self._testbed, Transient):
             self._testbed.demand_up()
 
     def demand_held(self) -> None:
-        """Go on only if no robot that can tell says that somebody ended this trial.
+        """Raise an error if a robot reports that its lock was broken; robots that do not answer are ignored.
 
         Raises:
-            LockLostError: Somebody aborted it, or took a robot when its lock had expired.
+            LockLostError: The trial was aborted, or the lock expired and another holder locked the robot.
         """
 
-        def ask(role: Role) -> None:
+        def check_lock(role: Role) -> None:
             try:
                 locks.demand(self.shells[role], self._plan.session)
             except LockLostError:
                 raise
             except FieldkitError:
-                return  # whatever keeps it from telling, the attempt has its own reasons
+                return  # the attempt already has reasons for its failure
 
-        self._everywhere(ask)
+        self._everywhere(check_lock)
 
     def end_jobs(self, remote: str) -> None:
         """End every job of an attempt; errors as `evidence.end_jobs`."""
         self._everywhere(lambda role: evidence.end_jobs(self.shells[role], remote))
 
     def end_left(self) -> None:
-        """End every job that a fieldkit which was killed left of this trial; errors as `evidence.end_all`."""
+        """End every job of this trial that remains from a killed run; errors as for `evidence.end_all`."""
 
         def end(role: Role) -> None:
             jobs.install(self.shells[role], Deadline.after(jobs.REPLY_S))
@@ -267,16 +266,16 @@ class Robots:
         self._everywhere(end)
 
     def hang_up(self) -> None:
-        """Break every control connection; the next command makes a new one, but no fetch goes on."""
+        """Close every control connection and cancel fetching; the next command opens a new connection."""
         self._hung_up = True
         for shell in self.shells.values():
             shell.close()
 
-    def discard(self, remote: str | None = None) -> None:
-        """Remove an attempt's folder from the robots, or everything of the trial, as far as it was fetched.
+    def delete_remote(self, remote: str | None = None) -> None:
+        """Remove the folder of an attempt, or of the whole trial, from the robots, except unfetched evidence.
 
         Raises:
-            FieldkitError: As `evidence.discard`.
+            FieldkitError: As for `evidence.discard`.
         """
 
         def remove(role: Role) -> None:

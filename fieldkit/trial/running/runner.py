@@ -1,4 +1,4 @@
-"""Run a planned trial, or go on with one: every repeat attempted until it is valid, or failed for good."""
+"""Run or resume a planned trial: every repeat is attempted until it is valid or has failed."""
 
 import errno
 import time
@@ -28,12 +28,12 @@ from fieldkit.core.model import ENDED, RepeatId
 from fieldkit.core.prompts import Answer
 from fieldkit.core.units import TimeEstimate
 from fieldkit.trial import estimates, journal, manifest, rows, store
-from fieldkit.trial.estimates import Taken
+from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import preflight
 from fieldkit.trial.running.attempts import Attempts
 from fieldkit.trial.running.ledger import Ledger
-from fieldkit.trial.running.motion_leave import MotionLeave
+from fieldkit.trial.running.motion_leave import MotionPermission
 from fieldkit.trial.running.resumption import resumable
 from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.stop import Stop
@@ -48,7 +48,7 @@ class Outcome:
         cells: Its summary.
         valid: Repeats that are valid.
         failed: Repeats that no attempt made valid.
-        judgements: What the summary says of the procedure's expectations.
+        judgements: Judgements of the procedure's expectations.
     """
 
     folder: Path
@@ -59,112 +59,114 @@ class Outcome:
 
 
 def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
-    """Place the robots and run a trial; None when the operator left it for later. Errors as `place` and `begin`."""
-    placing = place(plan, testbed, sink)
-    if placing.answer.skip:
+    """Place the robots and run a trial; None if the operator skipped it. Errors as for `place` and `begin`."""
+    placement = place(plan, testbed, sink)
+    if placement.answer.skip:
         return None
-    return begin(plan.with_note(placing.answer.note), testbed, out, sink, stop or Stop())
+    return begin(plan.with_note(placement.answer.note), testbed, out, sink, stop or Stop())
 
 
 def resume_trial(
     folder: Path, testbed: Testbed, sink: Sink, stop: Stop | None = None, *, failed: bool = False
 ) -> Outcome | None:
-    """Place the robots and go on with a trial; None when the operator left it for later. Errors as `go_on`."""
-    placing = place(resumable(folder), testbed, sink)
-    return None if placing.answer.skip else go_on(folder, testbed, sink, stop or Stop(), failed=failed)
+    """Place the robots and resume a trial; None if the operator skipped it. Errors as for `continue_trial`."""
+    placement = place(resumable(folder), testbed, sink)
+    if placement.answer.skip:
+        return None
+    return go_on(folder, testbed, sink, stop or Stop(), failed=failed)
 
 
 @dataclass(frozen=True)
-class Placing:
-    """Placing of a trial's robots.
+class PlacementResult:
+    """Result of placing a trial's robots.
 
     Attributes:
-        answer: What the operator said to it: a note, or to leave the trial for later.
-        took_s: How long it took.
+        answer: The operator's answer: a note, or a request to skip the trial.
+        took_s: Duration in seconds.
     """
 
     answer: Answer
     took_s: float
 
 
-def place(plan: Plan, testbed: Testbed, sink: Sink) -> Placing:
-    """Bring the robots to the places of a trial; errors as `Testbed.place`."""
-    began_s = time.monotonic()
-    placing = Placing(testbed.place(plan.placement), time.monotonic() - began_s)
-    sink(Placed(placing.answer.skip, placing.answer.note, placing.took_s))
-    return placing
+def place(plan: Plan, testbed: Testbed, sink: Sink) -> PlacementResult:
+    """Bring the robots to the places of a trial; errors as for `Testbed.place`."""
+    started_s = time.monotonic()
+    placement = PlacementResult(testbed.place(plan.placement), time.monotonic() - started_s)
+    sink(Placed(placement.answer.skip, placement.answer.note, placement.took_s))
+    return placement
 
 
-def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, told: bool = True) -> Outcome:
-    """Check robots that stand at their places, and run every repeat.
+def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, report_resume: bool = True) -> Outcome:
+    """Run preflight on robots at their places, and run every repeat.
 
-    Whatever ends the trial early, the folder holds the plan, the journal, every attempt that had ended, their rows
-    and a manifest over them, and `go_on` goes on; only a kill leaves out the summary, which `rebuild` makes.
+    If the trial ends early, its folder contains the plan, the journal, every attempt that ended, their rows and a
+    manifest, and `continue_trial` resumes it. Only after a kill the summary is missing; `rebuild` writes it.
 
     Args:
         plan: The trial.
         testbed: The robots.
-        out: Folder that the trial's own folder is made in.
-        sink: Told what happens.
-        stop: Tells the trial to stop.
-        told: Whether to tell how to go on with this trial alone when it stops.
+        out: Folder in which the trial's folder is created.
+        sink: Receives events.
+        stop: Request to stop the trial.
+        report_resume: Whether to report how to resume this trial alone if it stops.
 
     Raises:
-        ConfigurationError: The folder cannot be made.
-        LinkError: A robot did not answer when a repeat was about to begin.
+        ConfigurationError: The folder cannot be created.
+        LinkError: A robot did not answer at the start of a repeat.
         RobotError: Preflight found a problem.
-        KeyboardInterrupt: `stop` was asked for.
+        KeyboardInterrupt: A stop was requested.
     """
     folder = store.create(out, plan)
     sink(Note(f"trial {folder}"))
     with journal.claimed(folder), _writing(folder):
-        return _run(plan, testbed, folder, sink, stop, told=told)
+        return _run(plan, testbed, folder, sink, stop, report_resume=report_resume)
 
 
 def go_on(
-    folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, told: bool = True, failed: bool = False
+    folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, report_resume: bool = True, failed: bool = False
 ) -> Outcome:
-    """Go on with a trial that stopped: what is over stays as it is, each other repeat is run once more.
+    """Resume an interrupted trial: finished repeats are kept, each other repeat is attempted again.
 
-    An attempt whose steps were done is fetched and judged; one that was cut short is kept as void and counts for none
-    of the attempts that the procedure allows.
+    The evidence of an attempt whose steps were done is fetched and judged. An interrupted attempt is stored as void
+    and does not count as one of the allowed attempts.
 
     Args:
         folder: The trial's folder.
         testbed: The robots of its plan, at their places.
-        sink: Told what happens.
-        stop: Tells the trial to stop.
-        told: As `begin`.
-        failed: Whether failed repeats are redone too, with as many attempts as the procedure allows.
+        sink: Receives events.
+        stop: Request to stop the trial.
+        report_resume: As for `begin`.
+        failed: Whether failed repeats are repeated too, each with as many attempts as the procedure allows.
 
     Raises:
-        ConfigurationError: `folder` is no trial, other code began it, or another fieldkit runs it now.
+        ConfigurationError: `folder` is not a trial, other code started it, or another fieldkit runs it now.
         EvidenceError: Its journal is damaged.
-        FieldkitError: As `begin`.
+        FieldkitError: As for `begin`.
     """
     plan = resumable(folder)
     with journal.claimed(folder), _writing(folder):
-        if failed and not journal.reopen_failed(folder, plan) and told:
+        if failed and not journal.reopen_failed(folder, plan) and report_resume:
             sink(Note("no repeat of this trial failed"))
-        return _run(plan, testbed, folder, sink, stop, told=told)
+        return _run(plan, testbed, folder, sink, stop, report_resume=report_resume)
 
 
-def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, told: bool) -> Outcome:
-    """Run what is left of a trial whose journal is ours."""
+def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, report_resume: bool) -> Outcome:
+    """Run the remaining repeats of a trial whose journal is locked by this process."""
     ledger = Ledger(plan, folder, stop)
     robots = Robots(plan, testbed, sink)
     for ended in ledger.ended:
-        robots.remember(ended, store.attempt_folder(folder, ended.folder))
+        robots.restore_unfetched(ended, store.attempt_folder(folder, ended.folder))
     repeats = list(plan.order())
-    past = estimates.taken(plan, journal.read(folder))
+    past = estimates.finished_repeats(plan, journal.read(folder))
     if ledger.differences:
-        sink(Note(f"not as it was when it was kept, and left so: {manifest.few(ledger.differences)}"))
+        sink(Note(f"the evidence has changed since it was stored: {manifest.few(ledger.differences)}"))
     try:
         sink(TrialStarted(str(folder), ledger.done, len(repeats)))
         robots.end_left()
         sink(PhaseStarted("preflight"))
         variants = preflight.preflight(plan, robots.shells, folder, sink)
-        leave = MotionLeave(plan, testbed, folder)
+        permission = MotionPermission(plan, testbed, folder)
         attempts = Attempts(
             plan,
             folder,
@@ -173,34 +175,34 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
             variants=variants,
             sink=sink,
             motions=stop.motions,
-            origins=leave.origins,
+            origins=permission.origins,
         )
         for cut in ledger.cut_short:
             attempts.recover(cut)
         for repeat in repeats:
-            began_s = time.monotonic()
+            started_s = time.monotonic()
             while not ledger.is_over(repeat):
-                leave.demand()
+                permission.demand()
                 lasts_s = plan.procedure.expected_s(repeat.protocol)
                 notes = plan.abort_notes(plan.scene(repeat, ""))
-                with leave.noting(sink), stop.finishing(lasts_s, notes):
+                with permission.noting(sink), stop.finishing(lasts_s, notes):
                     remedy = attempts.make(repeat)
                     if ledger.is_over(repeat):
-                        past.append(Taken(plan, repeat.protocol, time.monotonic() - began_s))
-                    left = [one for one in repeats if not ledger.is_over(one)]
-                    # Before a request to stop is taken up: what was let finish is told too.
+                        past.append(FinishedRepeat(plan, repeat.protocol, time.monotonic() - started_s))
+                    left = [other for other in repeats if not ledger.is_over(other)]
+                    # Inside the context, so that a repeat that a stop request let finish is reported too.
                     sink(_ended(plan, ledger, len(repeats), _left(plan, left, past), remedy))
     except BaseException as error:
-        if told:
+        if report_resume:
             sink(TrialStopped(str(folder), ledger.done, len(repeats)))
         if isinstance(error, OSError):
             raise  # nothing more can be written
-        _tell_left(robots, sink)
+        _report_unfetched(robots, sink)
         ledger.summarize()
         raise
     cells = ledger.summarize()
-    robots.discard()
-    _tell_left(robots, sink)
+    robots.delete_remote()
+    _report_unfetched(robots, sink)
     valid, void, failed = map(ledger.counts, ENDED)
     judgements = judge(plan.procedure.expectations, cells)
     _show_judgements(judgements, sink)
@@ -215,7 +217,7 @@ def _show_judgements(judgements: Iterable[Judgement], sink: Sink) -> None:
 
 def _judged(judgement: Judgement) -> ExpectationJudged:
     _, protocol, measured, interval, _ = wording.judged(judgement)
-    found = judgement.found
+    estimate = judgement.found
     return ExpectationJudged(
         expectation=judgement.expectation.text,
         protocol=protocol.lower(),
@@ -223,21 +225,21 @@ def _judged(judgement: Judgement) -> ExpectationJudged:
         why=judgement.why,
         measured=measured,
         interval=interval,
-        n=found.n if found else 0,
+        n=estimate.n if estimate else 0,
         n_valid=judgement.cell.n_valid if judgement.cell else 0,
-        n_censored=found.n_censored if found else 0,
+        n_censored=estimate.n_censored if estimate else 0,
     )
 
 
-def _tell_left(robots: Robots, sink: Sink) -> None:
-    """Tell what was not fetched, which is on the robots still."""
-    for robot, folders in robots.left().items():
+def _report_unfetched(robots: Robots, sink: Sink) -> None:
+    """Report evidence that was not fetched and is still on the robots."""
+    for robot, folders in robots.unfetched().items():
         where = ", ".join(f"~/{folder}" for folder in folders)
-        sink(Note(f"{robot}: evidence that was not fetched stays on it; delete it when nobody needs it: {where}"))
+        sink(Note(f"{robot}: evidence that was not fetched stays on it; delete it when it is not needed: {where}"))
 
 
-def _left(plan: Plan, left: Sequence[RepeatId], past: Sequence[Taken]) -> TimeEstimate:
-    """Return how long the repeats take that are left."""
+def _left(plan: Plan, left: Sequence[RepeatId], past: Sequence[FinishedRepeat]) -> TimeEstimate:
+    """Return the estimated duration of the remaining repeats."""
     counts = Counter(repeat.protocol for repeat in left)
     return estimates.total(estimates.of_repeats(plan, protocol, counts[protocol], past) for protocol in counts)
 
@@ -260,15 +262,15 @@ def _ended(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: s
 
 @contextmanager
 def _writing(folder: Path) -> Iterator[None]:
-    """Say what to do where a trial's folder cannot be written any more: the disk is full, or it was moved away."""
+    """Convert errors from writing to a trial's folder, for example if the disk is full or the folder was moved."""
     try:
         yield
     except OSError as error:
-        first = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "mend that"
+        first = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "fix that"
         raise ConfigurationError(
-            f"cannot be written: {error.strerror or error}; what had ended is saved",
+            f"cannot be written: {error.strerror or error}; the repeats that ended are saved",
             where=str(error.filename or folder),
             remedy=f"{first}, then: {typed('fieldkit', 'resume', folder)}"
             if folder.is_dir()
-            else "fieldkit resume FOLDER, where that is now",
+            else "fieldkit resume FOLDER, with the present path of the folder",
         ) from error

@@ -1,4 +1,4 @@
-"""Errors of a program in a kind of step: the attempt fails with one line, and the traceback goes to a file."""
+"""Errors in the code of a step kind: the attempt fails with a one-line message, the traceback goes to a file."""
 
 import errno
 import traceback
@@ -10,8 +10,8 @@ from typing import Final
 from fieldkit.core import laptop_files
 from fieldkit.core.errors import FieldkitError, RobotError
 
-_OF_THE_DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE})
-"""Errors of this machine, which no other attempt avoids."""
+_DISK_ERRORS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE})
+"""Errors of this machine that another attempt would not avoid."""
 
 
 class StepError(RobotError):
@@ -36,7 +36,7 @@ def reported(kind: str, folder: Path | None) -> Iterator[None]:
     except (FieldkitError, MemoryError):
         raise
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in _OF_THE_DISK:
+        if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
             raise
         remedy = "report it to the author of the step"
         if folder is not None:

@@ -8,17 +8,17 @@ from fieldkit.steps.motions import Motions
 
 
 class Stop:
-    """One request to stop.
+    """A request to stop.
 
-    It is taken up at once while a robot moves by itself or may begin to (`motions`); otherwise between two repeats
-    while one runs, and at once while none does.
+    It takes effect immediately while a robot moves without a person or may start to (`motions`), and while no repeat
+    runs; otherwise after the running repeat.
 
     Attributes:
-        asked: Whether the trial is to stop after the repeat that runs.
-        patient: Whether a repeat runs that may be finished first.
-        saving: Whether something is being written that must not be left half done.
-        due: Whether to stop as soon as it is.
-        motions: The robots that move by themselves.
+        asked: Whether the trial must stop after the running repeat.
+        patient: Whether a repeat is running that may be finished first.
+        saving: Whether files are being written that must not be left incomplete.
+        due: Whether to stop as soon as they are written.
+        motions: The robots that move without a person.
     """
 
     def __init__(self) -> None:
@@ -31,19 +31,19 @@ class Stop:
 
     @property
     def left_s(self) -> float:
-        """About how many seconds the repeat that runs takes from now on; 0 where it takes longer than it should."""
+        """Estimated remaining time of the running repeat in seconds; 0 if it takes longer than estimated."""
         return self._ends.remaining_s
 
     @contextmanager
     def finishing(self, lasts_s: float, motions: tuple[str, ...]) -> Iterator[None]:
-        """Let the body end before a request to stop is taken up, unless robots move in it by themselves.
+        """Let the body finish before a request to stop takes effect, unless robots move in it without a person.
 
         Args:
-            lasts_s: About how long it takes.
-            motions: See `Motions.ahead`: until the body clears that, a request to stop is taken up at once.
+            lasts_s: Estimated duration of the body, in seconds.
+            motions: See `Motions.ahead`: until the body clears it, a request to stop takes effect immediately.
 
         Raises:
-            KeyboardInterrupt: The body has ended, and a stop was requested meanwhile.
+            KeyboardInterrupt: The body has finished, and a stop was requested meanwhile.
         """
         self._ends, self.motions.ahead = Deadline.after(lasts_s), motions
         self.patient = True
@@ -56,10 +56,10 @@ class Stop:
 
     @contextmanager
     def whole(self) -> Iterator[None]:
-        """Let the body end, which takes a moment, before anything stops.
+        """Let the body, which is short, finish before a stop.
 
         Raises:
-            KeyboardInterrupt: The body has ended, and something was to stop meanwhile.
+            KeyboardInterrupt: The body has finished, and a stop was due meanwhile.
         """
         self.saving = True
         try:

@@ -1,4 +1,4 @@
-"""What is made of a robot's answers: verbatim outputs of the tools in, findings out."""
+"""Checks of a robot: verbatim outputs of tools as input, findings as output."""
 
 import re
 from collections.abc import Sequence
@@ -36,12 +36,12 @@ def said(name: str, code: int = 0) -> Said:
 
 
 def only(findings: Sequence[Finding], check: str) -> Finding:
-    (finding,) = [one for one in findings if one.check == check]
+    (finding,) = [finding for finding in findings if finding.check == check]
     return finding
 
 
 def heard(robot: Robot, **sections: Said) -> list[Finding]:
-    """Judge the radio; an underscore in a section's name stands for a hyphen."""
+    """Judge the radio; an underscore in the name of a section is replaced by a hyphen."""
     base = {"interface": said("ip/6.1.0/up.txt")}
     report = Report(robot.name)
     radio.judge(robot, base | {name.replace("_", "-"): text for name, text in sections.items()}, report)
@@ -87,10 +87,10 @@ def test_a_station_has_access_point_channel_signal_and_rate() -> None:
     assert only(findings, "Wi-Fi").detail == (
         "managed 'knowhere', at f0:99:bf:0e:86:98, channel 11, -65 dBm, 65.0 MBit/s"
     )
-    assert {one.status for one in findings} == {OK}
+    assert {finding.status for finding in findings} == {OK}
 
 
-def test_a_signal_near_the_sensitivity_is_warned_of() -> None:
+def test_a_signal_near_the_sensitivity_is_a_warning() -> None:
     link = said("iw/link-station.txt")
     # The TurtleBot's sensitivity is -82 dBm.
     for dbm, status in ((-72, OK), (-73, WARN)):
@@ -99,7 +99,7 @@ def test_a_signal_near_the_sensitivity_is_warned_of() -> None:
         assert only(findings, "Wi-Fi").status is status
 
 
-def test_power_save_is_warned_of_with_the_command_that_ends_it() -> None:
+def test_power_save_is_a_warning_with_the_command_that_disables_it() -> None:
     findings = heard(
         SENDER,
         wifi_info=said("iw/info-station.txt"),
@@ -110,7 +110,7 @@ def test_power_save_is_warned_of_with_the_command_that_ends_it() -> None:
     assert (finding.status, finding.remedy) == (WARN, "sudo iw dev wlan0 set power_save off")
 
 
-def test_a_station_of_no_network_fails() -> None:
+def test_a_station_without_a_network_fails() -> None:
     findings = heard(SENDER, wifi_info=said("iw/info-txpower.txt"), wifi_link=said("iw/link-none.txt"))
     assert only(findings, "Wi-Fi").status is FAIL
 
@@ -118,16 +118,16 @@ def test_a_station_of_no_network_fails() -> None:
 def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
     findings = heard(RELAY, wifi_info=said("iw/info-ap.txt"), wifi_stations=said("iw/stations-ap.txt"))
     assert only(findings, "Wi-Fi").detail == "AP 'xx', channel 1, 1 stations, -57 dBm"
-    assert "power save" not in {one.check for one in findings}
+    assert "power save" not in {finding.check for finding in findings}
 
 
-def test_an_ad_hoc_cell_is_no_missing_network() -> None:
+def test_an_ad_hoc_cell_is_not_a_missing_network() -> None:
     ibss = Said(said("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
     findings = heard(SENDER, wifi_info=ibss, wifi_link=said("iw/link-ibss.txt"))
     assert only(findings, "Wi-Fi").detail == "IBSS 'knowhere', at 02:11:87:86:a3:0f, channel 11"
 
 
-def test_the_kernels_own_wifi_stack_is_read_in_every_mode() -> None:
+def test_outputs_of_the_kernels_wifi_stack_are_read_in_every_mode() -> None:
     station = heard(SENDER, wifi_info=said("iw/info-hwsim-station-6.txt"), wifi_link=said("iw/link-hwsim-6.txt"))
     assert only(station, "Wi-Fi").detail == "managed 'lawn', at 02:00:00:00:00:00, channel 6, -30 dBm, 1.0 MBit/s"
     relay = heard(RELAY, wifi_info=said("iw/info-hwsim-ap-6.txt"), wifi_stations=said("iw/stations-hwsim-ap-6.txt"))
@@ -138,19 +138,19 @@ def test_the_kernels_own_wifi_stack_is_read_in_every_mode() -> None:
     assert only(down, "Wi-Fi").detail == "joined to no network"
 
 
-def test_an_interface_that_is_no_radio_has_no_wifi_findings() -> None:
+def test_an_interface_without_a_radio_has_no_wifi_findings() -> None:
     findings = heard(SENDER, wifi_info=said("iw/no-wifi.txt", 1))
-    assert {one.check for one in findings} == {"interface wlan0", "control", "offloads"}
+    assert {finding.check for finding in findings} == {"interface wlan0", "control", "offloads"}
 
 
-def test_a_radio_without_iw_is_warned_of() -> None:
+def test_a_radio_without_iw_is_a_warning() -> None:
     ether = Said(said("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
     findings = heard(SENDER, interface=ether, wireless=Said("/sys/class/net/wlan0/phy80211", 0))
     assert only(findings, "Wi-Fi").remedy == "sudo apt-get install iw"
 
 
 def probed(role: Role, **changes: Said) -> list[Finding]:
-    """Judge the system of a robot that has everything, but for `changes`."""
+    """Judge the system of a robot that has everything except for `changes`."""
     sections: dict[str, Said] = {
         "system": Said("Raspbian GNU/Linux 10 (buster), Linux 5.10.63-v7+ armv7l", 0),
         "disk": Said(
@@ -173,7 +173,7 @@ def probed(role: Role, **changes: Said) -> list[Finding]:
         (Role.RECEIVER, (100 << 10) + 1_000, OK),
         (Role.RECEIVER, 100 << 10, FAIL),
         (Role.RECEIVER, 0, FAIL),
-        # The one that records does so by rosbag, which leaves 1 GiB free.
+        # The recording robot uses rosbag, which leaves 1 GiB free.
         (Role.SENDER, (1 << 20) + 1_000, OK),
         (Role.SENDER, 1 << 20, FAIL),
     ],
@@ -184,7 +184,7 @@ def test_a_robot_s_disk_must_hold_an_attempt(role: Role, free_kib: int, status: 
     assert finding.status is status
 
 
-def test_a_disk_that_cannot_be_told_fails() -> None:
+def test_a_disk_with_unknown_space_fails() -> None:
     assert only(probed(Role.SENDER, disk=Said("df: .: Stale file handle", 1)), "disk").status is FAIL
 
 
@@ -196,10 +196,10 @@ def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
         assert only(report.findings, "disk").status is status
 
 
-def test_evidence_that_takes_long_to_fetch_is_warned_of_with_size_and_rate(tmp_path: Path) -> None:
+def test_evidence_that_takes_long_to_fetch_is_a_warning_with_size_and_rate(tmp_path: Path) -> None:
     report = Report("laptop")
     system.judge_laptop(PLAN, tmp_path, report)
-    assert "fetch" not in {one.check for one in report.findings}
+    assert "fetch" not in {finding.check for finding in report.findings}
     (entry, *others) = PLAN.procedure.steps
     long = type(entry)(entry.kind, entry.step.with_record(36_000.0))
     procedure = PLAN.procedure.model_copy(update={"steps": (long, *others)})
@@ -212,18 +212,18 @@ def test_evidence_that_takes_long_to_fetch_is_warned_of_with_size_and_rate(tmp_p
 LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1795259 1"
 
 
-def test_a_port_that_is_taken_fails_on_the_receiver_alone() -> None:
+def test_a_port_in_use_fails_on_the_receiver_only() -> None:
     taken = Said(LISTENER, 0)
     finding = only(probed(Role.RECEIVER, listeners=taken), "port 1234")
     assert finding.status is FAIL
     assert "1234" in finding.remedy
     assert only(probed(Role.RECEIVER, listeners=Said(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status is OK
-    assert "port 1234" not in {one.check for one in probed(Role.SENDER, listeners=taken)}
+    assert "port 1234" not in {finding.check for finding in probed(Role.SENDER, listeners=taken)}
 
 
-def test_a_low_battery_is_warned_of() -> None:
+def test_a_low_battery_is_a_warning() -> None:
     findings = probed(Role.SENDER, batteries=Said("BAT0 81\nbq27000-0 19", 0))
-    assert [(one.status, one.detail) for one in findings if one.check == "battery"] == [
+    assert [(finding.status, finding.detail) for finding in findings if finding.check == "battery"] == [
         (OK, "BAT0 at 81 %"),
         (WARN, "bq27000-0 at 19 %"),
     ]
@@ -233,15 +233,13 @@ def test_a_low_battery_is_warned_of() -> None:
     ("offset_s", "error_s", "status"),
     [(0.9, 0.0, OK), (-1.1, 0.05, WARN), (1.3, 0.5, OK), (3600.0, 0.01, WARN), (-7200.0, 0.01, WARN)],
 )
-def test_a_clock_that_is_surely_off_by_a_second_is_warned_of(
-    offset_s: float, error_s: float, status: Verdict
-) -> None:
+def test_a_clock_with_an_error_above_a_second_is_a_warning(offset_s: float, error_s: float, status: Verdict) -> None:
     report = Report("turtlebot-1")
     contact.judge_clock(Offset(offset_s, error_s), "pi@robot", report)
     assert only(report.findings, "clock").status is status
 
 
-def test_an_hour_off_is_told_plainly() -> None:
+def test_an_error_of_an_hour_is_reported_in_hours() -> None:
     report = Report("turtlebot-1")
     contact.judge_clock(Offset(-3601.0, 0.01), "-p 2222 pi@robot", report)
     (finding,) = report.findings
@@ -275,21 +273,21 @@ def judged(sections: Sections, plan: Plan = PLAN) -> list[Finding]:
 
 
 def procedure_of(step: str) -> Procedure:
-    """A procedure of this one step."""
+    """A procedure with this step only."""
     head = "name: x\nsummary: X\nscenario: los\ntopology: master\nprotocols: [tcp]\nrepeats: 1\nsteps:\n"
     return schema.validate(schema.parse(f"{head}- {step}\n", source="x.yaml"), Procedure)
 
 
 def test_a_robot_that_has_everything_passes() -> None:
     findings = judged(installed())
-    assert {one.status for one in findings} == {OK}
+    assert {finding.status for finding in findings} == {OK}
     tools = "traditional netcat, ping from iputils 20221126, tcpdump version 4.99.3"
     assert only(findings, "tools").detail == tools
 
 
 def test_a_missing_program_is_one_failure_with_its_package() -> None:
     sections = installed() | {"program nc.traditional": Said("", 1)}
-    (failed,) = [one for one in judged(sections) if one.status is not OK]
+    (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
     assert failed.check == "nc.traditional"
     assert failed.remedy == "sudo apt-get install netcat-traditional"
 
@@ -306,26 +304,26 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
         ("run: {robot: sender, command: busybox uptime}", "busybox", "sudo apt-get install busybox"),
     ],
 )
-def test_a_program_of_a_step_that_is_missing_says_where_it_comes_from(step: str, program: str, remedy: str) -> None:
+def test_a_missing_program_of_a_step_is_reported_with_its_source(step: str, program: str, remedy: str) -> None:
     plan = PLAN.model_copy(update={"procedure": procedure_of(step)})
     sections = installed(plan) | {f"program {program}": Said("", 127)}
-    (failed,) = [one for one in judged(sections, plan) if one.status is not OK]
+    (failed,) = [finding for finding in judged(sections, plan) if finding.status is not OK]
     assert (failed.check, failed.remedy) == (program, remedy)
 
 
-def test_a_robot_without_ros_is_asked_for_no_recorder_and_no_topic() -> None:
+def test_a_robot_without_ros_needs_no_recorder_and_no_topic() -> None:
     procedure = procedure_of("ping: {from: sender, to: receiver}")
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}, "procedure": procedure})
     sections = installed(plan)
-    assert {one.status for one in judged(sections, plan)} == {OK}
+    assert {finding.status for finding in judged(sections, plan)} == {OK}
     assert not any("ros" in " ".join(argv) for argv in software.commands(plan, Role.SENDER).values())
     assert software.can_record(plan, Role.SENDER, sections)
     assert topics.battery_of(robot) == ""
     assert topics.recorded(plan, Role.SENDER) == ()
 
 
-def test_a_robot_without_ros_that_is_to_record_is_refused() -> None:
+def test_a_recording_on_a_robot_without_ros_is_rejected() -> None:
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
     with pytest.raises(ConfigurationError, match="cannot record: its profile turtlebot3_burger has no ros"):
@@ -335,19 +333,21 @@ def test_a_robot_without_ros_that_is_to_record_is_refused() -> None:
 def test_a_setup_file_that_is_missing_is_one_failure() -> None:
     missing = "bash: line 1: /opt/ros/noetic/setup.bash: No such file or directory"
     sections = installed() | {"ROS": Said(missing, 1), "program rosbag": Said(missing, 1)}
-    (failed,) = [one for one in judged(sections) if one.status is not OK]
+    (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
     assert (failed.check, failed.detail) == ("ROS", missing)
     assert not software.can_record(PLAN, Role.SENDER, sections)
-    assert software.can_record(PLAN, Role.RECEIVER, {}), "where nothing is recorded, nothing was asked for"
+    assert software.can_record(PLAN, Role.RECEIVER, {}), "without a recording nothing is needed"
 
 
-def test_no_right_to_capture_fails_with_the_command_that_gives_it() -> None:
+def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:
     refused = Said("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
-    (failed,) = [one for one in judged(installed() | {"right to capture": refused}) if one.status is not OK]
+    (failed,) = [
+        finding for finding in judged(installed() | {"right to capture": refused}) if finding.status is not OK
+    ]
     assert failed.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
 
 
-def test_no_right_by_sudo_fails_with_the_rule_that_gives_it() -> None:
+def test_a_missing_sudo_permission_fails_with_the_rule_that_grants_it() -> None:
     tools = TURTLEBOT.tools.model_copy(update={"capture_right": "sudo"})
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"tools": tools})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
@@ -356,13 +356,15 @@ def test_no_right_by_sudo_fails_with_the_rule_that_gives_it() -> None:
         (Said("sh: 9: sudo: not found", Said.MISSING), "capture_right: direct"),
     ):
         (failed,) = [
-            one for one in judged(installed(plan) | {"right to capture": said}, plan) if one.status is not OK
+            finding
+            for finding in judged(installed(plan) | {"right to capture": said}, plan)
+            if finding.status is not OK
         ]
         assert remedy in failed.remedy
 
 
-def test_ros_1_without_a_master_is_warned_of() -> None:
-    (warned,) = [one for one in judged(installed() | {"ROS": Said("noetic", 0)}) if one.status is not OK]
+def test_ros_1_without_a_master_is_a_warning() -> None:
+    (warned,) = [finding for finding in judged(installed() | {"ROS": Said("noetic", 0)}) if finding.status is not OK]
     assert "ROS_MASTER_URI" in warned.detail
 
 
@@ -382,19 +384,19 @@ def recorded(count: int, span_s: float) -> Bag:
         (None, FAIL),
     ],
 )
-def test_a_topic_must_be_alive_and_should_have_its_rate(bag: Bag | None, status: Verdict) -> None:
+def test_a_topic_must_be_published_and_should_have_its_rate(bag: Bag | None, status: Verdict) -> None:
     report = Report("turtlebot-1")
     topics.judge(SENDER, ["/scan"], bag, report)
     assert only(report.findings, "topic /scan").status is status
 
 
-def test_a_topic_that_the_profile_does_not_know_has_no_rate() -> None:
+def test_a_topic_missing_in_the_profile_has_no_rate() -> None:
     report = Report("turtlebot-1")
     topics.judge(SENDER, ["/tf_static"], Bag(3, 0, 1.0, MappingProxyType({"/tf_static": 3})), report)
     assert only(report.findings, "topic /tf_static").status is OK
 
 
-def test_a_check_records_what_the_procedure_records_long_enough_for_the_slowest() -> None:
+def test_a_check_records_long_enough_for_the_slowest_topic() -> None:
     assert topics.recorded(PLAN, Role.SENDER) == ("/scan",)
     assert topics.recorded(PLAN, Role.RELAY) == ()
     assert topics.recording(Role.SENDER, SENDER, ["/scan"]).duration == topics.RECORD_S
@@ -413,12 +415,12 @@ def test_a_check_records_what_the_procedure_records_long_enough_for_the_slowest(
 
 
 @given(st.text())
-def test_any_answer_can_be_parsed(text: str) -> None:
+def test_any_output_can_be_parsed(text: str) -> None:
     assert all(section.code >= 0 for section in parse(text).values())
 
 
 @given(st.text())
-def test_what_a_robot_says_cannot_garble_the_terminal(text: str) -> None:
+def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
     report = Report("turtlebot-1")
     everything = {name: Said(text, 0) for name in (*installed(), "system", "disk", "interface", "wifi-info")}
     system.judge(PLAN, Role.SENDER, everything, report)
@@ -433,24 +435,22 @@ def test_what_a_robot_says_cannot_garble_the_terminal(text: str) -> None:
     [
         ("10.42.0.254 51000 10.42.0.1 22", Control.RADIO, OK, "as the site file says"),
         ("10.42.0.254 51000 10.42.0.1 22", Control.SEPARATE, WARN, "does not say control: radio"),
-        ("192.168.1.9 51000 192.168.1.5 22", Control.SEPARATE, OK, "it comes to 192.168.1.5"),
-        ("192.168.1.9 51000 192.168.1.5 22", Control.RADIO, OK, "it comes to 192.168.1.5"),
-        ("", Control.SEPARATE, OK, "does not say which way"),
+        ("192.168.1.9 51000 192.168.1.5 22", Control.SEPARATE, OK, "it arrives at 192.168.1.5"),
+        ("192.168.1.9 51000 192.168.1.5 22", Control.RADIO, OK, "it arrives at 192.168.1.5"),
+        ("", Control.SEPARATE, OK, "does not report the addresses"),
     ],
 )
-def test_the_way_of_ssh_is_seen_and_not_believed(
-    connection: str, control: Control, status: Verdict, detail: str
-) -> None:
+def test_the_route_of_ssh_is_detected(connection: str, control: Control, status: Verdict, detail: str) -> None:
     finding = only(heard(SENDER.model_copy(update={"control": control}), control=Said(connection, 0)), "control")
     assert finding.status is status
     assert detail in finding.detail
 
 
 @pytest.mark.parametrize("file", ["ip/6.1.0/nope.txt", "busybox/1.35.0/ip-nope.txt"])
-def test_an_interface_that_is_not_there_says_nothing_of_the_right_to_capture(file: str) -> None:
+def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) -> None:
     refused = Said("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
     sections = installed() | {"right to capture": refused, "interface": said(file, 1)}
-    assert "right to capture" not in {one.check for one in judged(sections)}
+    assert "right to capture" not in {finding.check for finding in judged(sections)}
     there = judged(sections | {"interface": said("ip/6.1.0/up.txt")})
     assert only(there, "right to capture").status is FAIL
 
@@ -461,40 +461,40 @@ def test_an_interface_that_is_not_there_says_nothing_of_the_right_to_capture(fil
         ("1000", "sudo apt-get", "sudo apt-get install iw", "sudo apt-get install iw"),
         ("0", "apt-get", "sudo apt-get install iw", "apt-get install iw"),
         ("1000", "apt-get", "sudo apt-get install iw", "as root: apt-get install iw"),
-        ("0", "", "sudo apt-get install iw", "install iw (so called in Debian)"),
+        ("0", "", "sudo apt-get install iw", "install iw (package name in Debian)"),
         ("0", "sudo", "sudo ip link set wlan0 up", "ip link set wlan0 up"),
         ("1000", "", "sudo ip link set wlan0 up", "as root: ip link set wlan0 up"),
-        ("1000", "sudo", "sudo setcap x y", "sudo setcap x y # setcap is of Debian's libcap2-bin"),
+        ("1000", "sudo", "sudo setcap x y", "sudo setcap x y # setcap is in Debian's libcap2-bin"),
         ("1000", "sudo setcap", "sudo setcap x y", "sudo setcap x y"),
         ("1000", "sudo", "fieldkit abort", "fieldkit abort"),
     ],
 )
-def test_a_remedy_can_be_typed_on_the_robot_at_hand(user: str, programs: str, remedy: str, typed: str) -> None:
+def test_a_remedy_can_be_typed_on_this_robot(user: str, programs: str, remedy: str, typed: str) -> None:
     report = Report("turtlebot-1")
-    report.means = system.means({"user": Said(user, 0), "means": Said("\n".join(programs.split()), 0)})
+    report.user_tools = system.user_tools({"user": Said(user, 0), "means": Said("\n".join(programs.split()), 0)})
     report.fail("iw", "not found", remedy)
     assert only(report.findings, "iw").remedy == typed
 
 
-def test_a_port_is_looked_for_by_what_the_robot_has() -> None:
+def test_the_remedy_for_a_port_uses_an_available_tool() -> None:
     report = Report(RECEIVER.name)
-    report.means = system.means({"user": Said("0", 0), "means": Said("netstat", 0)})
+    report.user_tools = system.user_tools({"user": Said("0", 0), "means": Said("netstat", 0)})
     system.judge(PLAN, Role.RECEIVER, {"listeners": Said(LISTENER, 0)}, report)
-    assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # names it; end it"
+    assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # shows it; stop it"
 
 
-def test_a_clock_is_set_by_what_the_robot_has() -> None:
+def test_the_remedy_for_a_clock_uses_an_available_tool() -> None:
     for user, programs, command in (
         ("0", "", "ssh -t -p 2222 pi@robot date -u -s @$(date +%s)"),
         ("1000", "sudo", "ssh -t -p 2222 pi@robot sudo date -u -s @$(date +%s)"),
         ("1000", "", "ssh -t -p 2222 pi@robot \"su -c 'date -u -s @$(date +%s)'\""),
     ):
         report = Report("turtlebot-1")
-        report.means = system.means({"user": Said(user, 0), "means": Said(programs, 0)})
+        report.user_tools = system.user_tools({"user": Said(user, 0), "means": Said(programs, 0)})
         contact.judge_clock(Offset(5.0, 0.1), "-p 2222 pi@robot", report)
         assert only(report.findings, "clock").remedy == f"{command} # on the laptop"
 
 
-def test_no_remedy_names_a_file_that_the_operator_did_not_name() -> None:
+def test_no_remedy_names_an_unknown_file() -> None:
     finding = only(heard(SENDER, control=Said("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
     assert finding.remedy == "write control: radio in the site file, or give host another network"

@@ -1,4 +1,4 @@
-"""The probe in the shells that robots have."""
+"""The probe in the shells of robots."""
 
 import subprocess
 
@@ -12,7 +12,7 @@ SHELLS = [("dash",), ("bash",), ("busybox", "ash")]
 
 
 @pytest.mark.parametrize("shell", SHELLS, ids=" ".join)
-def test_every_section_is_answered(shell: tuple[str, ...]) -> None:
+def test_every_section_has_an_answer(shell: tuple[str, ...]) -> None:
     commands = {
         "program it's": ("printf", "%s", AWKWARD),
         "no such": ("no-such-tool",),
@@ -24,7 +24,9 @@ def test_every_section_is_answered(shell: tuple[str, ...]) -> None:
     sections = parse(done.stdout.decode())
     assert sections["program it's"].text == AWKWARD
     assert sections["no such"].code == Said.MISSING
-    assert (sections["reads"].text, sections["reads"].code) == ("", 0), "it must not eat the script"
+    assert (sections["reads"].text, sections["reads"].code) == ("", 0), (
+        "commands must not read the script from standard input"
+    )
     assert (sections["fails"].text, sections["fails"].code) == ("said", 3)
     assert "LOOPBACK" in sections["interface"].text
     assert sections["disk"].ok

@@ -1,4 +1,4 @@
-"""Which variant a tool is, told from what the tool itself says."""
+"""Detection of a tool's variant from its output."""
 
 import contextlib
 import os
@@ -49,9 +49,9 @@ def with_tools(**names: str) -> RobotProfile:
         ),
     ],
 )
-def test_each_netcat_is_told_by_its_help(file: str, kind: Netcat, version: str) -> None:
-    found = tools.parse(USER + section("netcat", about(file), 1), TURTLEBOT)
-    assert (found.netcat, found.versions) == (kind, {Tool.NETCAT: version})
+def test_each_netcat_is_identified_by_its_help(file: str, kind: Netcat, version: str) -> None:
+    detected = tools.parse(USER + section("netcat", about(file), 1), TURTLEBOT)
+    assert (detected.netcat, detected.versions) == (kind, {Tool.NETCAT: version})
 
 
 @pytest.mark.parametrize(
@@ -66,27 +66,27 @@ def test_each_netcat_is_told_by_its_help(file: str, kind: Netcat, version: str) 
         (b"ping utility, iputils-sss20101006\n", PingTool.IPUTILS_OLD),
     ],
 )
-def test_each_ping_is_told_by_its_version(text: bytes, kind: PingTool) -> None:
+def test_each_ping_is_identified_by_its_version(text: bytes, kind: PingTool) -> None:
     assert tools.parse(USER + section("ping", text), TURTLEBOT).ping is kind
 
 
 @pytest.mark.parametrize("tool", ["netcat", "ping", "capture"])
-def test_a_tool_that_is_missing_or_unknown_is_refused_with_a_remedy(tool: str) -> None:
+def test_a_missing_or_unknown_tool_is_rejected_with_a_remedy(tool: str) -> None:
     with pytest.raises(RobotError, match="there is no") as missing:
         tools.parse(USER + section(tool, b"sh: 4: nc: not found\n", 127), TURTLEBOT)
-    with pytest.raises(RobotError, match="none that is known: GNU something") as unknown:
+    with pytest.raises(RobotError, match="of an unknown kind: GNU something") as unknown:
         tools.parse(USER + section(tool, b"GNU something 0.7.1\n"), TURTLEBOT)
     assert "apt-get install" in missing.value.remedy
     assert "apt-get install" in unknown.value.remedy
 
 
-def test_a_recorder_that_was_killed_is_not_taken_for_one_that_is_missing() -> None:
-    with pytest.raises(RobotError, match="rosbag record --help did not end in time") as slow:
+def test_a_killed_recorder_is_not_reported_as_missing() -> None:
+    with pytest.raises(RobotError, match="rosbag record --help did not exit in time") as slow:
         tools.parse(USER + section("recorder", b"", 137), TURTLEBOT)
     assert "is the robot busy?" in slow.value.remedy
 
 
-def test_a_ping_that_may_not_send_is_refused_with_a_remedy() -> None:
+def test_a_ping_without_permission_is_rejected_with_a_remedy() -> None:
     denied = section("echo", b"ping: permission denied (are you root?)\n", 1)
     busybox = section("ping", about("busybox/1.35.0/ping-about.txt"))
     with pytest.raises(RobotError, match=r"permission denied \(are you root\?\)") as caught:
@@ -97,7 +97,7 @@ def test_a_ping_that_may_not_send_is_refused_with_a_remedy() -> None:
     assert caught.value.remedy.startswith("sudo setcap cap_net_raw+ep")
 
 
-def test_whether_tcpdump_knows_immediate_mode_and_the_user_is_root() -> None:
+def test_immediate_mode_of_tcpdump_and_root_are_detected() -> None:
     new = tools.parse(section("user", b"0\n") + section("capture", about("tcpdump/4.99.3/about.txt")), TURTLEBOT)
     assert (new.immediate_mode, new.root) == (True, True)
     old = tools.parse(USER + section("capture", about("tcpdump/4.5.1/about.txt"), 1), TURTLEBOT)
@@ -105,12 +105,12 @@ def test_whether_tcpdump_knows_immediate_mode_and_the_user_is_root() -> None:
     assert (old.immediate_mode, old.root) == (False, False)
 
 
-def test_an_answer_without_sections_is_refused() -> None:
-    with pytest.raises(RobotError, match="cannot tell its tools apart: This account is closed"):
+def test_an_output_without_sections_is_rejected() -> None:
+    with pytest.raises(RobotError, match="its tools cannot be identified: This account is closed"):
         tools.parse(b"This account is closed.\n", TURTLEBOT)
 
 
-def test_what_was_not_asked_is_what_the_profile_lets_expect() -> None:
+def test_tools_that_were_not_probed_have_the_expected_variant() -> None:
     profile = with_tools(netcat="/usr/bin/nc.openbsd", ping="/opt/busybox/ping")
     assert tools.parse(USER, profile) == variants.expected(profile)
     assert variants.expected(profile).netcat is Netcat.OPENBSD
@@ -134,7 +134,7 @@ SHELLS = {"dash": ("dash",), "bash": ("bash",), "ash": ("busybox", "ash")}
 
 
 def run(profile: RobotProfile, shell: str = "dash") -> bytes:
-    """What the probe prints on this machine."""
+    """Return the output of the probe on this machine."""
     _, *rest = tools.probe(profile)
     return subprocess.run((*SHELLS[shell], *rest), capture_output=True, check=False, timeout=tools.PROBE_S).stdout
 
@@ -147,13 +147,18 @@ def test_the_probe_finds_this_machines_tools_in_every_shell(shell: str, netcat: 
     link = tmp_path / "nc"
     link.symlink_to("/bin/busybox")
     profile = with_tools(netcat=programs.get(netcat, str(link)))
-    found = tools.parse(run(profile, shell), profile)
-    assert (found.netcat, found.ping, found.immediate_mode, found.root) == (netcat, PingTool.IPUTILS, True, True)
-    assert found.versions.keys() == {Tool.NETCAT, Tool.PING, Tool.CAPTURE}
+    detected = tools.parse(run(profile, shell), profile)
+    assert (detected.netcat, detected.ping, detected.immediate_mode, detected.root) == (
+        netcat,
+        PingTool.IPUTILS,
+        True,
+        True,
+    )
+    assert detected.versions.keys() == {Tool.NETCAT, Tool.PING, Tool.CAPTURE}
 
 
 @pytest.mark.emulated
-def test_a_tool_that_never_ends_is_ended(tmp_path: Path) -> None:
+def test_a_tool_that_does_not_exit_is_killed(tmp_path: Path) -> None:
     program = tmp_path / "nc"
     program.write_text("#!/bin/sh\necho $$ >>pid\nexec sleep 1000\n")
     program.chmod(0o755)
@@ -162,13 +167,13 @@ def test_a_tool_that_never_ends_is_ended(tmp_path: Path) -> None:
     output = subprocess.run(
         ("sh", *rest), stdin=subprocess.PIPE, capture_output=True, check=False, timeout=tools.PROBE_S, cwd=tmp_path
     ).stdout
-    with pytest.raises(RobotError, match="nc did not end in time"):
+    with pytest.raises(RobotError, match="nc did not exit in time"):
         tools.parse(output, profile)
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)
 
 
-def test_what_a_tool_says_may_look_like_the_beginning_of_another() -> None:
+def test_output_of_a_tool_may_look_like_a_section_header() -> None:
     said = b"OpenBSD netcat\n==> ping <==\nmore"
-    found = tools.parse(USER + section("netcat", said, 1) + b"==> capture <==\nno end", TURTLEBOT)
-    assert (found.netcat, set(found.versions)) == (Netcat.OPENBSD, {Tool.NETCAT})
+    detected = tools.parse(USER + section("netcat", said, 1) + b"==> capture <==\nno end", TURTLEBOT)
+    assert (detected.netcat, set(detected.versions)) == (Netcat.OPENBSD, {Tool.NETCAT})

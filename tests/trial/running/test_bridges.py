@@ -1,4 +1,4 @@
-"""Bridges that profiles ask for: what is started on robots and when, and a scan that crosses from ROS 1 to DDS."""
+"""Bridges in profiles: the jobs on robots and their times, and a laser scan that is bridged from ROS 1 to DDS."""
 
 import json
 import subprocess
@@ -51,9 +51,9 @@ def asking(bridge: RobotBridge = BRIDGE) -> RobotProfile:
 
 
 def cast(bridge: RobotBridge = BRIDGE) -> Cast:
-    """Return a TurtleBot that asks for a bridge, and a drone."""
-    found = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
-    return {**found, Role.SENDER: found[Role.SENDER].model_copy(update={"profile": asking(bridge)})}
+    """Return a TurtleBot with a bridge, and a drone."""
+    robots = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
+    return {**robots, Role.SENDER: robots[Role.SENDER].model_copy(update={"profile": asking(bridge)})}
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def soon() -> Deadline:
 
 
 def first_heard(pid: int, address: str) -> bytes:
-    """Return the first scan that a node of DDS hears in a robot's network."""
+    """Return the first scan that a DDS node receives in a robot's network."""
     network = json.dumps({"address": address, "node": "ears", "domain": BRIDGE.domain})
     kind, profile = "sensor_msgs/LaserScan", PROFILES["sensor_data"]
     topic = json.dumps(topics.describe(shipped(), "/scan", kind, profile, domain=BRIDGE.domain, node="ears"))
@@ -84,20 +84,20 @@ def first_heard(pid: int, address: str) -> bytes:
 
 
 @pytest.mark.emulated
-def test_another_robot_hears_over_dds_what_ros_1_publishes_while_the_session_lasts(up: EmulatedTestbed) -> None:
-    told: list[Event] = []
+def test_dds_nodes_receive_ros_1_messages_during_the_session(up: EmulatedTestbed) -> None:
+    events: list[Event] = []
     shell, drone = up.shells[Role.SENDER], up.robots[Role.RECEIVER]
-    with bridges.running(cast(), up.shells, "s1", sink=told.append):
+    with bridges.running(cast(), up.shells, "s1", sink=events.append):
         (left,) = jobs.left(shell, soon())
         assert f"/{bridges.folder_of('s1')}/" in left
         scan: Any = shipped().ros2.deserialize_cdr(first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan")
     assert (scan.header.frame_id, len(scan.ranges)) == ("base_scan", 360)
     assert jobs.left(shell, soon()) == ()
-    assert not [one for one in told if isinstance(one, Note)], "it ended well"
+    assert not [event for event in events if isinstance(event, Note)], "the bridge exited successfully"
 
 
 @pytest.mark.emulated
-def test_one_that_does_not_start_is_told_with_what_it_says(up: EmulatedTestbed) -> None:
+def test_a_bridge_that_does_not_start_is_reported_with_its_output(up: EmulatedTestbed) -> None:
     wrong = cast(BRIDGE.model_copy(update={"topics": ("/scan:sensor_msgs/LasrScan",)}))
     with (
         pytest.raises(RobotError, match="LaserScan") as caught,
@@ -109,19 +109,19 @@ def test_one_that_does_not_start_is_told_with_what_it_says(up: EmulatedTestbed) 
 
 
 @pytest.mark.emulated
-def test_one_that_ends_by_itself_is_told(up: EmulatedTestbed) -> None:
-    told: list[Event] = []
+def test_a_bridge_that_exits_early_is_reported(up: EmulatedTestbed) -> None:
+    events: list[Event] = []
     short = f"#!/bin/sh\necho {BRIDGE_IS_UP}\nexit 3\n"
     up.shells[Role.SENDER].run(("sh", "-c", "cat >short && chmod +x short"), stdin=short.encode(), deadline=soon())
     ends = cast(BRIDGE.model_copy(update={"program": "/root/short"}))
-    with bridges.running(ends, up.shells, "s3", sink=told.append):
+    with bridges.running(ends, up.shells, "s3", sink=events.append):
         wait_until(lambda: not jobs.left(up.shells[Role.SENDER], soon()), soon())
-    (note,) = [one for one in told if isinstance(one, Note)]
-    assert note.text == "the bridge on turtlebot-1 ended before its time, with exit code 3"
+    (note,) = [event for event in events if isinstance(event, Note)]
+    assert note.text == "the bridge on turtlebot-1 exited early, with exit code 3"
 
 
 @pytest.mark.emulated
-def test_in_a_lab_to_play_with_it_is_a_service_of_the_robot() -> None:
+def test_in_an_interactive_lab_the_bridge_is_a_service_of_the_robot() -> None:
     members = {
         name: LabRobot(name, profile, address, ())
         for name, profile, address in (
@@ -136,9 +136,9 @@ def test_in_a_lab_to_play_with_it_is_a_service_of_the_robot() -> None:
 
 
 def test_the_command_line_of_a_robot() -> None:
-    found = bridges.jobs_of(cast(), "s1")
-    assert found.keys() == {Role.SENDER}
-    assert found[Role.SENDER].argv == (
+    jobs_by_role = bridges.jobs_of(cast(), "s1")
+    assert jobs_by_role.keys() == {Role.SENDER}
+    assert jobs_by_role[Role.SENDER].argv == (
         *("bash", "-c", '. /opt/ros/noetic/setup.bash && exec "$@"', "bash"),
         *("fieldkit", "bridge", "--from", "ros1", "--to", "dds", "--address", "10.42.0.1", "--domain", "7"),
         *("--patience", "5", "--back", TWIST, SCAN),
@@ -150,17 +150,17 @@ def test_the_command_line_of_a_robot() -> None:
     )
 
 
-def test_of_robots_that_share_a_master_the_first_carries() -> None:
+def test_of_robots_with_a_common_master_only_the_first_has_a_bridge() -> None:
     master = EmulatedBackend(None, None).cast(Topology.MASTER)
     asking_both = {"profile": asking()}
     robots = {
         role: robot.model_copy(update=asking_both if role is not Role.RELAY else {}) for role, robot in master.items()
     }
-    assert bridges.jobs_of(robots, "s1").keys() == {Role.SENDER, Role.RECEIVER}, "each has a master of its own"
+    assert bridges.jobs_of(robots, "s1").keys() == {Role.SENDER, Role.RECEIVER}, "each robot has a separate master"
     shared = {role: robot.model_copy(update={"ros_master": "10.42.0.3"}) for role, robot in robots.items()}
-    found = bridges.jobs_of(shared, "s1")
-    assert found.keys() == {Role.SENDER}
-    assert "10.42.0.3" in found[Role.SENDER].argv
+    jobs_by_role = bridges.jobs_of(shared, "s1")
+    assert jobs_by_role.keys() == {Role.SENDER}
+    assert "10.42.0.3" in jobs_by_role[Role.SENDER].argv
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_of_robots_that_share_a_master_the_first_carries() -> None:
         ("{to: dds, topic: ['/scan:sensor_msgs/LaserScan']}", "topics"),
     ],
 )
-def test_a_profile_that_asks_wrongly_is_told_where(text: str, said: str, tmp_path: Path) -> None:
+def test_a_wrong_profile_is_reported_with_its_location(text: str, said: str, tmp_path: Path) -> None:
     own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     file = tmp_path / "own.yaml"
     file.write_text(own.replace("ros:\n  variant: ros1\n", f"ros:\n  variant: ros1\n  bridge: {text}\n"))
@@ -184,7 +184,7 @@ def test_a_profile_that_asks_wrongly_is_told_where(text: str, said: str, tmp_pat
     assert "own.yaml:" in str(caught.value)
 
 
-def test_a_robot_with_ros_2_needs_none(tmp_path: Path) -> None:
+def test_a_robot_with_ros_2_needs_no_bridge(tmp_path: Path) -> None:
     own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     file = tmp_path / "own.yaml"
     asks = f"ros:\n  variant: ros2\n  bridge: {{to: dds, topics: ['{SCAN}']}}\n"
@@ -193,7 +193,7 @@ def test_a_robot_with_ros_2_needs_none(tmp_path: Path) -> None:
         schema.load(file, RobotProfile)
 
 
-def test_an_emulated_lab_without_debian_s_ros_refuses_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_emulated_lab_without_debian_s_ros_rejects_it(monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin}}\n"
     document = schema.parse(text, source="fieldkit.yaml")
     backend = EmulatedBackend(schema.validate(document, Site), document)
@@ -205,7 +205,7 @@ def test_an_emulated_lab_without_debian_s_ros_refuses_it(monkeypatch: pytest.Mon
         raise AssertionError("it is open")
 
 
-def test_preflight_looks_for_the_program() -> None:
+def test_preflight_checks_the_program() -> None:
     plan = los_plan()
     robot = plan.cast[Role.SENDER].model_copy(update={"profile": asking()})
     plan = plan.model_copy(update={"cast": {**plan.cast, Role.SENDER: robot}})

@@ -1,4 +1,4 @@
-"""`resume --failed`: failed repeats are run once more, what they left is kept, and the tables always agree."""
+"""`resume --failed`: failed repeats are run again, their evidence is kept, and the tables are always consistent."""
 
 import os
 import shutil
@@ -25,7 +25,7 @@ FIRST = RepeatId(Protocol.TCP, 1)
 
 @pytest.fixture
 def broken(monkeypatch: pytest.MonkeyPatch) -> set[str]:
-    """Repeats whose evidence is not whole."""
+    """Repeats whose evidence is incomplete."""
     robots_with_evidence(monkeypatch)
     names: set[str] = set()
 
@@ -47,19 +47,19 @@ def with_a_failed_repeat(out: Path, broken: set[str]) -> Path:
     return outcome.folder
 
 
-def redo(folder: Path, told: list[Event] | None = None) -> Outcome:
-    events: list[Event] = [] if told is None else told
+def redo(folder: Path, received: list[Event] | None = None) -> Outcome:
+    events: list[Event] = [] if received is None else received
     outcome = resume_trial(folder, IdleTestbed(), events.append, failed=True)
     assert outcome is not None
     return outcome
 
 
-def test_a_failed_repeat_is_redone_and_what_failed_is_kept_as_void(tmp_path: Path, broken: set[str]) -> None:
+def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path, broken: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, broken)
     broken.clear()
     unasked = resume_trial(folder, IdleTestbed(), lambda _: None)
     assert unasked is not None
-    assert unasked.failed == 1, "nobody asked for it"
+    assert unasked.failed == 1, "failed repeats are not repeated without the option"
     outcome = redo(folder)
     assert (outcome.valid, outcome.failed) == (2, 0)
     table = rows(folder)
@@ -71,7 +71,7 @@ def test_a_failed_repeat_is_redone_and_what_failed_is_kept_as_void(tmp_path: Pat
     demand_agreement(folder)
 
 
-def test_it_has_all_attempts_again_and_may_fail_again(tmp_path: Path, broken: set[str]) -> None:
+def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: Path, broken: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, broken)
     assert redo(folder).failed == 1
     assert [row["status"] for row in rows(folder) if row["repeat"] == "1"] == ["void"] * 5 + ["failed"]
@@ -79,13 +79,13 @@ def test_it_has_all_attempts_again_and_may_fail_again(tmp_path: Path, broken: se
     broken.clear()
     assert redo(folder).failed == 0
     demand_agreement(folder)
-    told: list[Event] = []
-    assert redo(folder, told).valid == 2
-    assert Note("no repeat of this trial failed") in told
+    received: list[Event] = []
+    assert redo(folder, received).valid == 2
+    assert Note("no repeat of this trial failed") in received
 
 
 def moments(folder: Path) -> Iterator[Path]:
-    """Yield the trial's folder as a process left it that died at each of its writes while it redid a repeat."""
+    """Yield the trial's folder after a kill at each of the writes while a repeat is run again."""
     moment, kept = 0, folder.with_name("kept")
     shutil.copytree(folder, kept)
     while True:
@@ -104,7 +104,7 @@ def moments(folder: Path) -> Iterator[Path]:
         assert code == KILLED
 
 
-def test_it_may_die_at_any_write(tmp_path: Path, broken: set[str]) -> None:
+def test_a_kill_at_any_write_is_recovered(tmp_path: Path, broken: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, broken)
     broken.clear()
     count = 0
@@ -114,13 +114,13 @@ def test_it_may_die_at_any_write(tmp_path: Path, broken: set[str]) -> None:
         assert Status.FAILED not in {attempt.status for attempt in journal.ended(journal.read(died))}
         assert [row["repeat"] for row in rows(died) if row["status"] == "valid"].count("1") == 1
         demand_agreement(died)
-    assert count > 10, "hardly a write was met"
+    assert count > 10, "too few writes were interrupted"
 
 
 def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, broken: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, broken)
     journal.append(folder, JournalEntry(1, Protocol.TCP, 2, 0, Status.PLANNED))
-    with pytest.raises(EvidenceError, match="tcp-02 is planned again, though it was valid"):
+    with pytest.raises(EvidenceError, match="tcp-02 is planned again, although it was valid"):
         redo(folder)
 
 

@@ -1,4 +1,4 @@
-"""The ledger: linear in the repeats, nothing measured or summed twice, and no evidence blessed that has changed."""
+"""The ledger: linear cost, no repeated measurement or checksum, and no acceptance of changed evidence."""
 
 import os
 from collections import Counter
@@ -34,7 +34,7 @@ CHANGED = "repeats/tcp-02/ping.txt"
 
 
 def begin(out: Path, repeats: int) -> tuple[Ledger, Plan, Path]:
-    """Begin a trial of so many repeats, of one ping each."""
+    """Start a trial with this number of repeats, each with one ping."""
     request = TrialRequest(validate(parse(PROCEDURE, source="x"), Procedure), parse_distance("30ft"), repeats=repeats)
     plan = make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, 12, 0, tzinfo=UTC))
     folder = store.create(out / str(repeats), plan)
@@ -53,7 +53,7 @@ def keep(to: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> None:
 
 @pytest.fixture
 def trial(tmp_path: Path) -> Path:
-    """A trial of three repeats of which two are over."""
+    """A trial of three repeats, of which two have ended."""
     to, plan, folder = begin(tmp_path, 3)
     for repeat in list(plan.order())[:2]:
         keep(to, plan, folder, repeat)
@@ -65,10 +65,8 @@ def again(folder: Path) -> Ledger:
     return Ledger(store.read_plan(folder), folder, Stop())
 
 
-def test_what_a_trial_writes_and_renders_grows_as_the_trial_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Twice the repeats take twice the bytes; by a table and a manifest anew for each, they would take four times."""
+def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice the repeats take twice the bytes; with a new table and manifest after each they would take four times."""
     monkeypatch.setattr(ledger, "TABLE_SHARE", 0.1)
     monkeypatch.setattr(os, "fsync", lambda _: None)
     written: Counter[int] = Counter()
@@ -97,7 +95,7 @@ def test_what_a_trial_writes_and_renders_grows_as_the_trial_does(
     assert written[120] < 3 * written[60]
 
 
-def test_a_small_trial_has_every_row_at_once(trial: Path) -> None:
+def test_a_small_trial_writes_every_row_immediately(trial: Path) -> None:
     plan = store.read_plan(trial)
     before = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
     keep(again(trial), plan, trial, list(plan.order())[2])
@@ -106,7 +104,7 @@ def test_a_small_trial_has_every_row_at_once(trial: Path) -> None:
     assert after.count("\n") == before.count("\n") + 1
 
 
-def test_a_trial_that_is_opened_again_measures_and_sums_nothing_anew(
+def test_a_reopened_trial_measures_nothing_and_computes_no_checksum_again(
     trial: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table = (trial / store.TRIAL_CSV).read_bytes()
@@ -123,20 +121,20 @@ def test_a_trial_that_is_opened_again_measures_and_sums_nothing_anew(
     assert (trial / store.TRIAL_CSV).read_bytes() == table
 
 
-def test_rows_that_a_kill_kept_from_the_table_are_measured(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_missing_in_the_table_after_a_kill_are_measured(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = store.read_plan(trial)
     table = (trial / store.TRIAL_CSV).read_bytes()
     monkeypatch.setattr(ledger, "TABLE_SHARE", 2.0)
     keep(again(trial), plan, trial, list(plan.order())[2])
-    assert (trial / store.TRIAL_CSV).read_bytes() == table, "a kill comes here"
+    assert (trial / store.TRIAL_CSV).read_bytes() == table, "the process is killed here"
     again(trial).summarize()
     assert manifest.verify(trial) == []
     assert rebuild(trial).changed == ()
     assert (trial / store.TRIAL_CSV).read_bytes().startswith(table)
 
 
-def test_tables_made_again_are_summed_again_and_nothing_else(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another fieldkit measures other rows; a journal that another hand changed stays one that differs."""
+def test_only_rebuilt_tables_get_new_checksums(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another version of fieldkit measures other rows; an edited journal is still reported as changed."""
     with (trial / "preflight.txt").open("a", encoding="utf-8") as file:
         file.write("changed\n")
     again(trial).summarize()
@@ -164,7 +162,7 @@ def rot(path: Path) -> None:
     ],
     ids=["changed", "missing", "more", "moved"],
 )
-def test_what_was_summed_stays_summed_and_a_difference_is_told(
+def test_checksums_are_kept_and_differences_reported(
     trial: Path,
     befalls: Callable[[Path], object],
     what: dict[str, str],
@@ -177,17 +175,17 @@ def test_what_was_summed_stays_summed_and_a_difference_is_told(
     assert to.differences == what
     to.summarize()
     assert set(said) <= set(manifest.verify(trial))
-    with pytest.raises(EvidenceError, match="the tables stay as they are") as caught:
+    with pytest.raises(EvidenceError, match="the tables are not changed") as caught:
         rebuild(trial)
-    assert all(one in caught.value.what for one in said)
+    assert all(text in caught.value.what for text in said)
     assert {name: (trial / name).read_bytes() for name in tables} == tables
     assert main(["aggregate", str(trial), "--rebuild"]) == 0
-    assert all(one in " ".join(capsys.readouterr().err.split()) for one in said)
+    assert all(text in " ".join(capsys.readouterr().err.split()) for text in said)
     assert main(["export", str(trial), "--format", "mcap", "-o", str(trial.parent / "out.mcap")]) == 0
-    assert all(one in " ".join(capsys.readouterr().err.split()) for one in said)
+    assert all(text in " ".join(capsys.readouterr().err.split()) for text in said)
 
 
-def test_a_plan_a_journal_and_a_table_that_changed_are_told(trial: Path) -> None:
+def test_changes_of_plan_journal_and_table_are_reported(trial: Path) -> None:
     for name in (store.TRIAL_CSV, "trial.yaml"):
         with (trial / name).open("a", encoding="utf-8") as file:
             file.write("\n" if name == "trial.yaml" else "x\n")
@@ -201,21 +199,21 @@ def test_a_plan_a_journal_and_a_table_that_changed_are_told(trial: Path) -> None
 
 
 @pytest.mark.parametrize("name", [journal.JOURNAL_FILE, "trial.yaml"])
-def test_no_table_is_made_again_from_a_plan_or_a_journal_that_changed(trial: Path, name: str) -> None:
-    """A journal cut at the end of a line says that there were fewer repeats, a plan another distance."""
+def test_no_table_is_rebuilt_from_a_changed_plan_or_journal(trial: Path, name: str) -> None:
+    """A journal cut at the end of a line has fewer repeats, an edited plan has another distance."""
     tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
     text = (trial / name).read_text(encoding="utf-8")
     cut = "".join(text.splitlines(keepends=True)[:-1])
     (trial / name).write_text(cut if name == journal.JOURNAL_FILE else text + "\n", encoding="utf-8")
-    with pytest.raises(EvidenceError, match=f"the tables stay as they are: {name}: changed"):
+    with pytest.raises(EvidenceError, match=f"the tables are not changed: {name}: changed"):
         rebuild(trial)
     assert {name: (trial / name).read_bytes() for name in tables} == tables
 
 
-def test_a_machine_of_too_little_memory_makes_no_table(
+def test_too_little_memory_leaves_the_table_unchanged(
     trial: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What one machine cannot hold says nothing of the evidence: no figure is left out for it."""
+    """Too little memory is not a property of the evidence, so no value is left out because of it."""
     tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
 
     def exhausted(_path: Path) -> ping.Ping:
@@ -227,14 +225,14 @@ def test_a_machine_of_too_little_memory_makes_no_table(
     assert {name: (trial / name).read_bytes() for name in tables} == tables
 
 
-def test_a_table_is_not_made_again_from_evidence_that_changed(trial: Path) -> None:
+def test_a_table_is_not_rebuilt_from_changed_evidence(trial: Path) -> None:
     (trial / store.TRIAL_CSV).write_text("gone\n", encoding="utf-8")
     rot(trial / CHANGED)
     with pytest.raises(EvidenceError, match=rf"evidence is not what was measured: {CHANGED}: changed"):
         again(trial)
 
 
-def test_a_table_that_is_gone_is_made_again_and_told(trial: Path) -> None:
+def test_a_missing_table_is_rebuilt_and_reported(trial: Path) -> None:
     table = (trial / store.TRIAL_CSV).read_bytes()
     (trial / store.TRIAL_CSV).unlink()
     to = again(trial)
@@ -243,16 +241,16 @@ def test_a_table_that_is_gone_is_made_again_and_told(trial: Path) -> None:
     assert (trial / store.TRIAL_CSV).read_bytes() == table
 
 
-def test_a_manifest_that_is_gone_or_no_manifest_is_told(trial: Path) -> None:
+def test_a_missing_or_invalid_manifest_is_reported(trial: Path) -> None:
     (trial / store.MANIFEST_FILE).write_text("nonsense\n", encoding="utf-8")
-    with pytest.raises(EvidenceError, match="no readable manifest: this is no line of one: nonsense") as caught:
+    with pytest.raises(EvidenceError, match="no readable manifest: not a line of a manifest: nonsense") as caught:
         again(trial)
     assert caught.value.remedy == "restore the file from a copy"
     (trial / store.MANIFEST_FILE).unlink()
     assert again(trial).differences.keys() == {store.MANIFEST_FILE}
 
 
-def test_a_report_leaves_out_evidence_that_changed_and_says_so(trial: Path) -> None:
+def test_a_report_leaves_out_changed_evidence_with_a_note(trial: Path) -> None:
     rot(trial / CHANGED)
     page = trial.parent / "report.html"
     assert main(["report", str(trial), "-o", str(page)]) == 0

@@ -1,4 +1,4 @@
-"""Locks on robots: one holder at a time whatever happens, expiry, abort from another laptop."""
+"""Locks on robots: one holder at a time in any case, expiry, abort from another laptop."""
 
 import re
 import uuid
@@ -58,7 +58,7 @@ def begin(robot: LocalShell, holder: Holder) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo", token=holder.token)
 
 
-def test_a_held_robot_names_its_holder_and_is_given_back(robot: LocalShell) -> None:
+def test_a_locked_robot_names_its_holder_and_is_unlocked(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         with (
@@ -74,25 +74,25 @@ def test_a_held_robot_names_its_holder_and_is_given_back(robot: LocalShell) -> N
         begin(robot, BERT)
 
 
-def test_the_holder_is_told_without_taking_the_robot(robot: LocalShell) -> None:
+def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     assert locks.holder(robot) is None
     with taken({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=60):
-        found = locks.holder(robot)
-        assert found is not None
-        assert found.holder == ANNA
-        assert 50 < found.left_s <= 60
+        lock = locks.holder(robot)
+        assert lock is not None
+        assert lock.holder == ANNA
+        assert 50 < lock.left_s <= 60
         alter(robot, (4, "0"))
         assert locks.holder(robot) is None, "it has expired"
     assert locks.holder(robot) is None
 
 
-def test_the_same_trial_takes_its_own_lock_again(robot: LocalShell) -> None:
+def test_the_same_trial_can_lock_its_robot_again(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet), taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
 
 
-def test_of_many_laptops_at_once_one_gets_the_robot(robot: LocalShell) -> None:
+def test_only_one_of_many_simultaneous_laptops_locks_the_robot(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     holders = [Holder(f"trial-{number}", f"laptop-{number}", "x") for number in range(12)]
 
@@ -105,12 +105,12 @@ def test_of_many_laptops_at_once_one_gets_the_robot(robot: LocalShell) -> None:
             won = [holder for holder, taken in zip(holders, pool.map(take, holders), strict=True) if taken]
         (winner,) = won
         assert record(robot)[:2] == ["held", winner.token]
-        alter(robot, (4, "1"), (5, "0"), (6, "1"))  # expired: the next turn is about who takes it over
+        alter(robot, (4, "1"), (5, "0"), (6, "1"))  # expired: in the next round, laptops compete to replace it
         assert turn < 3
 
 
-def test_a_number_that_was_used_and_removed_meanwhile_wins_nothing(robot: LocalShell) -> None:
-    """A laptop that read the lock before two others had changed it finds its next number free again."""
+def test_a_lock_number_that_was_used_and_removed_is_not_valid(robot: LocalShell) -> None:
+    """A laptop that read the lock before two others changed it finds its next number free again."""
     jobs.install(robot, Deadline.after(30))
     script = """set -- needs; . "$1"; base=.fieldkit; newest
     for words in "lock trial-b 60 bert x" "unlock trial-b" "lock trial-c 60 carl x"; do sh "$0" $words || exit; done
@@ -121,7 +121,7 @@ def test_a_number_that_was_used_and_removed_meanwhile_wins_nothing(robot: LocalS
     assert record(robot)[:2] == ["held", "trial-c"]
 
 
-def test_an_expired_lock_is_taken_over_and_its_holder_told(robot: LocalShell) -> None:
+def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (4, "1"))
         with taken({Role.SENDER: robot}, BERT, sink=quiet):
@@ -131,12 +131,12 @@ def test_an_expired_lock_is_taken_over_and_its_holder_told(robot: LocalShell) ->
             begin(robot, BERT)
 
 
-def test_a_lock_of_an_earlier_boot_goes_by_the_clock(robot: LocalShell) -> None:
+def test_a_lock_of_an_earlier_boot_expires_by_the_clock(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (2, "another-boot"), (4, "1"))
         with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
             raise AssertionError("taken twice")
-        alter(robot, (5, "99999999999"), (6, "99999999999"))  # the robot booted into the past: it has no clock
+        alter(robot, (5, "99999999999"), (6, "99999999999"))  # the robot's clock is in the past: it has no battery
         with taken({Role.SENDER: robot}, BERT, sink=quiet):
             begin(robot, BERT)
 
@@ -153,14 +153,14 @@ def test_begin_renews_at_half_time_and_not_before(robot: LocalShell) -> None:
         assert renewed[7:] == fresh[7:]
 
 
-def test_an_expired_lock_that_nobody_took_is_renewed(robot: LocalShell) -> None:
+def test_an_expired_lock_without_a_new_holder_is_renewed(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (4, "1"))
         begin(robot, ANNA)
         assert int(record(robot)[4]) > 1
 
 
-def test_abort_ends_jobs_of_any_trial_and_tells_the_holder_who_did_it(robot: LocalShell) -> None:
+def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         evidence.begin(robot, jobs.work_folder("older", "udp-03-1"), "sender", "lo")
@@ -187,9 +187,7 @@ def test_abort_ends_jobs_of_any_trial_and_tells_the_holder_who_did_it(robot: Loc
 
 
 @pytest.mark.parametrize("says", ["", "exit 1", "echo no zone", "echo no zone; echo 1800000000"])
-def test_a_robot_whose_date_tells_no_time_is_locked_all_the_same(
-    robot: LocalShell, tmp_path: Path, says: str
-) -> None:
+def test_a_robot_without_a_working_date_can_be_locked(robot: LocalShell, tmp_path: Path, says: str) -> None:
     (tmp_path / "bin" / "date").unlink(missing_ok=True)
     (tmp_path / "bin" / "date").write_text(f"#!/bin/sh\n{says}\n", encoding="ascii")
     (tmp_path / "bin" / "date").chmod(0o755)
@@ -199,7 +197,7 @@ def test_a_robot_whose_date_tells_no_time_is_locked_all_the_same(
         assert [ended.locked for ended in locks.abort({"turtlebot-1": robot}, "bert@two").values()] == [True]
 
 
-def test_a_torn_record_holds_nobody_up_for_long(robot: LocalShell) -> None:
+def test_a_torn_record_does_not_block_for_long(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     for content in ("", "held", "held trial-b boot x y z 1 bert trial"):
         (robot.home / ".fieldkit" / "lock.7").write_text(content, encoding="ascii")
@@ -209,8 +207,8 @@ def test_a_torn_record_holds_nobody_up_for_long(robot: LocalShell) -> None:
             path.unlink()
 
 
-def test_a_record_that_says_nothing_hides_no_lock(robot: LocalShell) -> None:
-    """As an older fieldkit leaves one where power ends just after it was written."""
+def test_an_empty_record_hides_no_lock(robot: LocalShell) -> None:
+    """An older fieldkit leaves such a record if the power fails just after it was written."""
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         (robot.home / ".fieldkit" / "lock.9").touch()
         with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
@@ -254,9 +252,9 @@ def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
-        found = locks.holder(robot)
-        assert found is not None
-        assert found.left_s > 7200
+        lock = locks.holder(robot)
+        assert lock is not None
+        assert lock.left_s > 7200
         fresh = record(robot)
         jobs.run(robot, Job(folder=FOLDER, name="short", argv=("true",), limit_s=60, log="log"))
         assert record(robot) == fresh
@@ -274,13 +272,13 @@ def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -
     assert not (robot.home / FOLDER / "started").exists()
 
 
-def test_no_job_starts_in_a_folder_that_was_made_while_somebody_aborted(robot: LocalShell, tmp_path: Path) -> None:
+def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tmp_path: Path) -> None:
     called, go = robot.home / "called", robot.home / "go"
     with taken({Role.SENDER: robot}, ANNA, sink=quiet), ThreadPoolExecutor(1) as pool:
         real = "busybox df" if (tmp_path / "bin" / "df").exists() else "/bin/df"
         (tmp_path / "bin" / "df").unlink(missing_ok=True)
         waits = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
-        (tmp_path / "bin" / "df").write_text(waits, encoding="ascii")  # called after the lock was looked at
+        (tmp_path / "bin" / "df").write_text(waits, encoding="ascii")  # called after the lock was checked
         (tmp_path / "bin" / "df").chmod(0o755)
         begun = pool.submit(begin, robot, ANNA)
         wait_until(called.exists, Deadline.after(30))
@@ -292,7 +290,7 @@ def test_no_job_starts_in_a_folder_that_was_made_while_somebody_aborted(robot: L
     assert not (robot.home / FOLDER / "started").exists()
 
 
-def test_a_free_robot_is_not_said_to_have_been_locked(robot: LocalShell) -> None:
+def test_aborting_a_free_robot_reports_no_lock(robot: LocalShell) -> None:
     for _ in range(2):
         (ended,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
         assert (ended.locked, ended.error) == (False, None)
@@ -301,8 +299,8 @@ def test_a_free_robot_is_not_said_to_have_been_locked(robot: LocalShell) -> None
     assert not locks.abort({"turtlebot-1": robot}, "bert@two")["turtlebot-1"].locked
 
 
-def test_who_lost_a_robot_is_told_when_it_asks(robot: LocalShell, tmp_path: Path) -> None:
-    """Also where another robot cannot tell."""
+def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Path) -> None:
+    """The holder is also notified if another robot does not answer."""
     plan = los_plan()
     anna = Holder(plan.session, "anna@one", plan.trial)
     shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
@@ -314,7 +312,7 @@ def test_who_lost_a_robot_is_told_when_it_asks(robot: LocalShell, tmp_path: Path
             robots.demand_held()
 
 
-def test_what_was_fetched_does_not_stay_on_a_robot_whose_lock_was_broken(robot: LocalShell) -> None:
+def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> None:
     with taken({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         locks.abort({"turtlebot-1": robot}, "bert@two")
@@ -324,7 +322,7 @@ def test_what_was_fetched_does_not_stay_on_a_robot_whose_lock_was_broken(robot: 
 
 
 class Unreachable(LocalShell):
-    """A robot that goes out of range after so many commands."""
+    """A robot that goes out of range after a number of commands."""
 
     left = 0
 
@@ -345,24 +343,24 @@ def cast(tmp_path: Path) -> dict[Role, Unreachable]:
     return shells
 
 
-def test_all_robots_are_taken_or_none(cast: dict[Role, Unreachable]) -> None:
+def test_all_robots_are_locked_or_none(cast: dict[Role, Unreachable]) -> None:
     with taken({Role.SENDER: cast[Role.SENDER]}, BERT, sink=quiet):
         with pytest.raises(RobotError, match="zoe: bert@two holds it"), taken(cast, ANNA, sink=quiet):
             raise AssertionError("taken")
-        assert record(cast[Role.RECEIVER])[0] == "free", "taken first, in the order of names, and given back"
+        assert record(cast[Role.RECEIVER])[0] == "free", "locked first, in the order of names, and unlocked"
 
 
-def test_a_robot_that_cannot_be_given_back_is_told(cast: dict[Role, Unreachable]) -> None:
-    told: list[Event] = []
-    with taken(cast, ANNA, sink=told.append):
+def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, Unreachable]) -> None:
+    events: list[Event] = []
+    with taken(cast, ANNA, sink=events.append):
         cast[Role.SENDER].left = 0
-    (note,) = told
+    (note,) = events
     assert isinstance(note, Note)
     assert note.text.startswith("zoe stays locked until its lock expires")
     assert record(cast[Role.RECEIVER])[0] == "free"
 
 
-def test_a_robot_that_cannot_be_reached_keeps_no_other_from_being_aborted(cast: dict[Role, Unreachable]) -> None:
+def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, Unreachable]) -> None:
     with ExitStack() as stack:
         stack.enter_context(taken(cast, ANNA, sink=lambda event: None))
         cast[Role.RECEIVER].left = 0
@@ -378,8 +376,8 @@ def test_the_user_of_this_machine_has_a_name() -> None:
     assert machine
 
 
-def test_a_second_fieldkit_with_the_token_leaves_the_first_one_its_robots(cast: dict[Role, Unreachable]) -> None:
-    # A trial without a session is its own, and its name may be longer than that of a socket.
+def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[Role, Unreachable]) -> None:
+    # A trial without a session uses its name as the token, which may be longer than the name of a socket.
     anna = Holder(uuid.uuid4().hex + "_of_a_long_procedure" * 10, "anna@one", "trial-a")
     with held(cast, anna, sink=quiet):
         with (
@@ -393,8 +391,8 @@ def test_a_second_fieldkit_with_the_token_leaves_the_first_one_its_robots(cast: 
         begin(cast[Role.SENDER], anna)
 
 
-def test_ctrl_c_hangs_up_before_the_robots_are_given_back(cast: dict[Role, Unreachable]) -> None:
-    """A link that was lost must not be awaited for the site's patience once more."""
+def test_ctrl_c_closes_connections_before_the_robots_are_unlocked(cast: dict[Role, Unreachable]) -> None:
+    """The program must not wait again for a lost link."""
     done: list[str] = []
     for shell in cast.values():
         shell.close = lambda name=shell.robot: done.append(name)  # type: ignore[method-assign,misc]

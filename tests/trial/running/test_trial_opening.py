@@ -1,4 +1,4 @@
-"""A trial's way to its robots: what is done in order, what is given back, which trials are told as not begun."""
+"""Opening the robots of a trial: the order of the steps, the clean-up, and the report of trials not started."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -28,7 +28,7 @@ TESTBED = IdleTestbed()
 
 
 class Nobody:
-    """An operator who must not be asked."""
+    """An operator that must not be asked."""
 
     def ask(self, request: str, *, may_skip: bool = False) -> Any:  # noqa: ANN401 (never returns)
         raise AssertionError(request, may_skip)
@@ -38,7 +38,7 @@ class Nobody:
 
 
 class Recorder:
-    """A backend that notes what is done with its testbed; it stands for preflight, locks and runner as well.
+    """A backend that records the use of its testbed; it also replaces preflight, locks and runner.
 
     Args:
         failing: What raises, by name.
@@ -51,7 +51,7 @@ class Recorder:
     def __init__(self, failing: Mapping[str, BaseException]) -> None:
         self.failing = dict(failing)
         self.done: list[str] = []
-        self.told: list[Event] = []
+        self.events: list[Event] = []
         self.holder: Holder | None = None
 
     def note(self, what: str) -> None:
@@ -81,7 +81,7 @@ class Recorder:
         raise AssertionError
 
     def run(self, plans: list[Plan], out: Path) -> list[Outcome | None]:
-        return opening.run(plans, self, CAST, out, sink=self.told.append, operator=Nobody(), stop=Stop())
+        return opening.run(plans, self, CAST, out, sink=self.events.append, operator=Nobody(), stop=Stop())
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def plans() -> list[Plan]:
 
 
 def notes(recorder: Recorder) -> list[str]:
-    return [event.text for event in recorder.told if isinstance(event, Note)]
+    return [event.text for event in recorder.events if isinstance(event, Note)]
 
 
 def test_trials_run_one_after_the_other_on_robots_opened_once(
@@ -147,7 +147,7 @@ def test_trials_run_one_after_the_other_on_robots_opened_once(
         ("hold", RobotError("x"), ["open", "meet", "hold", "open ends"]),
     ],
 )
-def test_robots_that_are_not_reached_or_held_are_let_go_before_any_trial(
+def test_robots_are_released_if_one_cannot_be_reached_or_locked(
     recorder: Callable[..., Recorder], tmp_path: Path, failing: str, error: FieldkitError, done: list[str]
 ) -> None:
     made = recorder(**{failing: error})
@@ -159,17 +159,17 @@ def test_robots_that_are_not_reached_or_held_are_let_go_before_any_trial(
 
 @pytest.mark.parametrize("error", [RobotError("x"), KeyboardInterrupt()])
 @pytest.mark.parametrize(
-    ("failing", "told"),
-    [("run_10ft", ["not begun: 20ft, 30ft"]), ("run_20ft", ["not begun: 30ft"]), ("run_30ft", [])],
+    ("failing", "expected_notes"),
+    [("run_10ft", ["not started: 20ft, 30ft"]), ("run_20ft", ["not started: 30ft"]), ("run_30ft", [])],
 )
-def test_a_trial_that_stops_gives_the_robots_back_and_tells_which_were_not_begun(
-    recorder: Callable[..., Recorder], tmp_path: Path, error: BaseException, failing: str, told: list[str]
+def test_a_stopped_trial_unlocks_the_robots_and_reports_trials_not_started(
+    recorder: Callable[..., Recorder], tmp_path: Path, error: BaseException, failing: str, expected_notes: list[str]
 ) -> None:
     made = recorder(**{failing: error})
     with pytest.raises(type(error)):
         made.run(plans(), tmp_path)
     assert made.done[-3:] == [failing, "hold ends", "open ends"]
-    assert notes(made) == told
+    assert notes(made) == expected_notes
 
 
 def test_nothing_is_opened_for_a_folder_that_cannot_be_written(
@@ -183,10 +183,12 @@ def test_nothing_is_opened_for_a_folder_that_cannot_be_written(
 
 
 def resume(made: Recorder, folder: Path, backend: str = "field") -> Outcome | None:
-    return opening.resume(folder, backend, made, failed=False, sink=made.told.append, operator=Nobody(), stop=Stop())
+    return opening.resume(
+        folder, backend, made, failed=False, sink=made.events.append, operator=Nobody(), stop=Stop()
+    )
 
 
-def test_a_trial_is_resumed_by_the_same_way(recorder: Callable[..., Recorder], tmp_path: Path) -> None:
+def test_a_trial_is_resumed_through_the_same_steps(recorder: Callable[..., Recorder], tmp_path: Path) -> None:
     made, plan = recorder(), los_plan()
     folder = store.create(tmp_path, plan)
     assert resume(made, folder) == Outcome(folder, (), 2, 0)
@@ -194,7 +196,7 @@ def test_a_trial_is_resumed_by_the_same_way(recorder: Callable[..., Recorder], t
     assert made.holder == Holder(plan.session, runtime.me(), plan.trial)
 
 
-def test_a_trial_of_another_backend_is_refused_before_anything_is_opened(
+def test_a_trial_of_another_backend_is_rejected_before_robots_are_opened(
     recorder: Callable[..., Recorder], tmp_path: Path
 ) -> None:
     made, folder = recorder(), store.create(tmp_path, los_plan())

@@ -1,4 +1,4 @@
-"""A kept trial goes on with the code, the backend and the robots that it began with, and with no others."""
+"""A trial can only be resumed with the code, the backend and the robots with which it started."""
 
 from pathlib import Path
 
@@ -16,25 +16,25 @@ TRIAL: Path = min(TRIALS.iterdir())
 PLAN = store.read_plan(TRIAL)
 
 
-def test_rows_of_two_ways_to_measure_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_of_different_code_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
     assert resumption.resumable(TRIAL) == PLAN
     monkeypatch.setattr(resumption, "code_hash", lambda: "another")
-    with pytest.raises(ConfigurationError, match=f"begun by other code .fieldkit .*, {PLAN.code_sha256}") as caught:
+    with pytest.raises(ConfigurationError, match=f"started by other code .fieldkit .*, {PLAN.code_sha256}") as caught:
         resumption.resumable(TRIAL)
     assert caught.value.where == str(TRIAL)
     assert typed("fieldkit", "rebuild", TRIAL) in caught.value.remedy
 
 
-def test_robots_of_another_backend_are_refused() -> None:
+def test_robots_of_another_backend_are_rejected() -> None:
     resumption.demand_backend(PLAN, PLAN.backend, TRIAL)
-    with pytest.raises(ConfigurationError, match=f"it was begun on backend {PLAN.backend}, not imagined") as caught:
+    with pytest.raises(ConfigurationError, match=f"it was started on backend {PLAN.backend}, not imagined") as caught:
         resumption.demand_backend(PLAN, "imagined", TRIAL)
     assert caught.value.remedy == typed("fieldkit", "resume", TRIAL, "--backend", PLAN.backend)
 
 
 @pytest.mark.parametrize("change", [{"name": "other"}, {"address": "10.42.0.99"}, None])
-def test_other_robots_are_refused(change: dict[str, str] | None) -> None:
+def test_other_robots_are_rejected(change: dict[str, str] | None) -> None:
     resumption.demand_cast(PLAN, PLAN.cast)
     changed = dict(PLAN.cast)
     sender = changed.pop(Role.SENDER)
@@ -45,21 +45,21 @@ def test_other_robots_are_refused(change: dict[str, str] | None) -> None:
     assert caught.value.where == PLAN.trial
 
 
-def test_a_robot_that_drove_by_itself_needs_leave_again() -> None:
+def test_a_self_moving_robot_needs_permission_again() -> None:
     shipped = load_procedure("driveaway")
     driving = {role: robot.model_copy(update={"drives": True}) for role, robot in PLAN.cast.items()}
     by_hand = {role: robot.model_copy(update={"drives": False}) for role, robot in PLAN.cast.items()}
     plan = PLAN.model_copy(update={"procedure": shipped, "cast": driving})
     resumption.demand_cast(plan, driving)
-    with pytest.raises(ConfigurationError, match="moved by itself in this trial, and may not now") as caught:
+    with pytest.raises(ConfigurationError, match="moved without a person in this trial, and may not now") as caught:
         resumption.demand_cast(plan, by_hand)
     assert "--allow-motion" in caught.value.remedy
-    # What the lab lets it do is no matter where nobody moves it, or a person did.
+    # Permission to move does not matter if nothing moves the robot, or if a person does.
     resumption.demand_cast(PLAN.model_copy(update={"cast": driving}), by_hand)
     resumption.demand_cast(plan.model_copy(update={"cast": by_hand}), driving)
 
 
-def test_a_trial_whose_program_has_changed_does_not_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_with_a_changed_program_is_not_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     program = tmp_path / "probe"
     program.write_bytes(b"1")

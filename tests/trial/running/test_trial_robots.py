@@ -1,4 +1,4 @@
-"""Ctrl-C while robots are served at once: nothing is written into an attempt any more once it is kept."""
+"""Ctrl-C during parallel operations on robots: nothing is written into an attempt's folder after it was stored."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ from tests.helpers.userlands import LocalShell
 
 
 class Slow(LocalShell):
-    """A robot that sends its evidence only until somebody hangs up, which takes it a moment."""
+    """A robot that sends its evidence until the connection is closed, and needs a moment to stop."""
 
     def __init__(self, home: Path, fetching: Callable[[], None]) -> None:
         super().__init__(home)
@@ -40,14 +40,14 @@ class Slow(LocalShell):
 
 
 def slow_testbed(home: Path) -> IdleTestbed:
-    """Return a testbed of slow robots; fetching from the last of them, the operator presses Ctrl-C."""
+    """Return a testbed of slow robots; the operator presses Ctrl-C while the last one is fetched."""
     barrier = threading.Barrier(2, action=lambda: os.kill(os.getpid(), signal.SIGINT))
     return IdleTestbed(
         {role: Slow(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
     )
 
 
-def test_ctrl_c_hangs_up_and_waits_until_nobody_writes_evidence(tmp_path: Path) -> None:
+def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: Path) -> None:
     into = tmp_path / "into"
     into.mkdir()
     robots = Robots(los_plan(), slow_testbed(tmp_path))
@@ -57,19 +57,19 @@ def test_ctrl_c_hangs_up_and_waits_until_nobody_writes_evidence(tmp_path: Path) 
     robots.hang_up()
     kept = into.rename(tmp_path / "kept")
     wait_until(lambda: others.issuperset(threading.enumerate()), Deadline.after(60))
-    assert list(kept.iterdir()) == [], "what was being fetched is cleared away before the attempt is kept"
+    assert list(kept.iterdir()) == [], "partially fetched files are removed before the attempt is stored"
     assert not into.exists()
 
 
 class Unreachable(LocalShell):
-    """A robot whose link breaks whenever it sends its evidence."""
+    """A robot whose link fails whenever it sends its evidence."""
 
     def fetch(self, argv: object, to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         raise LinkError("the connection broke", where="turtlebot-1")
 
 
 @pytest.mark.emulated
-def test_what_a_robot_did_not_give_stays_on_it(tmp_path: Path) -> None:
+def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
     plan, shells = los_plan(), {}
     attempts = {name: jobs.work_folder(plan.trial, name) for name in ("udp-01-1", "udp-01-2")}
     for role, kind in ((Role.SENDER, Unreachable), (Role.RECEIVER, LocalShell)):
@@ -87,15 +87,15 @@ def test_what_a_robot_did_not_give_stays_on_it(tmp_path: Path) -> None:
         "receiver-after.txt",
         "sender-unfetched.txt",
     }
-    assert robots.left() == {"turtlebot-1": [attempts["udp-01-1"]]}
-    robots.discard(attempts["udp-01-1"])
-    robots.discard()
+    assert robots.unfetched() == {"turtlebot-1": [attempts["udp-01-1"]]}
+    robots.delete_remote(attempts["udp-01-1"])
+    robots.delete_remote()
     kept = {role: sorted(path.name for path in (tmp_path / role / ".fieldkit").glob("*/*")) for role in shells}
     assert kept == {Role.SENDER: ["udp-01-1"], Role.RECEIVER: []}
 
 
 class Rebooted(LocalShell):
-    """A robot that lost its power after an attempt began, and what it had not written to its disk."""
+    """A robot that lost power after the start of an attempt, with the data not yet written to its disk."""
 
     boots = 0
 
@@ -115,12 +115,12 @@ def test_a_void_attempt_says_that_its_robot_rebooted(tmp_path: Path) -> None:
     said = robots.fetch("x", tmp_path, clean=False)
     reasons = [f"{name}: the robot rebooted during the repeat" for name in ("turtlebot-2", "turtlebot-1")]
     assert sorted(said) == sorted(reasons)
-    told = hosts.without_effects(["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *said])
-    assert sorted(told) == sorted(["scan.bag: there is no bag", *reasons])
+    shown = hosts.without_effects(["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *said])
+    assert sorted(shown) == sorted(["scan.bag: there is no bag", *reasons])
 
 
 class Impatient(LocalShell):
-    """A robot of which somebody hangs up after the first piece of a large file."""
+    """A robot whose connection is closed after the first segment of a large file."""
 
     def __init__(self, home: Path) -> None:
         super().__init__(home)
@@ -136,7 +136,7 @@ class Impatient(LocalShell):
 
 
 @pytest.mark.emulated
-def test_no_piece_is_asked_for_after_somebody_hung_up(tmp_path: Path) -> None:
+def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path) -> None:
     plan = los_plan()
     remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
     for role in (Role.SENDER, Role.RECEIVER):
@@ -155,11 +155,11 @@ def test_no_piece_is_asked_for_after_somebody_hung_up(tmp_path: Path) -> None:
     for path in into.glob("*.txt"):
         path.unlink()
     assert robots.fetch(remote, into, clean=True) == []
-    assert shells[Role.SENDER].pieces == 3, "it goes on where it was"
+    assert shells[Role.SENDER].pieces == 3, "fetching resumes at the same segment"
 
 
 @pytest.mark.emulated
-def test_what_came_whole_does_not_stay_because_a_job_ended_badly(tmp_path: Path) -> None:
+def test_completely_fetched_evidence_is_deleted_even_if_a_job_failed(tmp_path: Path) -> None:
     plan = los_plan()
     remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
     for role in (Role.SENDER, Role.RECEIVER):
@@ -176,5 +176,5 @@ def test_what_came_whole_does_not_stay_because_a_job_ended_badly(tmp_path: Path)
     into.mkdir()
     (said,) = robots.fetch(remote, into, clean=True)
     assert said.endswith("job capture ended with exit code 3")
-    assert "exit code 1" not in said, "it is said in the robot's own words"
-    assert robots.left() == {}
+    assert "exit code 1" not in said, "the message is from the robot"
+    assert robots.unfetched() == {}

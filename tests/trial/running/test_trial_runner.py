@@ -1,4 +1,4 @@
-"""What a trial tells and leaves behind while it runs, without robots: everything but them is the real thing."""
+"""Events and files of a running trial without robots; everything else is real."""
 
 import errno
 import os
@@ -48,11 +48,11 @@ def ended(events: list[Event]) -> list[RepeatEnded]:
 
 
 def only(folder: Path) -> Path:
-    (found,) = folder.glob("*/trial.yaml")
-    return found.parent
+    (plan_file,) = folder.glob("*/trial.yaml")
+    return plan_file.parent
 
 
-def test_the_time_left_is_that_of_repeats_that_are_over(
+def test_the_remaining_time_is_estimated_from_finished_repeats(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def clock() -> Iterator[float]:
@@ -66,11 +66,11 @@ def test_the_time_left_is_that_of_repeats_that_are_over(
     void, first, second = ended(events)
     assert (void.status, void.left_s) == (Status.VOID, 2 * of_two().procedure.expected_s(Protocol.TCP))
     assert first.status is Status.VALID
-    assert first.left_s == first.left_most_s >= STEP_S, "as long as the one that is over, void attempts included"
+    assert first.left_s == first.left_most_s >= STEP_S, "the duration of the finished repeat with its void attempts"
     assert second.left_s == 0
 
 
-def test_the_repeat_that_ctrl_c_lets_end_is_told(
+def test_the_repeat_that_ctrl_c_lets_finish_is_reported(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stop, fetch = Stop(), Robots.fetch
@@ -82,10 +82,10 @@ def test_the_repeat_that_ctrl_c_lets_end_is_told(
     monkeypatch.setattr(Robots, "fetch", asked)
     with pytest.raises(KeyboardInterrupt):
         run_trial(of_two(), IdleTestbed(), tmp_path, events.append, stop)
-    assert [one.status for one in ended(events)] == [Status.VOID, Status.VALID]
+    assert [event.status for event in ended(events)] == [Status.VOID, Status.VALID]
 
 
-def test_after_another_s_abort_no_folder_of_a_fetched_repeat_stays(
+def test_after_an_abort_by_another_user_fetched_folders_are_deleted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     removed: list[str | None] = []
@@ -95,15 +95,13 @@ def test_after_another_s_abort_no_folder_of_a_fetched_repeat_stays(
             raise LockLostError("the trial was aborted by anna@one at 12:00:00 UTC", where="turtlebot-1")
 
     monkeypatch.setattr(Robots, "begin", begin)
-    monkeypatch.setattr(Robots, "discard", lambda _, remote=None: removed.append(remote))
+    monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed.append(remote))
     with pytest.raises(LockLostError):
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
 
 
-def test_an_attempt_that_somebody_aborts_is_none_of_those_allowed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_aborted_attempt_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     removed: list[str | None] = []
 
     def measure(*_: object) -> None:
@@ -114,7 +112,7 @@ def test_an_attempt_that_somebody_aborts_is_none_of_those_allowed(
 
     monkeypatch.setattr(Robots, "measure", measure)
     monkeypatch.setattr(Robots, "demand_held", aborted)
-    monkeypatch.setattr(Robots, "discard", lambda _, remote=None: removed.append(remote))
+    monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed.append(remote))
     with pytest.raises(LockLostError):
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     (cut,) = journal.ended(journal.read(only(tmp_path)))
@@ -123,7 +121,7 @@ def test_an_attempt_that_somebody_aborts_is_none_of_those_allowed(
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
 
 
-def test_what_to_do_about_a_step_that_failed_is_told(
+def test_the_remedy_of_a_failed_step_is_reported(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failures = iter([RobotError("sending began too late", remedy="a larger `idle` leaves it more time")])
@@ -134,12 +132,12 @@ def test_what_to_do_about_a_step_that_failed_is_told(
 
     monkeypatch.setattr(Robots, "measure", measure)
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    told = [(event.reason, event.remedy) for event in ended(events)]
-    assert told[0] == ("sending began too late", "a larger `idle` leaves it more time")
-    assert not any(remedy for _, remedy in told[1:])
+    reasons_and_remedies = [(event.reason, event.remedy) for event in ended(events)]
+    assert reasons_and_remedies[0] == ("sending began too late", "a larger `idle` leaves it more time")
+    assert not any(remedy for _, remedy in reasons_and_remedies[1:])
 
 
-def test_a_step_that_fails_as_nobody_foresaw_is_told_from_an_interruption(
+def test_an_unexpected_exception_of_a_step_is_not_an_interruption(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def measure(*_: object) -> None:
@@ -152,9 +150,7 @@ def test_a_step_that_fails_as_nobody_foresaw_is_told_from_an_interruption(
     assert (cut.status, cut.excused, cut.reason) == (Status.VOID, True, "KeyError: 'load'")
 
 
-def test_evidence_that_was_gone_when_fieldkit_came_back_is_said_in_words(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_evidence_missing_after_a_kill_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = store.create(tmp_path, of_two())
     (repeat, _) = of_two().order()
     journal.append(
@@ -172,10 +168,10 @@ def test_evidence_that_was_gone_when_fieldkit_came_back_is_said_in_words(
     resume_trial(folder, IdleTestbed(), lambda _: None)
     first = journal.ended(journal.read(folder))[0]
     assert (first.status, first.excused) == (Status.VOID, True)
-    assert first.reason == f"fieldkit was killed before it had the evidence, which was not to be had later; {gone}"
+    assert first.reason == f"fieldkit was killed before it had the evidence, which could not be fetched later; {gone}"
 
 
-def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
+def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fetch = Robots.fetch
@@ -190,21 +186,21 @@ def test_evidence_that_stays_on_a_robot_is_told_also_by_who_goes_on(
     with pytest.raises(LockLostError):
         run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     folder = only(tmp_path)
-    told = Note(
-        f"turtlebot-1: evidence that was not fetched stays on it; delete it when nobody needs it: "
+    note = Note(
+        f"turtlebot-1: evidence that was not fetched stays on it; delete it when it is not needed: "
         f"~/.fieldkit/{folder.name}/tcp-01-1, ~/.fieldkit/{folder.name}/tcp-01-2"
     )
-    assert told in events
+    assert note in events
     kept = folder / "repeats/tcp-01.void1" / unfetched_file(Role.SENDER)
     assert "the link broke ?\nturtlebot-1 has it in ~/.fieldkit/" in kept.read_text(encoding="utf-8")
     events.clear()
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(folder, IdleTestbed(), events.append)
-    assert told in events
+    assert note in events
     assert manifest.verify(folder) == []
 
 
-def test_what_the_laptop_s_memory_cannot_hold_makes_an_attempt_void_and_ends_no_trial(
+def test_too_little_memory_makes_an_attempt_void_and_does_not_end_the_trial(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     judge, calls = gates.judge, 0
@@ -220,7 +216,7 @@ def test_what_the_laptop_s_memory_cannot_hold_makes_an_attempt_void_and_ends_no_
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     void, exhausting, *valid = ended(events)
     assert exhausting.reason == "this machine has too little memory to measure it"
-    assert [one.status for one in (void, exhausting, *valid)] == [
+    assert [attempt.status for attempt in (void, exhausting, *valid)] == [
         Status.VOID,
         Status.VOID,
         Status.VALID,
@@ -232,7 +228,7 @@ def interrupt(*_words: object, **_more: object) -> list[str]:
     raise KeyboardInterrupt
 
 
-def test_an_attempt_that_is_stopped_while_it_is_fetched_is_fetched_by_who_goes_on(
+def test_an_attempt_stopped_during_fetching_is_fetched_by_resume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
@@ -256,7 +252,7 @@ def test_an_attempt_that_is_stopped_while_it_is_fetched_is_fetched_by_who_goes_o
     assert fetched[0] == first.remote(folder.name)
 
 
-def test_what_is_stopped_while_it_is_measured_stays_on_the_robots_and_is_told(
+def test_evidence_of_an_attempt_stopped_during_its_steps_stays_on_the_robots(
     tmp_path: Path, events: list[Event], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
@@ -269,15 +265,15 @@ def test_what_is_stopped_while_it_is_measured_stays_on_the_robots_and_is_told(
         kept = folder / "repeats/tcp-01.void1" / unfetched_file(role)
         assert kept.read_text(encoding="utf-8").startswith("interrupted\n")
     for _ in range(2):
-        told = [event.text for event in events if isinstance(event, Note)]
-        assert sum("was not fetched stays" in one and remote in one for one in told) == 2
+        notes = [event.text for event in events if isinstance(event, Note)]
+        assert sum("was not fetched stays" in note and remote in note for note in notes) == 2
         events.clear()
         resume_trial(folder, IdleTestbed(), events.append)
     assert manifest.verify(folder) == []
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> list[str]:
-    """Let the `moment`-th call that writes, and all after it, fail; return the calls that did."""
+    """Make the `moment`-th writing call and all later ones fail; return the calls that failed."""
     count, failed = 0, []
 
     def watched(name: str, call: Callable[..., object]) -> Callable[..., object]:
@@ -312,12 +308,12 @@ def test_a_disk_may_be_full_at_any_write(tmp_path: Path, monkeypatch: pytest.Mon
             resume_trial(folder, IdleTestbed(), lambda _: None)
             assert manifest.verify(folder) == []
             assert rebuild(folder).changed == ()
-            assert sum(one.status is Status.VALID for one in journal.ended(journal.read(folder))) == 1
+            assert sum(attempt.status is Status.VALID for attempt in journal.ended(journal.read(folder))) == 1
         shutil.rmtree(out, ignore_errors=True)
-    assert moment > 30, "hardly a write was met"
+    assert moment > 30, "too few writes were interrupted"
 
 
-def test_a_folder_that_is_moved_away_stops_the_trial_which_goes_on_where_it_is(
+def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fetch = Robots.fetch
@@ -331,14 +327,18 @@ def test_a_folder_that_is_moved_away_stops_the_trial_which_goes_on_where_it_is(
     monkeypatch.setattr(Robots, "fetch", moving)
     with pytest.raises(ConfigurationError, match="cannot be written: No such file or directory") as caught:
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
-    assert caught.value.remedy == "fieldkit resume FOLDER, where that is now"
+    assert caught.value.remedy == "fieldkit resume FOLDER, with the present path of the folder"
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(tmp_path / "moved", IdleTestbed(), lambda _: None)
     assert manifest.verify(tmp_path / "moved") == []
-    assert [one.status for one in journal.ended(journal.read(tmp_path / "moved"))] == ["void", "valid", "valid"]
+    assert [attempt.status for attempt in journal.ended(journal.read(tmp_path / "moved"))] == [
+        "void",
+        "valid",
+        "valid",
+    ]
 
 
-def test_a_trial_that_runs_is_not_rebuilt(tmp_path: Path) -> None:
+def test_a_running_trial_is_not_rebuilt(tmp_path: Path) -> None:
     run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     with (
         journal.claimed(only(tmp_path)),
@@ -347,16 +347,16 @@ def test_a_trial_that_runs_is_not_rebuilt(tmp_path: Path) -> None:
         rebuild(only(tmp_path))
 
 
-def test_who_goes_on_is_told_of_evidence_that_changed(tmp_path: Path, events: list[Event]) -> None:
+def test_changed_evidence_is_reported_on_resume(tmp_path: Path, events: list[Event]) -> None:
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     folder = only(tmp_path)
     (folder / "repeats/tcp-02/ping.txt").write_text(PING.replace("time=2", "time=9"), encoding="utf-8")
     resume_trial(folder, IdleTestbed(), events.append)
-    assert Note("not as it was when it was kept, and left so: repeats/tcp-02/ping.txt: changed") in events
+    assert Note("the evidence has changed since it was stored: repeats/tcp-02/ping.txt: changed") in events
     assert manifest.verify(folder) == ["repeats/tcp-02/ping.txt: changed"]
 
 
-def test_a_trial_begun_with_another_version_of_a_package_that_adds_steps_is_not_gone_on_with(
+def test_a_trial_started_with_another_version_of_a_step_package_is_not_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun = of_two()
@@ -365,7 +365,7 @@ def test_a_trial_begun_with_another_version_of_a_package_that_adds_steps_is_not_
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.0", "fieldkit": "stale"})
     assert resumable(folder) == begun
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.1"})
-    with pytest.raises(ConfigurationError, match=r"begun by other code \(lab-steps 1\.0\)"):
+    with pytest.raises(ConfigurationError, match=r"started by other code \(lab-steps 1\.0\)"):
         resumable(folder)
 
 
