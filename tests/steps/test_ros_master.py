@@ -77,9 +77,7 @@ def test_master_is_set_only_if_its_role_is_cast() -> None:
 @pytest.mark.parametrize("role", ["drone", "rival"])
 def test_master_role_without_robot_is_refused(role: str) -> None:
     text = SITE.replace("ros_master: relay", f"ros_master: {role}")
-    with pytest.raises(
-        ConfigurationError, match="one of the assigned roles: sender, receiver, relay"
-    ) as caught:
+    with pytest.raises(ConfigurationError, match="one of the assigned roles: sender, receiver, relay") as caught:
         site(text)
     assert caught.value.where == "fieldkit.yaml:9"
 
