@@ -266,7 +266,7 @@ def test_a_whole_file_beside_lost_packets_that_copies_make_up_for(udp: Attempt) 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
 def test_answers_that_are_in_no_capture(attempt: Attempt, role: str) -> None:
     attempt.capture(role, lambda packets: packets[:-30])
-    demand(attempt, f"but the {role}'s capture ")
+    demand(attempt, f"and the {role}'s capture holds")
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
@@ -282,7 +282,7 @@ def test_answers_that_only_another_pings_packets_could_make_up_for(attempt: Atte
         return [(time_us, others.get(at, rest)) for at, (time_us, rest) in enumerate(packets)]
 
     attempt.capture(role, shared)
-    demand(attempt, f"but the {role}'s capture ")
+    demand(attempt, f"and the {role}'s capture holds")
 
 
 def _is_later(rest: bytes) -> bool:
