@@ -83,15 +83,14 @@ def measure(flow: LoadFlow, sender: Packets | None, receiver: Packets | None) ->
     return Measured.of(values, "no packet of the test is in a capture, or its datagrams were fragmented")
 
 
-def _loss(flow: LoadFlow, sent_amount: list[Packets], received_amount: list[Packets]) -> float | None:
+def _loss(flow: LoadFlow, sent: list[Packets], received: list[Packets]) -> float | None:
     if flow.protocol is Protocol.UDP:
-        if any(packets.more_fragments.any() for packets in sent_amount):
+        if any(packets.more_fragments.any() for packets in sent):
             return None
-        sent_amount, received_amount = (sum(map(len, streams)) for streams in (sent_amount, received_amount))
+        sent_amount, received_amount = (sum(map(len, streams)) for streams in (sent, received))
     else:
         sent_amount, received_amount = (
-            sum(int(stream.tcp_payload_bytes.sum()) for stream in streams)
-            for streams in (sent_amount, received_amount)
+            sum(int(stream.tcp_payload_bytes.sum()) for stream in streams) for streams in (sent, received)
         )
     return 1 - received_amount / sent_amount if sent_amount else None
 

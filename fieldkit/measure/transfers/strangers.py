@@ -47,7 +47,8 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
     if is_earlier_traffic and len(other_port) > _MAX_STRAGGLERS and not len(expected):
         return (
             f"none of its {len(sent)} packets reached the receiver, but {len(other_port)} others did"
-            f" {_most_common_ends(other_port)}: packets of an earlier attempt, or a router changed the port and more"
+            f" {_most_common_ends(other_port)}: packets of an earlier attempt were still on the way,"
+            " or a router changed the port and more"
         )
     if is_earlier_traffic or len(other_port) <= _MAX_STRAGGLERS:
         other_port = other_port.where(matches_sent)
