@@ -206,7 +206,7 @@ def test_the_page_warns_of_what_matters(tmp_path: Path) -> None:
     assert said[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
     assert "2 repeats give 50 %" in plain(said[3][0])
     assert said[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
-    assert said[5][0].startswith("Several versions of fieldkit")
+    assert said[5][0].startswith("Different versions of fieldkit")
     assert len(said) == 6
 
 
