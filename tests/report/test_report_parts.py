@@ -210,7 +210,7 @@ def test_warnings_of_a_page(tmp_path: Path) -> None:
     assert shown[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
     assert "2 repeats give 50 %" in plain(shown[3][0])
     assert shown[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
-    assert shown[5][0].startswith("Several versions of fieldkit")
+    assert shown[5][0].startswith("Different versions of fieldkit")
     assert len(shown) == 6
 
 
