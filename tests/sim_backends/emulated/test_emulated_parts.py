@@ -230,10 +230,10 @@ class TestMessages:
     @pytest.mark.parametrize(("path", "value"), FIELDS, ids=[path for path, _ in FIELDS])
     def test_each_number_is_in_its_field(self, path: str, value: float) -> None:
         kind, *names = path.split(".")
-        value = read_back(messages.Source(sensor(kind)).message(0, 0), kind)
+        field = read_back(messages.Source(sensor(kind)).message(0, 0), kind)
         for name in names:
-            value = value[int(name)] if name.isdecimal() else getattr(value, name)
-        assert value == pytest.approx(value, rel=0.01, nan_ok=True)
+            field = field[int(name)] if name.isdecimal() else getattr(field, name)
+        assert field == pytest.approx(value, rel=0.01, nan_ok=True)
 
     def test_noise_has_the_deviation_of_the_sensor(self) -> None:
         source = messages.Source(sensor("sensor_msgs/Imu"))
