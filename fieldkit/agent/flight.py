@@ -102,7 +102,7 @@ class OffboardPilot:
         log_line("ready")
         dialect, start_m = self._wait_until_ready()
         origin = self._origin(start_m)
-        loop.begin(origin, start_m[2])
+        loop.set_origin(origin, start_m[2])
         self._log.begin(origin, start_m[2])
         log_line(f"origin {json.dumps(asdict(origin))}")
         self._start_phase("standing")
@@ -159,7 +159,7 @@ class OffboardPilot:
         hold_start = None if commands else lambda: start_m
         if hold_start is not None:
             loop.run_until(lambda: time.monotonic() - start_s > _SET_POINTS_S, set_point=hold_start)
-        loop.request_missing(
+        loop.command_until(
             lambda: drone.command(*dialect.guided_command()),
             lambda: drone.guided,
             f"the mode {dialect.guided_mode}",
@@ -167,7 +167,7 @@ class OffboardPilot:
         )
         loop.state = FLYING
         self._require_armable(hold_start)
-        loop.request_missing(lambda: drone.command(ARM, 1), lambda: drone.armed, "to arm", hold_start)
+        loop.command_until(lambda: drone.command(ARM, 1), lambda: drone.armed, "to arm", hold_start)
         loop.has_armed = True
         self._start_phase("climbing")
         if commands:

@@ -40,14 +40,14 @@ class Stream:
     """Parameters of a stream of samples.
 
     Attributes:
-        stop_event: Name of the middleware.
+        over: Name of the middleware.
         size_bytes: Length of the data of a sample, at least `LEAST_BYTES`.
         rate_hz: Samples per second.
         duration_s: Duration.
         patience_s: Time for which the publisher waits for a subscription.
     """
 
-    stop_event: str
+    over: str
     size_bytes: int
     rate_hz: float
     duration_s: float

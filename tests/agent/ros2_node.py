@@ -32,13 +32,13 @@ def main(count: int, kind: str) -> None:
     deadline_s = time.monotonic() + LIMIT_S
     while len(messages) < count and time.monotonic() < deadline_s:
         rclpy.spin_once(node, timeout_sec=0.1)
-    (publisher,) = node.get_publishers_info_by_topic("/stream")
-    quality = publisher.qos_profile
+    (publisher_info,) = node.get_publishers_info_by_topic("/stream")
+    quality = publisher_info.qos_profile
     report = {
         "heard": [data.hex() for data in messages],
         "again": [serialize_message(deserialize_message(data, message_type)).hex() for data in messages],
-        "type": publisher.topic_type,
-        "hash": str(publisher.topic_type_hash),
+        "type": publisher_info.topic_type,
+        "hash": str(publisher_info.topic_type_hash),
         "reliability": quality.reliability.name,
         "depth": quality.depth,
         "subscribers": [subscription.topic_type for subscription in node.get_subscriptions_info_by_topic("/again")],

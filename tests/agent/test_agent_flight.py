@@ -70,9 +70,9 @@ def test_state_from_messages_of_an_autopilot() -> None:
     assert state.speed_m_s == pytest.approx(0.5)
     assert state.yaw_rad == pytest.approx(1.5)
     assert state.command_results == {400: 4}
-    assert state.messages == "mode OFFBOARD, its last text: Arming denied: it falls"
-    assert state.texts.new() == ["Arming denied: it falls"]
-    assert state.texts.new() == []
+    assert state.status_text == "mode OFFBOARD, its last text: Arming denied: it falls"
+    assert state.texts.unread() == ["Arming denied: it falls"]
+    assert state.texts.unread() == []
 
 
 def test_other_systems_and_damaged_frames_are_ignored() -> None:
@@ -150,7 +150,7 @@ def test_acknowledgements_for_others_and_in_progress_are_ignored() -> None:
         d.MAVLink_statustext_message(d.MAV_SEVERITY_INFO, b"Arming motors"),
     )
     assert state.command_results == {176: d.MAV_RESULT_ACCEPTED, 21: d.MAV_RESULT_FAILED}
-    assert state.texts.new() == ["Fence Breached"]
+    assert state.texts.unread() == ["Fence Breached"]
     assert state.texts.warnings == []
 
 

@@ -80,7 +80,7 @@ def test_no_faults_for_a_ready_autopilot() -> None:
         ({"place": None}, "it does not report its position"),
         (
             {"estimate": d.MAVLink_ekf_status_report_message(0xA7, 1, 1, 1, 1, 1)},
-            "its estimate of where it is does not hold",
+            "its position estimate is not valid",
         ),
         ({"estimate": d.MAVLink_estimator_status_message(1, 0x400, *(1,) * 8)}, "flags 0x400"),
         ({"status": None}, "it does not report its status"),

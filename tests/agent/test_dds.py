@@ -56,7 +56,7 @@ def test_custom_type_can_be_built() -> None:
     kind = types.ros2.types["lab_msgs/msg/Radio"]
     level, raw = np.array([1, 2, 3, 4], np.float32), np.array([9, 8], np.uint8)
     message = kind(
-        level, "x", raw, np.array([1], np.int16), good=True, element=7, wide=0.5, big=np.array([1, 2], np.int64)
+        level, "x", raw, np.array([1], np.int16), good=True, one=7, wide=0.5, big=np.array([1, 2], np.int64)
     )
     written = bytes(types.ros2.serialize_cdr(message, "lab_msgs/msg/Radio"))
     read = dds.struct_type(topic("lab_msgs/Radio", types)).deserialize(written)  # type: ignore[attr-defined]

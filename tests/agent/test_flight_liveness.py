@@ -21,7 +21,7 @@ from fieldkit.agent.flying.liveness import FLYING, PILOT, LivenessFile
 file = LivenessFile(sys.argv[1], PILOT)
 for count in range(10**9):
     if count < int(sys.argv[2]):
-        file.beat(FLYING)
+        file.update(FLYING)
     time.sleep(0.02)
 """
 

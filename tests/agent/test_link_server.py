@@ -74,7 +74,7 @@ def exchange_until(sessions: list[AutopilotSession], condition: Callable[[], boo
     while not condition():
         assert time.monotonic() < began_s + PATIENCE_S
         for session in sessions:
-            session.turn(0.02)
+            session.exchange(0.02)
     return time.monotonic() - began_s
 
 

@@ -45,9 +45,9 @@ def test_killed_writer_leaves_all_noted_records(tmp_path: Path) -> None:
         rest = process.stdout.read()
     noted = SEVERAL_PIECES + len(rest) // 8
 
-    log = topic_log.read(tmp_path / "log")
-    assert not log.whole
-    samples = log.samples
+    content = topic_log.read(tmp_path / "log")
+    assert not content.whole
+    samples = content.samples
     assert len(samples) - noted in {0, 1}, "the last record was stored, and perhaps not yet sent"
     assert samples.sequence.tolist() == list(range(len(samples)))
     assert (samples.at_ns - samples.sequence == 2).all()
@@ -61,9 +61,9 @@ def test_closed_log_contains_only_its_records(tmp_path: Path) -> None:
     log.end(6)
     size = (tmp_path / "log").stat().st_size
     assert size == len(records.MAGIC) + (SEVERAL_PIECES + 1) * records.RECORD.size
-    log = topic_log.read(tmp_path / "log")
-    assert log.whole
-    assert log.samples.sequence.tolist() == list(range(SEVERAL_PIECES))
+    content = topic_log.read(tmp_path / "log")
+    assert content.whole
+    assert content.samples.sequence.tolist() == list(range(SEVERAL_PIECES))
 
 
 def test_full_disk_is_reported_and_keeps_noted_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,8 +81,8 @@ def test_full_disk_is_reported_and_keeps_noted_records(tmp_path: Path, monkeypat
             log.note(records.SAMPLE, 5, sequence=room)
     with pytest.raises(LogError):
         log.end(6)
-    log = topic_log.read(tmp_path / "log")
-    assert (len(log.samples), log.whole) == (room, False)
+    content = topic_log.read(tmp_path / "log")
+    assert (len(content.samples), content.whole) == (room, False)
 
 
 @pytest.mark.emulated

@@ -219,9 +219,9 @@ def test_types_are_those_of_the_distribution(tmp_path: Path) -> None:
         writer.write(connection, BEGUN_NS, types.serialize_ros1(info, "sensor_msgs/msg/CameraInfo"))
     contents.convert(bag, tmp_path / "camera", distribution="humble")
     with AnyReader([tmp_path / "camera"]) as reader:
-        ((connection, _, data),) = reader.messages()
-        recovered = reader.deserialize(data, connection.msgtype)
-        assert connection.digest == get_typestore(Stores.ROS2_HUMBLE).hash_rihs01("sensor_msgs/msg/CameraInfo")
+        ((recorded, _, data),) = reader.messages()
+        recovered = reader.deserialize(data, recorded.msgtype)
+        assert recorded.digest == get_typestore(Stores.ROS2_HUMBLE).hash_rihs01("sensor_msgs/msg/CameraInfo")
     assert list(recovered.k) == list(numbers[:9])  # type: ignore[attr-defined]
 
 

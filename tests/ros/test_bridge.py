@@ -297,7 +297,7 @@ def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatc
         source.deliver(of_ros1, time.time_ns())
         target.takes = True
     source.deliver(of_ros1, time.time_ns())  # after the carrier was stopped
-    report = carrier.report()
+    report = carrier.told()
     assert target.written == [sample]
     assert (report.messages, report.unreadable, report.refused) == (1, 4, 1)
     assert report.bytes == len(of_ros1)

@@ -124,7 +124,7 @@ def resolve_origin(recorded: FlightOrigin | None, start: FlightOrigin) -> Flight
             "origin are not known: wait for GPS, or start a new trial with the drone at its place"
         )
     if (distance_m := math.hypot(north_m, east_m)) > START_M:
-        bearing_deg = math.latitude_longitude(math.atan2(east_m, north_m)) % 360
+        bearing_deg = math.degrees(math.atan2(east_m, north_m)) % 360
         raise OriginError(
             f"it is {distance_m:.1f} m from the place where its first flight of this trial started, at a bearing of "
             f"{bearing_deg:.0f} degrees; at most {START_M:g} m are allowed: carry it back"
