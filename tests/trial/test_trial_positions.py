@@ -86,7 +86,7 @@ def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
         (["receiver=trial"], 2, "there is no such file"),
         (["receiver=walk.txt"], 4, "neither GPX nor CSV"),
         (["receiver=bad.csv"], 4, "bad.csv:2: 'noon' is not a time"),
-        (["receiver=huge.gpx"], 2, "huge.gpx: has 67 MB"),
+        (["receiver=huge.gpx"], 2, "huge.gpx: it has 67 MB"),
         (["receiver=walk.csv", "--offset", "3"], 2, "has no unit"),
         (["receiver=walk.csv", "--gap", "soon"], 2, "is not a duration"),
         (["receiver=walk.csv", "--clear"], 2, "--clear forgets"),

@@ -88,7 +88,7 @@ class Attempts:
             failure = self._measure(started, remote, partial)
             reasons = [failure.located] if failure else []
             if reasons:
-                self._robots.demand_up()  # fails immediately if an emulated robot has exited
+                self._robots.demand_up()  # fails immediately if a process that the robots need has exited
             else:
                 self._ledger.measured(started)
                 self._reached = Status.MEASURED

@@ -43,7 +43,7 @@ def opened(
     """
     with backend.open(cast, seed=seed, sink=sink, operator=operator) as testbed:
         preflight.meet(cast, testbed.shells, sink)
-        # Failure to unlock an emulated robot does not matter, because the robot exits now.
+        # Failure to unlock a transient robot does not matter, because the robot ends now.
         on_lost_lock = (lambda _: None) if isinstance(testbed, Transient) else sink
         with (
             locks.held(testbed.shells, Holder(session, runtime.me(), what), sink=on_lost_lock),

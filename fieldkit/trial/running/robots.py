@@ -125,7 +125,7 @@ class Robots:
 
     @contextmanager
     def _watched(self) -> Iterator[None]:
-        """Unblock the body if a process that emulates robots has exited, because no answer can arrive any more."""
+        """Unblock the body if a process that the robots need has exited, because no answer can arrive any more."""
         ended = Event()
 
         def watch() -> None:
@@ -231,7 +231,7 @@ class Robots:
         return None
 
     def demand_up(self) -> None:
-        """Raise an error if a process that emulates robots has exited; errors as for `Transient.demand_up`."""
+        """Raise an error if a process that the robots need has exited; errors as for `Transient.demand_up`."""
         if isinstance(self._testbed, Transient):
             self._testbed.demand_up()
 
